@@ -1,0 +1,1 @@
+"""The device bus: EtherCAT type 1, below the stations."""

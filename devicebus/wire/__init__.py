@@ -1,0 +1,1 @@
+"""Type-1 frames: bytes to records and back."""

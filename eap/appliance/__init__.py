@@ -1,0 +1,1 @@
+"""Assembly: specifications become processes, sockets and the control protocol."""

@@ -1,0 +1,1 @@
+"""Bytes to records and back.  Pure functions, no state, no I/O."""

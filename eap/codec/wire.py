@@ -1,0 +1,138 @@
+"""Little-endian records that read like the tables of the standard.
+
+A record is a frozen :class:`msgspec.Struct` whose annotations give the width of
+each field.  The class statement compiles them once into one
+:class:`struct.Struct` and two straight-line functions; nothing is interpreted
+per frame.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Annotated, Any, ClassVar, Self, TypeAlias, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from eap.errors import CodecError, MalformedError, TruncatedError
+from eap.ids import NetId
+
+Buffer: TypeAlias = bytes | bytearray | memoryview
+
+
+class Scalar(msgspec.Struct, frozen=True):
+    """One field that is a whole number of bytes, optionally wrapped in a value type."""
+
+    code: str
+    wrap: type | None = None
+
+
+class Bits(msgspec.Struct, frozen=True):
+    """One field that is part of a word; neighbours fill it from bit 0 up."""
+
+    width: int
+
+
+u8 = Annotated[int, Scalar("B")]
+u16 = Annotated[int, Scalar("H")]
+u32 = Annotated[int, Scalar("I")]
+u64 = Annotated[int, Scalar("Q")]
+net_id = Annotated[NetId, Scalar("6s", NetId)]
+bit = Annotated[int, Bits(1)]
+bits3 = Annotated[int, Bits(3)]
+bits4 = Annotated[int, Bits(4)]
+bits11 = Annotated[int, Bits(11)]
+
+_WORD_CODE = {8: "B", 16: "H", 32: "I", 64: "Q"}
+
+
+class WireStruct(msgspec.Struct, frozen=True, gc=False):
+    """Base of every fixed-size record."""
+
+    LAYOUT: ClassVar[struct.Struct]
+    SIZE: ClassVar[int]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        _compile(cls)
+
+    @classmethod
+    def decode(cls, data: Buffer, offset: int = 0) -> Self:
+        """Read one record at *offset*.
+
+        Raises TruncatedError if it does not fit and MalformedError if a field
+        holds a value that its type does not know.
+        """
+        raise NotImplementedError  # every subclass gets its own from _compile()
+
+    def encode(self) -> bytes:
+        """Return the record's bytes; raise CodecError if a value is out of range."""
+        raise NotImplementedError  # every subclass gets its own from _compile()
+
+
+def _compile(cls: type[WireStruct]) -> None:
+    codes: list[str] = []  # one struct code a word
+    reads: list[str] = []  # one expression over w0, w1, ... a field
+    writes: list[str] = []  # one expression over self a word
+    scope: dict[str, Any] = {}
+    filled = 0  # bits used of an open word, 0 when none is open
+
+    def close_word() -> None:
+        nonlocal filled
+        if filled not in _WORD_CODE:
+            raise TypeError(f"{cls.__name__}: bit fields stop at bit {filled} of a word")
+        codes[-1] = _WORD_CODE[filled]
+        filled = 0
+
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        if get_origin(hint) is ClassVar:
+            continue
+        kind = get_args(hint)[1]
+        if isinstance(kind, Scalar):
+            if filled:
+                close_word()
+            word = len(codes)
+            codes.append(kind.code)
+            writes.append(f"self.{name}")
+            reads.append(f"w{word}" if kind.wrap is None else f"c{word}(w{word})")
+            scope[f"c{word}"] = kind.wrap
+        else:
+            if not filled:
+                codes.append("")
+                writes.append("0")
+            mask = (1 << kind.width) - 1
+            reads.append(f"w{len(codes) - 1} >> {filled} & {mask:#x}")
+            writes[-1] += f" | (self.{name} & {mask:#x}) << {filled}"
+            filled += kind.width
+    if filled:
+        close_word()
+
+    cls.LAYOUT = struct.Struct("<" + "".join(codes))
+    cls.SIZE = cls.LAYOUT.size
+    words = ", ".join(f"w{n}" for n in range(len(codes)))
+    source = f"""
+def decode(cls, data, offset=0):
+    try:
+        {words}, = unpack(data, offset)
+        return cls({", ".join(reads)})
+    except error as exc:
+        raise TruncatedError(str(exc), layout=cls.__name__, offset=offset) from None
+    except ValueError as exc:
+        raise MalformedError(str(exc), layout=cls.__name__, offset=offset) from None
+
+def encode(self):
+    try:
+        return pack({", ".join(writes)})
+    except error as exc:
+        raise CodecError(str(exc), layout=type(self).__name__) from None
+"""
+    scope |= {
+        "unpack": cls.LAYOUT.unpack_from,
+        "pack": cls.LAYOUT.pack,
+        "error": struct.error,
+        "CodecError": CodecError,
+        "MalformedError": MalformedError,
+        "TruncatedError": TruncatedError,
+    }
+    exec(source, scope)  # noqa: S102  as dataclasses and attrs do
+    cls.decode = classmethod(scope["decode"])  # type: ignore[assignment, method-assign]
+    cls.encode = scope["encode"]  # type: ignore[method-assign]

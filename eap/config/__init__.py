@@ -1,0 +1,1 @@
+"""The plant file: structs, loading with file and line, semantic checks."""

@@ -1,0 +1,154 @@
+"""Addresses as value types."""
+
+from __future__ import annotations
+
+import re
+from enum import Enum, auto
+from ipaddress import IPv4Address
+from typing import NamedTuple, Self
+from urllib.parse import parse_qsl, urlencode
+
+
+class NetId(bytes):
+    """An AMS NetID: six octets, written ``5.23.91.23.1.1``.  Not an IP address."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read the dotted form; raise ValueError if it is not six octets."""
+        octets = text.split(".")
+        if len(octets) != 6 or not all(part.isascii() and part.isdigit() for part in octets):
+            raise ValueError(f"{text!r} is not an AMS NetID (six numbers such as 5.23.91.23.1.1)")
+        numbers = [int(part) for part in octets]
+        if max(numbers) > 255:
+            raise ValueError(f"{text!r} has an octet above 255")
+        return cls(numbers)
+
+    def __str__(self) -> str:
+        return ".".join(map(str, self))
+
+    def __repr__(self) -> str:
+        return f"NetId.parse({str(self)!r})"
+
+
+_MAC = re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}")
+
+
+class MacAddr(bytes):
+    """An Ethernet address: six octets, written ``01:01:05:04:00:00``."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read the form with colons or dashes; raise ValueError if it is not six octets."""
+        if not _MAC.fullmatch(text):
+            raise ValueError(
+                f"{text!r} is not a MAC address (six octets such as 01:01:05:04:00:00)"
+            )
+        return cls.fromhex(text.replace("-", "").replace(":", ""))
+
+    @property
+    def is_group(self) -> bool:
+        """Whether this is a multicast or the broadcast address."""
+        return bool(self[0] & 1)
+
+    def __str__(self) -> str:
+        return ":".join(f"{octet:02x}" for octet in self)
+
+    def __repr__(self) -> str:
+        return f"MacAddr.parse({str(self)!r})"
+
+
+BROADCAST_MAC = MacAddr(b"\xff" * 6)
+EAP_MULTICAST_MAC = MacAddr.parse("01:01:05:04:00:00")
+"""Default destination of a publisher on Ethernet."""
+
+
+INTERFACE_SCHEMES = ("udp", "ethernet", "tcp", "loop", "sim")
+
+
+class InterfaceUri(NamedTuple):
+    """What a port is attached to: ``udp://127.0.1.1``, ``ethernet://eth0``, ``loop://line``.
+
+    *host* is an address, an interface name or a loopback's name; *port* is 0 unless given.
+    """
+
+    scheme: str
+    host: str
+    port: int = 0
+    options: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read the URI form; raise ValueError with the reason if it is not one of ours."""
+        scheme, separator, rest = text.partition("://")
+        if not separator or scheme not in INTERFACE_SCHEMES:
+            known = ", ".join(f"{name}://…" for name in INTERFACE_SCHEMES)
+            raise ValueError(f"{text!r} is not an interface (one of {known})")
+        rest, _, query = rest.partition("?")
+        options = tuple(parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query)))
+        if scheme in {"udp", "tcp"}:
+            host, port = _split_port(rest)
+            return cls(scheme, host, port, options)
+        if not rest:
+            raise ValueError(f"{text!r} names no interface")
+        return cls(scheme, rest, 0, options)
+
+    def __str__(self) -> str:
+        port = f":{self.port}" if self.port else ""
+        query = f"?{urlencode(self.options)}" if self.options else ""
+        return f"{self.scheme}://{self.host}{port}{query}"
+
+
+class DestinationKind(Enum):
+    """Which kind of address a frame goes to."""
+
+    MAC = auto()
+    IP = auto()
+    TCP = auto()
+
+
+class Destination(NamedTuple):
+    """Where a frame goes: a MAC address, an IPv4 address or ``tcp://`` and an IPv4 address."""
+
+    kind: DestinationKind
+    host: str
+    port: int = 0
+    """UDP or TCP port, 0 for the usual one."""
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read any of the forms; raise ValueError if it is none of them."""
+        if text.startswith("tcp://"):
+            return cls(DestinationKind.TCP, *_split_port(text[6:]))
+        if text.count(":") == 5 or text.count("-") == 5:
+            return cls(DestinationKind.MAC, str(MacAddr.parse(text)))
+        return cls(DestinationKind.IP, *_split_port(text))
+
+    @property
+    def is_group(self) -> bool:
+        """Whether more than one station may listen there (multicast, or 255.255.255.255)."""
+        if self.kind is DestinationKind.MAC:
+            return MacAddr.parse(self.host).is_group
+        address = IPv4Address(self.host)
+        return address.is_multicast or address == IPv4Address("255.255.255.255")
+
+    def __str__(self) -> str:
+        scheme = "tcp://" if self.kind is DestinationKind.TCP else ""
+        port = f":{self.port}" if self.port else ""
+        return f"{scheme}{self.host}{port}"
+
+
+def _split_port(text: str) -> tuple[str, int]:
+    host, separator, port = text.partition(":")
+    try:
+        address = str(IPv4Address(host))
+    except ValueError:
+        raise ValueError(f"{host!r} is not an IPv4 address") from None
+    if not separator:
+        return address, 0
+    if not port.isdigit() or not 0 < int(port) < 65536:
+        raise ValueError(f"{port!r} is not a port (1 to 65535)")
+    return address, int(port)

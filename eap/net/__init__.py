@@ -1,0 +1,1 @@
+"""Drivers: each owns one socket, file or timer and knows nothing of the protocol."""

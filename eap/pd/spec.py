@@ -1,0 +1,219 @@
+"""What one station is asked to do, complete and checked: the input of the engine.
+
+A plant file and, later, an object dictionary both end in these records.  They hold names and plain
+values only, so that they cross from the supervisor to the engine as JSON; times and sizes are in
+the units their names say, and 0 means "off" where a field says so.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import msgspec
+
+
+class Writer(StrEnum):
+    """Who may write a variable; each has a region of the process image to itself."""
+
+    ENGINE = "engine"
+    """Received process data and the generators that run in the cycle."""
+    SERVICES = "services"
+    """Sources that need I/O: host measurements, CSV replay."""
+    APPLICATION = "application"
+    """User programs and ``eapctl pd set``."""
+
+
+class Substitute(StrEnum):
+    """What a subscriber's variables hold after its time-out."""
+
+    HOLD = "hold"
+    ZERO = "zero"
+    DEFAULT = "default"
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all specifications."""
+
+
+class VariableSpec(Record, frozen=True):
+    """One variable; *type* as ``eap.codec.datatypes.parse`` reads it."""
+
+    name: str
+    type: str
+    writer: Writer = Writer.APPLICATION
+    default: bool | int | float | str | list[bool | int | float] | None = None
+    """Value at the start and, with Substitute.DEFAULT, after a time-out; None is all zero.
+
+    Raw blocks take a string of hexadecimal digits.
+    """
+    unit: str = ""
+    comment: str = ""
+
+
+class CounterSource(Record, frozen=True, tag="counter", tag_field="kind"):
+    """One *step* up in each device cycle, wrapping with the type."""
+
+    variable: str
+    step: int = 1
+
+
+class RampSource(Record, frozen=True, tag="ramp", tag_field="kind"):
+    """From *low* to *high* in *period_ms*, then again."""
+
+    variable: str
+    low: float
+    high: float
+    period_ms: float
+
+
+class SineSource(Record, frozen=True, tag="sine", tag_field="kind"):
+    """*offset* plus *amplitude* times the sine of a full turn in *period_ms*."""
+
+    variable: str
+    amplitude: float
+    period_ms: float
+    offset: float = 0.0
+
+
+class RandomSource(Record, frozen=True, tag="random", tag_field="kind"):
+    """Random octets in each device cycle in which the variable is sent."""
+
+    variable: str
+    seed: int = 0
+
+
+class HostSource(Record, frozen=True, tag="host", tag_field="kind"):
+    """A measurement of this host, read from /proc; *measure* as ``eap.net.host`` names them."""
+
+    variable: str
+    measure: str
+    argument: str = ""
+    period_ms: int = 500
+
+
+class CsvSource(Record, frozen=True, tag="csv", tag_field="kind"):
+    """One *column* of *file*, a row every *period_ms*, from the start again at the end."""
+
+    variable: str
+    file: str
+    column: str
+    period_ms: int = 100
+
+
+EngineSource = CounterSource | RampSource | SineSource | RandomSource
+ServicesSource = HostSource | CsvSource
+Source = EngineSource | ServicesSource
+
+
+class OnChangeSpec(Record, frozen=True):
+    """Send when the data differs from what was sent last."""
+
+    timeout_ms: int = 0
+    """Send again though unchanged after this time; 0 never."""
+    inhibit_us: int = 0
+    """Shortest gap between two frames sent for a change; 0 none."""
+
+
+class TriggerSpec(Record, frozen=True):
+    """When a TxPD is sent; docs/triggers.md has the truth table.  All off: each device cycle."""
+
+    cycle_us: int = 0
+    divider: int = 0
+    modulo: int = 0
+    on_change: OnChangeSpec | None = None
+    event: bool = False
+    """Send when the application raises bit 1 of the PD's ``.VarCtrl``."""
+
+
+class TxPdSpec(Record, frozen=True):
+    """One PD to send: *variables* of this station, in PDO order."""
+
+    name: str
+    pd_id: int
+    variables: tuple[str, ...]
+    version: int = 0
+    trigger: TriggerSpec = TriggerSpec()
+
+
+class TxFrameSpec(Record, frozen=True):
+    """One frame to send from *port* to *destination*.
+
+    *destination* is a MAC address, an IPv4 address (``address[:port]``) or ``tcp://address[:port]``.
+    """
+
+    name: str
+    port: str
+    destination: str
+    pds: tuple[TxPdSpec, ...]
+    divider: int = 0
+    modulo: int = 0
+
+
+class RxPdSpec(Record, frozen=True):
+    """One PD to receive into *variables* of this station, in PDO order."""
+
+    name: str
+    port: str
+    pd_id: int
+    variables: tuple[str, ...]
+    publisher: str = ""
+    """NetID in dotted form; empty is any publisher."""
+    version: int = 0
+    ignore_version: bool = False
+    timeout_ms: int = 0
+    """Age at which the substitute applies; 0 never."""
+    substitute: Substitute = Substitute.HOLD
+    sender_cycle_us: int = 0
+    """The sender's device cycle, 0 if unknown: needed for jitter, lateness and long gaps."""
+    step: int = 0
+    """Sender cycles between two of this PD, 0 if it has no fixed step: needed to count losses."""
+
+
+class PortKind(StrEnum):
+    """What a port speaks: EAP to other stations or type 1 down to slaves."""
+
+    EAP = "eap"
+    BUS = "bus"
+
+
+class Wake(StrEnum):
+    """When received frames are taken."""
+
+    CYCLE = "cycle"
+    """At the start of the station's next cycle: the fewest wake-ups."""
+    ARRIVAL = "arrival"
+    """As they arrive: the shortest latency, at the price of a wake-up a frame."""
+
+
+class PortSpec(Record, frozen=True):
+    """One port; *interface* is a URI such as ``udp://127.0.1.1`` or ``ethernet://eth0``."""
+
+    name: str
+    kind: PortKind
+    interface: str
+    net_id: str
+    vlan_id: int = 0
+    """Send tagged with this VID and take only its frames; 0 sends untagged."""
+    vlan_priority: int = 0
+    join: tuple[str, ...] = ()
+    """Multicast groups (MAC or IPv4) to listen to; the EAP default on Ethernet always is."""
+    broadcast: bool = False
+    """Whether to listen to UDP broadcasts."""
+    tcp: bool = False
+    """Whether type 4 is taken from TCP connections too."""
+    wake: Wake = Wake.CYCLE
+
+
+class StationSpec(Record, frozen=True):
+    """One station, complete."""
+
+    name: str
+    net_id: str
+    cycle_us: int
+    ports: tuple[PortSpec, ...]
+    phase_us: int = 0
+    """Where in the cycle the station runs; stations of one engine are staggered."""
+    variables: tuple[VariableSpec, ...] = ()
+    sources: tuple[Source, ...] = ()
+    frames: tuple[TxFrameSpec, ...] = ()
+    subscriptions: tuple[RxPdSpec, ...] = ()
