@@ -1,0 +1,206 @@
+"""The runtime directory: one folder per running appliance, found by everyone who wants to talk.
+
+A folder is alive exactly as long as its supervisor holds the lock in it.  The kernel drops that
+lock however the supervisor ends, so nothing here ever has to guess from a process id.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from eap.errors import EnvironmentalError
+
+VARIABLE = "EAP_RUNTIME_DIR"
+MAX_SOCKET_PATH = 107
+"""Octets of a Unix socket's path (``sun_path`` less its final zero)."""
+
+_FLOCK = struct.Struct("hhqqi4x")
+_MAX_NAME = 60
+
+
+class ProcessInfo(msgspec.Struct):
+    """One process of an appliance; *pid* is 0 while it is being started again."""
+
+    pid: int = 0
+    restarts: int = 0
+    report: dict[str, Any] = {}
+    """What the process said of itself when it became ready."""
+
+
+class ApplianceInfo(msgspec.Struct):
+    """What a supervisor tells about its appliance (``appliance.json``)."""
+
+    plant: str
+    plant_file: str
+    stations: list[str]
+    started_at: str
+    """Wall clock, ISO 8601 with time zone."""
+    supervisor: int
+    """Process id."""
+    engine: ProcessInfo = msgspec.field(default_factory=ProcessInfo)
+    services: ProcessInfo = msgspec.field(default_factory=ProcessInfo)
+
+
+def runtime_root() -> Path:
+    """Return EAP_RUNTIME_DIR, else ``$XDG_RUNTIME_DIR/eap``, else ``/run/eap``."""
+    if given := os.environ.get(VARIABLE):
+        return Path(given)
+    if session := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(session) / "eap"
+    return Path("/run/eap")
+
+
+def folder_name(plant: str, subset: Sequence[str] = ()) -> str:
+    """Return the folder of *plant*, or of the *subset* of its stations that an appliance runs."""
+    name = f"{plant}@{'+'.join(subset)}" if subset else plant
+    safe = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in name)
+    if safe == name and len(name) <= _MAX_NAME and not name.startswith("."):
+        return name
+    digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+    return f"{safe[:_MAX_NAME].lstrip('.')}-{digest}"
+
+
+class ApplianceFolder:
+    """The paths of one appliance's folder; whoever claims it holds its lock until ``close``."""
+
+    def __init__(self, path: Path, lock_fd: int = -1) -> None:
+        self.path = path
+        self._lock_fd = lock_fd
+
+    @classmethod
+    def claim(cls, name: str) -> Self:
+        """Make the folder *name* ours and empty.
+
+        Raises:
+            EnvironmentalError: another process holds it, or the directory cannot be written.
+        """
+        path = runtime_root() / name
+        try:
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            lock_fd = _lock(path)
+        except OSError as exc:
+            raise EnvironmentalError(
+                f"runtime directory {path}: {exc.strerror}; set {VARIABLE} to a directory that"
+                f" you may write"
+            ) from None
+        folder = cls(path, lock_fd)
+        if len(os.fsencode(folder.control_socket)) > MAX_SOCKET_PATH:
+            folder.close()
+            raise EnvironmentalError(
+                f"runtime directory {path} is too long for a socket's path (at most"
+                f" {MAX_SOCKET_PATH} octets): set {VARIABLE} to a shorter one"
+            )
+        folder._empty()
+        return folder
+
+    @property
+    def control_socket(self) -> Path:
+        """Where clients connect."""
+        return self.path / "control"
+
+    @property
+    def discards(self) -> Path:
+        """The counters of the services process."""
+        return self.path / "discards"
+
+    def image(self, station: str) -> Path:
+        """Return the file of one station's process image."""
+        return self.path / f"{folder_name(station)}.image"
+
+    def write_info(self, info: ApplianceInfo) -> None:
+        """Replace ``appliance.json`` in one step."""
+        temporary = self.path / "appliance.json.new"
+        with temporary.open("wb") as file:
+            file.write(msgspec.json.format(msgspec.json.encode(info)))
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(self.path / "appliance.json")
+
+    def read_info(self) -> ApplianceInfo:
+        """Return what the supervisor wrote last; raise OSError when there is nothing yet."""
+        return msgspec.json.decode((self.path / "appliance.json").read_bytes(), type=ApplianceInfo)
+
+    def is_alive(self) -> bool:
+        """Whether a supervisor holds the lock; asking never disturbs one that is starting."""
+        try:
+            fd = os.open(self.path / "lock", os.O_RDWR | os.O_CLOEXEC)
+        except OSError:
+            return False
+        try:
+            request = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+            answer = fcntl.fcntl(fd, fcntl.F_OFD_GETLK, request)
+        finally:
+            os.close(fd)
+        return bool(_FLOCK.unpack(answer)[0] != fcntl.F_UNLCK)
+
+    def close(self) -> None:
+        """Remove the folder and let go of the lock."""
+        if self._lock_fd < 0:
+            return
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock_fd)
+        self._lock_fd = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _empty(self) -> None:
+        for entry in self.path.iterdir():
+            if entry.name != "lock":
+                entry.unlink()
+
+
+def find_appliances() -> list[ApplianceFolder]:
+    """Return the folders of all running appliances, by name."""
+    try:
+        folders = sorted(entry for entry in runtime_root().iterdir() if entry.is_dir())
+    except OSError:
+        return []
+    return [folder for folder in map(ApplianceFolder, folders) if folder.is_alive()]
+
+
+def _lock(path: Path) -> int:
+    """Take the lock of *path*; a folder removed by its last owner meanwhile is made again."""
+    while True:
+        fd = os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            request = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+            fcntl.fcntl(fd, fcntl.F_OFD_SETLK, request)
+        except BlockingIOError:
+            holder = os.pread(fd, 16, 0).decode("ascii", "replace") or "another process"
+            os.close(fd)
+            raise EnvironmentalError(
+                f"appliance {path.name} already runs (process {holder}); stop it first, or choose"
+                f" other stations with --station"
+            ) from None
+        if _is_same_file(fd, path / "lock"):
+            os.ftruncate(fd, 0)
+            os.pwrite(fd, str(os.getpid()).encode(), 0)
+            return fd
+        os.close(fd)
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+
+def _is_same_file(fd: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(fd), path.stat())
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,107 @@
+"""The runtime directory: claims, refusals, dead folders."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from eap.appliance import runtime
+from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_appliances, folder_name
+from eap.errors import EnvironmentalError
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path / "eap"))
+    return tmp_path / "eap"
+
+
+def info(plant: str = "demo") -> ApplianceInfo:
+    return ApplianceInfo(plant, "demo.yaml", ["a"], "2026-01-01T00:00:00+00:00", os.getpid())
+
+
+def test_order_of_directories(monkeypatch):
+    monkeypatch.setenv("EAP_RUNTIME_DIR", "/x")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/y")
+    assert runtime.runtime_root() == Path("/x")
+    monkeypatch.delenv("EAP_RUNTIME_DIR")
+    assert runtime.runtime_root() == Path("/y/eap")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert runtime.runtime_root() == Path("/run/eap")
+
+
+def test_folder_names_are_readable_and_unique():
+    assert folder_name("demo") == "demo"
+    assert folder_name("demo", ["a", "b"]) == "demo@a+b"
+    assert "/" not in folder_name("a/b")
+    assert folder_name("a/b") != folder_name("a_b")
+    assert folder_name("..") not in {"..", "."}
+    long = [f"station-{n}" for n in range(40)]
+    assert len(folder_name("demo", long)) < 80
+    assert folder_name("demo", long) != folder_name("demo", long[:-1])
+
+
+def test_claim_refuses_a_second_start_and_names_the_holder():
+    with ApplianceFolder.claim("demo"), pytest.raises(EnvironmentalError, match=str(os.getpid())):
+        ApplianceFolder.claim("demo")
+    with ApplianceFolder.claim("demo"):
+        pass
+
+
+def test_find_sees_only_the_living(root):
+    assert find_appliances() == []
+    dead = root / "dead"
+    dead.mkdir(parents=True)
+    (dead / "lock").write_text("1")
+    (dead / "appliance.json").write_text("{}")
+    (root / "no-lock").mkdir()
+    with ApplianceFolder.claim("demo") as folder:
+        folder.write_info(info())
+        assert [found.path.name for found in find_appliances()] == ["demo"]
+        assert find_appliances()[0].read_info() == info()
+        with pytest.raises(EnvironmentalError):  # asking took nothing away
+            ApplianceFolder.claim("demo")
+    assert find_appliances() == []
+    assert not (root / "demo").exists()
+
+
+def test_a_killed_holder_leaves_a_folder_that_is_emptied_and_reused(root):
+    code = (
+        "import os, signal\n"
+        "from eap.appliance.runtime import ApplianceFolder\n"
+        "folder = ApplianceFolder.claim('demo')\n"
+        "folder.image('a').write_bytes(b'old')\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False)
+    assert done.returncode == -9
+    assert (root / "demo" / "a.image").exists()
+    assert find_appliances() == []
+    with ApplianceFolder.claim("demo") as folder:
+        assert not folder.image("a").exists()
+
+
+def test_a_directory_that_cannot_be_made_names_the_variable(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path / "file" / "eap"))
+    with pytest.raises(EnvironmentalError, match="EAP_RUNTIME_DIR"):
+        ApplianceFolder.claim("demo")
+    assert find_appliances() == []
+
+
+def test_a_path_too_long_for_a_socket_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path / ("x" * 100)))
+    with pytest.raises(EnvironmentalError, match="107"):
+        ApplianceFolder.claim("demo")
+
+
+def test_closing_twice_is_harmless_and_keeps_a_successor():
+    first = ApplianceFolder.claim("demo")
+    first.close()
+    with ApplianceFolder.claim("demo") as second:
+        first.close()
+        assert second.is_alive()
