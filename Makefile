@@ -1,0 +1,49 @@
+# Everything a person or CI does with this tree.  `make` alone lists the targets.
+
+# The interpreter that .venv is made with; at least 3.11.
+PYTHON ?= python3
+# How long the demo runs; empty means until Ctrl-C.
+SECONDS ?=
+# More arguments for pytest or the benchmark: make test ARGS="-k codec".
+ARGS ?=
+
+BIN := .venv/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check bench clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-6s %s\n", $$1, $$2 }' Makefile
+
+setup: .venv/.stamp-dev  ## prepare .venv (done once, and again when pyproject.toml changes)
+
+.venv/.stamp-dev: pyproject.toml
+	@PYTHON='$(PYTHON)' sh tools/venv.sh
+
+.venv/.stamp-bench: .venv/.stamp-dev
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --group bench
+	@touch $@
+
+demo: setup  ## run the demo plant and show its values moving; Ctrl-C ends it
+	@$(BIN)/python tools/demo.py $(if $(SECONDS),--seconds '$(SECONDS)')
+
+# Tests with sockets and processes run last, alone and in one worker; tests/conftest.py sees to it.
+test: setup  ## run all tests; as root, first install the programs they use
+	@sh tools/install_peers.sh test || echo 'make test: going on; what needs them is skipped and listed'
+	@$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadgroup --no-loadscope-reorder $(ARGS)
+
+check: setup  ## format, lint, types, import contracts, tree
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/python tools/check_tree.py
+
+bench: .venv/.stamp-bench  ## measure speed and memory (as root for everything; takes minutes)
+	@sh tools/install_peers.sh bench || echo 'make bench: going on without; what needs them is left out'
+	@$(BIN)/python -m tools.bench $(ARGS)
+
+clean:  ## remove .venv and everything that was generated
+	rm -rf .venv build dist *.egg-info .coverage .hypothesis .import_linter_cache \
+		.mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,81 @@
+"""What holds for every test: the hypothesis profile, who is skipped and why, and who runs alone.
+
+Tests marked ``net`` open sockets and start processes, on fixed addresses and with an eye on the
+clock.  They come after all others; under xdist they share one worker, and while one of them runs
+the other workers wait.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Generator
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+settings.register_profile(
+    "ci",
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("ci")
+
+_CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_SYS_ADMIN": 21}
+"""What a network namespace with a veth pair and a raw socket takes: name to bit."""
+
+_TURN = os.open(__file__, os.O_RDONLY)  # only ever locked: shared by the rest, exclusive for net
+
+
+def _lacks_root() -> str | None:
+    """Say why this process cannot make network namespaces and raw sockets, or None if it can."""
+    if os.geteuid() != 0:
+        return "needs root (namespaces, raw sockets); run the tests as root"
+    status = Path("/proc/self/status").read_text()
+    held = int(status.partition("CapEff:")[2].split()[0], 16)
+    for name, bit in _CAPABILITIES.items():
+        if not held >> bit & 1:
+            return f"needs {name}, which root does not have here (a container without it?)"
+    return _lacks_program("ip", package="iproute2")
+
+
+def _lacks_program(name: str, *, package: str) -> str | None:
+    if shutil.which(name) is None:
+        return f"needs {name}; to install: apt-get install {package}"
+    return None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip what this machine cannot do, and put the ``net`` tests last and in one group."""
+    missing = {"root": _lacks_root(), "tshark": _lacks_program("tshark", package="tshark")}
+    for item in items:
+        for marker, reason in missing.items():
+            if reason is not None and item.get_closest_marker(marker) is not None:
+                item.add_marker(pytest.mark.skip(reason=reason))
+        if _is_net(item) and config.pluginmanager.hasplugin("xdist"):
+            item.add_marker(pytest.mark.xdist_group("net"))
+    items.sort(key=_is_net)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Under xdist, let a ``net`` test have the machine to itself.
+
+    Outside pytest-timeout's wrapper, so that waiting for a turn costs no test its time.
+    """
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return (yield)
+    fcntl.flock(_TURN, fcntl.LOCK_EX if _is_net(item) else fcntl.LOCK_SH)
+    try:
+        return (yield)
+    finally:
+        fcntl.flock(_TURN, fcntl.LOCK_UN)
+
+
+def _is_net(item: pytest.Item) -> bool:
+    return item.get_closest_marker("net") is not None

@@ -1,0 +1,151 @@
+"""The tree check, on small trees made for it."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+from tools.check_tree import MAX_LINES, check, check_text, list_files, main
+
+TWO_DOTS = ".."
+
+
+def grow(root: Path, *names: str, text: str = "") -> Path:
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return root
+
+
+def found(root: Path) -> list[str]:
+    return [str(violation) for violation in check(root)]
+
+
+def test_clean_tree_has_no_findings(tmp_path):
+    grow(tmp_path, "README.md", ".ci/run", "eap/__init__.py", "eap/ids.py", "eap/pd/a.py")
+    grow(tmp_path, "tests/unit/eap/test_ids.py", "tests/unit/eap/pd/test_a.py")
+    grow(tmp_path, "tests/unit/conftest.py", "tests/support/link.py", "docs/picture.svg")
+
+    assert found(tmp_path) == []
+    assert main([str(tmp_path)]) == 0
+
+
+def test_every_finding_is_one_line_and_the_status_is_1(tmp_path, capsys):
+    grow(tmp_path, "notes.txt", "eap/ids.py")
+
+    assert main([str(tmp_path)]) == 1
+
+    assert capsys.readouterr().out.splitlines() == [
+        "eap/ids.py:1: no unit test file, expected one at tests/unit/eap/test_ids.py",
+        "notes.txt:1: 'notes.txt' at the top level, expected one of the rooms we have",
+    ]
+
+
+def test_a_foreign_directory_is_reported_once(tmp_path):
+    grow(tmp_path, "vendor/a.txt", "vendor/b.txt")
+    assert found(tmp_path) == [
+        "vendor/a.txt:1: 'vendor' at the top level, expected one of the rooms we have"
+    ]
+
+
+def test_unit_test_without_its_module(tmp_path):
+    grow(tmp_path, "tests/unit/eap/test_gone.py", "tests/unit/tools/test_gone.py")
+    assert found(tmp_path) == [
+        f"tests/unit/{room}/test_gone.py:1: a unit test file of no module, "
+        "expected its module's path"
+        for room in ("eap", "tools")
+    ]
+
+
+def test_helper_in_the_mirror(tmp_path):
+    grow(tmp_path, "tests/unit/eap/helper.py")
+    assert found(tmp_path) == [
+        "tests/unit/eap/helper.py:1: no test file, expected helpers of tests in tests/support"
+    ]
+
+
+def test_dunder_modules_are_mirrored_without_their_underscores(tmp_path):
+    grow(tmp_path, "eap/__init__.py", "eap/cli/__main__.py")
+    grow(tmp_path, "tests/unit/eap/test_init.py", "tests/unit/eap/cli/test_main.py")
+    assert found(tmp_path) == []
+
+
+def test_tools_need_no_test_but_keep_the_length(tmp_path):
+    grow(tmp_path, "tools/short.py", text="x = 1\n" * MAX_LINES)
+    grow(tmp_path, "tools/long.py", text="x = 1\n" * (MAX_LINES + 1))
+    assert found(tmp_path) == [
+        "tools/long.py:401: 401 lines, expected at most 400: split it by what it does"
+    ]
+
+
+def test_length_of_tests_and_texts_is_free(tmp_path):
+    grow(tmp_path, "docs/long.md", "tests/integration/test_long.py", text="\n" * 1000)
+    assert found(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "see /wor" + "k/main/x",
+        'PATH="/hom' + 'e/jane/bin"',
+        "(/roo" + "t/x)",
+        f"see {TWO_DOTS}/shared/spec",
+        "pip install -i https://py" + "pi.org/simple x",
+        "Get http://de" + "b.debian.org/debian",
+        "registry.np" + "mjs.org",
+    ],
+)
+def test_what_is_true_of_one_machine_only(line):
+    violations = list(check_text(PurePosixPath("docs/x.md"), f"\n{line}\n"))
+    assert [violation.line for violation in violations] == [2]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["net/work/x", "./home/x", "https://example.org/a", f"{TWO_DOTS}/sharedness", "~/work/x"],
+)
+def test_what_only_looks_like_it(line):
+    assert list(check_text(PurePosixPath("docs/x.md"), line)) == []
+
+
+@pytest.mark.parametrize(
+    ("line", "is_fine"),
+    [
+        ("# TO" + "DO: later", False),
+        ("# FIX" + "ME later", False),
+        ("# TO" + "DO(#12): later", True),
+        ("# TO" + "DO #12 later", True),
+        ("AUTO" + "DOC", True),
+    ],
+)
+def test_unfinished_work_names_its_issue(line, is_fine):
+    assert (list(check_text(PurePosixPath("eap/x.py"), line)) == []) == is_fine
+
+
+def test_a_page_may_talk_about_unfinished_marks():
+    assert list(check_text(PurePosixPath("CONTRIBUTING.md"), "no TO" + "DO")) == []
+
+
+def test_binary_files_are_not_read_as_text(tmp_path):
+    grow(tmp_path, "tests/vectors/a.pcap", text="\0 /wor" + "k/x")
+    assert found(tmp_path) == []
+
+
+def test_without_git_generated_files_are_left_out(tmp_path):
+    grow(tmp_path, "eap/a.py", ".venv/x.py", "eap/__pycache__/a.pyc", "eap_appliance.egg-info/x")
+    assert list_files(tmp_path) == [PurePosixPath("eap/a.py")]
+
+
+def test_with_git_ignored_and_deleted_files_are_left_out(tmp_path):
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    grow(tmp_path, ".gitignore", text="scratch\n")
+    grow(tmp_path, "scratch", "README.md", "gone.md")
+    subprocess.run(["git", "-C", tmp_path, "add", "."], check=True)
+    (tmp_path / "gone.md").unlink()
+    grow(tmp_path, "docs/new.md")
+
+    names = [".gitignore", "README.md", "docs/new.md"]
+    assert list_files(tmp_path) == [PurePosixPath(name) for name in names]

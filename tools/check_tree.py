@@ -1,0 +1,173 @@
+"""Check the shape of the tree: what no linter of single files sees.
+
+Rules: the top level holds only what ``docs/architecture.md`` allows; modules stay under 400 lines;
+every module of the two packages has its own unit test file, and every unit test file its module;
+nothing that is true of one machine only is committed; unfinished work names its issue.
+
+    python tools/check_tree.py [ROOT]
+
+Prints one line a violation, ``file:line: what, what was expected``; exits with 1 if there is any.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+TOP_LEVEL = frozenset(
+    {
+        ".ci",
+        ".gitignore",
+        "CHANGELOG.md",
+        "CONTRIBUTING.md",
+        "LICENSE",
+        "Makefile",
+        "README.md",
+        "config",
+        "devicebus",
+        "docs",
+        "eap",
+        "pyproject.toml",
+        "tests",
+        "tools",
+    }
+)
+PACKAGES = ("eap", "devicebus")
+MAX_LINES = 400
+UNIT = PurePosixPath("tests/unit")
+
+# Written so that no pattern matches its own line.
+FORBIDDEN = (
+    (re.compile(r"(?<![\w.~-])/(?:work|root|home)/"), "a path of one machine", "a relative path"),
+    (
+        re.compile(
+            r"\b(?:pypi|python[h]osted|npm[j]s)\.(?:org|com)\b|\b(?:deb|security|snapshot)\.debian\.org\b"
+            r"|\bcrates\.io\b|\bproxy\.golang\.org\b"
+        ),
+        "the host of a package registry",
+        "the package's name alone",
+    ),
+    (re.compile(r"\.\./shared\b"), "a file beside the repository", "a file of the repository"),
+)
+UNFINISHED = re.compile(r"\b(?:TO[D]O|FIX[M]E)\b(?!\W{0,3}#\d)")
+CODE_SUFFIXES = frozenset({"", ".py", ".sh", ".toml", ".yaml"})
+
+
+class Violation(NamedTuple):
+    """One broken rule; *line* 1 stands for the file as a whole."""
+
+    path: PurePosixPath
+    line: int
+    what: str
+    expected: str
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line}: {self.what}, expected {self.expected}"
+
+
+def list_files(root: Path) -> list[PurePosixPath]:
+    """Name the files under version control or about to be; without git, all but generated ones."""
+    command = [
+        "git",
+        "-C",
+        str(root),
+        "ls-files",
+        "-z",
+        "--cached",
+        "--others",
+        "--exclude-standard",
+    ]
+    try:
+        listed = subprocess.run(command, capture_output=True, check=True, text=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        names = _walk(root)
+    else:
+        names = [PurePosixPath(name) for name in listed.split("\0") if name]
+    return sorted(name for name in names if (root / name).is_file())
+
+
+def _walk(root: Path) -> list[PurePosixPath]:
+    found = []
+    for path in root.rglob("*"):
+        name = PurePosixPath(path.relative_to(root).as_posix())
+        if not any(map(_is_generated, name.parts)):
+            found.append(name)
+    return found
+
+
+def _is_generated(part: str) -> bool:
+    if part in {".ci", ".gitignore"}:
+        return False
+    return part.startswith(".") or part in {"__pycache__", "build", "dist"} or "egg-info" in part
+
+
+def check(root: Path) -> list[Violation]:
+    """Return every violation in the tree under *root*, in the order of the files."""
+    files = list_files(root)
+    found = [*check_top_level(files), *check_unit_tests(files)]
+    for name in files:
+        data = (root / name).read_bytes()
+        if b"\0" not in data:
+            found += check_text(name, data.decode(errors="replace"))
+    return sorted(found)
+
+
+def check_top_level(files: list[PurePosixPath]) -> Iterator[Violation]:
+    """Yield what stands at the top and does not belong there, each entry once."""
+    for entry in sorted({name.parts[0] for name in files} - TOP_LEVEL):
+        first = next(name for name in files if name.parts[0] == entry)
+        yield Violation(first, 1, f"{entry!r} at the top level", "one of the rooms we have")
+
+
+def check_unit_tests(files: list[PurePosixPath]) -> Iterator[Violation]:
+    """Yield modules without their unit test file, and files in the mirror without a module."""
+    known = set(files)
+    for name in files:
+        if name.suffix == ".py" and name.parts[0] in PACKAGES and name.name != "__init__.py":
+            test = _test_of(name)
+            if test not in known:
+                yield Violation(name, 1, "no unit test file", f"one at {test}")
+    mirrored = {_test_of(name) for name in files if name.suffix == ".py"}
+    for name in files:
+        if name.is_relative_to(UNIT) and name.suffix == ".py" and name.name != "conftest.py":
+            if not name.name.startswith("test_"):
+                yield Violation(name, 1, "no test file", "helpers of tests in tests/support")
+            elif name not in mirrored:
+                yield Violation(name, 1, "a unit test file of no module", "its module's path")
+
+
+def _test_of(module: PurePosixPath) -> PurePosixPath:
+    """Say where a module's unit tests stand: ``a/__main__.py`` has ``a/test_main.py``."""
+    return UNIT / module.parent / f"test_{module.stem.strip('_')}.py"
+
+
+def check_text(name: PurePosixPath, text: str) -> Iterator[Violation]:
+    """Yield what one file's text breaks: its length, its paths and hosts, its loose ends."""
+    lines = text.splitlines()
+    is_module = name.suffix == ".py" and name.parts[0] in {*PACKAGES, "tools"}
+    if is_module and len(lines) > MAX_LINES:
+        expected = f"at most {MAX_LINES}: split it by what it does"
+        yield Violation(name, MAX_LINES + 1, f"{len(lines)} lines", expected)
+    for number, line in enumerate(lines, 1):
+        for pattern, what, expected in FORBIDDEN:
+            if match := pattern.search(line):
+                yield Violation(name, number, f"{what} ({match[0]})", expected)
+        if name.suffix in CODE_SUFFIXES and (match := UNFINISHED.search(line)):
+            yield Violation(name, number, f"{match[0]} without an issue", f"{match[0]} #12 or none")
+
+
+def main(arguments: list[str]) -> int:
+    """Print the violations; return the exit status."""
+    root = Path(arguments[0]) if arguments else Path(__file__).resolve().parent.parent
+    found = check(root)
+    for violation in found:
+        print(violation)
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

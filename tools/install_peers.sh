@@ -1,0 +1,22 @@
+#!/bin/sh
+# Makes sure of the Debian programs that a group of commands meets as peers or builds its networks with.
+# Usage: tools/install_peers.sh test|bench      Exit status 1 when something is still missing.
+set -eu
+here=$(dirname "$0")
+case ${1:-} in
+    # command=package
+    test) wanted="tshark=tshark ip=iproute2 setpriv=util-linux" ;;
+    bench) wanted="cyclictest=rt-tests ip=iproute2 taskset=util-linux" ;;
+    *)
+        echo "usage: $0 test|bench" >&2
+        exit 2
+        ;;
+esac
+
+packages=""
+for pair in $wanted; do
+    PATH=$PATH:/usr/sbin:/sbin command -v "${pair%%=*}" >/dev/null || packages="$packages ${pair#*=}"
+done
+[ -n "$packages" ] || exit 0
+# shellcheck disable=SC2086  # a list of package names
+exec sh "$here/apt.sh" "make $1" $packages
