@@ -22,6 +22,10 @@ Plain: TypeAlias = bool | int | float | str | list[int] | list[float]
 """A value as YAML and JSON carry it: a raw block is a string of hexadecimal digits."""
 
 
+_SHOWN = 60
+"""Characters of a refused value in a message."""
+
+
 class DataType(msgspec.Struct, frozen=True):
     """One type, complete with its length; made by ``datatypes.parse``."""
 
@@ -72,7 +76,7 @@ class DataType(msgspec.Struct, frozen=True):
         """Read a value as typed on a command line; raise ValueError if it is none."""
         raise NotImplementedError
 
-    def from_plain(self, plain: Plain) -> Value:
+    def from_plain(self, plain: object) -> Value:
         """Read a value as a plant file or JSON holds it; raise ValueError if it is none."""
         return self.decode(self.encode(plain), 0)
 
@@ -90,7 +94,10 @@ class DataType(msgspec.Struct, frozen=True):
         )
 
     def _refuse(self, value: object, expected: str) -> ValueError:
-        return ValueError(f"{value!r} is not a value of {self.text}: expected {expected}")
+        shown = repr(value)
+        if len(shown) > _SHOWN:
+            shown = f"{shown[:_SHOWN]}…"
+        return ValueError(f"{shown} is not a value of {self.text}: expected {expected}")
 
 
 class Integer(DataType, frozen=True):
@@ -250,7 +257,7 @@ class Block(DataType, frozen=True):
             raise self._refuse(text, f"{self.size} octets in hexadecimal") from None
         return self.encode(octets)
 
-    def from_plain(self, plain: Plain) -> Value:
+    def from_plain(self, plain: object) -> Value:
         """Read hexadecimal digits."""
         if not isinstance(plain, str):
             raise self._refuse(plain, f"{self.size} octets in hexadecimal")

@@ -27,9 +27,10 @@ class Scalar(msgspec.Struct, frozen=True):
 
 
 class Bits(msgspec.Struct, frozen=True):
-    """One field that is part of a word; neighbours fill it from bit 0 up."""
+    """One field that is part of a word, optionally wrapped; neighbours fill it from bit 0 up."""
 
     width: int
+    wrap: type | None = None
 
 
 u8 = Annotated[int, Scalar("B")]
@@ -38,8 +39,10 @@ u32 = Annotated[int, Scalar("I")]
 u64 = Annotated[int, Scalar("Q")]
 net_id = Annotated[NetId, Scalar("6s", NetId)]
 bit = Annotated[int, Bits(1)]
+bits2 = Annotated[int, Bits(2)]
 bits3 = Annotated[int, Bits(3)]
 bits4 = Annotated[int, Bits(4)]
+bits6 = Annotated[int, Bits(6)]
 bits11 = Annotated[int, Bits(11)]
 
 _WORD_CODE = {8: "B", 16: "H", 32: "I", 64: "Q"}
@@ -73,6 +76,7 @@ def _compile(cls: type[WireStruct]) -> None:
     codes: list[str] = []  # one struct code a word
     reads: list[str] = []  # one expression over w0, w1, ... a field
     writes: list[str] = []  # one expression over self a word
+    checks: list[str] = []  # true for a value that pack() would cut or pad without a word
     scope: dict[str, Any] = {}
     filled = 0  # bits used of an open word, 0 when none is open
 
@@ -95,13 +99,17 @@ def _compile(cls: type[WireStruct]) -> None:
             writes.append(f"self.{name}")
             reads.append(f"w{word}" if kind.wrap is None else f"c{word}(w{word})")
             scope[f"c{word}"] = kind.wrap
+            if kind.code.endswith("s"):
+                checks.append(f"len(self.{name}) != {struct.calcsize(kind.code)}")
         else:
             if not filled:
                 codes.append("")
                 writes.append("0")
-            mask = (1 << kind.width) - 1
-            reads.append(f"w{len(codes) - 1} >> {filled} & {mask:#x}")
-            writes[-1] += f" | (self.{name} & {mask:#x}) << {filled}"
+            part = f"w{len(codes) - 1} >> {filled} & {(1 << kind.width) - 1:#x}"
+            reads.append(part if kind.wrap is None else f"c_{name}({part})")
+            scope[f"c_{name}"] = kind.wrap
+            writes[-1] += f" | self.{name} << {filled}"
+            checks.append(f"self.{name} >> {kind.width}")
             filled += kind.width
     if filled:
         close_word()
@@ -109,6 +117,7 @@ def _compile(cls: type[WireStruct]) -> None:
     cls.LAYOUT = struct.Struct("<" + "".join(codes))
     cls.SIZE = cls.LAYOUT.size
     words = ", ".join(f"w{n}" for n in range(len(codes)))
+    unfit = " or ".join(checks) or "False"
     source = f"""
 def decode(cls, data, offset=0):
     try:
@@ -121,9 +130,11 @@ def decode(cls, data, offset=0):
 
 def encode(self):
     try:
+        if {unfit}:
+            raise error("a field is too large for its bits or octets")
         return pack({", ".join(writes)})
-    except error as exc:
-        raise CodecError(str(exc), layout=type(self).__name__) from None
+    except (error, TypeError) as exc:
+        raise CodecError(f"{{exc}} in {{self!r}}", layout=type(self).__name__) from None
 """
     scope |= {
         "unpack": cls.LAYOUT.unpack_from,

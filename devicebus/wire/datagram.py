@@ -1,0 +1,135 @@
+"""Datagrams of the device protocol: what a type-1 frame carries."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from enum import IntEnum
+from typing import Annotated, NamedTuple
+
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.wire import Buffer, Scalar, WireStruct, bit, bits3, bits11, u8, u16
+from eap.errors import CodecError, MalformedError, TruncatedError
+
+
+class Command(IntEnum):
+    """ETG.1000.4: how a datagram is addressed and whether slaves read, write or do both."""
+
+    NOP = 0
+    APRD = 1
+    APWR = 2
+    APRW = 3
+    FPRD = 4
+    FPWR = 5
+    FPRW = 6
+    BRD = 7
+    BWR = 8
+    BRW = 9
+    LRD = 10
+    LWR = 11
+    LRW = 12
+    ARMW = 13
+    FRMW = 14
+
+    @property
+    def is_logical(self) -> bool:
+        """Whether ADP and ADO together are one logical address."""
+        return self in _LOGICAL
+
+
+_LOGICAL = frozenset((Command.LRD, Command.LWR, Command.LRW))
+
+
+class DatagramHeader(WireStruct, frozen=True):
+    """ETG.1000.4: ten octets in front of a datagram's data.
+
+    *adp* is a position or a station address, *ado* a register offset; in logical commands they are
+    the low and the high word of the address.  *more* says that another datagram follows.
+    """
+
+    command: Annotated[Command, Scalar("B", Command)]
+    index: u8
+    adp: u16
+    ado: u16
+    length: bits11
+    reserved: bits3 = 0
+    circulating: bit = 0
+    more: bit = 0
+    irq: u16 = 0
+
+    @property
+    def logical_address(self) -> int:
+        """ADP and ADO as one address."""
+        return self.ado << 16 | self.adp
+
+
+class WorkingCounter(WireStruct, frozen=True):
+    """ETG.1000.4: the two octets behind a datagram's data, counted up by every slave that acts."""
+
+    value: u16 = 0
+
+
+OVERHEAD = DatagramHeader.SIZE + WorkingCounter.SIZE
+"""Octets of a datagram beside its data."""
+
+
+class Datagram(NamedTuple):
+    """One datagram of a frame; *data* is a view of the frame it was read from."""
+
+    header: DatagramHeader
+    data: bytes | memoryview
+    wkc: int = 0
+
+
+def iter_datagrams(frame: Buffer) -> Iterator[Datagram]:
+    """Yield each datagram of a whole frame; nothing is copied.
+
+    Octets behind the last datagram are ignored.
+
+    Raises:
+        TruncatedError: the frame is shorter than its Length, or a datagram reaches past it.
+        MalformedError: the frame is of another type, or a command is unknown.
+    """
+    ethercat = EtherCatHeader.decode(frame)
+    if ethercat.type != FrameType.DATAGRAM:
+        raise MalformedError(f"frame type {ethercat.type}, expected 1", layout="EtherCatHeader")
+    end = EtherCatHeader.SIZE + ethercat.length
+    if end > len(frame):
+        raise TruncatedError(
+            f"length {ethercat.length}, but {len(frame) - EtherCatHeader.SIZE} octets follow",
+            layout="EtherCatHeader",
+        )
+    view = memoryview(frame)[:end]
+    offset = EtherCatHeader.SIZE
+    more = 1
+    while more:
+        header = DatagramHeader.decode(view, offset)
+        start = offset + DatagramHeader.SIZE
+        offset = start + header.length
+        wkc = WorkingCounter.decode(view, offset).value
+        yield Datagram(header, view[start:offset], wkc)
+        offset += WorkingCounter.SIZE
+        more = header.more
+
+
+def encode_frame(datagrams: Sequence[Datagram]) -> bytes:
+    """Return a whole frame; *length* and *more* of each datagram are set.
+
+    Raises CodecError if there is no datagram or they do not fit the 11 bits of a Length.
+    """
+    if not datagrams:
+        raise CodecError("a frame needs at least one datagram", layout="DatagramHeader")
+    body = b""
+    for number, (header, data, wkc) in enumerate(datagrams, 1):
+        fixed = DatagramHeader(
+            header.command,
+            header.index,
+            header.adp,
+            header.ado,
+            len(data),
+            header.reserved,
+            header.circulating,
+            more=int(number < len(datagrams)),
+            irq=header.irq,
+        )
+        body += fixed.encode() + data + WorkingCounter(wkc).encode()
+    return EtherCatHeader(len(body), type=FrameType.DATAGRAM).encode() + body

@@ -1,0 +1,132 @@
+"""Mailbox messages: the header shared by all mailbox protocols, and the error reply.
+
+The same message travels in a slave's mailbox and, behind a frame header of type 5, between
+stations and to a mailbox gateway (ETG.8200).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Annotated
+
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.wire import Bits, Buffer, WireStruct, bit, bits2, bits3, bits6, u16
+from eap.errors import MalformedError, TruncatedError
+
+
+class MailboxType(IntEnum):
+    """Which protocol the data of a message belongs to (ETG.1000.4, mailbox header)."""
+
+    ERR = 0
+    AOE = 1
+    EOE = 2
+    COE = 3
+    FOE = 4
+    SOE = 5
+    VOE = 15
+
+
+class MailboxHeader(WireStruct, frozen=True):
+    """ETG.1000.4: the six octets in front of every mailbox message.
+
+    *address* is a slave's station address, 0 the master or station itself.  *counter* runs from 1
+    to 7 and detects repeats; 0 means no detection.
+    """
+
+    length: u16
+    address: u16 = 0
+    channel: bits6 = 0
+    priority: bits2 = 0
+    type: Annotated[MailboxType, Bits(4, MailboxType)] = MailboxType.ERR
+    counter: bits3 = 0
+    reserved: bit = 0
+
+
+class MailboxError(IntEnum):
+    """Why a message was refused (ETG.1000.4, mailbox error reply)."""
+
+    SYNTAX = 1
+    UNSUPPORTED_PROTOCOL = 2
+    INVALID_CHANNEL = 3
+    SERVICE_NOT_SUPPORTED = 4
+    INVALID_HEADER = 5
+    SIZE_TOO_SHORT = 6
+    NO_MORE_MEMORY = 7
+    INVALID_SIZE = 8
+    SERVICE_IN_WORK = 9
+
+    @classmethod
+    def name_of(cls, detail: int) -> str:
+        """Return the name of a detail code, or its number for one nobody documents."""
+        return cls(detail).name if detail in cls._value2member_map_ else f"0x{detail:04x}"
+
+
+ERROR_REPLY = 1
+"""The only kind of message that the standard knows behind type 0."""
+
+
+class MailboxErrorReply(WireStruct, frozen=True):
+    """ETG.1000.4: the data of a message of type 0; *detail* as :class:`MailboxError`."""
+
+    detail_type: u16 = ERROR_REPLY
+    detail: u16 = MailboxError.SYNTAX
+
+
+def decode_message(data: Buffer, offset: int = 0) -> tuple[MailboxHeader, memoryview]:
+    """Return header and data of the message at *offset*; surplus octets behind it are ignored.
+
+    Raises:
+        TruncatedError: fewer octets follow than the header says.
+        MalformedError: nobody knows the protocol.
+    """
+    header = MailboxHeader.decode(data, offset)
+    start = offset + MailboxHeader.SIZE
+    body = memoryview(data)[start : start + header.length]
+    if len(body) < header.length:
+        raise TruncatedError(
+            f"length {header.length}, but {len(body)} octets follow",
+            layout="MailboxHeader",
+            offset=offset,
+        )
+    return header, body
+
+
+def decode_frame(data: Buffer) -> tuple[MailboxHeader, memoryview]:
+    """Return header and data of the message in a whole frame of type 5.
+
+    Raises:
+        TruncatedError: the frame is shorter than its Length, or its message than its length.
+        MalformedError: the frame is of another type, or nobody knows the protocol.
+    """
+    ethercat = EtherCatHeader.decode(data)
+    if ethercat.type != FrameType.MAILBOX:
+        raise MalformedError(f"frame type {ethercat.type}, expected 5", layout="EtherCatHeader")
+    end = EtherCatHeader.SIZE + ethercat.length
+    if end > len(data):
+        raise TruncatedError(
+            f"length {ethercat.length}, but {len(data) - EtherCatHeader.SIZE} octets follow",
+            layout="EtherCatHeader",
+        )
+    return decode_message(memoryview(data)[:end], EtherCatHeader.SIZE)
+
+
+def encode_message(header: MailboxHeader, body: Buffer) -> bytes:
+    """Return a whole message; the length is set from *body*."""
+    return MailboxHeader(
+        len(body),
+        header.address,
+        header.channel,
+        header.priority,
+        header.type,
+        header.counter,
+        header.reserved,
+    ).encode() + bytes(body)
+
+
+def encode_frame(header: MailboxHeader, body: Buffer) -> bytes:
+    """Return a whole frame of type 5; the lengths are set from *body*.
+
+    Raises CodecError if *body* is too long for the 11 bits of the frame's Length (2041 octets).
+    """
+    message = encode_message(header, body)
+    return EtherCatHeader(len(message), type=FrameType.MAILBOX).encode() + message
