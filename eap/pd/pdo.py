@@ -1,8 +1,8 @@
 """How the variables of a PD lie in its data: the one rule that publisher and subscriber share.
 
-In PDO order, bits (BOOL, BIT1 to BIT8) pack behind each other from bit 0 up, everything else starts
-on the next whole octet, and the PD ends on one.  Nothing is aligned to more than an octet (ETG.1000.6
-mappings know bit lengths only; the skipped bits are padding entries of such a mapping).
+In PDO order, bits (BOOL, BIT1 to BIT8) pack behind each other from bit 0 up, everything else
+starts on the next whole octet, and the PD ends on one.  Nothing is aligned to more than an octet
+(mappings of ETG.1000.6 know bit lengths only; the skipped bits are padding entries of one).
 """
 
 from __future__ import annotations

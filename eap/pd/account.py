@@ -1,0 +1,149 @@
+"""What the cycle counter and the arrival times of a publisher's frames tell.
+
+Rule 1: PDs that have always arrived together share one account; they part when they first arrive
+apart.  All members of an account have the same history, so the copy that starts the new account
+is exact, and a frame of a hundred PDs costs one account, not a hundred.
+Rule 2: an older counter is a reordered frame and not taken, since newer data is here already, but
+the third in a row is a sender that counts anew, and is taken.
+Rule 3: the same counter again counts as duplicated and is taken: some terminals never count.
+"""
+
+from __future__ import annotations
+
+from eap.pd.words import ACCOUNT_START, BIN_OF_US, RxState, RxWord, histogram_bin
+
+_RECEIVED = RxWord.RECEIVED - ACCOUNT_START
+_DUPLICATED = RxWord.DUPLICATED - ACCOUNT_START
+_REORDERED = RxWord.REORDERED - ACCOUNT_START
+_LATE = RxWord.LATE - ACCOUNT_START
+_TIMEOUTS = RxWord.TIMEOUTS - ACCOUNT_START
+_LOST = RxWord.LOST - ACCOUNT_START
+_STATE = RxWord.STATE - ACCOUNT_START
+_LAST_CYCLE = RxWord.LAST_CYCLE - ACCOUNT_START
+_ARRIVED_AT_NS = RxWord.ARRIVED_AT_NS - ACCOUNT_START
+_ARRIVED_IN_CYCLE = RxWord.ARRIVED_IN_CYCLE - ACCOUNT_START
+_BEHIND = RxWord.BEHIND - ACCOUNT_START
+_JITTER_MAX_US = RxWord.JITTER_MAX_US - ACCOUNT_START
+_JITTER = RxWord.JITTER - ACCOUNT_START
+
+_RUNNING = int(RxState.RUNNING)
+REORDER_WINDOW = 32
+"""Sender steps by which a frame can be out of order; further back the sender has restarted."""
+RESTARTED_AFTER = 3
+"""Older counters in a row that mean the same."""
+
+
+class Timing:
+    """What is known of the sender, and of the receiver's own cycle; 0 where unknown.
+
+    Attributes:
+        step: Sender cycles between two frames, 0 when it sends on change or event.
+        sender_cycle_ns: The sender's device cycle.
+        own_cycle_ns: The receiver's device cycle.
+    """
+
+    __slots__ = ("own_cycle_ns", "sender_cycle_ns", "step")
+
+    def __init__(self, *, step: int, sender_cycle_ns: int, own_cycle_ns: int) -> None:
+        self.step = step
+        self.sender_cycle_ns = sender_cycle_ns
+        self.own_cycle_ns = own_cycle_ns
+
+
+class Account:
+    """The account in the block of words that starts at *first_word*."""
+
+    __slots__ = ("_sender_cycle_ns", "_step", "_timing", "_words", "_wrap_ns", "first_word")
+
+    def __init__(self, words: memoryview, first_word: int, timing: Timing) -> None:
+        self.first_word = first_word
+        self._timing = timing
+        self._step = timing.step
+        self._sender_cycle_ns = timing.sender_cycle_ns
+        self._wrap_ns = timing.sender_cycle_ns << 14 or 1 << 62
+        self._words = words[first_word + ACCOUNT_START : first_word + RxWord.SIZE]
+        if not self._words[_RECEIVED]:
+            self.forget_sender()
+
+    @property
+    def state(self) -> RxState:
+        """Where the subscriptions of this account stand."""
+        return RxState(self._words[_STATE])
+
+    @property
+    def arrived_at_ns(self) -> int:
+        """When the last frame taken arrived."""
+        return int(self._words[_ARRIVED_AT_NS])
+
+    def forget_sender(self) -> None:
+        """Let the next frame be the first of a sender: nothing to compare it with."""
+        self._words[_LAST_CYCLE] = -1
+
+    def time_out(self) -> None:
+        """Enter that the sender went quiet."""
+        self._words[_STATE] = RxState.STALE
+        self._words[_TIMEOUTS] += 1
+
+    def part(self, words: memoryview, first_word: int) -> Account:
+        """Start an account of the same history in the block at *first_word*."""
+        words[first_word + ACCOUNT_START : first_word + RxWord.SIZE] = self._words
+        return Account(words, first_word, self._timing)
+
+    def arrived(self, cycle: int, at_ns: int, own_cycle: int) -> bool:
+        """Enter a frame; return whether its data is to be taken.
+
+        Args:
+            cycle: Its cycle counter, 16 bits.
+            at_ns: When the kernel received it.
+            own_cycle: The own cycle whose input image it refreshes.
+        """
+        words = self._words
+        last = words[_LAST_CYCLE]
+        if last >= 0:
+            elapsed_ns = at_ns - words[_ARRIVED_AT_NS]
+            gap = cycle - last & 0xFFFF
+            if gap > 0x3FFF or elapsed_ns > self._wrap_ns:
+                gap = self._resolve(gap, elapsed_ns)
+            if gap > 0:
+                step = self._step
+                if step and gap >= 2 * step:
+                    words[_LOST] += gap // step - 1
+                if self._sender_cycle_ns:
+                    self._enter_jitter(elapsed_ns - gap * self._sender_cycle_ns)
+            elif gap == 0:
+                words[_DUPLICATED] += 1
+            elif self._is_reordered(-gap):
+                return False
+        words[_RECEIVED] += 1
+        words[_LAST_CYCLE] = cycle
+        words[_ARRIVED_AT_NS] = at_ns
+        words[_ARRIVED_IN_CYCLE] = own_cycle
+        words[_STATE] = _RUNNING
+        words[_BEHIND] = 0
+        return True
+
+    def _resolve(self, gap: int, elapsed_ns: int) -> int:
+        """Of all gaps that the wrapped counter can mean, return the one nearest to the time."""
+        if not self._sender_cycle_ns:
+            return gap - 0x10000 if gap > 0x7FFF else gap
+        return gap + 0x10000 * round((elapsed_ns / self._sender_cycle_ns - gap) / 0x10000)
+
+    def _is_reordered(self, behind: int) -> bool:
+        words = self._words
+        words[_BEHIND] += 1
+        restarted = behind > REORDER_WINDOW * max(self._step, 1)
+        if restarted or words[_BEHIND] >= RESTARTED_AFTER:
+            return False
+        words[_REORDERED] += 1
+        return True
+
+    def _enter_jitter(self, deviation_ns: int) -> None:
+        words = self._words
+        if deviation_ns > self._timing.own_cycle_ns:
+            words[_LATE] += 1
+        micros = abs(deviation_ns) // 1000
+        if micros < len(BIN_OF_US):
+            words[_JITTER + BIN_OF_US[micros]] += 1
+        else:
+            words[_JITTER + histogram_bin(micros)] += 1
+        words[_JITTER_MAX_US] = max(words[_JITTER_MAX_US], micros)

@@ -1,0 +1,102 @@
+"""What to do with a frame of a known layout: learned once, then checked and copied.
+
+Publishers repeat the layout of their frames.  The plan of a layout compares all PD headers in one
+step and copies PDs that lie side by side, both in the frame and in the image, in one piece.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeAlias
+
+from eap.codec.pd import PdHeader
+from eap.pd.account import Account
+
+Copy: TypeAlias = tuple[slice, slice]
+"""Octets of the frame and where they go in the image."""
+
+
+class Taken(NamedTuple):
+    """A PD of the frame that a subscription takes: offsets of its header here and there."""
+
+    account: Account
+    words: int
+    """Index of the first word of the RxPD."""
+    source: int
+    target: int
+    size: int
+    """Octets, header included."""
+
+
+class Refused(NamedTuple):
+    """A PD that nobody takes: the counters to add one to, and the VarState words to set."""
+
+    counters: tuple[int, ...]
+    mismatches: tuple[tuple[int, int], ...] = ()
+    """(index of the MISMATCH word, its value)"""
+
+
+class FramePlan:
+    """The plan of one layout.
+
+    Attributes:
+        headers: Reads all PD headers but their quality from a frame, at offset FIRST_PD.
+        expected: What it must return for this plan to apply.
+        end: Octets of the frame by its Length.
+        parts: For each account that the frame concerns, the copies to make if it agrees.
+        taken_words: First words of the RxPDs that take one of its PDs.
+        refused: The PDs that nobody takes.
+        roaming: Accounts that follow any publisher.
+    """
+
+    __slots__ = ("end", "expected", "headers", "parts", "refused", "roaming", "taken_words")
+
+    def __init__(
+        self,
+        end: int,
+        pds: Iterable[tuple[bytes, int]],
+        taken: Iterable[Taken],
+        refused: Iterable[Refused],
+        roaming: Iterable[Account] = (),
+    ) -> None:
+        """Build the plan from (header without quality, data length) of each PD and their fate."""
+        pds = tuple(pds)
+        layout = struct.Struct("<" + "".join(f"6s{2 + length}x" for _, length in pds))
+        self.headers: Callable[..., tuple[Any, ...]] = layout.unpack_from
+        self.expected: tuple[Any, ...] = tuple(header for header, _ in pds)
+        self.end = end
+        taken = tuple(taken)
+        self.parts = _parts(taken)
+        self.taken_words = tuple(pd.words for pd in taken)
+        self.refused = tuple(refused)
+        self.roaming = tuple(roaming)
+
+
+def _parts(taken: Iterable[Taken]) -> tuple[tuple[Account, tuple[Copy, ...]], ...]:
+    runs: dict[Account, list[Taken]] = {}
+    for pd in taken:
+        pieces = runs.setdefault(pd.account, [])
+        if pieces and _continues(pieces[-1], pd):
+            pieces[-1] = pieces[-1]._replace(size=pieces[-1].size + pd.size)
+        else:
+            pieces.append(pd)
+    return tuple(
+        (
+            account,
+            tuple(
+                (slice(p.source, p.source + p.size), slice(p.target, p.target + p.size))
+                for p in pieces
+            ),
+        )
+        for account, pieces in runs.items()
+    )
+
+
+def _continues(run: Taken, pd: Taken) -> bool:
+    return run.source + run.size == pd.source and run.target + run.size == pd.target
+
+
+HEADER_KEY = struct.Struct("<6s2x")
+"""A PD header as plans compare it: everything but the quality."""
+assert HEADER_KEY.size == PdHeader.SIZE  # noqa: S101  the two must not drift apart

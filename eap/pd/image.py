@@ -1,0 +1,190 @@
+"""The process image of one station: every variable and every counter, in shared memory.
+
+Rule 1: each region of variables has one writer, who makes its sequence word odd while writing.
+Rule 2: a reader copies and looks whether the word was even and stayed the same; if not, it tries
+again, a bounded number of times, and then names the writer that stopped in the middle.
+Rule 3: counters are single words with a single writer and need no such care.
+
+This module works on any writable buffer; ``eap.net.image_file`` maps one from a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+
+from eap.codec import datatypes
+from eap.errors import ImageError, TornReadError
+from eap.pd.layout import HEADER, LAYOUT_VERSION, MAGIC, WORDS_OFFSET, ImageLayout, VariablePlace
+from eap.pd.spec import Writer
+
+READ_ATTEMPTS = 200
+
+
+def _no_pause() -> None:
+    """Try again at once."""
+
+
+class Image:
+    """Named access to the memory that an :class:`ImageLayout` describes.
+
+    Args:
+        memory: At least ``layout.size`` octets, already formatted.
+        layout: What lies where.
+        pause: Called between two attempts at a read; a driver gives the processor away here.
+    """
+
+    def __init__(
+        self, memory: memoryview, layout: ImageLayout, *, pause: Callable[[], None] = _no_pause
+    ) -> None:
+        self.memory = memory
+        self.layout = layout
+        self.words = memory[WORDS_OFFSET : WORDS_OFFSET + 8 * layout.word_count].cast("q")
+        self.places = {place.name: place for place in layout.variables}
+        self._pause = pause
+
+    def region(self, writer: Writer) -> memoryview:
+        """Return the variables of *writer*, live."""
+        place = self.layout.regions[writer]
+        return self.memory[place.offset : place.offset + place.size]
+
+    def read(self, name: str) -> Any:
+        """Return one variable's value; raise ImageError if there is none of that name."""
+        place = self._place(name)
+        first, last = place.bit_offset // 8, _end_octet(place)
+        data = self._stable_copy(place.writer, first, last)
+        return _decode(place, data, 8 * first)
+
+    def read_all(self) -> dict[str, Any]:
+        """Return all variables; those of one writer belong to one moment."""
+        values = {}
+        copies = {}
+        for writer, region in self.layout.regions.items():
+            copies[writer] = self._stable_copy(writer, region.offset, region.offset + region.size)
+        for place in self.layout.variables:
+            region = self.layout.regions[place.writer]
+            values[place.name] = _decode(place, copies[place.writer], 8 * region.offset)
+        return values
+
+    def write(self, name: str, value: Any) -> None:
+        """Store one value; raise ValueError if the type cannot hold it.
+
+        The caller is the region's writer and stands inside :meth:`writing`.
+        """
+        place = self._place(name)
+        kind = datatypes.parse(place.type)
+        offset, bit = divmod(place.bit_offset, 8)
+        if not kind.is_bits or not bit:
+            kind.write(self.memory, offset, value)
+            return
+        scratch = bytearray(1)
+        kind.write(scratch, 0, value)
+        end = _end_octet(place)
+        mask = (1 << kind.bit_length) - 1 << bit
+        word = int.from_bytes(self.memory[offset:end], "little") & ~mask | scratch[0] << bit
+        self.memory[offset:end] = word.to_bytes(end - offset, "little")
+
+    @contextmanager
+    def writing(self, writer: Writer) -> Iterator[None]:
+        """Mark the region of *writer* as changing while the block runs."""
+        sequence = self.layout.regions[writer].sequence
+        # A predecessor that was killed in the middle left an odd word; odd it stays until we end.
+        self.words[sequence] += 1 + self.words[sequence] % 2
+        try:
+            yield
+        finally:
+            self.words[sequence] += 1
+
+    def set_defaults(self) -> None:
+        """Store the default of every variable that has one; for a fresh image."""
+        for place in self.layout.variables:
+            if place.default is not None:
+                self.write(place.name, default_value(place))
+
+    def _place(self, name: str) -> VariablePlace:
+        try:
+            return self.places[name]
+        except KeyError:
+            raise ImageError(f"station {self.layout.station} has no variable {name!r}") from None
+
+    def _stable_copy(self, writer: Writer, first: int, last: int) -> bytes:
+        words, sequence = self.words, self.layout.regions[writer].sequence
+        for _ in range(READ_ATTEMPTS):
+            before = words[sequence]
+            if not before % 2:
+                data = bytes(self.memory[first:last])
+                if words[sequence] == before:
+                    return data
+            self._pause()
+        raise TornReadError(
+            f"station {self.layout.station}: the {writer} stopped in the middle of writing its "
+            f"variables; they are not consistent until it writes again",
+            writer=writer,
+        )
+
+
+def format_image(memory: memoryview, layout: ImageLayout, generation: int) -> Image:
+    """Write header, directory and default values into zeroed *memory*."""
+    directory = layout.encode()
+    offset = layout.directory_offset
+    memory[offset : offset + len(directory)] = directory
+    image = Image(memory, layout)
+    image.set_defaults()
+    # The header comes last: a file without magic is one whose making was interrupted.
+    HEADER.pack_into(
+        memory, 0, MAGIC, LAYOUT_VERSION, generation, offset, len(directory), layout.size
+    )
+    return image
+
+
+def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
+    """Return the layout and the generation of a formatted image.
+
+    Raises:
+        ImageError: it is no image, of another layout version, or damaged.
+    """
+    if len(memory) < WORDS_OFFSET:
+        raise ImageError("not a process image: it is shorter than the header")
+    magic, version, generation, offset, length, size = HEADER.unpack_from(memory)
+    if magic != MAGIC:
+        raise ImageError("not a process image: the magic is missing")
+    if version != LAYOUT_VERSION:
+        raise ImageError(
+            f"process image of layout version {version}, this program knows {LAYOUT_VERSION}: "
+            f"use the same release of eap-appliance on both sides"
+        )
+    if size > len(memory) or offset + length > size:
+        raise ImageError(f"process image is cut off: {len(memory)} octets of {size}")
+    try:
+        layout = msgspec.json.decode(memory[offset : offset + length], type=ImageLayout)
+    except msgspec.MsgspecError as exc:
+        raise ImageError(f"process image has a damaged directory: {exc}") from None
+    return layout, generation
+
+
+def default_value(place: VariablePlace) -> Any:
+    """Return the value that *place* starts with; zero if it names none."""
+    kind = datatypes.parse(place.type)
+    if place.default is None:
+        return kind.zero
+    if isinstance(place.default, str):
+        return kind.parse_text(place.default)
+    return place.default
+
+
+def _end_octet(place: VariablePlace) -> int:
+    return -(-(place.bit_offset + datatypes.parse(place.type).bit_length) // 8)
+
+
+def _decode(place: VariablePlace, data: bytes, first_bit: int) -> Any:
+    kind = datatypes.parse(place.type)
+    offset, bit = divmod(place.bit_offset - first_bit, 8)
+    if not kind.is_bits or not bit:
+        if kind.is_bits and kind.bit_length < 8:
+            return kind.read(bytes((data[offset] & (1 << kind.bit_length) - 1,)), 0)
+        return kind.read(data, offset)
+    word = int.from_bytes(data[offset : offset + 2], "little") >> bit
+    return kind.read(bytes((word & (1 << kind.bit_length) - 1,)), 0)

@@ -1,0 +1,275 @@
+"""Where everything of one station lies in its process image.
+
+The image is a header, the words of ``words.py``, one region of variables for each writer, and the
+directory: this layout as JSON, so that a program that attaches needs no plant file.
+
+A received PD lies in the engine's region as it travels: eight octets of PD header, then the data.
+PDs that follow each other in a frame also follow each other here, so that one copy takes them all.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+
+import msgspec
+
+from eap.codec import datatypes
+from eap.codec.pd import PdHeader
+from eap.pd import pdo
+from eap.pd.spec import Record, RxPdSpec, StationSpec, Substitute, VariableSpec, Writer
+from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
+
+MAGIC = b"EAPIMAGE"
+LAYOUT_VERSION = 1
+HEADER = struct.Struct("<8sIIQQQ")
+"""Magic, layout version, generation, offset and length of the directory, size of the file."""
+WORDS_OFFSET = 64
+
+VAR_CTRL = ".VarCtrl"
+"""Suffix of the control variable of a TxPD: bit 0 suppresses it, a rising bit 1 sends it."""
+FRAME_CTRL = ".FrameCtrl"
+"""Suffix of the control variable of a TxFrame: bit 0 suppresses it."""
+
+
+class VariablePlace(Record, frozen=True):
+    """One variable: *bit_offset* counts from the start of the image."""
+
+    name: str
+    type: str
+    writer: Writer
+    bit_offset: int
+    unit: str = ""
+    comment: str = ""
+    default: bool | int | float | str | list[bool | int | float] | None = None
+
+
+class RegionPlace(Record, frozen=True):
+    """The variables of one writer, and the word that guards them; offsets in octets."""
+
+    offset: int
+    size: int
+    sequence: int
+
+
+class PortPlace(Record, frozen=True):
+    """What a reader wants to know of a port."""
+
+    name: str
+    kind: str
+    net_id: str
+    interface: str
+
+
+class FramePlace(Record, frozen=True):
+    """A TxFrame: *words* is the index of its first word."""
+
+    name: str
+    port: str
+    destination: str
+    words: int
+
+
+class TxPlace(Record, frozen=True):
+    """A TxPD; *frame_words* is the index of its frame's first word, *size* the data's octets."""
+
+    name: str
+    frame: str
+    port: str
+    pd_id: int
+    version: int
+    size: int
+    variables: tuple[str, ...]
+    words: int
+    frame_words: int
+    by_schedule: bool
+    """Whether cycle time or divider is its only trigger."""
+    cyclic: bool
+    """Whether that schedule is a cycle time (or each cycle), not a divider."""
+
+
+class RxPlace(Record, frozen=True):
+    """An RxPD: its PD header lies at octet *offset*, its data behind it."""
+
+    name: str
+    port: str
+    pd_id: int
+    version: int
+    publisher: str
+    size: int
+    variables: tuple[str, ...]
+    words: int
+    offset: int
+    step: int
+    sender_cycle_us: int
+    timeout_ms: int
+    substitute: Substitute
+
+
+class ImageLayout(Record, frozen=True):
+    """The directory of one station's image."""
+
+    station: str
+    net_id: str
+    cycle_us: int
+    ports: tuple[PortPlace, ...]
+    variables: tuple[VariablePlace, ...]
+    regions: dict[Writer, RegionPlace]
+    frames: tuple[FramePlace, ...]
+    tx: tuple[TxPlace, ...]
+    rx: tuple[RxPlace, ...]
+    word_count: int
+    directory_offset: int
+
+    def encode(self) -> bytes:
+        """Return the directory as it stands in the image."""
+        return msgspec.json.encode(self)
+
+    @property
+    def size(self) -> int:
+        """Octets of the whole image."""
+        return self.directory_offset + len(self.encode())
+
+
+def plan_layout(spec: StationSpec) -> ImageLayout:
+    """Give everything in *spec* its place."""
+    words = _Allocator(0)
+    words.take(StationWord.SIZE)
+    frames = tuple(
+        FramePlace(f.name, f.port, f.destination, words.take(FrameWord.SIZE)) for f in spec.frames
+    )
+    types = {variable.name: datatypes.parse(variable.type) for variable in spec.variables}
+    tx = tuple(_tx_places(spec, frames, types, words))
+    rx_words = [words.take(RxWord.SIZE) for _ in spec.subscriptions]
+
+    octets = _Allocator(WORDS_OFFSET + 8 * words.used)
+    named = {variable.name: variable for variable in spec.variables}
+    places: dict[str, VariablePlace] = {}
+    regions = {}
+
+    start = octets.used
+    rx = tuple(_rx_places(spec.subscriptions, rx_words, named, places, octets))
+    for writer in Writer:
+        _place_variables(
+            (v for v in spec.variables if v.writer is writer and v.name not in places),
+            places,
+            octets,
+        )
+        if writer is Writer.APPLICATION:
+            _place_variables(_control_variables(spec), places, octets)
+        octets.align()
+        sequence = StationWord[f"{writer.name}_SEQUENCE"]
+        regions[writer] = RegionPlace(start, octets.used - start, sequence)
+        start = octets.used
+
+    return ImageLayout(
+        station=spec.name,
+        net_id=spec.net_id,
+        cycle_us=spec.cycle_us,
+        ports=tuple(PortPlace(p.name, p.kind, p.net_id, p.interface) for p in spec.ports),
+        variables=tuple(places.values()),
+        regions=regions,
+        frames=frames,
+        tx=tx,
+        rx=rx,
+        word_count=words.used,
+        directory_offset=octets.used,
+    )
+
+
+class _Allocator:
+    """Hands out consecutive units."""
+
+    def __init__(self, start: int) -> None:
+        self.used = start
+
+    def take(self, size: int) -> int:
+        start = self.used
+        self.used += size
+        return start
+
+    def align(self) -> None:
+        self.used += -self.used % 8
+
+
+def _control_variables(spec: StationSpec) -> Iterable[VariableSpec]:
+    for frame in spec.frames:
+        yield VariableSpec(frame.name + FRAME_CTRL, "UINT", comment="bit 0: suppress the frame")
+        for pd in frame.pds:
+            yield VariableSpec(
+                pd.name + VAR_CTRL, "UINT", comment="bit 0: suppress the PD; rising bit 1: send it"
+            )
+
+
+def _place_variables(
+    variables: Iterable[VariableSpec], places: dict[str, VariablePlace], octets: _Allocator
+) -> None:
+    for variable in variables:
+        offset = octets.take(datatypes.parse(variable.type).size)
+        places[variable.name] = _place(variable, 8 * offset)
+
+
+def _place(variable: VariableSpec, bit_offset: int) -> VariablePlace:
+    return VariablePlace(
+        variable.name,
+        variable.type,
+        variable.writer,
+        bit_offset,
+        variable.unit,
+        variable.comment,
+        variable.default,
+    )
+
+
+def _tx_places(
+    spec: StationSpec,
+    frames: tuple[FramePlace, ...],
+    types: dict[str, datatypes.DataType],
+    words: _Allocator,
+) -> Iterable[TxPlace]:
+    for frame, place in zip(spec.frames, frames, strict=True):
+        for pd in frame.pds:
+            trigger = pd.trigger
+            yield TxPlace(
+                name=pd.name,
+                frame=frame.name,
+                port=frame.port,
+                pd_id=pd.pd_id,
+                version=pd.version,
+                size=pdo.layout([types[name] for name in pd.variables]).size,
+                variables=pd.variables,
+                words=words.take(TxWord.SIZE),
+                frame_words=place.words,
+                by_schedule=trigger.on_change is None and not trigger.event,
+                cyclic=not trigger.divider and not frame.divider,
+            )
+
+
+def _rx_places(
+    subscriptions: tuple[RxPdSpec, ...],
+    words: list[int],
+    named: dict[str, VariableSpec],
+    places: dict[str, VariablePlace],
+    octets: _Allocator,
+) -> Iterable[RxPlace]:
+    for pd, first_word in zip(subscriptions, words, strict=True):
+        plan = pdo.layout([datatypes.parse(named[name].type) for name in pd.variables])
+        offset = octets.take(PdHeader.SIZE + plan.size)
+        data = 8 * (offset + PdHeader.SIZE)
+        for name, bit_offset in zip(pd.variables, plan.bit_offsets, strict=True):
+            places[name] = _place(named[name], data + bit_offset)
+        yield RxPlace(
+            name=pd.name,
+            port=pd.port,
+            pd_id=pd.pd_id,
+            version=pd.version,
+            publisher=pd.publisher,
+            size=plan.size,
+            variables=pd.variables,
+            words=first_word,
+            offset=offset,
+            step=pd.step,
+            sender_cycle_us=pd.sender_cycle_us,
+            timeout_ms=pd.timeout_ms,
+            substitute=pd.substitute,
+        )

@@ -1,0 +1,305 @@
+"""All subscriptions of one EAP port: which PDs of a frame are taken, and why the others are not.
+
+Nothing a publisher sends raises: what is not taken is counted under its reason.  Data goes from
+the frame straight into the process image; state and counters live there too.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.pd import FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
+from eap.errors import TruncatedError
+from eap.ids import NetId
+from eap.pd.account import Account, Timing
+from eap.pd.frame_plan import FramePlan, Refused, Taken
+from eap.pd.image import Image
+from eap.pd.layout import RxPlace
+from eap.pd.spec import RxPdSpec
+from eap.pd.substitute import SubstituteValue
+from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
+
+_KEY = struct.Struct("<10sH").unpack_from
+"""EtherCAT header, publisher and count: what tells layouts apart; then the cycle counter."""
+_PLANS_KEPT = 1024
+_NEVER = 1 << 62
+
+_CYCLE = int(StationWord.CYCLE)
+_SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
+
+
+class Subscription:
+    """One RxPD at run time."""
+
+    __slots__ = ("account", "ignore_version", "place", "substitute", "timeout_ns")
+
+    def __init__(self, spec: RxPdSpec, place: RxPlace, substitute: SubstituteValue) -> None:
+        self.place = place
+        self.ignore_version = spec.ignore_version
+        self.timeout_ns = spec.timeout_ms * 1_000_000
+        self.substitute = substitute
+        self.account: Account  # the subscriber opens it
+
+    def mismatch(self, version: int, length: int) -> Discard | None:
+        """Return why a PD of this version and length does not fit, None if it does."""
+        if version != self.place.version and not self.ignore_version:
+            return Discard.VERSION
+        if length != self.place.size:
+            return Discard.LENGTH
+        return None
+
+
+class Subscriber:
+    """Takes the frames of one port.
+
+    Args:
+        image: The station's process image.
+        subscriptions: The port's RxPDs, each with its place.
+        own_cycle_ns: The station's device cycle.
+    """
+
+    def __init__(
+        self, image: Image, subscriptions: Iterable[tuple[RxPdSpec, RxPlace]], own_cycle_ns: int
+    ) -> None:
+        self._memory = image.memory
+        self._words = image.words
+        self._subscriptions = [
+            Subscription(spec, place, SubstituteValue(image, place))
+            for spec, place in subscriptions
+        ]
+        self._by_key: dict[tuple[bytes, int], list[Subscription]] = {}
+        self._by_id: dict[int, list[Subscription]] = {}
+        for subscription in self._subscriptions:
+            place = subscription.place
+            publisher = NetId.parse(place.publisher) if place.publisher else b""
+            self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
+            self._by_id.setdefault(place.pd_id, []).append(subscription)
+        self._plans: dict[bytes, list[FramePlan]] = {}
+        self._plan_count = 0
+        self._open_from_ns = _NEVER
+        self._closed_reason = Discard.SUPPRESSED
+        self._next_timeout_ns = _NEVER
+        self._senders: dict[Account, bytes] = {}
+        self._open_accounts(own_cycle_ns)
+
+    def open(self, from_ns: int) -> None:
+        """Take what arrives from now on; what arrived earlier is stale (the station is in Op)."""
+        self._open_from_ns = from_ns
+        self._closed_reason = Discard.STALE
+        self._next_timeout_ns = from_ns
+
+    def close(self) -> None:
+        """Take nothing (the station left Op)."""
+        self._open_from_ns = _NEVER
+        self._closed_reason = Discard.SUPPRESSED
+        self._next_timeout_ns = _NEVER
+
+    def receive_frame(self, data: memoryview, size: int, at_ns: int) -> None:
+        """Take one EtherCAT frame of *size* octets that arrived at *at_ns*."""
+        plan = self._find_plan(data, size)
+        if plan is None:
+            return
+        if at_ns < self._open_from_ns:
+            self._discard(self._closed_reason, len(plan.expected), plan.taken_words)
+            return
+        if plan.roaming:
+            self._note_sender(bytes(data[PD_FRAME_START : PD_FRAME_START + 6]), plan.roaming)
+        words, memory = self._words, self._memory
+        # A frame taken outside the station's own cycle has to mark the region as changing itself.
+        outside = not words[_SEQUENCE] & 1
+        if outside:
+            words[_SEQUENCE] += 1
+        cycle = _KEY(data)[1]
+        own_cycle = words[_CYCLE] + outside
+        for account, copies in plan.parts:
+            if account.arrived(cycle, at_ns, own_cycle):
+                for source, target in copies:
+                    memory[target] = data[source]
+        if outside:
+            words[_SEQUENCE] += 1
+        if plan.refused:
+            self._refuse(plan, at_ns)
+
+    def next_timeout(self) -> int | None:
+        """Return when handle_timeout() has to be called, None for never."""
+        return None if self._next_timeout_ns == _NEVER else self._next_timeout_ns
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Apply the substitute of every subscription whose data is too old; early calls do no harm.
+
+        Called in each cycle; it looks at the subscriptions only when one can have timed out.
+        """
+        if now_ns < self._next_timeout_ns:
+            return
+        following = _NEVER
+        expired: dict[Account, list[Subscription]] = {}
+        for subscription in self._subscriptions:
+            timeout_ns, account = subscription.timeout_ns, subscription.account
+            if not timeout_ns:
+                continue
+            if account.state is not RxState.RUNNING:
+                # It may start to run at any moment, and then has this long.
+                following = min(following, now_ns + timeout_ns)
+                continue
+            deadline_ns = account.arrived_at_ns + timeout_ns
+            if deadline_ns <= now_ns:
+                expired.setdefault(account, []).append(subscription)
+                following = min(following, now_ns + timeout_ns)
+            else:
+                following = min(following, deadline_ns)
+        for account, subscriptions in expired.items():
+            account.time_out()
+            for subscription in subscriptions:
+                subscription.substitute.apply()
+        self._next_timeout_ns = following
+
+    def _find_plan(self, data: memoryview, size: int) -> FramePlan | None:
+        if size >= FIRST_PD:
+            for plan in self._plans.get(_KEY(data)[0], ()):
+                if plan.end <= size and plan.headers(data, FIRST_PD) == plan.expected:
+                    return plan
+        return self._learn(data, size)
+
+    def _learn(self, data: memoryview, size: int) -> FramePlan | None:
+        """Make the plan of a layout not seen before; count and drop what is no PD frame."""
+        pds = _walk(data, size)
+        if isinstance(pds, Discard):
+            self._discard(pds, 1)
+            return None
+        publisher = bytes(data[PD_FRAME_START : PD_FRAME_START + 6])
+        chosen: list[tuple[Subscription, int]] = []
+        refused = []
+        for header, offset in pds:
+            match = self._match(publisher, header)
+            if isinstance(match, Subscription):
+                chosen.append((match, offset))
+            else:
+                refused.append(match)
+        if self._part_accounts({subscription for subscription, _ in chosen}):
+            self._forget_plans()
+        plan = FramePlan(
+            PD_FRAME_START + EtherCatHeader.decode(data).length,
+            [(bytes(data[offset : offset + 6]), header.length) for header, offset in pds],
+            [
+                Taken(s.account, s.place.words, offset, s.place.offset, 8 + s.place.size)
+                for s, offset in chosen
+            ],
+            refused,
+            {s.account for s, _ in chosen if not s.place.publisher},
+        )
+        if self._plan_count >= _PLANS_KEPT:
+            self._forget_plans()
+        self._plan_count += 1
+        self._plans.setdefault(_KEY(data)[0], []).append(plan)
+        return plan
+
+    def _forget_plans(self) -> None:
+        self._plans.clear()
+        self._plan_count = 0
+
+    def _match(self, publisher: bytes, header: PdHeader) -> Subscription | Refused:
+        """Find who takes a PD, or what to count instead."""
+        key = header.pd_id
+        candidates = self._by_key.get((publisher, key), []) + self._by_key.get((b"", key), [])
+        discard = Discard.UNKNOWN_ID
+        for candidate in candidates:
+            reason = candidate.mismatch(header.version, header.length)
+            if reason is None:
+                return candidate
+            discard = reason
+        if not candidates and key in self._by_id:
+            discard = Discard.WRONG_PUBLISHER
+            candidates = self._by_id[key]
+        index = DISCARD_INDEX[discard]
+        counters = [StationWord.DISCARDED + index]
+        counters += [c.place.words + RxWord.DISCARDED + index for c in candidates]
+        bit = {Discard.VERSION: 1, Discard.LENGTH: 2}.get(discard, 0)
+        marked = [c.place.words for c in candidates] if bit else []
+        return Refused(tuple(counters), tuple((first, bit) for first in marked))
+
+    def _discard(self, reason: Discard, count: int, subscriptions: Iterable[int] = ()) -> None:
+        index = DISCARD_INDEX[reason]
+        self._words[StationWord.DISCARDED + index] += count
+        for first_word in subscriptions:
+            self._words[first_word + RxWord.DISCARDED + index] += 1
+
+    def _refuse(self, plan: FramePlan, at_ns: int) -> None:
+        words = self._words
+        for pd in plan.refused:
+            for counter in pd.counters:
+                words[counter] += 1
+            for first_word, bit in pd.mismatches:
+                words[first_word + RxWord.MISMATCH] = bit
+                words[first_word + RxWord.MISMATCH_AT_NS] = at_ns
+
+    def _open_accounts(self, own_cycle_ns: int) -> None:
+        """Find the accounts that an earlier engine left in the image, or start new ones."""
+        accounts: dict[object, Account] = {}
+        for subscription in self._subscriptions:
+            place = subscription.place
+            first_word = self._words[place.words + RxWord.ACCOUNT]
+            timing = Timing(
+                step=place.step,
+                sender_cycle_ns=place.sender_cycle_us * 1000,
+                own_cycle_ns=own_cycle_ns,
+            )
+            # Only PDs that are judged alike can share; with any publisher nothing is known.
+            history: object = first_word or (
+                (place.publisher, place.step, place.sender_cycle_us, subscription.timeout_ns)
+                if place.publisher
+                else place.name
+            )
+            if history not in accounts:
+                accounts[history] = Account(self._words, first_word or place.words, timing)
+            self._assign(subscription, accounts[history])
+
+    def _assign(self, subscription: Subscription, account: Account) -> None:
+        subscription.account = account
+        self._words[subscription.place.words + RxWord.ACCOUNT] = account.first_word
+
+    def _part_accounts(self, arriving: set[Subscription]) -> bool:
+        """Give PDs that arrive without the others of their account one of their own."""
+        parted = False
+        for account in {subscription.account for subscription in arriving}:
+            members = [s for s in self._subscriptions if s.account is account]
+            here = [s for s in members if s in arriving]
+            if len(here) == len(members):
+                continue
+            parted = True
+            # Whoever owns the block keeps it; the others move to the block of their first.
+            owner_arrives = any(s.place.words == account.first_word for s in here)
+            leaving = [s for s in members if s not in arriving] if owner_arrives else here
+            new = account.part(self._words, leaving[0].place.words)
+            for subscription in leaving:
+                self._assign(subscription, new)
+        return parted
+
+    def _note_sender(self, publisher: bytes, accounts: Iterable[Account]) -> None:
+        for account in accounts:
+            if self._senders.get(account) != publisher:
+                self._senders[account] = publisher
+                account.forget_sender()
+
+
+def _walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | Discard:
+    """Return each PD header with its offset, or why the frame is dropped as a whole."""
+    try:
+        ethercat = EtherCatHeader.decode(data[:size])
+        if ethercat.type != FrameType.PROCESS_DATA:
+            return Discard.WRONG_TYPE
+        end = PD_FRAME_START + ethercat.length
+        frame = data[: min(end, size)]
+        count = PdFrameHeader.decode(frame, PD_FRAME_START).count
+        if FIRST_PD + count * PdHeader.SIZE > end:
+            return Discard.COUNT_TOO_LARGE
+        pds = []
+        offset = FIRST_PD
+        for _ in range(count):
+            header = PdHeader.decode(frame, offset)
+            pds.append((header, offset))
+            offset += PdHeader.SIZE + header.length
+    except TruncatedError:
+        return Discard.TRUNCATED
+    return pds if offset <= end <= size else Discard.TRUNCATED

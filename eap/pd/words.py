@@ -1,0 +1,190 @@
+"""The counters of a process image: which 64-bit word means what.
+
+One station's image ends in an array of signed 64-bit words.  It starts with the station's own
+block, followed by one block for each TxFrame, TxPD and RxPD.  Counters are incremented in place,
+there is no second copy: that is why they survive the engine.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, StrEnum, auto
+
+
+class Discard(StrEnum):
+    """Why a PD, or a whole frame, was seen and not taken."""
+
+    WRONG_PUBLISHER = auto()
+    UNKNOWN_ID = auto()
+    VERSION = auto()
+    LENGTH = auto()
+    SUPPRESSED = auto()
+    """The station was not in Op."""
+    STALE = auto()
+    """It had waited in the socket since before the engine started."""
+    TRUNCATED = auto()
+    COUNT_TOO_LARGE = auto()
+    WRONG_TYPE = auto()
+    """The frame is of a type that has no business here, such as TwinCAT's undocumented 7."""
+
+
+class Reason(StrEnum):
+    """Why a PD was sent."""
+
+    CYCLE = auto()
+    DIVIDER = auto()
+    CHANGE = auto()
+    CHANGE_TIMEOUT = auto()
+    EVENT = auto()
+
+
+DISCARDS = tuple(Discard)
+REASONS = tuple(Reason)
+DISCARD_INDEX = {reason: index for index, reason in enumerate(DISCARDS)}
+REASON_INDEX = {reason: index for index, reason in enumerate(REASONS)}
+
+HISTOGRAM_BINS = 64
+
+
+class StationWord(IntEnum):
+    """The station's own block."""
+
+    CYCLE = 0
+    """Cycle counter, not wrapped; its low 16 bits travel."""
+    CYCLE_AT_NS = 1
+    """When that cycle was due, on the monotonic clock."""
+    FUTEX = 2
+    """Low half: the cycle again, as the word that waiting programs sleep on."""
+    WAITERS = 3
+    """Set by a program that is about to sleep, cleared by the engine that wakes it."""
+    ENGINE_SEQUENCE = 4
+    """Odd while the engine writes its region; likewise the next two."""
+    SERVICES_SEQUENCE = 5
+    APPLICATION_SEQUENCE = 6
+    ENGINE_PID = 7
+    RETIRED = 8
+    """1 when a file of a newer generation has taken this one's place."""
+    STATE = 9
+    """Device state as AL status numbers it: 1 Init, 2 PreOp, 4 SafeOp, 8 Op."""
+    STARTED_AT_NS = 10
+    """When this engine reached Op, on the monotonic clock."""
+    RESTARTS = 11
+    OVERRUNS = 12
+    """Cycles left out because the engine came too late for them."""
+    TORN = 13
+    """Cycles in which a writer had stopped in the middle of writing."""
+    LATENESS_MAX_NS = 14
+    DISCARDED = 15
+    LATENESS = DISCARDED + len(DISCARDS)
+    SIZE = LATENESS + HISTOGRAM_BINS
+
+
+class FrameWord(IntEnum):
+    """The block of a TxFrame."""
+
+    WHOLE = 0
+    """Sent with all its PDs, each due by its schedule: their own counters are not touched."""
+    PARTIAL = 1
+    """Sent otherwise."""
+    SKIPPED = 2
+    """Due, but suppressed or refused by the network."""
+    SKIPPED_WHOLE = 3
+    """Of these, the ones that would have counted as WHOLE."""
+    STATE = 4
+    """FrameState: bit 0 not sent."""
+    SENT_AT_NS = 5
+    SIZE = 6
+
+
+class TxWord(IntEnum):
+    """The block of a TxPD."""
+
+    SKIPPED = 0
+    """Due, but suppressed or its frame skipped; what the frame counts whole comes on top."""
+    LAST_REASON = 1
+    """Index into REASONS of the last time it was sent on its own account, -1 before."""
+    SENT_AT_NS = 2
+    REASON = 3
+    SIZE = REASON + len(REASONS)
+
+
+class RxWord(IntEnum):
+    """The block of an RxPD: what is its own, then the account that it may share.
+
+    PDs that have always arrived together share one account; ACCOUNT says whose block holds it.
+    """
+
+    ACCOUNT = 0
+    """Index of the first word of the block that holds the account."""
+    MISMATCH = 1
+    """VarState: bit 0 version, bit 1 length, of the last PD refused."""
+    MISMATCH_AT_NS = 2
+    DISCARDED = 3
+    RECEIVED = DISCARDED + len(DISCARDS)
+    DUPLICATED = 13
+    REORDERED = 14
+    LATE = 15
+    LOST = 16
+    TIMEOUTS = 17
+    STATE = 18
+    """RxState as a number."""
+    LAST_CYCLE = 19
+    """Cycle counter of the last frame taken (CycleIndex)."""
+    ARRIVED_AT_NS = 20
+    ARRIVED_IN_CYCLE = 21
+    """Own cycle whose input image it refreshed: what quality counts from."""
+    BEHIND = 22
+    """Frames in a row that came with an older counter."""
+    JITTER_MAX_US = 23
+    JITTER = 24
+    SIZE = JITTER + HISTOGRAM_BINS
+
+
+ACCOUNT_START = RxWord.RECEIVED
+"""First word of the account within an RxPD's block; it reaches to the end of the block."""
+
+
+class RxState(IntEnum):
+    """Where a subscription stands."""
+
+    WAITING = 0
+    """Nothing received yet."""
+    RUNNING = 1
+    """Data is younger than the time-out."""
+    STALE = 2
+    """The publisher went quiet; the substitute applies."""
+
+
+def histogram_bin(value: int) -> int:
+    """Return the bin of *value* (microseconds): four bins to each power of two."""
+    if value < 4:
+        return max(value, 0)
+    exponent = value.bit_length()
+    if exponent > 17:
+        return HISTOGRAM_BINS - 1
+    return 4 * (exponent - 2) + (value >> exponent - 3 & 3)
+
+
+def bin_upper_edge(index: int) -> int:
+    """Return the largest value that falls into bin *index*."""
+    if index < 4:
+        return index
+    shift = index // 4 - 1
+    return ((index % 4 + 5) << shift) - 1
+
+
+BIN_OF_US = bytes(histogram_bin(value) for value in range(4096))
+"""The bins of the first 4 ms, looked up instead of computed in the cycle."""
+
+
+def percentile(bins: list[int], share: float) -> int | None:
+    """Return the upper edge of the bin below which *share* of all entries lie, None if empty."""
+    total = sum(bins)
+    if not total:
+        return None
+    wanted = total * share
+    seen = 0
+    for index, count in enumerate(bins):
+        seen += count
+        if seen >= wanted:
+            return bin_upper_edge(index)
+    return bin_upper_edge(HISTOGRAM_BINS - 1)  # unreachable but for rounding of a share above 1
