@@ -27,10 +27,10 @@ setup: .venv/.stamp-dev  ## prepare .venv (done once, and again when pyproject.t
 demo: setup  ## run the demo plant and show its values moving; Ctrl-C ends it
 	@$(BIN)/python tools/demo.py $(if $(SECONDS),--seconds '$(SECONDS)')
 
-# Tests with sockets and processes run last, alone and in one worker; tests/conftest.py sees to it.
+# Tests with sockets and processes come last, a file at a time with nothing beside it: see tests/conftest.py.
 test: setup  ## run all tests; as root, first install the programs they use
 	@sh tools/install_peers.sh test || echo 'make test: going on; what needs them is skipped and listed'
-	@$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadgroup --no-loadscope-reorder $(ARGS)
+	@$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: setup  ## format, lint, types, import contracts, tree
 	$(BIN)/ruff format --check .

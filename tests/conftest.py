@@ -1,8 +1,8 @@
 """What holds for every test: the hypothesis profile, who is skipped and why, and who runs alone.
 
 Tests marked ``net`` open sockets and start processes, on fixed addresses and with an eye on the
-clock.  They come after all others; under xdist they share one worker, and while one of them runs
-the other workers wait.
+clock.  They come after all others; under xdist, where each file has one worker (``--dist
+loadfile``), the other workers wait while a file of them runs.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ def _lacks_program(name: str, *, package: str) -> str | None:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip what this machine cannot do, and put the ``net`` tests last and in one group."""
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what this machine cannot do, and put the ``net`` tests last."""
     missing = {"root": _lacks_root(), "tshark": _lacks_program("tshark", package="tshark")}
     for item in items:
         for marker, reason in missing.items():
             if reason is not None and item.get_closest_marker(marker) is not None:
                 item.add_marker(pytest.mark.skip(reason=reason))
-        if _is_net(item) and config.pluginmanager.hasplugin("xdist"):
-            item.add_marker(pytest.mark.xdist_group("net"))
     items.sort(key=_is_net)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Under xdist, let a ``net`` test have the machine to itself.
+def pytest_runtest_protocol(
+    item: pytest.Item, nextitem: pytest.Item | None
+) -> Generator[None, object, object]:
+    """Under xdist, let a file of ``net`` tests have the machine to itself, its fixtures included.
 
     Outside pytest-timeout's wrapper, so that waiting for a turn costs no test its time.
     """
@@ -74,7 +74,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     try:
         return (yield)
     finally:
-        fcntl.flock(_TURN, fcntl.LOCK_UN)
+        if not (_is_net(item) and nextitem is not None and nextitem.path == item.path):
+            fcntl.flock(_TURN, fcntl.LOCK_UN)
 
 
 def _is_net(item: pytest.Item) -> bool:
