@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.errors import CodecError, TruncatedError
+from eap.ids import NetId
+from tests.support.records import records
+
+headers = records(AmsHeader)
+
+
+def test_header_lies_as_on_the_wire() -> None:
+    header = AmsHeader(
+        NetId.parse("192.168.0.1.2.1"),
+        1001,
+        NetId.parse("192.168.0.50.1.1"),
+        0x8000,
+        AmsCommand.READ,
+        StateFlags.ADS,
+        length=12,
+        error_code=6,
+        invoke_id=1,
+    )
+    assert header.encode().hex() == (
+        "c0a800010201e903c0a80032010100800200040" + "00c000000" + "06000000" + "01000000"
+    )
+    assert AmsHeader.SIZE == 32
+
+
+@given(headers, st.binary(max_size=60), st.binary(max_size=3))
+def test_packet_round_trip(header: AmsHeader, body: bytes, before: bytes) -> None:
+    packet = encode_packet(header, body)
+    read, data = decode_packet(before + packet + b"rest", len(before))
+    assert (read.length, bytes(data)) == (len(body), body)
+    assert encode_packet(read, data) == packet
+
+
+@given(headers, st.binary(max_size=20), st.data())
+def test_every_prefix_is_truncated(header: AmsHeader, body: bytes, data: st.DataObject) -> None:
+    packet = encode_packet(header, body)
+    cut = data.draw(st.integers(0, len(packet) - 1))
+    with pytest.raises(TruncatedError, match="AmsHeader"):
+        decode_packet(packet[:cut])
+
+
+@given(st.binary(max_size=80))
+def test_garbage_decodes_or_raises_codec_error(noise: bytes) -> None:
+    try:
+        header, data = decode_packet(noise)
+    except CodecError:
+        return
+    assert noise.startswith(encode_packet(header, data))
+
+
+def test_unknown_command_is_kept_for_whoever_answers_it() -> None:
+    header = AmsHeader(NetId(bytes(6)), 0, NetId(bytes(6)), 0, 0x1234)
+    assert AmsHeader.decode(header.encode()).command == 0x1234
+    assert AmsCommand.name_of(0x1234) == "0x1234"
+    assert AmsCommand.name_of(9) == "READ_WRITE"

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec.datatypes import parse
+
+# Index, bits and octets as the table of base data types in ETG.1020 gives them.
+TABLE = {
+    "BOOL": (0x01, 1, 1),
+    "SINT": (0x02, 8, 1),
+    "INT": (0x03, 16, 2),
+    "DINT": (0x04, 32, 4),
+    "USINT": (0x05, 8, 1),
+    "UINT": (0x06, 16, 2),
+    "UDINT": (0x07, 32, 4),
+    "REAL": (0x08, 32, 4),
+    "INT24": (0x10, 24, 3),
+    "LREAL": (0x11, 64, 8),
+    "INT40": (0x12, 40, 5),
+    "INT48": (0x13, 48, 6),
+    "INT56": (0x14, 56, 7),
+    "LINT": (0x15, 64, 8),
+    "UINT24": (0x16, 24, 3),
+    "UINT40": (0x18, 40, 5),
+    "UINT48": (0x19, 48, 6),
+    "UINT56": (0x1A, 56, 7),
+    "ULINT": (0x1B, 64, 8),
+    "BYTE": (0x1E, 8, 1),
+    "WORD": (0x1F, 16, 2),
+    "DWORD": (0x20, 32, 4),
+    "BIT1": (0x30, 1, 1),
+    "BIT8": (0x37, 8, 1),
+    "STRING(7)": (0x09, 56, 7),
+    "BLOCK(7)": (0x0A, 56, 7),
+}
+
+
+@pytest.mark.parametrize("text", TABLE)
+def test_base_type(text: str) -> None:
+    kind = parse(text)
+    assert (kind.code, kind.bit_length, kind.size) == TABLE[text]
+    assert (kind.text, kind.count) == (text, 1)
+    assert kind.is_bits == text.startswith("B") * (text[:3] in ("BOO", "BIT"))
+
+
+@pytest.mark.parametrize(
+    ("alias", "text"),
+    [
+        ("boolean", "BOOL"),
+        ("bit", "BIT1"),
+        *((name, "SINT") for name in ("I8", "INT8", "INTEGER8", "sint")),
+        *((name, "USINT") for name in ("U8", "UINT8", "UNSIGNED8")),
+        *((name, "INT") for name in ("i16", "INT16", "Integer16")),
+        *((name, "INT24") for name in ("I24", "INTEGER24")),
+        *((name, "UINT24") for name in ("U24", "UNSIGNED24")),
+        *((name, "ULINT") for name in ("U64", "UINT64", "UNSIGNED64")),
+        *((name, "REAL") for name in ("REAL32", "float")),
+        *((name, "LREAL") for name in ("REAL64", "double")),
+        ("visible_string(3)", "STRING(3)"),
+        ("OCTET_STRING( 3 )", "BLOCK(3)"),
+        (" u16 [ 8 ] ", "UINT[8]"),
+        ("ARRAY [0..7] OF UINT", "UINT[8]"),
+        ("array [1..3] of real", "REAL[3]"),
+    ],
+)
+def test_alias(alias: str, text: str) -> None:
+    assert parse(alias) == parse(text)
+    assert parse(alias).text == text
+
+
+def test_array_has_the_code_of_its_elements() -> None:
+    kind = parse("UINT24[4]")
+    assert (kind.code, kind.bit_length, kind.size, kind.count) == (0x16, 96, 12, 4)
+    assert kind.zero == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("UNIT", "'UNIT' is not a data type, did you mean UINT"),
+        ("STRIN(4)", "did you mean STRING"),
+        ("zzz", "is not a data type .such as UINT"),
+        ("", "is not a data type"),
+        ("UINT 16", "is not a data type"),
+        ("STRING", "lacks its length in octets, such as STRING.16."),
+        ("UINT(3)", "UINT has a fixed length, arrays are UINT.3."),
+        ("BOOL[8]", "arrays of bits are not supported"),
+        ("BIT2[8]", "arrays of bits are not supported"),
+        ("STRING(3)[2]", "only numbers form arrays"),
+        ("BLOCK(3)[2]", "only numbers form arrays"),
+        ("UINT[0]", "has 0 octets, expected 1 to 65535"),
+        ("STRING(0)", "has 0 octets"),
+        ("ARRAY [3..0] OF UINT", "has 0 octets"),
+        ("BLOCK(65536)", "has 65536 octets"),
+        ("UINT[32768]", "has 65536 octets"),
+        ("UINT[2][2]", "is not a data type"),
+    ],
+)
+def test_refused(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        parse(text)
+
+
+@given(st.text(max_size=20))
+def test_any_text_names_a_type_or_raises_value_error(text: str) -> None:
+    try:
+        kind = parse(text)
+    except ValueError as exc:
+        assert repr(text) in str(exc)  # noqa: PT017  the message must show what was read
+    else:
+        assert parse(kind.text) is kind or parse(kind.text) == kind
+
+
+def test_types_are_shared_and_cannot_be_changed() -> None:
+    assert parse("UINT") is parse("UINT")
+    with pytest.raises(AttributeError):
+        parse("UINT").size = 3

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.mailbox import (
+    MailboxError,
+    MailboxErrorReply,
+    MailboxHeader,
+    MailboxType,
+    decode_frame,
+    decode_message,
+    encode_frame,
+    encode_message,
+)
+from eap.errors import CodecError, MalformedError, TruncatedError
+from tests.support.records import records
+
+headers = records(MailboxHeader)
+
+
+def test_header_lies_as_on_the_wire() -> None:
+    header = MailboxHeader(10, 1001, channel=1, priority=3, type=MailboxType.COE, counter=2)
+    assert header.encode() == bytes.fromhex("0a00 e903 c1 23")
+
+
+@given(headers, st.binary(max_size=2041))
+def test_frame_round_trip(header: MailboxHeader, body: bytes) -> None:
+    frame = encode_frame(header, body)
+    read, data = decode_frame(frame + b"padding")
+    assert (read.length, bytes(data)) == (len(body), body)
+    assert encode_frame(read, data) == frame
+
+
+@given(headers, st.binary(max_size=40), st.binary(max_size=3))
+def test_message_round_trip(header: MailboxHeader, body: bytes, before: bytes) -> None:
+    message = encode_message(header, body)
+    read, data = decode_message(before + message + b"rest of the mailbox", len(before))
+    assert encode_message(read, data) == message
+
+
+@given(headers, st.binary(max_size=40), st.data())
+def test_every_prefix_is_truncated(header: MailboxHeader, body: bytes, data: st.DataObject) -> None:
+    frame = encode_frame(header, body)
+    cut = data.draw(st.integers(0, len(frame) - 1))
+    with pytest.raises(TruncatedError):
+        decode_frame(frame[:cut])
+    with pytest.raises(TruncatedError):
+        decode_message(frame[:cut], EtherCatHeader.SIZE)
+
+
+@given(st.binary(max_size=60), st.booleans())
+def test_garbage_decodes_or_raises_codec_error(noise: bytes, as_type_5: bool) -> None:
+    if as_type_5:
+        noise = EtherCatHeader(len(noise), type=FrameType.MAILBOX).encode() + noise
+    try:
+        header, data = decode_frame(noise)
+    except CodecError:
+        return
+    assert noise.startswith(encode_frame(header, data)[2:], 2)
+
+
+def test_message_longer_than_its_frame_is_truncated() -> None:
+    frame = EtherCatHeader(8, type=FrameType.MAILBOX).encode() + MailboxHeader(3).encode() + b"abc"
+    with pytest.raises(TruncatedError, match="length 3, but 2 octets follow"):
+        decode_frame(frame)
+
+
+def test_other_frame_type_is_malformed() -> None:
+    with pytest.raises(MalformedError, match="frame type 4, expected 5"):
+        decode_frame(EtherCatHeader(6).encode() + bytes(6))
+
+
+def test_unknown_protocol_is_malformed() -> None:
+    with pytest.raises(MalformedError, match="6 is not a valid MailboxType"):
+        decode_message(bytes.fromhex("0000 0000 00 16"))
+
+
+def test_body_too_long_for_a_frame_is_refused() -> None:
+    with pytest.raises(CodecError, match="EtherCatHeader"):
+        encode_frame(MailboxHeader(0), bytes(2042))
+
+
+def test_error_reply_names_its_reason() -> None:
+    reply = MailboxErrorReply.decode(bytes.fromhex("0100 0200"))
+    assert reply == MailboxErrorReply(detail=MailboxError.UNSUPPORTED_PROTOCOL)
+    assert MailboxError.name_of(reply.detail) == "UNSUPPORTED_PROTOCOL"
+    assert MailboxError.name_of(0x1234) == "0x1234"

@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.ids import (
+    BROADCAST_MAC,
+    EAP_MULTICAST_MAC,
+    Destination,
+    DestinationKind,
+    InterfaceUri,
+    MacAddr,
+    NetId,
+)
+
+six_octets = st.binary(min_size=6, max_size=6)
+addresses = st.ip_addresses(v=4).map(str)
+
+
+@given(six_octets)
+def test_net_id_round_trip(octets: bytes) -> None:
+    net_id = NetId(octets)
+    assert NetId.parse(str(net_id)) == net_id == octets
+    assert eval(repr(net_id)) == net_id
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "1.2.3.4.5", "1.2.3.4.5.6.7", "1.2.3.4.5.256", "1.2.3.4.5.x", "1.2.3.4.5.²", "1..3.4.5.6"],
+)
+def test_net_id_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"NetID|octet above 255"):
+        NetId.parse(text)
+
+
+@given(six_octets)
+def test_mac_round_trip(octets: bytes) -> None:
+    mac = MacAddr(octets)
+    assert MacAddr.parse(str(mac)) == mac == octets
+    assert MacAddr.parse(str(mac).upper().replace(":", "-")) == mac
+    assert eval(repr(mac)) == mac
+
+
+@pytest.mark.parametrize("text", ["", "01:02:03:04:05", "01:02:03:04:05:0g", "010203040506"])
+def test_mac_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a MAC address"):
+        MacAddr.parse(text)
+
+
+def test_group_addresses() -> None:
+    assert BROADCAST_MAC.is_group
+    assert EAP_MULTICAST_MAC.is_group
+    assert not MacAddr.parse("02:01:05:00:00:01").is_group
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "udp://127.0.1.1",
+        "udp://127.0.1.1:40000",
+        "tcp://10.0.0.1",
+        "ethernet://eth0",
+        "loop://line?delay_us=100&loss=0.1",
+        "sim://buses/a.yaml",
+    ],
+)
+def test_interface_round_trip(text: str) -> None:
+    assert str(InterfaceUri.parse(text)) == text
+
+
+def test_interface_parts() -> None:
+    assert InterfaceUri.parse("udp://127.0.1.1:40000") == ("udp", "127.0.1.1", 40000, ())
+    assert InterfaceUri.parse("loop://a?loss=1").options == (("loss", "1"),)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("eth0", "is not an interface"),
+        ("http://127.0.0.1", "one of udp://"),
+        ("udp://localhost", "'localhost' is not an IPv4 address"),
+        ("udp://1.2.3.4:0", "'0' is not a port"),
+        ("udp://1.2.3.4:70000", "is not a port"),
+        ("ethernet://", "names no interface"),
+        ("loop://a?loss", "bad query field"),
+    ],
+)
+def test_interface_refused(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        InterfaceUri.parse(text)
+
+
+@given(addresses, st.integers(0, 65535), st.booleans())
+def test_destination_round_trip(address: str, port: int, tcp: bool) -> None:
+    text = ("tcp://" if tcp else "") + address + (f":{port}" if port else "")
+    destination = Destination.parse(text)
+    assert destination.kind is (DestinationKind.TCP if tcp else DestinationKind.IP)
+    assert (destination.host, destination.port) == (address, port)
+    assert str(destination) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "is_group"),
+    [
+        ("01:01:05:04:00:00", True),
+        ("02-01-05-04-00-00", False),
+        ("239.1.2.3", True),
+        ("255.255.255.255", True),
+        ("127.0.1.1", False),
+        ("tcp://127.0.1.1", False),
+    ],
+)
+def test_destination_group(text: str, is_group: bool) -> None:
+    assert Destination.parse(text).is_group is is_group
+
+
+def test_destination_mac_has_one_spelling() -> None:
+    assert Destination.parse("02-01-05-0A-00-00") == (DestinationKind.MAC, "02:01:05:0a:00:00", 0)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "host", "1.2.3", "1.2.3.4:x", "01:02:03:04:05:zz", "tcp://eth0"]
+)
+def test_destination_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a"):
+        Destination.parse(text)
