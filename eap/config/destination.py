@@ -1,0 +1,135 @@
+"""Where a frame goes: from what the plant file says to the address that the engine is given."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+
+from eap.codec.ethercat import EAP_PORT, MAX_ETHERNET_FRAME, MAX_UDP_FRAME, EtherCatHeader
+from eap.config.index import Index
+from eap.config.structs import Port
+from eap.ids import (
+    BROADCAST_MAC,
+    EAP_MULTICAST_MAC,
+    Destination,
+    DestinationKind,
+    InterfaceUri,
+    MacAddr,
+)
+
+IP_BROADCAST = "255.255.255.255"
+MAX_STREAM_FRAME = EtherCatHeader.SIZE + 0x7FF
+"""What the 11 bits of Length allow where no wire does."""
+
+_ALLOWED = {
+    "udp": (DestinationKind.IP, DestinationKind.TCP),
+    "tcp": (DestinationKind.TCP,),
+    "ethernet": (DestinationKind.MAC,),
+    "loop": (DestinationKind.MAC,),
+}
+EXPECTED = {
+    "udp": "an IPv4 address, tcp:// and one, STATION/PORT or broadcast",
+    "tcp": "tcp:// and an IPv4 address, or STATION/PORT",
+    "ethernet": "a MAC address, multicast or broadcast",
+    "loop": "STATION/PORT, a MAC address, multicast or broadcast",
+}
+"""What ``to`` may be on each kind of interface."""
+_KEYWORDS = {
+    ("broadcast", "udp"): IP_BROADCAST,
+    ("broadcast", "ethernet"): str(BROADCAST_MAC),
+    ("broadcast", "loop"): str(BROADCAST_MAC),
+    ("multicast", "ethernet"): str(EAP_MULTICAST_MAC),
+    ("multicast", "loop"): str(EAP_MULTICAST_MAC),
+}
+
+
+def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
+    """Return the address that *text* means for a frame that leaves by *uri*.
+
+    Raises:
+        ValueError: there is no such address, or no frame gets there from this interface.
+    """
+    if text in {"broadcast", "multicast"}:
+        keyword = _KEYWORDS.get((text, uri.scheme))
+        if keyword is None:
+            raise ValueError(f"{text} has no usual address on {uri.scheme}://")
+        return Destination.parse(keyword)
+    if "/" in text and "://" not in text:
+        return _of_port(text, uri, index)
+    destination = Destination.parse(text)
+    if destination.kind not in _ALLOWED.get(uri.scheme, ()):
+        raise ValueError(f"{text} cannot be reached from {uri}")
+    return destination
+
+
+def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
+    station, _, name = text.partition("/")
+    target = index.uris.get((station, name))
+    if target is None:
+        raise ValueError(f"{text} is no port of this plant")
+    port = index.ports[station, name]
+    if target.scheme == "loop" == uri.scheme and target.host == uri.host:
+        return Destination.parse(str(EAP_MULTICAST_MAC))
+    address = f"{target.host}:{target.port}" if target.port else target.host
+    if target.scheme == uri.scheme == "udp":
+        return Destination.parse(address)
+    if uri.scheme in {"udp", "tcp"} and takes_tcp(port, target):
+        return Destination.parse(f"tcp://{address}")
+    raise ValueError(f"{text} ({target}) has no address that is known for frames from {uri}")
+
+
+def takes_tcp(port: Port, uri: InterfaceUri) -> bool:
+    """Tell whether *port* takes type 4 from TCP connections."""
+    return uri.scheme == "tcp" or (uri.scheme == "udp" and port.tcp)
+
+
+def frame_budget(destination: Destination, uri: InterfaceUri) -> int:
+    """Return the octets of the largest frame to *destination*, its EtherCAT header included."""
+    if destination.kind is DestinationKind.TCP or uri.scheme == "loop":
+        return MAX_STREAM_FRAME
+    return MAX_UDP_FRAME if destination.kind is DestinationKind.IP else MAX_ETHERNET_FRAME
+
+
+def reaches(
+    destination: Destination, sender: tuple[Port, InterfaceUri], receiver: tuple[Port, InterfaceUri]
+) -> bool:
+    """Tell whether a frame from *sender* arrives at *receiver*, which joins groups as needed.
+
+    A MAC address is believed: which interface has it is not in the plant file.
+    """
+    port, uri = receiver
+    if sender[1].scheme == "loop" or uri.scheme == "loop":
+        return (sender[1].scheme, sender[1].host) == (uri.scheme, uri.host)
+    if destination.kind is DestinationKind.MAC:
+        return uri.scheme == "ethernet" and _vid(sender[0]) == _vid(port)
+    if (destination.port or EAP_PORT) != (uri.port or EAP_PORT):
+        return False
+    if destination.kind is DestinationKind.TCP:
+        return takes_tcp(port, uri) and uri.host in {destination.host, "0.0.0.0"}  # noqa: S104
+    if uri.scheme != "udp":
+        return False
+    directed = port.broadcast and destination.host.endswith(".255")
+    return destination.is_group or directed or uri.host in {destination.host, "0.0.0.0"}  # noqa: S104
+
+
+def group_of(destination: Destination) -> str | None:
+    """Return the group that a receiver has to join for *destination*, None if there is none."""
+    if not destination.is_group or destination.host == IP_BROADCAST:
+        return None
+    if destination.kind is DestinationKind.MAC:
+        usual = {str(EAP_MULTICAST_MAC), str(BROADCAST_MAC)}
+        return None if destination.host in usual else destination.host
+    return destination.host
+
+
+def is_group(text: str, uri: InterfaceUri) -> bool:
+    """Tell whether *text* is a group that a port on *uri* can join."""
+    try:
+        if uri.scheme == "ethernet":
+            return MacAddr.parse(text).is_group
+        return uri.scheme == "udp" and IPv4Address(text).is_multicast
+    except ValueError:
+        return False
+
+
+def _vid(port: Port) -> int:
+    return port.vlan.id if port.vlan else 0

@@ -1,0 +1,145 @@
+"""Everything of a plant file by name: what one part refers to in another.
+
+Names that occur twice stand for their first owner; the second one is a finding of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from math import lcm
+from typing import NamedTuple, TypeVar
+
+from eap.codec import datatypes
+from eap.codec.datatypes import DataType
+from eap.config.structs import Frame, From, PlantFile, Port, Publish, Station, Subscribe
+from eap.ids import InterfaceUri
+from eap.pd.spec import PortKind
+
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
+
+
+class SentPd(NamedTuple):
+    """A PD that a station of the plant sends, with all that it hangs on."""
+
+    station: Station
+    pd: Publish
+    frame: Frame
+    port: Port
+
+    @property
+    def label(self) -> str:
+        """``STATION/PD``."""
+        return f"{self.station.name}/{self.pd.name}"
+
+
+class Index:
+    """The plant by names; what cannot be resolved is simply absent."""
+
+    def __init__(self, plant: PlantFile) -> None:
+        self.plant = plant
+        self.stations = _first((s.name, s) for s in plant.stations)
+        self.ports = _first(((s.name, p.name), p) for s in plant.stations for p in s.ports)
+        self.frames = _first(((s.name, f.name), f) for s in plant.stations for f in s.frames)
+        self.uris = {
+            key: uri
+            for key, port in self.ports.items()
+            if (uri := _interface(port.interface)) is not None
+        }
+        self.sent = _first(((s.station.name, s.pd.name), s) for s in self._sent())
+
+    def cycle_us(self, station: Station) -> int:
+        """Return the device cycle of *station*."""
+        return station.cycle_us or self.plant.defaults.cycle_us
+
+    def _sent(self) -> Iterator[SentPd]:
+        for station in self.plant.stations:
+            for pd in station.publish:
+                frame = self.frames.get((station.name, pd.frame))
+                port = frame and self.eap_port(station, frame.port)
+                if frame and port:
+                    yield SentPd(station, pd, frame, port)
+
+    def eap_port(self, station: Station, name: str) -> Port | None:
+        """Return the EAP port *name* of *station*, if it has one."""
+        port = self.ports.get((station.name, name))
+        return port if port is not None and port.kind is PortKind.EAP else None
+
+    def publishers(self, subscription: Subscribe) -> list[SentPd]:
+        """Return the PDs of this plant that *subscription* names: one, none, or several for any."""
+        source = subscription.source
+        if isinstance(source, str):
+            station, _, name = source.partition("/")
+            sent = self.sent.get((station, name))
+            return [sent] if sent else []
+        return [sent for sent in self.sent.values() if _matches(source, sent)]
+
+    def received(self, subscription: Subscribe) -> dict[str, str]:
+        """Return the variables of *subscription* and their types as texts, in PDO order."""
+        if subscription.variables is not None:
+            return {name: variable.type for name, variable in subscription.variables.items()}
+        if not isinstance(subscription.source, str):
+            return {}
+        return {
+            f"{subscription.name}.{name}": text
+            for sent in self.publishers(subscription)
+            for name in sent.pd.variables
+            if (text := self.type_text(sent.station, name)) is not None
+        }
+
+    def type_text(self, station: Station, name: str) -> str | None:
+        """Return the type of a variable of *station* as written, None if it has no such one."""
+        if name in station.variables:
+            return station.variables[name].type
+        for subscription in station.subscribe:
+            if subscription.variables is not None:
+                if name in subscription.variables:
+                    return subscription.variables[name].type
+            elif isinstance(subscription.source, str):
+                # Each hop takes a prefix off the name, so stations that forward in a circle end.
+                prefix, rest = f"{subscription.name}.", name.removeprefix(f"{subscription.name}.")
+                for sent in self.publishers(subscription):
+                    if name.startswith(prefix) and rest in sent.pd.variables:
+                        return self.type_text(sent.station, rest)
+        return None
+
+    def types(self, sent: SentPd) -> list[DataType] | None:
+        """Return the types of a PD's variables; None if one is missing or has no valid type."""
+        texts = [self.type_text(sent.station, name) for name in sent.pd.variables]
+        return parse_types(texts)
+
+    def step(self, sent: SentPd) -> int:
+        """Return the sender cycles between two of a PD, 0 if it has no fixed step."""
+        pd = sent.pd
+        if pd.on_change is not None or pd.event:
+            return 0
+        if pd.cycle_us:
+            return max(pd.cycle_us // self.cycle_us(sent.station), 1)
+        return lcm(pd.divider or 1, sent.frame.divider or 1)
+
+
+def parse_types(texts: list[str | None]) -> list[DataType] | None:
+    """Return all types, None if one is missing or is none."""
+    try:
+        kinds = [datatypes.parse(text) for text in texts if text is not None]
+    except ValueError:
+        return None
+    return kinds if len(kinds) == len(texts) else None
+
+
+def _matches(source: From, sent: SentPd) -> bool:
+    return source.id == sent.pd.id and source.publisher in ("any", sent.port.net_id)
+
+
+def _interface(text: str) -> InterfaceUri | None:
+    try:
+        return InterfaceUri.parse(text)
+    except ValueError:
+        return None
+
+
+def _first(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, _Value]:
+    found: dict[_Key, _Value] = {}
+    for key, value in pairs:
+        found.setdefault(key, value)
+    return found

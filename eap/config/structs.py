@@ -1,0 +1,147 @@
+"""The plant file as people write it; docs/plant-file.md explains every key.
+
+Shapes and ranges only: the ``check_`` modules see to what depends on another part of the file.
+Units are in the names.  Every section knows its path in the file, for findings.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, TypeAlias
+
+import msgspec
+from msgspec import Meta
+
+from eap.pd.spec import OnChangeSpec, PortKind, Source, Substitute, Wake
+
+U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
+Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
+Milliseconds = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
+DeviceCycle = Annotated[int, Meta(ge=100, le=60_000_000)]
+Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
+Plain: TypeAlias = bool | int | float | str | list[bool | int | float]
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True):
+    """Base of all sections; *at* is the section's path and no key of the file."""
+
+    at: str = ""
+
+    LATER: ClassVar[dict[str, str]] = {}
+    """Keys of later versions, and what they are for."""
+    SHORT: ClassVar[str] = ""
+    """The key that a bare text in place of the section stands for."""
+
+
+class Vlan(Section, frozen=True):
+    """The tag of an Ethernet port's frames."""
+
+    id: Annotated[int, Meta(ge=1, le=4094)]
+    priority: Annotated[int, Meta(ge=0, le=7)] = 0
+
+
+class Port(Section, frozen=True):
+    """A port; the NetID of an EAP port is the publisher ID of its frames."""
+
+    name: str
+    kind: PortKind
+    interface: str
+    net_id: str
+    vlan: Vlan | None = None
+    join: tuple[str, ...] = ()
+    broadcast: bool = False
+    tcp: bool = False
+    wake: Wake = Wake.CYCLE
+
+
+class Variable(Section, frozen=True):
+    """A variable; the short form in the file is just its type."""
+
+    type: str
+    unit: str = ""
+    comment: str = ""
+    default: Plain | None = None
+
+    SHORT: ClassVar[str] = "type"
+
+
+class Frame(Section, frozen=True):
+    """A frame to send."""
+
+    name: str
+    port: str
+    to: str
+    divider: Divider | None = None
+    modulo: U16 | None = None
+
+
+class Publish(Section, frozen=True):
+    """A PD to send in a frame."""
+
+    name: str
+    frame: str
+    id: U16
+    variables: tuple[str, ...]
+    version: U16 = 0
+    cycle_us: Period | None = None
+    divider: Divider | None = None
+    modulo: U16 | None = None
+    on_change: OnChangeSpec | None = None
+    event: bool = False
+
+
+class From(Section, frozen=True):
+    """A publisher that is known by its numbers."""
+
+    publisher: str
+    id: U16
+    cycle_us: Period | None = None
+    step: Divider | None = None
+
+
+class Subscribe(Section, frozen=True):
+    """A PD to receive."""
+
+    name: str
+    port: str
+    source: From | str = msgspec.field(name="from")
+    variables: dict[str, Variable] | None = None
+    version: U16 | None = None
+    ignore_version: bool = False
+    timeout_ms: Milliseconds = 0
+    substitute: Substitute = Substitute.HOLD
+    foreign: bool = False
+
+
+class Station(Section, frozen=True):
+    """A router with its ports, and what the station sends and receives."""
+
+    name: str
+    net_id: str
+    ports: tuple[Port, ...]
+    cycle_us: DeviceCycle | None = None
+    phase_us: Annotated[int, Meta(ge=0, le=60_000_000)] | None = None
+    variables: dict[str, Variable] = {}
+    sources: dict[str, Source] = {}
+    frames: tuple[Frame, ...] = ()
+    publish: tuple[Publish, ...] = ()
+    subscribe: tuple[Subscribe, ...] = ()
+
+    LATER: ClassVar[dict[str, str]] = {
+        "links": "links between ports",
+        "routes": "routes of the AoE router",
+        "access": "access rules",
+    }
+
+
+class Defaults(Section, frozen=True):
+    """What stations take that do not say it themselves."""
+
+    cycle_us: DeviceCycle = 10_000
+
+
+class PlantFile(Section, frozen=True):
+    """The whole file; top-level keys that begin with ``x-`` are free for anchors."""
+
+    plant: str
+    stations: tuple[Station, ...]
+    defaults: Defaults = Defaults()
