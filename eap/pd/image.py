@@ -168,11 +168,7 @@ def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
 def default_value(place: VariablePlace) -> Any:
     """Return the value that *place* starts with; zero if it names none."""
     kind = datatypes.parse(place.type)
-    if place.default is None:
-        return kind.zero
-    if isinstance(place.default, str):
-        return kind.parse_text(place.default)
-    return place.default
+    return kind.zero if place.default is None else kind.from_plain(place.default)
 
 
 def _end_octet(place: VariablePlace) -> int:
@@ -182,9 +178,7 @@ def _end_octet(place: VariablePlace) -> int:
 def _decode(place: VariablePlace, data: bytes, first_bit: int) -> Any:
     kind = datatypes.parse(place.type)
     offset, bit = divmod(place.bit_offset - first_bit, 8)
-    if not kind.is_bits or not bit:
-        if kind.is_bits and kind.bit_length < 8:
-            return kind.read(bytes((data[offset] & (1 << kind.bit_length) - 1,)), 0)
-        return kind.read(data, offset)
+    if not bit:
+        return kind.decode(data, offset)
     word = int.from_bytes(data[offset : offset + 2], "little") >> bit
-    return kind.read(bytes((word & (1 << kind.bit_length) - 1,)), 0)
+    return kind.decode(bytes((word & 0xFF,)), 0)

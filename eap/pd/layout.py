@@ -241,7 +241,7 @@ def _tx_places(
                 words=words.take(TxWord.SIZE),
                 frame_words=place.words,
                 by_schedule=trigger.on_change is None and not trigger.event,
-                cyclic=not trigger.divider and not frame.divider,
+                cyclic=bool(trigger.cycle_us) or not (trigger.divider or frame.divider),
             )
 
 

@@ -82,26 +82,24 @@ class FrameWord(IntEnum):
     """The block of a TxFrame."""
 
     WHOLE = 0
-    """Sent with all its PDs, each due by its schedule: their own counters are not touched."""
+    """Sent with all its PDs, each due by the same schedule: their own counters are not touched."""
     PARTIAL = 1
     """Sent otherwise."""
     SKIPPED = 2
     """Due, but suppressed or refused by the network."""
-    SKIPPED_WHOLE = 3
-    """Of these, the ones that would have counted as WHOLE."""
-    STATE = 4
+    STATE = 3
     """FrameState: bit 0 not sent."""
-    SENT_AT_NS = 5
-    SIZE = 6
+    SENT_AT_NS = 4
+    SIZE = 5
 
 
 class TxWord(IntEnum):
     """The block of a TxPD."""
 
     SKIPPED = 0
-    """Due, but suppressed or its frame skipped; what the frame counts whole comes on top."""
+    """Due, but suppressed, or its frame was."""
     LAST_REASON = 1
-    """Index into REASONS of the last time it was sent on its own account, -1 before."""
+    """Index into REASONS of the last time it was sent on its own account."""
     SENT_AT_NS = 2
     REASON = 3
     SIZE = REASON + len(REASONS)

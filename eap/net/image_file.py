@@ -1,0 +1,190 @@
+"""A process image in a file that processes share, and the futex that wakes who waits for a cycle.
+
+The file is mapped, not read: a restarted engine finds its counters, and programs that attached stay
+attached.  A station whose layout changed gets a new file under the same name; the old one is marked
+as retired, which tells the programs that still map it to open the new one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import mmap
+import os
+import struct
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from eap.errors import EnvironmentalError, ImageError, WriterConflictError
+from eap.pd.image import Image, format_image, read_header
+from eap.pd.layout import WORDS_OFFSET, ImageLayout
+from eap.pd.spec import Writer
+from eap.pd.words import StationWord
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_SYS_FUTEX = {"x86_64": 202, "aarch64": 98, "armv7l": 240, "riscv64": 98}.get(os.uname().machine)
+_FUTEX_WAIT, _FUTEX_WAKE = 0, 1
+_EVERYBODY = 0x7FFFFFFF
+_FLOCK = struct.Struct("hhqqi4x")
+
+
+class ImageFile:
+    """A mapped process image; use it as a context manager or :meth:`close` it.
+
+    Attributes:
+        image: Named access to the variables and words.
+        generation: Counts the layouts that the station has had.
+    """
+
+    def __init__(self, path: Path, descriptor: int) -> None:
+        self.path = path
+        self._fd = descriptor
+        self._map = mmap.mmap(descriptor, 0)
+        self._view = memoryview(self._map)
+        layout, self.generation = read_header(self._view)
+        self.image = Image(self._view, layout, pause=_pause)
+        self._futex = ctypes.c_uint32.from_buffer(self._map, WORDS_OFFSET + 8 * StationWord.FUTEX)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the descriptor, which also gives up the right to write.
+
+        The mapping goes with the last view of it; a view that outlives the file does no harm.
+        """
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    @property
+    def retired(self) -> bool:
+        """Whether a file of a newer layout has taken this one's place."""
+        return bool(self.image.words[StationWord.RETIRED])
+
+    def acquire_writer(self, writer: Writer) -> None:
+        """Become the one process that writes the region of *writer*, until :meth:`close`.
+
+        Raises:
+            WriterConflictError: another process is it already.
+        """
+        # Record locks end with their process, however it ends, and the kernel knows the holder.
+        start = list(Writer).index(writer)
+        try:
+            fcntl.lockf(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, start)
+        except OSError as exc:
+            if exc.errno not in {errno.EAGAIN, errno.EACCES}:
+                raise
+            holder = self._holder(start)
+            raise WriterConflictError(
+                f"station {self.image.layout.station}: the {writer} variables are being written "
+                f"by {holder}; end it first",
+                holder=holder,
+            ) from None
+
+    def release_writer(self, writer: Writer) -> None:
+        """Give up the right to write the region of *writer*."""
+        fcntl.lockf(self._fd, fcntl.LOCK_UN, 1, list(Writer).index(writer))
+
+    def wake_waiters(self) -> None:
+        """Wake every process that sleeps in :meth:`wait_cycle`."""
+        _libc.syscall(_SYS_FUTEX, ctypes.byref(self._futex), _FUTEX_WAKE, _EVERYBODY, None, None, 0)
+
+    def wait_cycle(self, cycle: int, timeout_s: float) -> bool:
+        """Sleep until the cycle counter differs from *cycle*; return False after *timeout_s*."""
+        words = self.image.words
+        seconds = int(timeout_s)
+        limit = (ctypes.c_long * 2)(seconds, int((timeout_s - seconds) * 1e9))
+        while words[StationWord.CYCLE] == cycle:
+            words[StationWord.WAITERS] = 1
+            result = _libc.syscall(
+                _SYS_FUTEX,
+                ctypes.byref(self._futex),
+                _FUTEX_WAIT,
+                ctypes.c_uint32(cycle & 0xFFFFFFFF),
+                limit,
+                None,
+                0,
+            )
+            if result < 0 and ctypes.get_errno() == errno.ETIMEDOUT:
+                return bool(words[StationWord.CYCLE] != cycle)
+        return True
+
+    def _holder(self, start: int) -> str:
+        query = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, start, 1, 0)
+        pid = _FLOCK.unpack(fcntl.fcntl(self._fd, fcntl.F_GETLK, query))[4]
+        try:
+            command = (
+                Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+            )
+        except (OSError, UnicodeDecodeError):
+            command = "unknown program"
+        return f"process {pid} ({command[:80]})"
+
+
+def create_image(path: Path, layout: ImageLayout) -> ImageFile:
+    """Open the image of a station for its engine, a fresh one if the layout is new.
+
+    Raises:
+        EnvironmentalError: the folder cannot be written.
+    """
+    generation = 1
+    try:
+        existing = open_image(path)
+    except ImageError:
+        pass
+    else:
+        if existing.image.layout == layout:
+            return existing
+        generation = existing.generation + 1
+        existing.image.words[StationWord.RETIRED] = 1
+        existing.wake_waiters()
+        existing.close()
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        os.ftruncate(descriptor, layout.size)
+        with mmap.mmap(descriptor, 0) as memory, memoryview(memory) as view:
+            _format(view, layout, generation)
+        fresh.rename(path)
+    except OSError as exc:
+        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
+    return ImageFile(path, descriptor)
+
+
+def open_image(path: Path) -> ImageFile:
+    """Open an existing image.
+
+    Raises:
+        ImageError: there is none, or it is no image of this release.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError as exc:
+        raise ImageError(f"{path}: no process image: {exc.strerror}") from None
+    try:
+        return ImageFile(path, descriptor)
+    except (ImageError, ValueError) as exc:
+        os.close(descriptor)
+        raise ImageError(f"{path}: {exc}") from None
+
+
+def _format(view: memoryview, layout: ImageLayout, generation: int) -> None:
+    image = format_image(view, layout, generation)
+    image.words.release()
+    image.memory.release()
+
+
+def _pause() -> None:
+    """Let a writer that was interrupted in the middle go on."""
+    _libc.usleep(100)

@@ -1,0 +1,180 @@
+"""The counters of a process image in words that people and programs read.
+
+The shapes are a contract: docs/control.md describes them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from eap.codec.pd import PdHeader
+from eap.pd.device import DeviceState
+from eap.pd.image import Image
+from eap.pd.layout import RxPlace, TxPlace
+from eap.pd.words import (
+    DISCARDS,
+    HISTOGRAM_BINS,
+    REASON_INDEX,
+    REASONS,
+    FrameWord,
+    Reason,
+    RxState,
+    RxWord,
+    StationWord,
+    TxWord,
+    percentile,
+)
+
+_QUALITY_NS = 100_000
+_QUALITY_MAX = 0xFFFF
+
+
+def station_status(image: Image, now_ns: int) -> dict[str, Any]:
+    """Return one station's entry of ``eapctl status``; *now_ns* on the monotonic clock."""
+    layout, words = image.layout, image.words
+    state = words[StationWord.STATE]
+    lateness = words[StationWord.LATENESS : StationWord.LATENESS + HISTOGRAM_BINS].tolist()
+    return {
+        "name": layout.station,
+        "net_id": layout.net_id,
+        "state": DeviceState(state).name if state else DeviceState.INIT.name,
+        "cycle": words[StationWord.CYCLE],
+        "cycle_us": layout.cycle_us,
+        "overruns": words[StationWord.OVERRUNS],
+        "restarts": words[StationWord.RESTARTS],
+        "torn": words[StationWord.TORN],
+        "lateness_us": {
+            "p50": percentile(lateness, 0.5),
+            "p99": percentile(lateness, 0.99),
+            "max": words[StationWord.LATENESS_MAX_NS] // 1000,
+        },
+        "ports": [
+            {"name": p.name, "kind": p.kind, "net_id": p.net_id, "interface": p.interface}
+            for p in layout.ports
+        ],
+        "discarded": _discarded(image, StationWord.DISCARDED),
+        "pd": {
+            "tx": [_tx(image, place) for place in layout.tx],
+            "rx": [_rx(image, place, now_ns) for place in layout.rx],
+        },
+    }
+
+
+def pd_list(image: Image) -> list[dict[str, Any]]:
+    """Return every PD of the station with what identifies it and its variables."""
+    layout = image.layout
+    net_ids = {port.name: port.net_id for port in layout.ports}
+    destinations = {frame.name: frame.destination for frame in layout.frames}
+
+    def variables(names: tuple[str, ...]) -> list[dict[str, Any]]:
+        return [
+            {"name": p.name, "type": p.type, "unit": p.unit, "writer": p.writer}
+            for p in (image.places[name] for name in names)
+        ]
+
+    def row(place: TxPlace | RxPlace, direction: str, **more: str | None) -> dict[str, Any]:
+        return {
+            "station": layout.station,
+            "direction": direction,
+            "name": place.name,
+            "id": place.pd_id,
+            "version": place.version,
+            "length": place.size,
+            "port": place.port,
+            **more,
+            "variables": variables(place.variables),
+        }
+
+    sent = [
+        row(
+            place,
+            "tx",
+            publisher=net_ids[place.port],
+            frame=place.frame,
+            destination=destinations[place.frame],
+        )
+        for place in layout.tx
+    ]
+    return sent + [row(place, "rx", publisher=place.publisher or None) for place in layout.rx]
+
+
+def account_word(image: Image, place: RxPlace) -> int:
+    """Return the index of the first word of the block that holds a subscription's account."""
+    return int(image.words[place.words + RxWord.ACCOUNT]) or place.words
+
+
+def quality(image: Image, place: RxPlace) -> int:
+    """Return the age of a subscription's data in units of 100 us, saturated at 65535.
+
+    It is the Quality that the frame carried plus the receiver's own cycles since; what is left
+    over of a unit is carried from cycle to cycle.
+    """
+    words = image.words
+    first = account_word(image, place)
+    cycles = words[StationWord.CYCLE] - words[first + RxWord.ARRIVED_IN_CYCLE]
+    own = max(cycles, 0) * image.layout.cycle_us * 1000 // _QUALITY_NS
+    sent = PdHeader.decode(image.memory, place.offset).quality
+    return min(sent + own, _QUALITY_MAX)
+
+
+def var_state(image: Image, place: RxPlace) -> int:
+    """Return VarState: bit 0 version, bit 1 length differ in what arrives now; 0 is well."""
+    words = image.words
+    first = account_word(image, place)
+    if words[place.words + RxWord.MISMATCH_AT_NS] <= words[first + RxWord.ARRIVED_AT_NS]:
+        return 0
+    return int(words[place.words + RxWord.MISMATCH])
+
+
+def _discarded(image: Image, first: int) -> dict[str, int]:
+    counts = image.words[first : first + len(DISCARDS)].tolist()
+    return {reason.value: count for reason, count in zip(DISCARDS, counts, strict=True) if count}
+
+
+def _tx(image: Image, place: TxPlace) -> dict[str, Any]:
+    words = image.words
+    counts = words[place.words + TxWord.REASON : place.words + TxWord.SIZE].tolist()
+    whole = words[place.frame_words + FrameWord.WHOLE]
+    scheduled = REASON_INDEX[Reason.CYCLE if place.cyclic else Reason.DIVIDER]
+    counts[scheduled] += whole
+    last = words[place.words + TxWord.LAST_REASON] if not whole else scheduled
+    return {
+        "name": place.name,
+        "port": place.port,
+        "frame": place.frame,
+        "sent": sum(counts),
+        "skipped": words[place.words + TxWord.SKIPPED],
+        "reason": {r.value: n for r, n in zip(REASONS, counts, strict=True) if n},
+        "last_reason": REASONS[last].value if sum(counts) else None,
+        "frame_state": words[place.frame_words + FrameWord.STATE],
+    }
+
+
+def _rx(image: Image, place: RxPlace, now_ns: int) -> dict[str, Any]:
+    words = image.words
+    first = account_word(image, place)
+    received = words[first + RxWord.RECEIVED]
+    bins = words[first + RxWord.JITTER : first + RxWord.JITTER + HISTOGRAM_BINS].tolist()
+    jitter_known = any(bins)
+    age_ns = now_ns - words[first + RxWord.ARRIVED_AT_NS]
+    return {
+        "name": place.name,
+        "port": place.port,
+        "received": received,
+        "lost": words[first + RxWord.LOST] if place.step else None,
+        "duplicated": words[first + RxWord.DUPLICATED],
+        "reordered": words[first + RxWord.REORDERED],
+        "late": words[first + RxWord.LATE],
+        "timeouts": words[first + RxWord.TIMEOUTS],
+        "discarded": _discarded(image, place.words + RxWord.DISCARDED),
+        "quality": quality(image, place) if received else None,
+        "cycle_index": words[first + RxWord.LAST_CYCLE] if received else None,
+        "var_state": var_state(image, place),
+        "age_us": max(age_ns, 0) // 1000 if received else None,
+        "jitter_us": {
+            "p50": percentile(bins, 0.5),
+            "p99": percentile(bins, 0.99),
+            "max": words[first + RxWord.JITTER_MAX_US] if jitter_known else None,
+        },
+        "state": RxState(words[first + RxWord.STATE]).name.lower(),
+    }

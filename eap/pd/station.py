@@ -1,0 +1,150 @@
+"""One station: its process image, its ports, and what happens in each of its cycles.
+
+The order within a cycle is written down here and nowhere else: take all pending frames, apply
+time-outs, compute generated variables, look at what others wrote, decide which PDs are due, patch
+their frames and send them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from eap.ids import NetId
+from eap.pd.device import Device, Request
+from eap.pd.generator import Generators
+from eap.pd.image import Image
+from eap.pd.inputs import Inputs
+from eap.pd.link import Channel, Taker
+from eap.pd.publisher import Publisher
+from eap.pd.spec import EngineSource, StationSpec
+from eap.pd.subscriber import Subscriber
+from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
+
+_CYCLE = int(StationWord.CYCLE)
+_CYCLE_AT_NS = int(StationWord.CYCLE_AT_NS)
+_SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
+_FUTEX = int(StationWord.FUTEX)
+_WAITERS = int(StationWord.WAITERS)
+_LATENESS = int(StationWord.LATENESS)
+_LATENESS_MAX_NS = int(StationWord.LATENESS_MAX_NS)
+
+
+class Station:
+    """Runs the cycle of one station.
+
+    Build it, hand :attr:`takers` to the channels, :meth:`connect` them, then :meth:`start`.
+
+    Args:
+        spec: The checked specification.
+        image: Its process image, fresh or left by an earlier engine of the same layout.
+        wake: Wakes the programs that wait for the next cycle.
+    """
+
+    def __init__(self, spec: StationSpec, image: Image, wake: Callable[[], None]) -> None:
+        self.spec = spec
+        self.image = image
+        self.cycle_ns = spec.cycle_us * 1000
+        self.device = Device()
+        self._words = image.words
+        self._wake = wake
+        self._inputs = Inputs(image)
+        self._generators = Generators(
+            image, [s for s in spec.sources if isinstance(s, EngineSource)]
+        )
+        self._publishers: list[tuple[Publisher, Channel]] = []
+        self._channels: list[Channel] = []
+        layout = image.layout
+        self._subscribers = {
+            port.name: Subscriber(
+                image,
+                [
+                    (pd, place)
+                    for pd, place in zip(spec.subscriptions, layout.rx, strict=True)
+                    if pd.port == port.name
+                ],
+                self.cycle_ns,
+            )
+            for port in spec.ports
+        }
+        self.takers: dict[str, Taker] = {
+            name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
+        }
+        """By port: who takes the frames that its channel receives."""
+
+    def connect(self, port: str, channel: Channel) -> None:
+        """Send the frames of *port* through *channel*, and drain it in each cycle."""
+        layout = self.image.layout
+        frames = [
+            (frame, place, tuple(pd for pd in layout.tx if pd.frame == frame.name))
+            for frame, place in zip(self.spec.frames, layout.frames, strict=True)
+            if frame.port == port
+        ]
+        self.drain_also(channel)
+        if frames:
+            net_id = next(p.net_id for p in self.spec.ports if p.name == port)
+            publisher = Publisher(self.image, self._inputs, NetId.parse(net_id), channel, frames)
+            self._publishers.append((publisher, channel))
+
+    def drain_also(self, channel: Channel) -> None:
+        """Drain another channel that feeds this station, such as a multicast group."""
+        if channel not in self._channels:
+            self._channels.append(channel)
+
+    def start(self, now_ns: int) -> int:
+        """Go to Op; return when the first cycle is due.
+
+        The cycle counter of an earlier engine goes on as if it had never stopped.
+        """
+        words = self._words
+        for request in (Request.START, Request.SAFEOP, Request.OP):
+            self.device.request(request)
+        words[StationWord.STATE] = self.device.state
+        words[StationWord.STARTED_AT_NS] = now_ns
+        words[_SEQUENCE] += words[_SEQUENCE] % 2  # a killed engine may have left it odd
+        for subscriber in self._subscribers.values():
+            subscriber.open(now_ns)
+        previous_ns = words[_CYCLE_AT_NS]
+        if 0 < previous_ns <= now_ns:
+            words[StationWord.RESTARTS] += 1
+            elapsed = (now_ns - previous_ns) // self.cycle_ns
+            words[_CYCLE] += elapsed
+            return int(previous_ns + (elapsed + 1) * self.cycle_ns)
+        phase_ns = self.spec.phase_us * 1000
+        grid_ns = now_ns - now_ns % self.cycle_ns + phase_ns
+        return grid_ns if grid_ns > now_ns else grid_ns + self.cycle_ns
+
+    def stop(self) -> None:
+        """Leave Op: nothing is taken or sent any more."""
+        self._words[StationWord.STATE] = self.device.request(Request.PREOP)
+        for subscriber in self._subscribers.values():
+            subscriber.close()
+
+    def cycle(self, due_ns: int, now_ns: int) -> None:
+        """Run one cycle that was due at *due_ns*."""
+        words = self._words
+        cycle = words[_CYCLE] + 1
+        words[_SEQUENCE] += 1
+        words[_CYCLE] = cycle
+        words[_CYCLE_AT_NS] = due_ns
+        for channel in self._channels:
+            channel.drain(now_ns)
+        for subscriber in self._subscribers.values():
+            subscriber.handle_timeout(now_ns)
+        self._generators.run(cycle)
+        words[_SEQUENCE] += 1
+        if self._inputs.refresh():
+            for publisher, _ in self._publishers:
+                publisher.read_controls()
+        for publisher, channel in self._publishers:
+            frames = publisher.frames_to_send(cycle, now_ns)
+            if frames:
+                publisher.sent(channel.send(frames, now_ns), now_ns)
+        late_us = (now_ns - due_ns) // 1000
+        bin_ = BIN_OF_US[late_us] if 0 <= late_us < len(BIN_OF_US) else histogram_bin(late_us)
+        words[_LATENESS + bin_] += 1
+        words[_LATENESS_MAX_NS] = max(words[_LATENESS_MAX_NS], now_ns - due_ns)
+        waiting = words[_WAITERS]
+        words[_WAITERS] = 0
+        words[_FUTEX] = cycle & 0xFFFFFFFF
+        if waiting:
+            self._wake()

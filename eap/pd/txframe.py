@@ -1,0 +1,142 @@
+"""One TxFrame: prebuilt buffers, patched in place, and the decision which of its PDs go.
+
+The headers of a frame never change as long as the same PDs are in it, so a buffer is kept for each
+selection of PDs that was sent; a cycle only writes the counter and the data.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+from eap.codec.ethercat import EtherCatHeader
+from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdFrameHeader, PdHeader
+from eap.ids import NetId
+from eap.pd.gather import Gather
+from eap.pd.layout import FramePlace, TxPlace
+from eap.pd.link import Channel, OutFrame
+from eap.pd.trigger import Schedule, Trigger
+
+_SELECTIONS_KEPT = 64
+_put_u16 = struct.Struct("<H").pack_into
+
+
+class TxPd:
+    """One TxPD at run time."""
+
+    __slots__ = ("data", "gather", "place", "reason", "trigger")
+
+    def __init__(self, place: TxPlace, trigger: Trigger, gather: Gather) -> None:
+        self.place = place
+        self.trigger = trigger
+        self.gather = gather
+        self.data: bytes | None = None
+        """What this cycle would send, where the trigger has to see it."""
+        self.reason = 0
+
+    def is_due(self, cycle: int, now_ns: int) -> bool:
+        """Decide whether to send in this cycle, and note the reason."""
+        if self.trigger.wants_data:
+            scratch = bytearray(self.gather.size)
+            self.gather.into(memoryview(scratch), 0)
+            self.data = bytes(scratch)
+        reason = self.trigger.reason(cycle, now_ns, self.data)
+        if reason is None:
+            return False
+        self.reason = reason
+        return True
+
+
+class Selection:
+    """A buffer for some of a frame's PDs, and where their data goes in it."""
+
+    __slots__ = ("_cycle_offset", "_gathers", "out", "pds")
+
+    def __init__(self, out: OutFrame, pds: tuple[TxPd, ...]) -> None:
+        self.out = out
+        self.pds = pds
+        self._cycle_offset = out.headroom + CYCLE_OFFSET
+        offsets = _data_offsets(pds, out.headroom)
+        self._gathers = [(pd.gather.into, at) for pd, at in zip(pds, offsets, strict=True)]
+
+    def patch(self, cycle: int) -> None:
+        """Write the counter and the current data of all PDs."""
+        view = self.out.view
+        _put_u16(view, self._cycle_offset, cycle & 0xFFFF)
+        for into, offset in self._gathers:
+            into(view, offset)
+
+
+class TxFrame:
+    """One TxFrame at run time."""
+
+    def __init__(
+        self,
+        place: FramePlace,
+        publisher: NetId,
+        pds: tuple[TxPd, ...],
+        gate: tuple[int, int],
+        channel: Channel,
+    ) -> None:
+        self.place = place
+        self.pds = pds
+        self.gate = gate
+        self.suppressed = False
+        self._publisher = publisher
+        self._channel = channel
+        self._selections: dict[tuple[TxPd, ...], Selection] = {}
+        self.whole = self._select(pds)
+        self.schedule = _common_schedule(pds)
+        """When all PDs go together by the clock, None when each cycle has to find out."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the frame goes whole by its schedule and nothing is suppressed."""
+        return (
+            self.schedule is not None
+            and not self.suppressed
+            and not any(pd.trigger.suppressed for pd in self.pds)
+        )
+
+    def select(self, cycle: int, now_ns: int) -> tuple[Selection | None, list[TxPd]]:
+        """Return what to send in this cycle, if anything, and what was due but suppressed."""
+        divider, modulo = self.gate
+        if divider and cycle % divider != modulo:
+            return None, []
+        due = [pd for pd in self.pds if pd.is_due(cycle, now_ns)]
+        if self.suppressed:
+            return None, due
+        skipped = [pd for pd in due if pd.trigger.suppressed]
+        chosen = tuple(pd for pd in due if not pd.trigger.suppressed)
+        return (self._select(chosen) if chosen else None), skipped
+
+    def _select(self, pds: tuple[TxPd, ...]) -> Selection:
+        if (selection := self._selections.get(pds)) is None:
+            if len(self._selections) >= _SELECTIONS_KEPT:
+                self._selections.clear()
+            selection = self._selections[pds] = Selection(self._build(pds), pds)
+        return selection
+
+    def _build(self, pds: tuple[TxPd, ...]) -> OutFrame:
+        destination = self.place.destination
+        header = self._channel.link_header(destination)
+        body = PdFrameHeader(self._publisher, len(pds), 0).encode()
+        for pd in pds:
+            body += PdHeader(pd.place.pd_id, pd.place.version, pd.place.size).encode()
+            body += bytes(pd.place.size)
+        octets = header + EtherCatHeader(len(body)).encode() + body
+        buffer = bytearray(octets.ljust(self._channel.minimum_size, b"\0"))
+        return OutFrame(buffer, len(header), destination)
+
+
+def _data_offsets(pds: tuple[TxPd, ...], headroom: int) -> Iterator[int]:
+    offset = headroom + FIRST_PD
+    for pd in pds:
+        offset += PdHeader.SIZE
+        yield offset
+        offset += pd.place.size
+
+
+def _common_schedule(pds: tuple[TxPd, ...]) -> Schedule | None:
+    schedules = {pd.trigger.schedule if pd.place.by_schedule else None for pd in pds}
+    return schedules.pop() if len(schedules) == 1 else None
