@@ -1,0 +1,110 @@
+"""Classic BPF programs by which the kernel sorts frames between engine and services.
+
+Frame types 2, 3 and 5 are acyclic and go to services; 1, 4 and everything unknown go to the
+engine, which counts what it does not know.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+import struct
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import TypeAlias
+
+from eap.codec.ethercat import ETHERTYPE, FrameType
+
+SO_ATTACH_FILTER = 26
+SO_ATTACH_REUSEPORT_CBPF = 51
+
+Instruction: TypeAlias = tuple[int, int, int, int]
+"""Operation, jump if true, jump if false, operand."""
+
+
+class Role(IntEnum):
+    """Which process a socket belongs to: its index in a group of two."""
+
+    ENGINE = 0
+    SERVICES = 1
+
+
+SERVICES_TYPES = (FrameType.AMS, FrameType.RAW_IO, FrameType.MAILBOX)
+
+_LOAD_WORD, _LOAD_HALF, _LOAD_BYTE, _LOAD_SIZE = 0x20, 0x28, 0x30, 0x80
+_SHIFT_RIGHT, _RETURN = 0x74, 0x06
+_EQUAL, _GREATER, _NOT_LESS = 0x15, 0x25, 0x35
+_PACKET_TYPE = 0xFFFFF000 + 4  # SKF_AD_OFF + SKF_AD_PKTTYPE
+_ALL = 0x40000
+_UDP_HEADER = 8
+_ETHERNET_HEADER = 14
+
+
+def _by_type(offset: int, services: int, others: int) -> list[Instruction]:
+    """Return *services* or *others* by the type nibble of the frame at *offset*."""
+    types = SERVICES_TYPES
+    last = len(types) - 1
+    checks: list[Instruction] = [
+        (_EQUAL, last - n + 1, 0, frame_type) for n, frame_type in enumerate(types)
+    ]
+    return [
+        (_LOAD_BYTE, 0, 0, offset + 1),
+        (_SHIFT_RIGHT, 0, 0, 4),
+        *checks,
+        (_RETURN, 0, 0, others),
+        (_RETURN, 0, 0, services),
+    ]
+
+
+def _verdicts(role: Role) -> tuple[int, int]:
+    return (_ALL, 0) if role is Role.SERVICES else (0, _ALL)
+
+
+def reuseport_index() -> list[Instruction]:
+    """Choose the socket of a SO_REUSEPORT group of two; a datagram too short goes to the engine.
+
+    The kernel ends a program that reads past the end with 0, which is the engine's index.
+    """
+    return _by_type(0, Role.SERVICES, Role.ENGINE)
+
+
+def udp_filter(role: Role) -> list[Instruction]:
+    """Keep the datagrams of *role*; those too short to have a type are the engine's."""
+    short = _ALL if role is Role.ENGINE else 0
+    return [
+        (_LOAD_SIZE, 0, 0, 0),
+        (_NOT_LESS, 1, 0, _UDP_HEADER + 2),
+        (_RETURN, 0, 0, short),
+        *_by_type(_UDP_HEADER, *_verdicts(role)),
+    ]
+
+
+def packet_filter(role: Role) -> list[Instruction]:
+    """Keep EtherCAT frames of *role* that are addressed to this host or to a group.
+
+    The kernel has taken a VLAN tag out before the program runs.
+    """
+    return [
+        (_LOAD_HALF, 0, 0, 12),
+        (_EQUAL, 1, 0, ETHERTYPE),
+        (_RETURN, 0, 0, 0),
+        (_LOAD_WORD, 0, 0, _PACKET_TYPE),
+        (_GREATER, 0, 1, socket.PACKET_MULTICAST),
+        (_RETURN, 0, 0, 0),
+        *_by_type(_ETHERNET_HEADER, *_verdicts(role)),
+    ]
+
+
+def drop_all() -> list[Instruction]:
+    """Keep nothing: what a socket holds until its real filter is in place."""
+    return [(_RETURN, 0, 0, 0)]
+
+
+def attach(
+    sock: socket.socket, program: Sequence[Instruction], option: int = SO_ATTACH_FILTER
+) -> None:
+    """Give *program* to *sock*; raise OSError if the kernel refuses it."""
+    code = b"".join(struct.pack("@HBBI", *instruction) for instruction in program)
+    memory = ctypes.create_string_buffer(code, len(code))
+    fprog = struct.pack("@HP", len(program), ctypes.addressof(memory))
+    sock.setsockopt(socket.SOL_SOCKET, option, fprog)

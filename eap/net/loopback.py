@@ -1,0 +1,150 @@
+"""A line in memory that joins all ports of one name: ``loop://NAME``.
+
+It behaves like a hub with faults to order and knows no clock but the one it is told, so that a
+plant, or a test of one, runs the same way every time.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from eap.errors import ConfigError
+from eap.ids import InterfaceUri
+from eap.pd.link import OutFrame, Taker
+
+DRAIN_LIMIT = 256
+HOLD_NS = 100_000_000
+"""Longest time that a frame to be reordered waits for the one that overtakes it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What happens to the frames that one port sends; shares are between 0 and 1."""
+
+    delay_ns: int = 0
+    loss: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    seed: int = 0
+
+    @classmethod
+    def parse(cls, uri: InterfaceUri) -> Faults:
+        """Read ``delay_us``, ``loss``, ``duplicate``, ``reorder`` and ``seed``.
+
+        Raises:
+            ConfigError: an option is unknown or its value is not what it should be.
+        """
+        values: dict[str, float] = {}
+        for name, text in uri.options:
+            if name not in {"delay_us", "loss", "duplicate", "reorder", "seed"}:
+                raise ConfigError(
+                    f"{uri}: unknown option {name!r}, expected delay_us, loss, duplicate, "
+                    "reorder or seed"
+                )
+            try:
+                values[name] = int(text) if name == "seed" else float(text)
+            except ValueError:
+                raise ConfigError(f"{uri}: {name} is {text!r}, expected a number") from None
+            limit = 1.0 if name in {"loss", "duplicate", "reorder"} else 2.0**53
+            if not 0 <= values[name] <= limit:
+                raise ConfigError(f"{uri}: {name} is {text}, expected 0 to {limit:.0f}")
+        return cls(
+            delay_ns=round(values.get("delay_us", 0) * 1000),
+            loss=values.get("loss", 0.0),
+            duplicate=values.get("duplicate", 0.0),
+            reorder=values.get("reorder", 0.0),
+            seed=int(values.get("seed", 0)),
+        )
+
+
+class _Waiting:
+    """One frame under way to one port."""
+
+    __slots__ = ("data", "due_ns", "order")
+
+    def __init__(self, data: memoryview, due_ns: int, order: float) -> None:
+        self.data = data
+        self.due_ns = due_ns
+        self.order = order
+
+
+class LoopbackChannel:
+    """One port on a line; what it sends reaches every other port of the line."""
+
+    minimum_size = 0
+
+    def __init__(self, ports: list[LoopbackChannel], faults: Faults) -> None:
+        self.takers: list[Taker] = []
+        self.errors: dict[str, int] = {}
+        self._ports = ports
+        self._faults = faults
+        self._random = random.Random(faults.seed)  # noqa: S311  repeatable, not secret
+        self._queue: list[_Waiting] = []
+        self._held: list[_Waiting] = []
+        self._order = 0
+        ports.append(self)
+
+    def drain(self, now_ns: int) -> int:
+        """Hand over what has arrived by *now_ns*, in the order of arrival."""
+        if not self._queue:
+            return 0
+        due = [frame for frame in self._queue if frame.due_ns <= now_ns]
+        due.sort(key=lambda frame: (frame.due_ns, frame.order))
+        del due[DRAIN_LIMIT:]
+        for frame in due:
+            self._queue.remove(frame)
+        for frame in due:
+            for take in self.takers:
+                take(frame.data, len(frame.data), frame.due_ns)
+        return len(due)
+
+    def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
+        """Put copies of *frames* on the line; a lost frame counts as sent, as on a wire."""
+        for frame in frames:
+            self._transmit(memoryview(bytes(frame.view[frame.headroom :])), now_ns)
+        return ()
+
+    def link_header(self, destination: str) -> bytes:
+        """Nothing: the line has no addresses, every port hears *destination*."""
+        del destination
+        return b""
+
+    def close(self) -> None:
+        """Leave the line."""
+        self._ports.remove(self)
+
+    def _transmit(self, data: memoryview, now_ns: int) -> None:
+        faults, draw = self._faults, self._random.random
+        due_ns = now_ns + faults.delay_ns
+        overtaken, self._held = self._held, []
+        for port in self._ports:
+            if port is self or (faults.loss and draw() < faults.loss):
+                continue
+            for _ in range(2 if faults.duplicate and draw() < faults.duplicate else 1):
+                self._order += 1
+                frame = _Waiting(data, due_ns, self._order)
+                port._queue.append(frame)  # noqa: SLF001  another port of the same line
+                if faults.reorder and draw() < faults.reorder:
+                    frame.due_ns += HOLD_NS
+                    self._held.append(frame)
+        for frame in overtaken:
+            if frame.due_ns > due_ns:
+                self._order += 1
+                frame.due_ns, frame.order = due_ns, self._order
+
+
+class LoopbackLines:
+    """All lines of one process, by name."""
+
+    def __init__(self) -> None:
+        self._lines: dict[str, list[LoopbackChannel]] = {}
+
+    def open(self, uri: InterfaceUri) -> LoopbackChannel:
+        """Return a new port on the line that *uri* names; its options fault what it sends.
+
+        Raises:
+            ConfigError: the options of *uri* are wrong.
+        """
+        return LoopbackChannel(self._lines.setdefault(uri.host, []), Faults.parse(uri))

@@ -1,0 +1,223 @@
+"""Many messages in one system call: ``recvmmsg`` and ``sendmmsg`` through ctypes.
+
+This is the hottest code of the drivers.  Whatever can be computed before the call is: the arrays
+the kernel reads are built once and their addresses are bound into the call, because ctypes takes
+longer to convert five arguments than the kernel takes to find an empty queue.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+
+from eap.pd.link import OutFrame
+
+SO_TIMESTAMPNS = 35
+"""Missing in the socket module; the same number on every Linux with 64-bit time."""
+
+BATCH = 64
+BUFFER_SIZE = 2112
+"""An Ethernet header, the largest frame that an 11-bit Length can announce, and some air."""
+STAMP_SIZE = 32
+"""Octets of control data that a time stamp takes."""
+
+_MMSGHDR = struct.Struct("@QQQQQQQQ")  # name, namelen, iov, iovlen, control, controllen, flags, len
+_IOVEC = struct.Struct("@QQ")
+_CACHED_BATCHES = 256
+
+_library = ctypes.CDLL(None, use_errno=True)
+_recvmmsg = _library["recvmmsg"]
+_sendmmsg = _library["sendmmsg"]
+
+
+def _address(memory: bytearray) -> int:
+    return ctypes.addressof(ctypes.c_char.from_buffer(memory))
+
+
+def count_error(errors: dict[str, int], number: int | None) -> None:
+    """Count a failed call under the name of its errno, such as ``ENETDOWN``."""
+    name = errno.errorcode.get(number or 0, str(number))
+    errors[name] = errors.get(name, 0) + 1
+
+
+def note_receive_error(errors: dict[str, int]) -> None:
+    """Count why the last receive call returned -1, unless there was just nothing to receive."""
+    number = ctypes.get_errno()
+    if number not in (errno.EAGAIN, errno.EINTR):
+        count_error(errors, number)
+
+
+class ReceiveBatch:
+    """The memory of one ``recvmmsg`` call, shared by all sockets of a process.
+
+    *control_size* must be exactly what the kernel writes for one message, the time stamp first:
+    then it leaves every header as it was and nothing needs to be set up again.
+    """
+
+    def __init__(self, control_size: int = STAMP_SIZE) -> None:
+        self._control_size = control_size
+        self._buffers = bytearray(BATCH * BUFFER_SIZE)
+        self._control = bytearray(BATCH * control_size)
+        iovecs = bytearray(BATCH * _IOVEC.size)
+        self._headers = bytearray(BATCH * _MMSGHDR.size)
+        buffers, control, vectors = map(_address, (self._buffers, self._control, iovecs))
+        for n in range(BATCH):
+            _IOVEC.pack_into(iovecs, n * _IOVEC.size, buffers + n * BUFFER_SIZE, BUFFER_SIZE)
+            vector = vectors + n * _IOVEC.size
+            place = control + n * control_size
+            _MMSGHDR.pack_into(
+                self._headers, n * _MMSGHDR.size, 0, 0, vector, 1, place, control_size, 0, 0
+            )
+        self._iovecs = iovecs  # the kernel reads it through the headers
+        self._words = memoryview(self._headers).cast("Q")
+        self._stamps = memoryview(self._control).cast("q")
+        self._stride = control_size // 8
+        self.control = memoryview(self._control)
+        view = memoryview(self._buffers)
+        self.views = [view[n * BUFFER_SIZE : (n + 1) * BUFFER_SIZE] for n in range(BATCH)]
+
+    def reader(self, fd: int) -> Callable[[], int]:
+        """Return the call that fills the batch from *fd* and returns how many came, or -1."""
+        headers = ctypes.c_void_p(_address(self._headers))
+        return partial(_recvmmsg, fd, headers, BATCH, socket.MSG_DONTWAIT, None)
+
+    def arrivals(self, count: int) -> Iterable[tuple[memoryview, int, int]]:
+        """Return view, size and arrival on the monotonic clock of the first *count* messages.
+
+        The kernel stamps with the wall clock; the distance of the two clocks is measured anew
+        each time, so that a step of the wall clock spoils at most the batch it falls into.
+        """
+        now_ns = time.monotonic_ns()
+        offset = now_ns - time.time_ns()
+        words, stamps = self._words, self._stamps
+        if count == 1 and words[5] == self._control_size:
+            at_ns = stamps[2] * 1_000_000_000 + stamps[3] + offset
+            return ((self.views[0], words[7], min(at_ns, now_ns)),)
+        sizes = words[7 : count * 8 : 8].tolist()
+        times = self._times(count, offset)
+        if words[5 : count * 8 : 8].tolist().count(self._control_size) != count:
+            times = self._mend(times, now_ns)
+        if times[0] > now_ns:  # the wall clock was set back since
+            times = [now_ns] * count
+        return zip(self.views, sizes, times, strict=False)
+
+    def _times(self, count: int, offset: int) -> list[int]:
+        stride = self._stride
+        seconds = self._stamps[2 : count * stride : stride].tolist()
+        nanoseconds = self._stamps[3 : count * stride : stride].tolist()
+        first = seconds[0]
+        if seconds.count(first) == count:
+            base = first * 1_000_000_000 + offset
+            return [base + rest for rest in nanoseconds]
+        return [
+            whole * 1_000_000_000 + rest + offset
+            for whole, rest in zip(seconds, nanoseconds, strict=True)
+        ]
+
+    def _mend(self, times: list[int], now_ns: int) -> list[int]:
+        """Replace the time of messages that came without a stamp, and restore their headers."""
+        for n in range(len(times)):
+            if self._words[n * 8 + 5] != self._control_size:
+                times[n] = now_ns
+                self._words[n * 8 + 5] = self._control_size
+        return times
+
+
+class SendBatch:
+    """Sends frames through one socket, several in one call, and never blocks or raises.
+
+    *address_of* gives the packed socket address and the Python one of a destination; without it
+    the socket itself knows where frames go.
+    """
+
+    def __init__(
+        self,
+        sock: socket.socket,
+        address_of: Callable[[str], tuple[bytes, tuple[str, int]]] | None = None,
+    ) -> None:
+        self.errors: dict[str, int] = {}
+        self._sock = sock
+        self._fd = sock.fileno()
+        self._address_of = address_of
+        self._addresses: dict[str, tuple[bytearray, tuple[str, int]]] = {}
+        self._headers: dict[OutFrame, tuple[bytes, bytearray]] = {}
+        self._batches: dict[tuple[OutFrame, ...], tuple[Callable[[], int], bytearray]] = {}
+
+    def send(self, frames: Sequence[OutFrame]) -> Sequence[OutFrame]:
+        """Send *frames* and return those that the kernel refused; :attr:`errors` says why."""
+        if len(frames) == 1:
+            return () if self._send_one(frames[0]) else frames
+        if not frames:
+            return ()
+        key = tuple(frames)
+        batch = self._batches.get(key)
+        if batch is None:
+            batch = self._prepare(key)
+        sent = batch[0]()
+        return () if sent == len(key) else self._send_rest(key, batch[1], sent)
+
+    def _send_one(self, frame: OutFrame) -> bool:
+        # For one frame the socket's own method is faster than anything through ctypes.
+        try:
+            if self._address_of is None:
+                self._sock.send(frame.buffer)
+            else:
+                known = self._addresses.get(frame.destination) or self._resolve(frame.destination)
+                self._sock.sendto(frame.buffer, known[1])
+        except OSError as error:
+            count_error(self.errors, error.errno)
+            return False
+        return True
+
+    def _send_rest(
+        self, frames: tuple[OutFrame, ...], headers: bytearray, sent: int
+    ) -> list[OutFrame]:
+        """Go on behind what *sent* says went out; each frame that fails is left out."""
+        failed: list[OutFrame] = []
+        done = 0
+        while True:
+            if sent < 0:
+                count_error(self.errors, ctypes.get_errno())
+                failed.append(frames[done])
+                sent = 1
+            done += sent
+            if done >= len(frames):
+                return failed
+            sent = self._call(headers, done)()
+
+    def _call(self, headers: bytearray, first: int) -> Callable[[], int]:
+        place = ctypes.c_void_p(_address(headers) + first * _MMSGHDR.size)
+        count = len(headers) // _MMSGHDR.size - first
+        return partial(_sendmmsg, self._fd, place, count, socket.MSG_DONTWAIT)
+
+    def _prepare(self, frames: tuple[OutFrame, ...]) -> tuple[Callable[[], int], bytearray]:
+        known = self._headers
+        headers = bytearray().join(
+            (known.get(frame) or self._describe(frame))[0] for frame in frames
+        )
+        if len(self._batches) >= _CACHED_BATCHES:
+            self._batches.clear()
+        batch = self._batches[frames] = self._call(headers, 0), headers
+        return batch
+
+    def _describe(self, frame: OutFrame) -> tuple[bytes, bytearray]:
+        """Return the kernel's description of *frame*; it holds for the life of the frame."""
+        name = name_size = 0
+        if self._address_of is not None:
+            known = self._addresses.get(frame.destination) or self._resolve(frame.destination)
+            name, name_size = _address(known[0]), len(known[0])
+        iovec = bytearray(_IOVEC.pack(_address(frame.buffer), len(frame.buffer)))
+        header = _MMSGHDR.pack(name, name_size, _address(iovec), 1, 0, 0, 0, 0)
+        self._headers[frame] = header, iovec
+        return header, iovec
+
+    def _resolve(self, destination: str) -> tuple[bytearray, tuple[str, int]]:
+        assert self._address_of is not None  # noqa: S101  the callers asked
+        packed, address = self._address_of(destination)
+        known = self._addresses[destination] = bytearray(packed), address
+        return known

@@ -1,0 +1,94 @@
+"""The pacing of the cycle: wait for a time, or for a descriptor, whichever comes first."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import time
+from functools import partial
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+_TFD_CLOEXEC_NONBLOCK = os.O_CLOEXEC | os.O_NONBLOCK
+_EVENTS = 8
+_LARGEST_EVENT = 16
+
+_library = ctypes.CDLL(None, use_errno=True)
+
+
+class Ticker:
+    """Waits on the monotonic clock, for the main thread of a process that runs cycles.
+
+    Without descriptors it sleeps to an absolute time; with some it waits on them and a timerfd.
+    Both were less late than a wait with a relative time-out, which the kernel rounds for
+    processes that are not real-time.
+    """
+
+    def __init__(self) -> None:
+        self._deadline = bytearray(32)
+        address = ctypes.addressof(ctypes.c_char.from_buffer(self._deadline))
+        self._times = memoryview(self._deadline).cast("q")
+        self._sleep = partial(
+            _library["clock_nanosleep"],
+            _CLOCK_MONOTONIC,
+            _TIMER_ABSTIME,
+            ctypes.c_void_p(address + 16),
+            None,
+        )
+        self._epoll: select.epoll | None = None
+        self._timer = -1
+        self._registered: set[int] = set()
+        self._events = bytearray(_EVENTS * _LARGEST_EVENT)
+
+    def register(self, fd: int) -> None:
+        """Let *fd* end a wait when it becomes readable; it does so until it is read empty."""
+        if self._epoll is None:
+            self._open()
+        assert self._epoll is not None  # noqa: S101  just opened
+        self._epoll.register(fd, select.EPOLLIN)
+        self._registered.add(fd)
+
+    def unregister(self, fd: int) -> None:
+        """Forget *fd*."""
+        if self._epoll is not None and fd in self._registered:
+            self._registered.remove(fd)
+            self._epoll.unregister(fd)
+
+    def wait(self, deadline_ns: int) -> bool:
+        """Return True once *deadline_ns* has passed, False if something else came first.
+
+        That is a descriptor or a signal; a Python signal handler has run by the time this returns.
+        A deadline in the past returns at once.
+        """
+        if time.monotonic_ns() >= deadline_ns:
+            return True
+        self._times[2], self._times[3] = divmod(deadline_ns, 1_000_000_000)
+        if not self._registered:
+            return not self._sleep()
+        self._set_timer()
+        self._poll()
+        return time.monotonic_ns() >= deadline_ns
+
+    def close(self) -> None:
+        """Give the timer back."""
+        if self._epoll is not None:
+            self._epoll.close()
+            os.close(self._timer)
+            self._epoll = None
+            self._registered.clear()
+
+    def _open(self) -> None:
+        self._timer = _library["timerfd_create"](_CLOCK_MONOTONIC, _TFD_CLOEXEC_NONBLOCK)
+        if self._timer < 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number))
+        self._epoll = select.epoll()
+        self._epoll.register(self._timer, select.EPOLLIN)
+        address = ctypes.addressof(ctypes.c_char.from_buffer(self._deadline))
+        self._set_timer = partial(
+            _library["timerfd_settime"], self._timer, _TIMER_ABSTIME, ctypes.c_void_p(address), None
+        )
+        events = ctypes.c_void_p(ctypes.addressof(ctypes.c_char.from_buffer(self._events)))
+        # Which descriptor it was is not asked: the clock says whether the deadline has passed.
+        self._poll = partial(_library["epoll_wait"], self._epoll.fileno(), events, _EVENTS, -1)

@@ -1,0 +1,88 @@
+"""The UDP driver: one bound socket, received in batches and sent in batches."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Sequence
+
+from eap.codec.ethercat import EAP_PORT
+from eap.ids import Destination
+from eap.net.mmsg import BATCH, ReceiveBatch, SendBatch, note_receive_error
+from eap.pd.link import OutFrame, Taker
+
+_BATCHES_PER_DRAIN = 4
+
+
+class UdpChannel:
+    """Frames in datagrams (ETG.1005: one frame each, UDP port 34980).
+
+    Serves a port's own socket, and those of multicast groups and of broadcasts, from which
+    nothing is sent: *takers* are all stations of the process that listen there.  *batch* may be
+    shared by all channels of a process, which are drained one after the other.
+    """
+
+    minimum_size = 0
+
+    def __init__(
+        self, sock: socket.socket, batch: ReceiveBatch, takers: Sequence[Taker] = ()
+    ) -> None:
+        sock.setblocking(False)
+        self.takers = list(takers)
+        self._sock = sock
+        self._batch = batch
+        self._receive = batch.reader(sock.fileno())
+        self._sender = SendBatch(sock, _socket_address)
+        self.errors = self._sender.errors
+
+    def drain(self, now_ns: int) -> int:
+        """Hand every waiting frame to the takers, at most 256 in one call."""
+        del now_ns  # the kernel's stamps are nearer to the wire
+        total = 0
+        for _ in range(_BATCHES_PER_DRAIN):
+            count = self._receive()
+            if count <= 0:
+                if count:
+                    note_receive_error(self.errors)
+                break
+            takers = self.takers
+            if len(takers) == 1:
+                take = takers[0]
+                for view, size, at_ns in self._batch.arrivals(count):
+                    take(view, size, at_ns)
+            else:
+                for view, size, at_ns in self._batch.arrivals(count):
+                    for take in takers:
+                        take(view, size, at_ns)
+            total += count
+            if count < BATCH:
+                break
+        return total
+
+    def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
+        """Send *frames* to their destinations; return those that the kernel refused."""
+        del now_ns
+        return self._sender.send(frames)
+
+    def link_header(self, destination: str) -> bytes:
+        """Nothing: the kernel writes the headers of a datagram to *destination*."""
+        del destination
+        return b""
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when a frame waits."""
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._sock.close()
+
+
+def _socket_address(destination: str) -> tuple[bytes, tuple[str, int]]:
+    """Return the packed ``sockaddr_in`` of *destination* and the form that Python takes."""
+    where = Destination.parse(destination)
+    address = where.host, where.port or EAP_PORT
+    port = struct.pack("!H", address[1])
+    return struct.pack("@H", socket.AF_INET) + port + socket.inet_aton(where.host) + bytes(
+        8
+    ), address
