@@ -1,0 +1,68 @@
+"""Golden octets of ``tests/vectors``: loading, and the EtherCAT frames within."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+FOLDER = Path(__file__).parents[1] / "vectors"
+
+
+class Vector(NamedTuple):
+    """Octets of one *layer* with what they mean; *error* instead of fields for broken ones."""
+
+    name: str
+    layer: str
+    octets: bytes
+    fields: dict
+    error: str
+
+    @property
+    def frame(self) -> bytes:
+        """The EtherCAT frame of a vector of layer ``ethernet`` or ``frame``, with its padding."""
+        return self.octets if self.layer == "frame" else _frame(self.octets)
+
+
+@cache
+def load(stem: str) -> tuple[Vector, ...]:
+    """All vectors of the file ``STEM.yaml``."""
+    content = yaml.safe_load((FOLDER / f"{stem}.yaml").read_text())
+    assert content["source"]
+    return tuple(
+        Vector(
+            f"{stem}/{item['name']}",
+            item.get("layer", content["layer"]),
+            bytes.fromhex(item["octets"]),
+            item.get("fields", {}),
+            item.get("error", ""),
+        )
+        for item in content["vectors"]
+    )
+
+
+def load_all(*layers: str) -> list[Vector]:
+    """The vectors of *layers* of all files."""
+    stems = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem != "type1_datagrams")
+    return [vector for stem in stems for vector in load(stem) if vector.layer in layers]
+
+
+def load_datagrams() -> list[tuple[str, dict]]:
+    """The datagrams of ``type1_datagrams.yaml``, which come as fields."""
+    content = yaml.safe_load((FOLDER / "type1_datagrams.yaml").read_text())
+    return [
+        (f"{Path(name).stem}#{item.pop('frame')}", item)
+        for name, items in content["files"].items()
+        for item in items
+    ]
+
+
+def _frame(octets: bytes) -> bytes:
+    start = 16 if octets[12:14] == b"\x81\x00" else 12
+    if octets[start : start + 2] == b"\x88\xa4":
+        return octets[start + 2 :]
+    assert octets[start : start + 2] == b"\x08\x00"
+    assert octets[start + 2] == 0x45, "no options in these IP headers"
+    return octets[start + 30 :]
