@@ -1,1 +1,20 @@
-"""EtherCAT Automation Protocol (ETG.1005) appliance; docs/architecture.md draws its rooms."""
+"""EtherCAT Automation Protocol (ETG.1005) appliance; docs/architecture.md draws its rooms.
+
+User programs need one name: ``eap.attach("station")`` gives the variables of a running station.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from eap.appliance.attach import AttachedStation
+
+__all__ = ["attach"]
+
+
+def attach(station: str) -> AttachedStation:
+    """Attach to the running station of that name; see :mod:`eap.appliance.attach`."""
+    from eap.appliance.attach import attach as attach_station  # the engine must not load it
+
+    return attach_station(station)

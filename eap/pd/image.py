@@ -74,17 +74,23 @@ class Image:
 
         The caller is the region's writer and stands inside :meth:`writing`.
         """
+        self.store(name, self.encode(name, value))
+
+    def encode(self, name: str, value: Any) -> bytes:
+        """Return the octets of *value* for :meth:`store`; raise ValueError if it does not fit."""
+        return datatypes.parse(self._place(name).type).encode(value)
+
+    def store(self, name: str, octets: bytes) -> None:
+        """Put encoded octets in a variable's place; the caller stands inside :meth:`writing`."""
         place = self._place(name)
-        kind = datatypes.parse(place.type)
         offset, bit = divmod(place.bit_offset, 8)
-        if not kind.is_bits or not bit:
-            kind.write(self.memory, offset, value)
-            return
-        scratch = bytearray(1)
-        kind.write(scratch, 0, value)
+        length = datatypes.parse(place.type).bit_length
         end = _end_octet(place)
-        mask = (1 << kind.bit_length) - 1 << bit
-        word = int.from_bytes(self.memory[offset:end], "little") & ~mask | scratch[0] << bit
+        if not bit and not length % 8:
+            self.memory[offset:end] = octets
+            return
+        mask = (1 << length) - 1 << bit
+        word = int.from_bytes(self.memory[offset:end], "little") & ~mask | octets[0] << bit
         self.memory[offset:end] = word.to_bytes(end - offset, "little")
 
     @contextmanager

@@ -1,0 +1,188 @@
+"""A user program's view of a running station: its variables by name, in step with its cycle.
+
+    with eap.attach("island-01") as station:
+        while True:
+            station["setpoint"] = station["left_level"] * 2
+            station.wait_cycle()
+
+Nothing here talks to a process: variables are read and written in the shared process image.  When
+the plant is changed and the image gets a new layout, the program moves there by itself.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from time import monotonic_ns
+from types import TracebackType
+from typing import Any, Self
+
+from eap.appliance.runtime import ApplianceFolder, find_appliances, runtime_root
+from eap.errors import EngineGoneError, ImageError, WriterConflictError
+from eap.net.image_file import ImageFile, open_image
+from eap.pd.image import Image
+from eap.pd.layout import VAR_CTRL
+from eap.pd.report import station_status
+from eap.pd.spec import Writer
+from eap.pd.trigger import EVENT_BIT
+from eap.pd.words import StationWord
+
+_GONE_AFTER_S = 2.0
+"""Without a cycle for this long the engine counts as gone; a restart takes less."""
+_GONE_AFTER_CYCLES = 10
+
+
+class AttachedStation:
+    """The variables of one running station; made by :func:`attach`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = open_image(path)
+        self._writes = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Detach, and let others write."""
+        self._file.close()
+
+    @property
+    def name(self) -> str:
+        """The station's name."""
+        return self._file.image.layout.station
+
+    @property
+    def cycle_s(self) -> float:
+        """The station's device cycle in seconds."""
+        return self._file.image.layout.cycle_us / 1e6
+
+    @property
+    def cycle(self) -> int:
+        """The station's cycle counter; its low 16 bits are what frames carry."""
+        return int(self._current().words[StationWord.CYCLE])
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the value of the variable *name*."""
+        return self._current().read(self._known(name))
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        """Write one variable; see :meth:`write`."""
+        self.write({name: value})
+
+    def read_all(self) -> dict[str, Any]:
+        """Return all variables; those of one writer belong to the same cycle."""
+        return self._current().read_all()
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Write several variables at once: the engine sees all of them or none.
+
+        Raises:
+            WriterConflictError: one of them is not the application's, or another program writes.
+            ValueError: a value does not fit its type; nothing was written.
+            EngineGoneError: nobody would read it.
+        """
+        image = self._current()
+        for name in values:
+            place = image.places[self._known(name)]
+            if place.writer is not Writer.APPLICATION:
+                raise WriterConflictError(
+                    f"station {self.name}: {name} is written by the {place.writer}, "
+                    f"not by applications",
+                    holder=place.writer,
+                )
+        self._become_writer()
+        checked = {name: image.encode(name, value) for name, value in values.items()}
+        with image.writing(Writer.APPLICATION):
+            for name, octets in checked.items():
+                image.store(name, octets)
+
+    def fire(self, pd: str) -> None:
+        """Send the TxPD *pd* in the next cycle; its trigger must say ``event``."""
+        name = pd + VAR_CTRL
+        control = self[name]
+        self.write({name: control & ~EVENT_BIT})
+        self.wait_cycle()
+        self.write({name: control | EVENT_BIT})
+
+    def wait_cycle(self) -> int:
+        """Sleep until the next cycle has run and return its number.
+
+        Raises:
+            EngineGoneError: no engine runs the station any more.
+        """
+        image = self._current()
+        before = image.words[StationWord.CYCLE]
+        if not self._file.wait_cycle(before, self._patience_s()):
+            image = self._current()  # a new layout, or the engine is gone
+        return int(image.words[StationWord.CYCLE])
+
+    def status(self) -> dict[str, Any]:
+        """Return the counters and states of the station, shaped as in ``eapctl status``."""
+        return station_status(self._current(), monotonic_ns())
+
+    def _current(self) -> Image:
+        """Return the image, of the newest layout and with an engine behind it."""
+        if self._file.retired:
+            self._move()
+        image = self._file.image
+        silent_s = (monotonic_ns() - image.words[StationWord.CYCLE_AT_NS]) / 1e9
+        if silent_s > self._patience_s():
+            raise EngineGoneError(
+                f"station {self.name}: its engine has not run a cycle for {silent_s:.1f} s; "
+                f"start the plant again"
+            )
+        return image
+
+    def _move(self) -> None:
+        old, self._file = self._file, open_image(self._path)
+        old.close()
+        if self._writes:
+            self._file.acquire_writer(Writer.APPLICATION)
+
+    def _become_writer(self) -> None:
+        if not self._writes:
+            self._file.acquire_writer(Writer.APPLICATION)
+            self._writes = True
+
+    def _patience_s(self) -> float:
+        return max(_GONE_AFTER_S, _GONE_AFTER_CYCLES * self.cycle_s)
+
+    def _known(self, name: str) -> str:
+        places = self._file.image.places
+        if name in places:
+            return name
+        near = get_close_matches(name, places, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ImageError(f"station {self.name} has no variable {name!r}{hint}")
+
+
+def attach(station: str) -> AttachedStation:
+    """Attach to the running station of that name.
+
+    Raises:
+        ImageError: no appliance of this user runs such a station; the message names those that run.
+    """
+    running: dict[str, ApplianceFolder] = {}
+    for folder in find_appliances():
+        try:
+            running |= dict.fromkeys(folder.read_info().stations, folder)
+        except OSError:
+            continue  # it is just starting or stopping
+    if station not in running:
+        listed = ", ".join(sorted(running)) or "none"
+        raise ImageError(
+            f"no station {station!r} runs here (running: {listed}; looked in {runtime_root()} as "
+            f"user {os.getuid()}): start its plant with eapctl run"
+        )
+    return AttachedStation(running[station].image(station))
