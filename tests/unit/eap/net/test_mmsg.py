@@ -1,0 +1,187 @@
+"""Batches of messages: sizes, times, partial sends, refusals."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import time
+
+import pytest
+
+from eap.net.mmsg import (
+    BATCH,
+    SO_TIMESTAMPNS,
+    ReceiveBatch,
+    SendBatch,
+    count_error,
+    note_receive_error,
+)
+from eap.net.udp import _socket_address
+from eap.pd.link import OutFrame
+
+pytestmark = pytest.mark.net
+
+
+@pytest.fixture
+def pair():
+    """Two bound sockets; the second is the receiver."""
+    with contextlib.ExitStack() as stack:
+        sockets = [
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
+        ]
+        for sock in sockets:
+            sock.bind(("127.0.3.10", 0))
+            sock.setblocking(False)
+        sockets[1].setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        yield sockets
+
+
+def frames_to(sock, count, size=20):
+    host, port = sock.getsockname()
+    return [OutFrame(bytearray([n]) * (size + n), 0, f"{host}:{port}") for n in range(count)]
+
+
+def receive(batch, sock):
+    count = batch.reader(sock.fileno())()
+    return [(bytes(view[:size]), at_ns) for view, size, at_ns in batch.arrivals(count)]
+
+
+@pytest.mark.parametrize("count", [1, 2, BATCH])
+def test_batch_arrives_whole_in_order_and_stamped(pair, count):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    frames = frames_to(receiver, count)
+    for _ in range(2):  # the second round uses what the first prepared
+        before = time.monotonic_ns()
+        assert out.send(frames) == ()
+        after = time.monotonic_ns()
+        got = receive(batch, receiver)
+        assert [data for data, _ in got] == [bytes(frame.buffer) for frame in frames]
+        times = [at_ns for _, at_ns in got]
+        # Two clocks are read one after the other: allow for a stall between the readings.
+        assert before - 5_000_000 < times[0] <= times[-1] < after + 5_000_000
+        assert times == sorted(times)
+    assert out.errors == {}
+
+
+def test_patched_octets_are_sent_by_a_prepared_batch(pair):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    frames = tuple(frames_to(receiver, 2))
+    out.send(frames)
+    receive(batch, receiver)
+    frames[1].view[3] = 0xEE
+    out.send(frames)
+    assert receive(batch, receiver)[1][0][3] == 0xEE
+
+
+def test_nothing_waiting_is_no_error(pair):
+    errors: dict[str, int] = {}
+    assert ReceiveBatch().reader(pair[1].fileno())() == -1
+    note_receive_error(errors)
+    assert errors == {}
+
+
+def test_broken_descriptor_is_counted_by_name():
+    errors: dict[str, int] = {}
+    assert ReceiveBatch().reader(-1)() == -1
+    note_receive_error(errors)
+    assert errors == {"EBADF": 1}
+
+
+def test_missing_stamp_falls_back_to_now_and_the_batch_recovers(pair):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    frames = frames_to(receiver, 3)
+    receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 0)
+    for count in (1, 3):
+        out.send(frames[:count])
+        before = time.monotonic_ns()
+        times = [at_ns for _, at_ns in receive(batch, receiver)]
+        assert len(times) == count
+        assert all(before <= at_ns <= time.monotonic_ns() for at_ns in times)
+    receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    out.send(frames)
+    times = [at_ns for _, at_ns in receive(batch, receiver)]
+    assert len(times) == 3
+    assert times[0] < times[2]
+
+
+def test_wall_clock_set_back_gives_no_time_in_the_future(pair, monkeypatch):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    real = time.time_ns
+    monkeypatch.setattr("time.time_ns", lambda: real() - 3600 * 10**9)
+    for count in (1, 2):
+        out.send(frames_to(receiver, count))
+        assert all(at_ns <= time.monotonic_ns() for _, at_ns in receive(batch, receiver))
+
+
+def test_batch_across_a_second_keeps_every_time():
+    batch = ReceiveBatch()
+    for n, second in enumerate((7, 7, 8)):
+        batch._stamps[n * 4 + 2], batch._stamps[n * 4 + 3] = second, 999 - n
+    assert batch._times(3, 1000) == [7_000_001_999, 7_000_001_998, 8_000_001_997]
+
+
+@pytest.mark.parametrize("bad", [0, 1, 2])
+def test_partial_send_goes_on_behind_the_refused_frame(pair, bad):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    frames = frames_to(receiver, 3)
+    huge = OutFrame(bytearray(70_000), 0, frames[0].destination)
+    frames[bad] = huge
+    assert out.send(frames) == [huge]
+    assert out.errors == {"EMSGSIZE": 1}
+    good = [bytes(frame.buffer) for frame in frames if frame is not huge]
+    assert [data for data, _ in receive(batch, receiver)] == good
+
+
+def test_refused_single_frame_is_returned(pair):
+    out = SendBatch(pair[0], _socket_address)
+    frames = [OutFrame(bytearray(70_000), 0, "127.0.3.10:9")]
+    assert out.send(frames) == frames
+    assert out.send(()) == ()
+    assert out.errors == {"EMSGSIZE": 1}
+
+
+def test_connected_socket_needs_no_address(pair):
+    sender, receiver = pair
+    sender.connect(receiver.getsockname())
+    out, batch = SendBatch(sender), ReceiveBatch()
+    frames = frames_to(receiver, 2)
+    assert out.send(frames) == out.send(frames[:1]) == ()
+    assert len(receive(batch, receiver)) == 3
+
+
+def test_refused_connection_is_counted_and_sending_goes_on(pair):
+    sender, receiver = pair
+    sender.connect(receiver.getsockname())
+    out = SendBatch(sender)
+    frames = frames_to(receiver, 2)
+    receiver.close()
+    for _ in range(3):
+        out.send(frames)
+    assert set(out.errors) == {"ECONNREFUSED"}
+
+
+def test_cache_of_batches_is_bounded(pair):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    frames = frames_to(receiver, 20)
+    for first in frames:
+        for second in frames:
+            out.send((first, second))
+        while batch.reader(receiver.fileno())() > 0:
+            pass
+    assert len(out._batches) <= 256
+    assert out.errors == {}
+
+
+def test_unknown_errno_is_counted_by_number():
+    errors: dict[str, int] = {}
+    count_error(errors, 99999)
+    count_error(errors, errno.ENOBUFS)
+    count_error(errors, errno.ENOBUFS)
+    assert errors == {"99999": 1, "ENOBUFS": 2}

@@ -1,0 +1,95 @@
+"""Waiting for a time, a descriptor or a signal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from eap.net.ticker import Ticker
+
+pytestmark = pytest.mark.net
+
+LATER_NS = 10_000_000_000
+
+
+@pytest.fixture
+def ticker():
+    made = Ticker()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def pipe():
+    ends = os.pipe()
+    yield ends
+    for end in ends:
+        os.close(end)
+
+
+def wait_us(ticker, after_us):
+    """Return what the wait said and how late it was."""
+    deadline_ns = time.monotonic_ns() + after_us * 1000
+    return ticker.wait(deadline_ns), time.monotonic_ns() - deadline_ns
+
+
+def test_deadline_is_never_early(ticker):
+    for after_us in (1, 100, 2000):
+        reached, late_ns = wait_us(ticker, after_us)
+        assert reached
+        assert late_ns >= 0
+
+
+def test_deadline_is_kept_with_a_silent_descriptor(ticker, pipe):
+    ticker.register(pipe[0])
+    for after_us in (1, 100, 2000):
+        reached, late_ns = wait_us(ticker, after_us)
+        assert reached
+        assert late_ns >= 0
+
+
+def test_deadline_in_the_past_returns_at_once(ticker):
+    assert ticker.wait(time.monotonic_ns() - LATER_NS)
+    assert ticker.wait(0)
+
+
+def test_readable_descriptor_ends_the_wait(ticker, pipe):
+    ticker.register(pipe[0])
+    os.write(pipe[1], b"x")
+    assert not ticker.wait(time.monotonic_ns() + LATER_NS)
+    os.read(pipe[0], 1)
+    assert wait_us(ticker, 500)[0]
+
+
+def test_forgotten_descriptor_ends_nothing(ticker, pipe):
+    ticker.register(pipe[0])
+    os.write(pipe[1], b"x")
+    ticker.unregister(pipe[0])
+    ticker.unregister(pipe[0])
+    assert wait_us(ticker, 500)[0]
+
+
+@pytest.mark.parametrize("with_descriptor", [False, True])
+def test_signal_ends_the_wait_and_its_handler_has_run(ticker, pipe, with_descriptor):
+    if with_descriptor:
+        ticker.register(pipe[0])
+    seen = []
+    before = signal.signal(signal.SIGALRM, lambda number, _frame: seen.append(number))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        assert not ticker.wait(time.monotonic_ns() + LATER_NS)
+        assert seen == [signal.SIGALRM]
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_closing_twice_is_harmless(pipe):
+    ticker = Ticker()
+    ticker.register(pipe[0])
+    ticker.close()
+    ticker.close()
+    assert wait_us(ticker, 100)[0]

@@ -1,0 +1,94 @@
+"""The UDP channel: what it hands over, to whom, and how much at once."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+
+from eap.net.mmsg import ReceiveBatch
+from eap.net.udp import UdpChannel, _socket_address
+from eap.net.udpsocket import open_udp_pair
+from eap.pd.link import OutFrame
+
+pytestmark = pytest.mark.net
+
+
+@pytest.fixture
+def channels():
+    """Two engine channels that share one batch."""
+    batch = ReceiveBatch()
+    with contextlib.ExitStack() as stack:
+        found = []
+        for host in ("127.0.3.12", "127.0.3.13"):
+            engine, services = open_udp_pair(host)
+            stack.callback(services.close)
+            found.append(UdpChannel(engine, batch))
+            stack.callback(found[-1].close)
+        yield found
+
+
+def process_data(number):
+    return OutFrame(bytearray([number, 0x40, number]), 0, "127.0.3.13")
+
+
+def test_frames_reach_the_only_taker(channels):
+    sender, receiver = channels
+    got = []
+    receiver.takers.append(lambda view, size, _at: got.append(bytes(view[:size])))
+    assert sender.send([process_data(n) for n in range(3)], 0) == ()
+    assert receiver.drain(0) == 3
+    assert got == [bytes([n, 0x40, n]) for n in range(3)]
+    assert receiver.drain(0) == 0
+    assert sender.errors == receiver.errors == {}
+
+
+def test_every_taker_of_a_shared_socket_gets_every_frame(channels):
+    sender, receiver = channels
+    got = []
+    receiver.takers += [
+        lambda view, _size, _at: got.append(("a", view[0])),
+        lambda view, _size, _at: got.append(("b", view[0])),
+    ]
+    sender.send([process_data(5), process_data(6)], 0)
+    assert receiver.drain(0) == 2
+    assert got == [("a", 5), ("b", 5), ("a", 6), ("b", 6)]
+
+
+def test_drain_is_bounded(channels):
+    sender, receiver = channels
+    got = []
+    receiver.takers.append(lambda view, _size, _at: got.append(view[0]))
+    frame = process_data(1)
+    for _ in range(300):
+        sender.send((frame,), 0)
+    assert receiver.drain(0) == 256
+    assert receiver.drain(0) == 44
+    assert len(got) == 300
+
+
+def test_unreachable_destination_is_counted_not_raised(channels):
+    sender, _ = channels
+    frame = OutFrame(bytearray(3), 0, "0.0.0.1")
+    assert sender.send([frame], 0) == [frame]
+    assert sum(sender.errors.values()) == 1
+
+
+def test_broken_socket_is_counted_not_raised(channels):
+    sender, receiver = channels
+    receiver._receive = receiver._batch.reader(-1)
+    assert receiver.drain(0) == 0
+    assert receiver.errors == {"EBADF": 1}
+    assert sender.fileno() != receiver.fileno()
+
+
+def test_datagrams_need_no_headroom(channels):
+    assert channels[0].link_header("127.0.3.13") == b""
+    assert channels[0].minimum_size == 0
+
+
+def test_destination_without_a_port_goes_to_the_usual_one():
+    packed, address = _socket_address("127.0.3.13")
+    assert address == ("127.0.3.13", 34980)
+    assert packed[2:] == b"\x88\xa4\x7f\x00\x03\x0d" + bytes(8)
+    assert _socket_address("127.0.3.13:9")[1] == ("127.0.3.13", 9)
