@@ -82,11 +82,39 @@ class RandomSource(Record, frozen=True, tag="random", tag_field="kind"):
     seed: int = 0
 
 
+class Measure(StrEnum):
+    """What a host can be asked for; docs/plant-file.md gives the units."""
+
+    LOAD1 = "load1"
+    LOAD5 = "load5"
+    LOAD15 = "load15"
+    CPU_PERCENT = "cpu_percent"
+    CPU_TIME = "cpu_time"
+    MEMORY_TOTAL = "memory_total"
+    MEMORY_AVAILABLE = "memory_available"
+    MEMORY_USED = "memory_used"
+    MEMORY_PERCENT = "memory_percent"
+    RX_OCTETS = "rx_octets"
+    TX_OCTETS = "tx_octets"
+    RX_PACKETS = "rx_packets"
+    TX_PACKETS = "tx_packets"
+    UPTIME = "uptime"
+    PROCESSES = "processes"
+    CONTEXT_SWITCHES = "context_switches"
+    TEMPERATURE = "temperature"
+
+
+INTERFACE_MEASURES = frozenset(
+    {Measure.RX_OCTETS, Measure.TX_OCTETS, Measure.RX_PACKETS, Measure.TX_PACKETS}
+)
+"""Measures whose argument is the name of a network interface."""
+
+
 class HostSource(Record, frozen=True, tag="host", tag_field="kind"):
-    """A measurement of this host, read from /proc; *measure* as ``eap.net.host`` names them."""
+    """A measurement of this host, read from /proc; *argument* as the measure needs one."""
 
     variable: str
-    measure: str
+    measure: Measure
     argument: str = ""
     period_ms: int = 500
 
