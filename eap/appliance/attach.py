@@ -21,7 +21,7 @@ from typing import Any, Self
 
 from eap.appliance.runtime import ApplianceFolder, find_appliances, runtime_root
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
-from eap.net.image_file import ImageFile, open_image
+from eap.net.image_file import open_image
 from eap.pd.image import Image
 from eap.pd.layout import VAR_CTRL
 from eap.pd.report import station_status
@@ -111,8 +111,9 @@ class AttachedStation:
         """Send the TxPD *pd* in the next cycle; its trigger must say ``event``."""
         name = pd + VAR_CTRL
         control = self[name]
-        self.write({name: control & ~EVENT_BIT})
-        self.wait_cycle()
+        if control & EVENT_BIT:  # the engine has to see it low before it can rise
+            self.write({name: control & ~EVENT_BIT})
+            self.wait_cycle()
         self.write({name: control | EVENT_BIT})
 
     def wait_cycle(self) -> int:

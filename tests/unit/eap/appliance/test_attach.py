@@ -1,0 +1,160 @@
+"""A user program against a real engine in a thread, on a real image in a runtime directory."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+import eap
+from eap.appliance import attach as attach_module
+from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
+from eap.errors import EngineGoneError, ImageError, WriterConflictError
+from eap.net.image_file import ImageFile, create_image
+from eap.pd.engine import Engine
+from eap.pd.layout import plan_layout
+from eap.pd.spec import CounterSource, StationSpec, VariableSpec, Writer
+from eap.pd.station import Station
+
+pytestmark = pytest.mark.net  # threads and real time
+
+CYCLE_US = 2000
+
+
+def spec(*more: VariableSpec) -> StationSpec:
+    return StationSpec(
+        name="mixer",
+        net_id="1.1.1.1.1.1",
+        cycle_us=CYCLE_US,
+        ports=(),
+        variables=(
+            VariableSpec("ticks", "UDINT", Writer.ENGINE),
+            VariableSpec("setpoint", "UINT", default=7),
+            VariableSpec("mode", "USINT"),
+            *more,
+        ),
+        sources=(CounterSource("ticks"),),
+    )
+
+
+class Runner:
+    """Runs an engine on an image until told to stop."""
+
+    def __init__(self, path: Path, station: StationSpec) -> None:
+        self.file: ImageFile = create_image(path, plan_layout(station))
+        self._engine = Engine([Station(station, self.file.image, self.file.wake_waiters)])
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        while not self.file.image.words[0]:
+            time.sleep(0.001)
+
+    def _run(self) -> None:
+        self._engine.start(time.monotonic_ns())
+        while not self._stop.wait(0.0005):
+            self._engine.handle_timeout(time.monotonic_ns())
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.file.close()
+
+
+@contextmanager
+def running(path: Path, station: StationSpec) -> Iterator[Runner]:
+    runner = Runner(path, station)
+    try:
+        yield runner
+    finally:
+        runner.stop()
+
+
+@pytest.fixture
+def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path / "run"))
+    with ApplianceFolder.claim("plant") as folder:
+        folder.write_info(
+            ApplianceInfo(
+                plant="plant",
+                plant_file="plant.yaml",
+                stations=["mixer"],
+                started_at="2026-01-01T00:00:00+00:00",
+                supervisor=1,
+            )
+        )
+        yield folder.image("mixer")
+
+
+def test_reads_defaults_and_what_the_engine_computes(path: Path) -> None:
+    with running(path, spec()), eap.attach("mixer") as station:
+        assert station.name == "mixer"
+        assert station["setpoint"] == 7
+        first = station.wait_cycle()
+        later = station.wait_cycle()
+        assert later > first
+        assert station["ticks"] >= later
+        assert set(station.read_all()) == {"ticks", "setpoint", "mode"}
+        assert station.status()["state"] == "OP"
+
+
+def test_writes_are_seen_together(path: Path) -> None:
+    with running(path, spec()), eap.attach("mixer") as station:
+        station.write({"setpoint": 500, "mode": 3})
+        assert (station["setpoint"], station["mode"]) == (500, 3)
+        station["mode"] = 4
+        assert station["mode"] == 4
+
+
+def test_a_value_that_does_not_fit_writes_nothing(path: Path) -> None:
+    with running(path, spec()), eap.attach("mixer") as station:
+        with pytest.raises(ValueError, match="70000 is not a value of UINT"):
+            station.write({"mode": 9, "setpoint": 70000})
+        assert (station["setpoint"], station["mode"]) == (7, 0)
+
+
+def test_others_variables_are_refused_by_name(path: Path) -> None:
+    with running(path, spec()), eap.attach("mixer") as station:
+        with pytest.raises(WriterConflictError, match="ticks is written by the engine") as caught:
+            station["ticks"] = 1
+        assert caught.value.holder == "engine"
+
+
+def test_unknown_names_suggest_the_near_one(path: Path) -> None:
+    with running(path, spec()), eap.attach("mixer") as station:
+        with pytest.raises(ImageError, match="did you mean 'setpoint'"):
+            station["setpiont"]
+        with pytest.raises(ImageError, match=r"no variable 'xyzzy'$"):
+            station["xyzzy"]
+
+
+def test_unknown_station_names_the_running_ones(path: Path) -> None:
+    with pytest.raises(ImageError, match=r"no station 'mixr' runs here \(running: mixer;"):
+        eap.attach("mixr")
+    assert not path.exists()
+
+
+def test_a_gone_engine_is_an_error_not_a_hang(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 0.1)
+    runner = Runner(path, spec())
+    with eap.attach("mixer") as station:
+        runner.stop()
+        with pytest.raises(EngineGoneError, match=r"station mixer: its engine has not run"):
+            station.wait_cycle()
+        with pytest.raises(EngineGoneError):
+            station["setpoint"]
+
+
+def test_moves_to_a_new_layout_and_stays_the_writer(path: Path) -> None:
+    first = Runner(path, spec())
+    with eap.attach("mixer") as station:
+        station["mode"] = 1
+        first.stop()
+        with running(path, spec(VariableSpec("extra", "INT", default=-5))) as second:
+            assert second.file.generation == 2
+            assert station["extra"] == -5
+            station["extra"] = 12
+            assert second.file.image.read("extra") == 12
