@@ -16,12 +16,12 @@ version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])') || f
     fail "'$python' is Python $version, but 3.11 or newer is needed; name one: make setup PYTHON=python3.11"
 
 if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
-    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+    if ! "$python" -c 'import ensurepip, venv; ensurepip.version()' 2>/dev/null; then
         package=python3-venv
         [ "$version" = "$(/usr/bin/python3 -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" ] ||
             package=python$version-venv
         sh tools/apt.sh "make setup" "$package" || exit 2
-        "$python" -c 'import ensurepip, venv' || fail "'$python' still has no venv after installing $package"
+        "$python" -c 'import ensurepip, venv; ensurepip.version()' || fail "'$python' still has no venv after installing $package"
     fi
     echo "make setup: making .venv with Python $version (once; needs the package index)"
     "$python" -m venv --clear .venv || fail "'$python -m venv .venv' failed"
