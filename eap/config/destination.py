@@ -58,6 +58,8 @@ def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
     destination = Destination.parse(text)
     if destination.kind not in _ALLOWED.get(uri.scheme, ()):
         raise ValueError(f"{text} cannot be reached from {uri}")
+    if destination.kind is DestinationKind.TCP and destination.is_group:
+        raise ValueError(f"{text} is a group, and TCP has none")
     return destination
 
 

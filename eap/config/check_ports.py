@@ -1,0 +1,157 @@
+"""Checks of names, NetIDs and ports: what must be unique and what fits an interface."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from ipaddress import IPv4Address
+
+from eap.config.destination import is_group, takes_tcp
+from eap.config.finding import Report
+from eap.config.index import Index
+from eap.config.structs import Port, Station
+from eap.ids import InterfaceUri, NetId
+from eap.pd.spec import PortKind
+
+_NAME = re.compile(r"[^\s/]+")
+_EAP_SCHEMES = {"udp", "ethernet", "tcp", "loop"}
+_MAX_INTERFACE_NAME = 15
+NAME = "a text without spaces and slashes"
+
+
+def check_ports(index: Index, report: Report) -> None:
+    """Report every station and port that cannot be as it is."""
+    plant = index.plant
+    if not _NAME.fullmatch(plant.plant):
+        report.add("plant", f"plant name {plant.plant!r}", NAME)
+    if not plant.stations:
+        report.add("stations", "the plant has no stations", "at least one station")
+    check_names(((s.at, s.name) for s in plant.stations), "station", report)
+    _check_net_ids(plant.stations, report)
+    for station in plant.stations:
+        check_names(((p.at, p.name) for p in station.ports), "port", report)
+        _check_order(station, report)
+        for port in station.ports:
+            _check_port(port, report)
+        cycle = index.cycle_us(station)
+        if station.phase_us is not None and station.phase_us >= cycle:
+            message = f"phase_us {station.phase_us} is not within the cycle"
+            report.add(f"{station.at}.phase_us", message, f"less than {cycle}")
+    _check_addresses(index, report)
+
+
+def check_names(names: Iterable[tuple[str, str]], what: str, report: Report) -> None:
+    """Report names that are malformed or given twice; *names* are (path of the item, name)."""
+    first: dict[str, str] = {}
+    for at, name in names:
+        path = f"{at}.name" if f"{at}.name" in report.lines else at
+        if not _NAME.fullmatch(name):
+            report.add(path, f"{what} name {name!r}", NAME)
+        elif name in first:
+            line = report.line_of(first[name])
+            report.add(path, f"{what} {name!r} exists already (line {line})", "a name of its own")
+        else:
+            first[name] = path
+
+
+def _check_net_ids(stations: tuple[Station, ...], report: Report) -> None:
+    first: dict[NetId, str] = {}
+    owners: list[Station | Port] = []
+    for station in stations:
+        owners += [station, *station.ports]
+    for section in owners:
+        path = f"{section.at}.net_id"
+        try:
+            net_id = NetId.parse(section.net_id)
+        except ValueError as exc:
+            report.add(path, f"net_id: {exc}", "an AMS NetID such as 5.23.91.23.1.1")
+            continue
+        if not any(net_id):
+            report.add(path, f"NetID {net_id} stands for any", "a NetID of its own")
+        elif net_id in first:
+            line = report.line_of(first[net_id])
+            message = f"NetID {net_id} is used twice (first in line {line})"
+            report.add(path, message, "a NetID of its own for each router and port")
+        else:
+            first[net_id] = path
+
+
+def _check_order(station: Station, report: Report) -> None:
+    if not station.ports and f"{station.at}.ports[0]" not in report.lines:
+        report.add(f"{station.at}.ports", f"station {station.name} has no ports", "an EAP port")
+    bus_seen = False
+    for port in station.ports:
+        if port.kind is PortKind.BUS:
+            bus_seen = True
+            report.add(
+                f"{port.at}.kind",
+                f"port {port.name}: bus ports come with the device bus",
+                "kind: eap in this version",
+            )
+        elif bus_seen:
+            report.add(port.at, f"EAP port {port.name} after a bus port", "EAP ports first")
+
+
+def _check_port(port: Port, report: Report) -> None:
+    path = f"{port.at}.interface"
+    try:
+        uri = InterfaceUri.parse(port.interface)
+    except ValueError as exc:
+        report.add(path, f"interface: {exc}", "such as udp://127.0.1.1 or ethernet://eth0")
+        return
+    if port.kind is PortKind.BUS:
+        return
+    if uri.scheme not in _EAP_SCHEMES:
+        report.add(path, f"{uri.scheme}:// is no interface of an EAP port", "udp, ethernet or tcp")
+        return
+    if uri.scheme == "ethernet" and (len(uri.host) > _MAX_INTERFACE_NAME or "/" in uri.host):
+        expected = f"a name of at most {_MAX_INTERFACE_NAME} characters"
+        report.add(path, f"{uri.host!r} is no interface name", expected)
+    if uri.scheme in {"udp", "tcp"} and not _is_own(uri.host):
+        report.add(path, f"{uri.host} is no address of a host", "the address of this station")
+    if uri.options and uri.scheme != "loop":
+        report.add(path, f"{uri.scheme}:// takes no options", f"{uri.scheme}://{uri.host}")
+    _check_options(port, uri, report)
+
+
+def _is_own(host: str) -> bool:
+    address = IPv4Address(host)
+    return not address.is_multicast and str(address) != "255.255.255.255"
+
+
+def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
+    only = f"it only on a port of another kind than {uri.scheme}://"
+    if port.vlan is not None and uri.scheme != "ethernet":
+        report.add(f"{port.at}.vlan", f"port {port.name} has a vlan", only)
+    if port.broadcast and uri.scheme != "udp":
+        report.add(f"{port.at}.broadcast", f"port {port.name} listens to UDP broadcasts", only)
+    if port.tcp and uri.scheme not in {"udp", "tcp"}:
+        report.add(f"{port.at}.tcp", f"port {port.name} takes type 4 from TCP", only)
+    for position, group in enumerate(port.join):
+        if not is_group(group, uri):
+            kind = "MAC" if uri.scheme == "ethernet" else "IPv4"
+            expected = (
+                f"a multicast address ({kind})" if uri.scheme in {"udp", "ethernet"} else only
+            )
+            report.add(f"{port.at}.join[{position}]", f"{group!r} cannot be joined", expected)
+
+
+def _check_addresses(index: Index, report: Report) -> None:
+    first: dict[tuple[str, ...], str] = {}
+    for (station, name), uri in index.uris.items():
+        port = index.ports[station, name]
+        keys: list[tuple[str, ...]] = []
+        if uri.scheme == "udp":
+            keys.append(("UDP", uri.host, str(uri.port)))
+        if takes_tcp(port, uri):
+            keys.append(("TCP", uri.host, str(uri.port)))
+        if uri.scheme == "ethernet" and port.kind is PortKind.EAP:
+            # Stations share an interface, ports of one station would take each frame twice.
+            keys.append((station, uri.host, str(port.vlan.id if port.vlan else 0)))
+        for key in keys:
+            if key in first:
+                line = report.line_of(first[key])
+                message = f"{uri} is used twice (first in line {line})"
+                report.add(f"{port.at}.interface", message, "an address of its own for each port")
+                break
+            first[key] = f"{port.at}.interface"

@@ -1,0 +1,189 @@
+"""From a plant file without findings to what the engine is given.
+
+Only what the checks have passed comes here, so nothing can fail; what the file leaves open is
+derived: writers, phases, addresses, groups to join, and what a subscriber must know of the sender.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from eap.codec import datatypes
+from eap.config.destination import IP_BROADCAST, group_of, resolve
+from eap.config.index import Index, SentPd
+from eap.config.structs import From, Port, Publish, Station, Subscribe, Variable
+from eap.ids import Destination, InterfaceUri, MacAddr, NetId
+from eap.pd.spec import (
+    CsvSource,
+    HostSource,
+    PortSpec,
+    RxPdSpec,
+    Source,
+    StationSpec,
+    TriggerSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
+
+MIN_STAGGER_US = 250
+"""Time that a station's cycle may take before the next station's begins."""
+
+
+def derive(index: Index, folder: Path) -> tuple[StationSpec, ...]:
+    """Return the specification of every station; files are relative to *folder*."""
+    count = len(index.plant.stations)
+    return tuple(
+        _station(index, station, _phase(index, station, position, count), folder)
+        for position, station in enumerate(index.plant.stations)
+    )
+
+
+def _phase(index: Index, station: Station, position: int, count: int) -> int:
+    if station.phase_us is not None:
+        return station.phase_us
+    cycle = index.cycle_us(station)
+    return position * max(cycle // count, MIN_STAGGER_US) % cycle
+
+
+def _station(index: Index, station: Station, phase_us: int, folder: Path) -> StationSpec:
+    return StationSpec(
+        name=station.name,
+        net_id=str(NetId.parse(station.net_id)),
+        cycle_us=index.cycle_us(station),
+        ports=tuple(_port(index, station, port) for port in station.ports),
+        phase_us=phase_us,
+        variables=tuple(_variables(index, station)),
+        sources=tuple(_source(source, folder) for source in station.sources.values()),
+        frames=tuple(_frames(index, station)),
+        subscriptions=tuple(_subscription(index, each) for each in station.subscribe),
+    )
+
+
+def _variables(index: Index, station: Station) -> Iterator[VariableSpec]:
+    for name, variable in station.variables.items():
+        source = station.sources.get(name)
+        writer = Writer.APPLICATION if source is None else Writer.ENGINE
+        if isinstance(source, HostSource | CsvSource):
+            writer = Writer.SERVICES
+        yield _variable(name, variable, writer)
+    for subscription in station.subscribe:
+        if subscription.variables is not None:
+            for name, variable in subscription.variables.items():
+                yield _variable(name, variable, Writer.ENGINE)
+        else:
+            sent = index.publishers(subscription)[0]
+            for name, text in index.received(subscription).items():
+                told = sent.station.variables.get(name.removeprefix(f"{subscription.name}."))
+                unit, comment = (told.unit, told.comment) if told else ("", "")
+                copy = Variable(type=text, unit=unit, comment=comment)
+                yield _variable(name, copy, Writer.ENGINE)
+
+
+def _variable(name: str, variable: Variable, writer: Writer) -> VariableSpec:
+    return VariableSpec(
+        name=name,
+        type=datatypes.parse(variable.type).text,
+        writer=writer,
+        default=variable.default,
+        unit=variable.unit,
+        comment=variable.comment,
+    )
+
+
+def _source(source: Source, folder: Path) -> Source:
+    if isinstance(source, CsvSource):
+        return msgspec.structs.replace(source, file=str((folder / source.file).resolve()))
+    return source
+
+
+def _frames(index: Index, station: Station) -> Iterator[TxFrameSpec]:
+    for frame in station.frames:
+        yield TxFrameSpec(
+            name=frame.name,
+            port=frame.port,
+            destination=str(resolve(frame.to, index.uris[station.name, frame.port], index)),
+            pds=tuple(_pd(pd) for pd in station.publish if pd.frame == frame.name),
+            divider=frame.divider or 0,
+            modulo=frame.modulo or 0,
+        )
+
+
+def _pd(pd: Publish) -> TxPdSpec:
+    trigger = TriggerSpec(
+        cycle_us=pd.cycle_us or 0,
+        divider=pd.divider or 0,
+        modulo=pd.modulo or 0,
+        on_change=pd.on_change,
+        event=pd.event,
+    )
+    return TxPdSpec(pd.name, pd.id, pd.variables, pd.version, trigger)
+
+
+def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
+    source, publishers = subscription.source, index.publishers(subscription)
+    if publishers:
+        sent = publishers[0]
+        pd_id, version = sent.pd.id, sent.pd.version
+        publisher = str(NetId.parse(sent.port.net_id))
+        step, sender_cycle_us = _pace(index, publishers)
+    if isinstance(source, From):
+        pd_id = source.id
+        publisher = "" if source.publisher == "any" else str(NetId.parse(source.publisher))
+        if not publishers:
+            version, step, sender_cycle_us = 0, source.step or 0, source.cycle_us or 0
+    return RxPdSpec(
+        name=subscription.name,
+        port=subscription.port,
+        pd_id=pd_id,
+        variables=tuple(index.received(subscription)),
+        publisher=publisher,
+        version=version if subscription.version is None else subscription.version,
+        ignore_version=subscription.ignore_version,
+        timeout_ms=subscription.timeout_ms,
+        substitute=subscription.substitute,
+        sender_cycle_us=sender_cycle_us,
+        step=step,
+    )
+
+
+def _pace(index: Index, publishers: list[SentPd]) -> tuple[int, int]:
+    """Return step and device cycle of *publishers*, 0 for what they do not have in common."""
+    steps = {index.step(sent) for sent in publishers}
+    cycles = {index.cycle_us(sent.station) for sent in publishers}
+    return steps.pop() if len(steps) == 1 else 0, cycles.pop() if len(cycles) == 1 else 0
+
+
+def _port(index: Index, station: Station, port: Port) -> PortSpec:
+    destinations = list(_heard(index, station, port))
+    groups = [_group(text) for text in port.join]
+    groups += [group for each in destinations if (group := group_of(each)) is not None]
+    return PortSpec(
+        name=port.name,
+        kind=port.kind,
+        interface=str(InterfaceUri.parse(port.interface)),
+        net_id=str(NetId.parse(port.net_id)),
+        vlan_id=port.vlan.id if port.vlan else 0,
+        vlan_priority=port.vlan.priority if port.vlan else 0,
+        join=tuple(dict.fromkeys(groups)),
+        broadcast=port.broadcast or any(each.host == IP_BROADCAST for each in destinations),
+        tcp=port.tcp,
+        wake=port.wake,
+    )
+
+
+def _group(text: str) -> str:
+    return str(MacAddr.parse(text)) if len(text) == len("01:01:05:04:00:00") else text
+
+
+def _heard(index: Index, station: Station, port: Port) -> Iterator[Destination]:
+    """Yield where the frames go that *port* subscribes to."""
+    for subscription in station.subscribe:
+        if subscription.port == port.name:
+            for sent in index.publishers(subscription):
+                uri = index.uris[sent.station.name, sent.port.name]
+                yield resolve(sent.frame.to, uri, index)

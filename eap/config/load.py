@@ -1,0 +1,49 @@
+"""The door of this package: a plant file in, stations or findings out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from eap.config.check_ports import check_ports
+from eap.config.check_publish import check_publish
+from eap.config.check_subscribe import check_subscribe
+from eap.config.check_variables import check_variables
+from eap.config.convert import convert
+from eap.config.derive import derive
+from eap.config.document import read
+from eap.config.finding import Finding, Report
+from eap.config.index import Index
+from eap.pd.spec import StationSpec
+
+
+class Plant(msgspec.Struct, frozen=True):
+    """A checked plant, complete."""
+
+    name: str
+    stations: tuple[StationSpec, ...]
+
+
+class LoadResult(msgspec.Struct, frozen=True):
+    """Either a plant and no findings, or no plant and all findings in the order of the file."""
+
+    plant: Plant | None
+    findings: tuple[Finding, ...]
+
+
+def load(path: Path) -> LoadResult:
+    """Read, check and complete the plant file at *path*; never raises for what the file holds."""
+    report = Report(str(path))
+    root = read(path, report)
+    plant_file = None if root is None else convert(root, report)
+    if plant_file is None:
+        return LoadResult(None, report.findings())
+    index = Index(plant_file)
+    check_ports(index, report)
+    check_variables(index, report, path.parent)
+    check_publish(index, report)
+    check_subscribe(index, report)
+    if findings := report.findings():
+        return LoadResult(None, findings)
+    return LoadResult(Plant(plant_file.plant, derive(index, path.parent)), ())
