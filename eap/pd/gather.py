@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeAlias
 
-from eap.codec import datatypes
-from eap.pd import pdo
+from eap.codec import datatypes, pdo
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
 from eap.pd.spec import Writer

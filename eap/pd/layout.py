@@ -14,9 +14,8 @@ from collections.abc import Iterable
 
 import msgspec
 
-from eap.codec import datatypes
+from eap.codec import datatypes, pdo
 from eap.codec.pd import PdHeader
-from eap.pd import pdo
 from eap.pd.spec import Record, RxPdSpec, StationSpec, Substitute, VariableSpec, Writer
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 
