@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from eap.codec import pdo
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.config.check_ports import check_names
 from eap.config.destination import EXPECTED, frame_budget, resolve
 from eap.config.finding import Report, near, one_of
 from eap.config.index import Index
 from eap.config.structs import Frame, Publish, Station
-from eap.pd import pdo
 from eap.pd.spec import PortKind
 
 
