@@ -1,0 +1,192 @@
+"""SDO semantics in one place: what may be read and written, in which state, with which refusal.
+
+Every method raises :class:`eap.od.abort.SdoAbortError` and leaves the dictionary as it was, or
+succeeds.  Data is in the form in which CoE transfers it (ETG.1000.6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from eap.codec import pdo
+from eap.od.abort import AbortCode, SdoAbortError
+from eap.od.model import Access, Entry, OdObject, OdState
+
+
+class ObjectDictionary:
+    """The objects of one device, by index."""
+
+    def __init__(self, objects: Iterable[OdObject] = ()) -> None:
+        self._objects: dict[int, OdObject] = {}
+        for item in objects:
+            self.add(item)
+
+    def add(self, item: OdObject) -> None:
+        """Add an object or put it in the place of the one of its index."""
+        self._objects[item.index] = item
+
+    def remove(self, index: int) -> None:
+        """Remove the object at *index*, if there is one."""
+        self._objects.pop(index, None)
+
+    def __contains__(self, index: int) -> bool:
+        return index in self._objects
+
+    def __getitem__(self, index: int) -> OdObject:
+        """Return the object at *index*; refuse with NO_OBJECT."""
+        try:
+            return self._objects[index]
+        except KeyError:
+            raise SdoAbortError(AbortCode.NO_OBJECT, index, 0) from None
+
+    def __iter__(self) -> Iterator[OdObject]:
+        """Yield the objects in the order of their indexes."""
+        return (self._objects[index] for index in sorted(self._objects))
+
+    def __len__(self) -> int:
+        return len(self._objects)
+
+    def entry(self, index: int, subindex: int) -> Entry:
+        """Return one entry; refuse gaps with NOT_STORED, what lies behind with NO_SUBINDEX."""
+        item = self[index]
+        try:
+            return item.entries[subindex]
+        except KeyError:
+            gap = subindex <= item.max_subindex
+            code = AbortCode.NOT_STORED if gap else AbortCode.NO_SUBINDEX
+            raise SdoAbortError(code, index, subindex) from None
+
+    def upload(self, index: int, subindex: int, state: OdState) -> bytes:
+        """Return the octets of one entry as a client in *state* may read them."""
+        entry = self.entry(index, subindex)
+        _check_readable(entry, index, subindex, state)
+        return entry.octets
+
+    def download(self, index: int, subindex: int, data: bytes, state: OdState) -> None:
+        """Write the octets of one entry."""
+        entry = self.entry(index, subindex)
+        _check_writable(entry, index, subindex, state)
+        _check_value(entry, index, subindex, data)
+        _store(entry, index, subindex, data)
+
+    def upload_complete(self, index: int, first: int, state: OdState) -> bytes:
+        """Return a whole object from subindex *first* (0 or 1) on; subindex 0 takes 16 bits.
+
+        Gaps and entries that may not be read now are left out, and are zero, respectively.
+        """
+        chosen = self._whole(index, first)
+        plan = pdo.layout([entry.kind for _, entry in chosen])
+        data = bytearray(plan.size)
+        for (_, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
+            if entry.access & state.read_right:
+                _put_bits(data, bit_offset, entry)
+        return bytes(_count_word(self[index]) + data if first == 0 else data)
+
+    def download_complete(self, index: int, first: int, data: bytes, state: OdState) -> None:
+        """Write a whole object from subindex *first* on; read-only entries are passed over.
+
+        All values are checked before the first is stored.
+        """
+        chosen = self._whole(index, first)
+        if first == 0:
+            data = data[2:]
+        plan = pdo.layout([entry.kind for _, entry in chosen])
+        if len(data) != plan.size:
+            short = len(data) < plan.size
+            code = AbortCode.TOO_SHORT if short else AbortCode.TOO_LONG
+            raise SdoAbortError(
+                code, index, first, f"{len(data)} octets for entries of {plan.size}"
+            )
+        accepted = []
+        for (subindex, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
+            if not entry.access & state.write_right:
+                continue
+            octets = _take_bits(data, bit_offset, entry)
+            _check_value(entry, index, subindex, octets)
+            accepted.append((subindex, entry, octets))
+        if not accepted:
+            writable = any(entry.access & Access.WRITE_ANY for _, entry in chosen)
+            code = AbortCode.DEVICE_STATE if writable else AbortCode.READ_ONLY
+            raise SdoAbortError(code, index, first)
+        for subindex, entry, octets in accepted:
+            _store(entry, index, subindex, octets)
+
+    def _whole(self, index: int, first: int) -> list[tuple[int, Entry]]:
+        item = self[index]
+        if not item.complete_access:
+            raise SdoAbortError(AbortCode.NO_COMPLETE_ACCESS, index, first)
+        if first > 1:
+            raise SdoAbortError(
+                AbortCode.UNSUPPORTED_ACCESS, index, first, "complete access starts at 0 or 1"
+            )
+        last = item.max_subindex
+        return [(sub, entry) for sub, entry in item.entries.items() if 1 <= sub <= last]
+
+
+def _count_word(item: OdObject) -> bytes:
+    return bytes((item.max_subindex, 0))
+
+
+def _check_readable(entry: Entry, index: int, subindex: int, state: OdState) -> None:
+    if not entry.access & state.read_right:
+        readable = entry.access & Access.READ_ANY
+        code = AbortCode.DEVICE_STATE if readable else AbortCode.WRITE_ONLY
+        raise SdoAbortError(code, index, subindex)
+
+
+def _check_writable(entry: Entry, index: int, subindex: int, state: OdState) -> None:
+    if not entry.access & state.write_right:
+        writable = entry.access & Access.WRITE_ANY
+        code = AbortCode.DEVICE_STATE if writable else AbortCode.READ_ONLY
+        raise SdoAbortError(code, index, subindex)
+
+
+def _check_value(entry: Entry, index: int, subindex: int, data: bytes) -> None:
+    size = entry.kind.size
+    if len(data) > size:
+        raise SdoAbortError(
+            AbortCode.TOO_LONG, index, subindex, f"{len(data)} octets for {entry.kind.text}"
+        )
+    if len(data) < size and not entry.is_text:
+        raise SdoAbortError(
+            AbortCode.TOO_SHORT, index, subindex, f"{len(data)} octets for {entry.kind.text}"
+        )
+    if entry.minimum is None and entry.maximum is None:
+        return
+    value = entry.kind.decode(data, 0)
+    if not isinstance(value, (int, float)):
+        return
+    if entry.maximum is not None and value > entry.maximum:
+        raise SdoAbortError(AbortCode.TOO_HIGH, index, subindex, f"{value} > {entry.maximum}")
+    if entry.minimum is not None and value < entry.minimum:
+        raise SdoAbortError(AbortCode.TOO_LOW, index, subindex, f"{value} < {entry.minimum}")
+
+
+def _store(entry: Entry, index: int, subindex: int, data: bytes) -> None:
+    if entry.write is not None:
+        try:
+            entry.write(data)
+        except ValueError as exc:
+            raise SdoAbortError(AbortCode.VALUE, index, subindex, str(exc)) from None
+    entry.octets = data
+
+
+def _put_bits(data: bytearray, bit_offset: int, entry: Entry) -> None:
+    offset, bit = divmod(bit_offset, 8)
+    octets = entry.octets
+    if not entry.kind.is_bits:
+        data[offset : offset + len(octets)] = octets
+        return
+    value = (octets[0] & (1 << entry.kind.bit_length) - 1) << bit
+    data[offset] |= value & 0xFF
+    if value > 0xFF:
+        data[offset + 1] |= value >> 8
+
+
+def _take_bits(data: bytes, bit_offset: int, entry: Entry) -> bytes:
+    offset, bit = divmod(bit_offset, 8)
+    if not entry.kind.is_bits:
+        octets = data[offset : offset + entry.kind.size]
+        return octets.rstrip(b"\0") if entry.is_text else octets
+    word = int.from_bytes(data[offset : offset + 2], "little") >> bit
+    return bytes((word & (1 << entry.kind.bit_length) - 1,))
