@@ -1,0 +1,113 @@
+"""What a process may become, asked of real processes: the test's own must stay as it is."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.net
+
+REPORT = """
+import gc, json, os, sys
+from eap.net import realtime
+{before}
+report = realtime.prepare({priority}, {cpus})
+report["gc"] = gc.isenabled()
+report["frozen"] = gc.get_freeze_count() > 0
+report["policy"] = os.sched_getscheduler(0)
+report["affinity"] = sorted(os.sched_getaffinity(0))
+print(json.dumps(report))
+"""
+CHILD = """
+import signal, sys, time
+from eap.net import realtime
+realtime.die_with_parent(int(sys.argv[1]), signal.SIGTERM)
+print("alive", flush=True)
+time.sleep(30)
+"""
+PARENT = f"""
+import os, subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", {CHILD!r}, str(os.getpid())])
+print(child.pid, flush=True)
+child.wait()
+"""
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+
+
+def prepare(priority=50, cpus="()", before="", prefix=()):
+    script = REPORT.format(priority=priority, cpus=cpus, before=before)
+    done = subprocess.run(
+        [*prefix, sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout)
+
+
+@pytest.mark.root
+@as_root
+def test_root_gets_everything():
+    report = prepare(cpus="(0,)")
+    assert report["scheduler"] == "fifo 50"
+    assert report["policy"] == os.SCHED_FIFO
+    assert report["cpus"] == report["affinity"] == [0]
+    assert report["memory_locked"] is True
+    assert report["timer_slack_ns"] in {0, 1}  # 0 from Linux 6.12 on for a real-time process
+    assert report["pm_qos"] is True or "/dev/cpu_dma_latency" in report["pm_qos"]
+    assert (report["gc"], report["frozen"]) == (False, True)
+
+
+@pytest.mark.root
+@as_root
+def test_ordinary_user_gets_reasons():
+    before = (
+        "import resource\n"
+        "resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))\n"
+        "resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))"
+    )
+    # The user may not see this tree: everything is imported before it becomes one.
+    drop = "os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)"
+    report = prepare(before=f"{before}\n{drop}")
+    assert report["scheduler"].startswith("other: needs CAP_SYS_NICE")
+    assert report["policy"] == os.SCHED_OTHER
+    assert report["memory_locked"].endswith("(ulimit -l is 64 kB)")
+    assert report["pm_qos"] is True or "/dev/cpu_dma_latency" in report["pm_qos"]
+    assert report["timer_slack_ns"] == 1
+    assert report["gc"] is False
+
+
+def test_wrong_processor_and_priority_are_reported():
+    report = prepare(priority=0, cpus="(4095,)")
+    assert report["scheduler"] == "other: not asked for"
+    assert report["cpus"] == "Invalid argument: [4095]"
+    report = prepare(priority=1000)
+    assert report["scheduler"] == "other: Invalid argument (priority 1000)"
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_child_dies_with_its_parent():
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE) as parent:
+        child = int(parent.stdout.readline())
+        assert parent.stdout.readline() == b"alive\n"
+        parent.kill()
+        parent.wait()
+        limit = time.monotonic() + 5
+        while is_alive(child) and time.monotonic() < limit:
+            time.sleep(0.01)
+        assert not is_alive(child)
+
+
+def test_child_of_a_parent_already_gone_ends_at_once():
+    done = subprocess.run([sys.executable, "-c", CHILD, "1"], capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (-signal.SIGTERM, b"")
