@@ -1,0 +1,116 @@
+"""From specifications and descriptors to a running engine: the graph of objects of one process."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Protocol
+
+from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.appliance.runtime import ApplianceFolder
+from eap.ids import InterfaceUri
+from eap.net.image_file import ImageFile, create_image
+from eap.net.loopback import LoopbackLines
+from eap.net.mmsg import ReceiveBatch
+from eap.net.udp import UdpChannel
+from eap.pd.engine import Engine
+from eap.pd.layout import plan_layout
+from eap.pd.link import Channel, Taker
+from eap.pd.spec import PortKind, PortSpec, Wake
+from eap.pd.station import Station
+from eap.pd.words import StationWord
+
+
+class SocketChannel(Channel, Protocol):
+    """A channel over a descriptor."""
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when a frame waits."""
+
+
+class EnginePlant:
+    """All stations of one engine process, with their images and channels.
+
+    Attributes:
+        engine: Runs them.
+        arrival_fds: Descriptors to wake up for, besides the cycle.
+    """
+
+    def __init__(self, handover: Handover) -> None:
+        self.arrival_fds: list[int] = []
+        self._resources = ExitStack()
+        self._handover = handover
+        folder = ApplianceFolder(Path(handover.folder))
+        self._files: dict[str, ImageFile] = {}
+        self._stations: dict[str, Station] = {}
+        self._batch = ReceiveBatch()
+        self._on_arrival: list[Channel] = []
+        for spec in handover.stations:
+            file = create_image(folder.image(spec.name), plan_layout(spec))
+            self._resources.callback(file.close)
+            self._files[spec.name] = file
+            self._stations[spec.name] = Station(spec, file.image, file.wake_waiters)
+        self._open_lines()
+        for shared in handover.sockets:
+            if shared.kind is not SocketKind.TCP:
+                self._open_shared(shared)
+        self.engine = Engine(list(self._stations.values()))
+        self.engine.drain_on_arrival(self._on_arrival)
+
+    def start(self, now_ns: int) -> None:
+        """Bring all stations to Op, and let programs that attach see who runs them."""
+        for file in self._files.values():
+            file.image.words[StationWord.ENGINE_PID] = os.getpid()
+        self.engine.start(now_ns)
+
+    def stop(self) -> None:
+        """Bring all stations out of Op and wake who waits for a cycle that will not come."""
+        self.engine.stop()
+        for file in self._files.values():
+            file.image.words[StationWord.ENGINE_PID] = 0
+            file.wake_waiters()
+
+    def close(self) -> None:
+        """Let go of all sockets and images."""
+        self._resources.close()
+
+    def _open_lines(self) -> None:
+        """Connect the ports that stay in this process."""
+        lines = LoopbackLines()
+        for name, port in self._ports():
+            uri = InterfaceUri.parse(port.interface)
+            if port.kind is PortKind.EAP and uri.scheme == "loop":
+                channel = lines.open(uri)
+                channel.takers.append(self._taker(name))
+                self._stations[name.station].connect(port.name, channel)
+
+    def _open_shared(self, shared: SharedSocket) -> None:
+        channel = UdpChannel(
+            socket.socket(fileno=shared.engine_fd),
+            self._batch,
+            [self._taker(owner) for owner in shared.owners],
+        )
+        self._resources.callback(channel.close)
+        for owner in shared.owners:
+            station = self._stations[owner.station]
+            if shared.kind is SocketKind.UDP:
+                station.connect(owner.port, channel)
+            else:
+                station.drain_also(channel)
+        self._wake_on_arrival(shared.owners, channel)
+
+    def _wake_on_arrival(self, owners: Iterable[PortName], channel: SocketChannel) -> None:
+        if any(self._handover.port(owner).wake is Wake.ARRIVAL for owner in owners):
+            self._on_arrival.append(channel)
+            self.arrival_fds.append(channel.fileno())
+
+    def _taker(self, name: PortName) -> Taker:
+        return self._stations[name.station].takers[name.port]
+
+    def _ports(self) -> Iterable[tuple[PortName, PortSpec]]:
+        for station in self._handover.stations:
+            for port in station.ports:
+                yield PortName(station.name, port.name), port

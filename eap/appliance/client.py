@@ -1,0 +1,185 @@
+"""The synchronous side of the control protocol: what the command line talks with."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from eap.appliance.control import (
+    MAX_LINE,
+    ErrorCode,
+    Reply,
+    decode_reply,
+    encode_request,
+)
+from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_appliances, runtime_root
+from eap.errors import ControlError
+
+TIMEOUT_S = 10.0
+"""Patience for one answer: services may be on their way back from a restart."""
+
+
+class Client:
+    """One connection to one running appliance."""
+
+    def __init__(self, connection: socket.socket, info: ApplianceInfo) -> None:
+        self.info = info
+        self._socket = connection
+        self._socket.settimeout(TIMEOUT_S)
+        self._reader = connection.makefile("rb")
+        self._last_id = 0
+
+    def request(self, method: str, **params: Any) -> Any:
+        """Return the result of *method*.
+
+        Raises:
+            ControlError: the appliance refused, or does not answer.
+        """
+        self._last_id += 1
+        try:
+            self._socket.sendall(encode_request(self._last_id, method, params))
+        except OSError as exc:
+            raise self._gone(exc) from None
+        while True:
+            reply = self._next_reply()
+            if reply.subscription is None:
+                return reply.result
+
+    def events(self, **params: Any) -> Iterator[dict[str, Any]]:
+        """Subscribe with *params* and yield each event until the appliance goes.
+
+        Nothing else is asked on this connection meanwhile.
+
+        Raises:
+            ControlError: the appliance refused, went away, or cannot read the values now.
+        """
+        self.request("subscribe", **params)
+        self._socket.settimeout(None)
+        while True:
+            event = self._next_reply().event
+            if event is None:
+                continue
+            if failure := event.get("error"):
+                raise ControlError(failure["message"], code=failure["code"])
+            yield event
+
+    def close(self) -> None:
+        """Hang up."""
+        self._reader.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _next_reply(self) -> Reply:
+        try:
+            line = self._reader.readline(MAX_LINE)
+        except OSError as exc:
+            raise self._gone(exc) from None
+        if not line:
+            raise self._gone(None)
+        reply = decode_reply(line)
+        if reply.error is not None:
+            raise ControlError(reply.error.message, code=reply.error.code)
+        return reply
+
+    def _gone(self, cause: OSError | None) -> ControlError:
+        why = str(cause) if cause else "it closed the connection"
+        return ControlError(
+            f"appliance {self.info.plant} (process {self.info.supervisor}) does not answer: {why}",
+            code=ErrorCode.UNAVAILABLE,
+        )
+
+
+def connect(plant: str | None = None, station: str | None = None) -> list[Client]:
+    """Connect to all running appliances, or to those that run *plant* or *station*.
+
+    Raises:
+        ControlError: there is none; the message says which others run, and where it looked.
+    """
+    running = list(_running())
+    chosen = [
+        (folder, info)
+        for folder, info in running
+        if (not plant or info.plant == plant) and (not station or station in info.stations)
+    ]
+    if not chosen:
+        raise _none_runs(plant, station, [info for _, info in running])
+    clients: list[Client] = []
+    try:
+        for folder, info in chosen:
+            clients.append(_connect_one(folder, info))
+    except ControlError:
+        for client in clients:
+            client.close()
+        raise
+    return clients
+
+
+def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return one answer for several appliances.
+
+    *processes* are those of the first; *appliances* lists all, each with its plant, its stations'
+    names and its processes.
+    """
+    appliances = [
+        {
+            "plant": answer["plant"],
+            "stations": [station["name"] for station in answer["stations"]],
+            "processes": answer["processes"],
+        }
+        for answer in answers
+    ]
+    return {
+        "version": answers[0]["version"],
+        "processes": answers[0]["processes"],
+        "stations": [station for answer in answers for station in answer["stations"]],
+        "appliances": appliances,
+    }
+
+
+def _running() -> Iterator[tuple[ApplianceFolder, ApplianceInfo]]:
+    for folder in find_appliances():
+        try:
+            yield folder, folder.read_info()
+        except (OSError, msgspec.MsgspecError):
+            continue  # it is starting, or of another release: nothing to talk to yet
+
+
+def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> Client:
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connection.settimeout(TIMEOUT_S)
+    try:
+        connection.connect(str(folder.control_socket))
+    except OSError as exc:
+        connection.close()
+        raise ControlError(
+            f"appliance {info.plant} (process {info.supervisor}) cannot be reached at"
+            f" {folder.control_socket}: {exc.strerror}",
+            code=ErrorCode.UNAVAILABLE,
+        ) from None
+    return Client(connection, info)
+
+
+def _none_runs(
+    plant: str | None, station: str | None, running: Sequence[ApplianceInfo]
+) -> ControlError:
+    wanted = f"station {station}" if station else f"plant {plant}" if plant else "appliance"
+    if running:
+        others = ", ".join(f"{info.plant} ({', '.join(info.stations)})" for info in running)
+        hint = f"running are {others}"
+    else:
+        hint = f"start one with 'eapctl run PLANT' (looked in {runtime_root()})"
+    return ControlError(f"no {wanted} runs: {hint}", code=ErrorCode.UNAVAILABLE)

@@ -1,0 +1,82 @@
+"""What the services process turned away, by station and reason, in a file that survives it."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Sequence
+from enum import StrEnum, auto
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+
+class Refusal(StrEnum):
+    """Why services did not take a frame or a connection."""
+
+    MAILBOX = auto()
+    """Type 5, and nothing in this release answers it."""
+    STALE = auto()
+    """It had waited in its socket since before services started."""
+    WRONG_TYPE = auto()
+    """Neither type 4 nor type 5."""
+    TRUNCATED = auto()
+    """Shorter than a frame header."""
+    TCP_OFF = auto()
+    """A type-4 connection to a station none of whose ports says ``tcp: true``."""
+    TCP_SILENT = auto()
+    """A connection that sent no frame header in time."""
+    TCP_FULL = auto()
+    """More connections than there is room for."""
+    ENGINE_BUSY = auto()
+    """The engine did not take a connection that was meant for it."""
+
+
+_REFUSALS = tuple(Refusal)
+_COLUMN = {reason: index for index, reason in enumerate(_REFUSALS)}
+
+
+class DiscardCounters:
+    """One 64-bit word for each station and reason; services is the only writer."""
+
+    def __init__(self, path: Path, stations: Sequence[str]) -> None:
+        size = 8 * len(_REFUSALS) * max(1, len(stations))
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            os.ftruncate(fd, size)
+            self._map = mmap.mmap(fd, size)
+        finally:
+            os.close(fd)
+        self._words = memoryview(self._map).cast("Q")
+        self._row = {name: row * len(_REFUSALS) for row, name in enumerate(stations)}
+
+    def count(self, station: str, reason: Refusal, number: int = 1) -> None:
+        """Add *number* to one counter."""
+        self._words[self._row[station] + _COLUMN[reason]] += number
+
+    def stats(self) -> dict[str, dict[str, int]]:
+        """Return all counters that are not zero, by station."""
+        return {
+            name: {
+                str(reason): self._words[row + column]
+                for reason, column in _COLUMN.items()
+                if self._words[row + column]
+            }
+            for name, row in self._row.items()
+        }
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._words.release()
+        self._map.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,98 @@
+"""The engine process: the cycles of all stations of an appliance, and nothing beside them.
+
+It is started by the supervisor with one argument, the descriptor of its handover.  Once it runs it
+makes nothing that the garbage collector would look for, does not log and waits for nobody.
+"""
+
+from __future__ import annotations
+
+import gc
+import signal
+import socket
+import sys
+from time import monotonic_ns
+
+from eap.appliance.build import EnginePlant
+from eap.appliance.handover import EngineOptions, Handover, tell_ready
+from eap.appliance.passing import take_connection
+from eap.errors import ConfigError, EapError, EnvironmentalError
+from eap.net import realtime
+from eap.net.ticker import Ticker
+
+LINK_PERIOD_NS = 20_000_000
+"""How often the engine looks whether services has passed it a connection: at most one a look."""
+
+
+class StopFlag:
+    """Set by SIGTERM; looked at once a cycle."""
+
+    def __init__(self) -> None:
+        self.is_set = False
+        signal.signal(signal.SIGTERM, self._set)
+
+    def _set(self, number: int, frame: object) -> None:
+        self.is_set = True
+
+
+def run_cycles(plant: EnginePlant, link: socket.socket, stop: StopFlag) -> None:
+    """Run every cycle when it is due, until *stop* is set."""
+    engine = plant.engine
+    look_ns = 0
+    ticker = Ticker()
+    try:
+        for fd in plant.arrival_fds:
+            ticker.register(fd)
+        while not stop.is_set:
+            if not ticker.wait(engine.next_timeout()):
+                engine.receive(monotonic_ns())
+                continue
+            now_ns = monotonic_ns()
+            engine.handle_timeout(now_ns)
+            if now_ns >= look_ns:
+                look_ns = now_ns + LINK_PERIOD_NS
+                if passed := take_connection(link):
+                    plant.add_connection(*passed)
+    finally:
+        ticker.close()
+
+
+def run_engine(handover: Handover) -> None:
+    """Build all stations, say that they run, and run them until SIGTERM."""
+    stop = StopFlag()
+    link = socket.socket(fileno=handover.link_fd)
+    plant = EnginePlant(handover)
+    try:
+        report = _prepare(handover.options)
+        plant.start(monotonic_ns())
+        tell_ready(handover.ready_fd, {"realtime": report})
+        run_cycles(plant, link, stop)
+        plant.stop()
+    finally:
+        plant.close()
+        link.close()
+
+
+def _prepare(options: EngineOptions) -> realtime.Report:
+    if options.realtime:
+        cpus = [options.cpu] if options.cpu >= 0 else []
+        return realtime.prepare(options.priority, cpus)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return {"scheduler": "other: not asked for"}
+
+
+def main() -> int:
+    """Return the exit code: 2 for what this machine or the specification lacks."""
+    handover = Handover.from_descriptor(int(sys.argv[1]))
+    realtime.die_with_parent(handover.supervisor)
+    try:
+        run_engine(handover)
+    except EapError as exc:
+        sys.stderr.write(f"engine: {exc}\n")
+        return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,118 @@
+"""What the supervisor hands down to a process it starts: specifications, descriptors, options.
+
+It travels as JSON in an anonymous file whose descriptor the child inherits, so that its size has no
+limit, nobody else can read it, and nothing is left behind.
+"""
+
+from __future__ import annotations
+
+import os
+from enum import StrEnum
+from typing import Any
+
+import msgspec
+
+from eap.pd.spec import PortSpec, Record, StationSpec
+
+NO_DESCRIPTOR = -1
+
+
+class SocketKind(StrEnum):
+    """How a shared socket is opened."""
+
+    UDP = "udp"
+    """A pair bound to one unicast address, sorted by frame type."""
+    GROUP = "group"
+    """A pair bound to one multicast group, or to the broadcast address, at one interface."""
+    PACKET = "packet"
+    """A pair of AF_PACKET sockets on one Ethernet interface and VLAN."""
+    TCP = "tcp"
+    """One listener, for services."""
+
+
+class PortName(Record, frozen=True, order=True):
+    """A port and its station."""
+
+    station: str
+    port: str
+
+
+class SharedSocket(Record, frozen=True):
+    """One socket, or one pair, that the supervisor opens once and keeps open.
+
+    *address* is an IPv4 address or the name of an Ethernet interface.
+    """
+
+    kind: SocketKind
+    address: str
+    port: int = 0
+    group: str = ""
+    vlan_id: int = 0
+    owners: tuple[PortName, ...] = ()
+    """Whose frames arrive here; several share a group, a broadcast or an Ethernet interface."""
+    engine_fd: int = NO_DESCRIPTOR
+    services_fd: int = NO_DESCRIPTOR
+
+
+class EngineOptions(Record, frozen=True):
+    """How hard the engine tries to be on time."""
+
+    realtime: bool = True
+    """Ask for SCHED_FIFO, locked memory and PM QoS; what is not permitted is reported."""
+    cpu: int = -1
+    """Run on this processor only; -1 on any."""
+    priority: int = 50
+    """Of SCHED_FIFO, 1 to 99."""
+
+
+class Handover(Record, frozen=True):
+    """All that a child gets; a descriptor that it does not need is NO_DESCRIPTOR."""
+
+    supervisor: int
+    """Process id: a child whose parent is another one has been orphaned."""
+    folder: str
+    """The appliance's runtime folder."""
+    plant: str
+    plant_file: str
+    stations: tuple[StationSpec, ...]
+    sockets: tuple[SharedSocket, ...]
+    ready_fd: int = NO_DESCRIPTOR
+    link_fd: int = NO_DESCRIPTOR
+    """This side of the SOCK_SEQPACKET pair between engine and services."""
+    control_fd: int = NO_DESCRIPTOR
+    options: EngineOptions = EngineOptions()
+
+    def port(self, name: PortName) -> PortSpec:
+        """Return the specification of one port."""
+        return next(
+            port
+            for station in self.stations
+            if station.name == name.station
+            for port in station.ports
+            if port.name == name.port
+        )
+
+    def to_descriptor(self) -> int:
+        """Return the descriptor of a file that holds this; the caller closes it."""
+        fd = os.memfd_create("eap-handover", os.MFD_CLOEXEC)
+        with os.fdopen(os.dup(fd), "wb") as file:
+            file.write(msgspec.json.encode(self))
+        return fd
+
+    @classmethod
+    def from_descriptor(cls, fd: int) -> Handover:
+        """Read what ``to_descriptor`` wrote, and close *fd*."""
+        with os.fdopen(fd, "rb") as file:
+            file.seek(0)
+            return msgspec.json.decode(file.read(), type=cls)
+
+
+def tell_ready(fd: int, report: dict[str, Any]) -> None:
+    """Say that this process runs, with a *report* for ``status``; close *fd*."""
+    os.write(fd, msgspec.json.encode(report) + b"\n")
+    os.close(fd)
+
+
+def decode_report(line: bytes) -> dict[str, Any]:
+    """Read what ``tell_ready`` wrote."""
+    return msgspec.json.decode(line, type=dict[str, Any])

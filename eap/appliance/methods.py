@@ -1,0 +1,249 @@
+"""What the control protocol can be asked for, answered from the process images.
+
+Rule: nothing here waits.  An image is read by copying, a value is written under the lock that also
+keeps user programs apart, and the engine notices neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
+from typing import Any, TypeVar
+
+import msgspec
+
+from eap.appliance import control
+from eap.appliance.control import VERSION, ErrorCode
+from eap.codec import datatypes
+from eap.errors import ControlError, WriterConflictError
+from eap.net.image_file import ImageFile
+from eap.pd.image import Image
+from eap.pd.layout import VariablePlace
+from eap.pd.report import pd_list, quality
+from eap.pd.spec import Writer
+from eap.pd.words import RxWord, StationWord
+
+MIN_PERIOD_MS = 10
+
+ParametersT = TypeVar("ParametersT", bound=control.Parameters)
+
+
+class Methods:
+    """All methods but the two that belong to a connection (subscribe, unsubscribe).
+
+    Args:
+        identity: What ``hello`` says beside the protocol's version.
+        files: The process image of each station.
+        status: Makes the answer to ``status``.
+        stop: Asks the appliance to end.
+    """
+
+    def __init__(
+        self,
+        identity: Mapping[str, Any],
+        files: Mapping[str, ImageFile],
+        *,
+        status: Callable[[], dict[str, Any]],
+        stop: Callable[[], None],
+    ) -> None:
+        self._identity = identity
+        self._files = files
+        self._status = status
+        self._stop = stop
+        self._methods: dict[str, Callable[[dict[str, Any]], Any]] = {
+            "hello": self._hello,
+            "status": self._get_status,
+            "pd_list": self._pd_list,
+            "variables": self._variables,
+            "read": self._read,
+            "write": self._write,
+            "stop": self._ask_to_stop,
+        }
+
+    def call(self, method: str, params: dict[str, Any]) -> Any:
+        """Return the result of one method; raise ControlError or ImageError if it is not done."""
+        try:
+            function = self._methods[method]
+        except KeyError:
+            known = [*self._methods, "subscribe", "unsubscribe"]
+            raise ControlError(
+                f"no method {method!r}{_near(method, known)}", code=ErrorCode.UNKNOWN_METHOD
+            ) from None
+        return function(params)
+
+    def watch(self, params: dict[str, Any]) -> Watch:
+        """Check the parameters of ``subscribe`` and return what makes its events."""
+        wanted = parameters(params, control.SubscribeParameters)
+        if wanted.period_ms < MIN_PERIOD_MS:
+            raise ControlError(
+                f"period_ms is {wanted.period_ms}, the shortest is {MIN_PERIOD_MS}: user programs"
+                f" that need each cycle attach to the process image",
+                code=ErrorCode.BAD_REQUEST,
+            )
+        image = self._image(wanted.station)
+        places = _places(image, wanted.names)
+        return Watch(image, places, wanted.period_ms, only_changes=wanted.on == "change")
+
+    def _hello(self, params: dict[str, Any]) -> dict[str, Any]:
+        parameters(params, control.NoParameters)
+        return {"version": VERSION, **self._identity, "stations": list(self._files)}
+
+    def _get_status(self, params: dict[str, Any]) -> dict[str, Any]:
+        parameters(params, control.NoParameters)
+        return self._status()
+
+    def _pd_list(self, params: dict[str, Any]) -> list[dict[str, Any]]:
+        wanted = parameters(params, control.PdListParameters).station
+        names = [wanted] if wanted else list(self._files)
+        return [{"station": name, **pd} for name in names for pd in pd_list(self._image(name))]
+
+    def _variables(self, params: dict[str, Any]) -> list[dict[str, Any]]:
+        image = self._image(parameters(params, control.VariablesParameters).station)
+        return [
+            {
+                "name": place.name,
+                "type": place.type,
+                "writer": place.writer,
+                "unit": place.unit,
+                "comment": place.comment,
+            }
+            for place in image.layout.variables
+        ]
+
+    def _read(self, params: dict[str, Any]) -> dict[str, Any]:
+        wanted = parameters(params, control.ReadParameters)
+        image = self._image(wanted.station)
+        return _snapshot(image, _places(image, wanted.names))
+
+    def _write(self, params: dict[str, Any]) -> dict[str, Any]:
+        wanted = parameters(params, control.WriteParameters)
+        file = self._file(wanted.station)
+        places = _places(file.image, wanted.values)
+        values = {place.name: _checked(place, wanted.values[place.name]) for place in places}
+        try:
+            file.acquire_writer(Writer.APPLICATION)
+        except WriterConflictError as exc:
+            raise ControlError(str(exc), code=ErrorCode.REFUSED) from None
+        try:
+            with file.image.writing(Writer.APPLICATION):
+                for name, value in values.items():
+                    file.image.write(name, value)
+        finally:
+            file.release_writer(Writer.APPLICATION)
+        return {"written": len(values)}
+
+    def _ask_to_stop(self, params: dict[str, Any]) -> dict[str, Any]:
+        parameters(params, control.NoParameters)
+        self._stop()
+        return {"stopping": True}
+
+    def _image(self, station: str) -> Image:
+        return self._file(station).image
+
+    def _file(self, station: str) -> ImageFile:
+        try:
+            return self._files[station]
+        except KeyError:
+            raise ControlError(
+                f"no station {station!r} here{_near(station, self._files)}",
+                code=ErrorCode.UNKNOWN_NAME,
+            ) from None
+
+
+class Watch:
+    """The events of one subscription; asked every *period_ms* by whoever sends them."""
+
+    def __init__(
+        self,
+        image: Image,
+        places: list[VariablePlace],
+        period_ms: int,
+        *,
+        only_changes: bool,
+    ) -> None:
+        self.period_ms = period_ms
+        self._image = image
+        self._places = places
+        self._only_changes = only_changes
+        self._last: dict[str, Any] = {}
+
+    def next_event(self) -> dict[str, Any] | None:
+        """Return what to send now, None if nothing changed; raise ImageError as a read does."""
+        event = _snapshot(self._image, self._places)
+        if self._only_changes:
+            values = event["values"]
+            changed = {
+                name: value
+                for name, value in values.items()
+                if name not in self._last or self._last[name] != value
+            }
+            self._last = values
+            if not changed:
+                return None
+            event["values"] = changed
+            event["quality"] = {n: q for n, q in event["quality"].items() if n in changed}
+        return event
+
+
+def parameters(params: dict[str, Any], kind: type[ParametersT]) -> ParametersT:
+    """Check *params*; raise ControlError that names the first wrong one."""
+    try:
+        return msgspec.convert(params, kind)
+    except msgspec.ValidationError as exc:
+        raise ControlError(f"params: {exc}", code=ErrorCode.BAD_REQUEST) from None
+
+
+def _snapshot(image: Image, places: list[VariablePlace]) -> dict[str, Any]:
+    """Return the values of *places*; those of one writer belong to one moment."""
+    cycle = image.words[StationWord.CYCLE]
+    values = image.read_all() if len(places) > 1 else {p.name: image.read(p.name) for p in places}
+    plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in places}
+    return {
+        "station": image.layout.station,
+        "cycle": cycle,
+        "values": plain,
+        "quality": _qualities(image, plain),
+    }
+
+
+def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
+    """Return the quality of those of *names* that are received, None before the first time."""
+    qualities: dict[str, int | None] = {}
+    for rx in image.layout.rx:
+        account = image.words[rx.words + RxWord.ACCOUNT]
+        value = quality(image, rx) if image.words[account + RxWord.RECEIVED] else None
+        qualities.update((name, value) for name in rx.variables if name in names)
+    return qualities
+
+
+def _places(image: Image, names: Iterable[str]) -> list[VariablePlace]:
+    """Return the places of *names*, of all variables when there are none."""
+    chosen = list(names)
+    if not chosen:
+        return list(image.layout.variables)
+    unknown = [name for name in chosen if name not in image.places]
+    if unknown:
+        raise ControlError(
+            f"station {image.layout.station} has no variable {unknown[0]!r}"
+            f"{_near(unknown[0], image.places)}",
+            code=ErrorCode.UNKNOWN_NAME,
+        )
+    return [image.places[name] for name in chosen]
+
+
+def _checked(place: VariablePlace, value: Any) -> Any:
+    if place.writer is not Writer.APPLICATION:
+        raise ControlError(
+            f"variable {place.name} is written by the {place.writer}; only variables of the"
+            f" application can be set",
+            code=ErrorCode.REFUSED,
+        )
+    try:
+        return datatypes.parse(place.type).from_plain(value)
+    except ValueError as exc:
+        raise ControlError(f"variable {place.name}: {exc}", code=ErrorCode.VALUE) from None
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    near = get_close_matches(name, list(known), n=1)
+    return f", did you mean {near[0]}?" if near else ""

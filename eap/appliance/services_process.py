@@ -1,0 +1,162 @@
+"""The services process: everything of an appliance that may take its time.
+
+It is started by the supervisor with one argument, the descriptor of its handover.  Whatever happens
+here, the engine goes on: the two share images, and a pair of sockets on which neither waits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+import sys
+from contextlib import ExitStack
+from importlib.metadata import version
+from pathlib import Path
+from time import monotonic_ns
+
+from eap.appliance.control_server import ControlServer
+from eap.appliance.discards import DiscardCounters, Refusal
+from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind, tell_ready
+from eap.appliance.intake import FrameIntake, watch_channel
+from eap.appliance.methods import Methods
+from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.sources import play_sources
+from eap.appliance.status import ProcessMeter, appliance_status
+from eap.appliance.tcp_door import TcpDoor
+from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
+from eap.ids import InterfaceUri
+from eap.net import realtime
+from eap.net.image_file import ImageFile, open_image
+from eap.net.mmsg import ReceiveBatch
+from eap.net.udp import UdpChannel
+
+IMAGE_PATIENCE_S = 15.0
+_IMAGE_PAUSE_S = 0.01
+
+
+class Services:
+    """The objects of one services process, from its start to its end."""
+
+    def __init__(self, handover: Handover, resources: ExitStack) -> None:
+        self._handover = handover
+        self._resources = resources
+        self._folder = ApplianceFolder(Path(handover.folder))
+        self._names = [station.name for station in handover.stations]
+        self._counters = resources.enter_context(
+            DiscardCounters(self._folder.discards, self._names)
+        )
+        self._link = resources.enter_context(socket.socket(fileno=handover.link_fd))
+        self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
+        self._batch = ReceiveBatch()
+        self._stopping = asyncio.Event()
+
+    async def run(self) -> None:
+        """Serve until SIGTERM."""
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
+        files = {name: await self._open_image(name) for name in self._names}
+        self._watch_sockets()
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(ControlServer(self._methods(files)).serve(self._listener))]
+            tasks += [group.create_task(door.serve()) for door in self._doors()]
+            tasks += [
+                group.create_task(play_sources(station, files[station.name]))
+                for station in self._handover.stations
+            ]
+            tell_ready(self._handover.ready_fd, {})
+            await self._stopping.wait()
+            for task in tasks:
+                task.cancel()
+
+    async def _open_image(self, station: str) -> ImageFile:
+        """Open one image; at the first start the engine is just making it."""
+        deadline_ns = monotonic_ns() + int(IMAGE_PATIENCE_S * 1e9)
+        while True:
+            try:
+                return self._resources.enter_context(open_image(self._folder.image(station)))
+            except ImageError:
+                if monotonic_ns() > deadline_ns:
+                    raise
+            await asyncio.sleep(_IMAGE_PAUSE_S)
+
+    def _methods(self, files: dict[str, ImageFile]) -> Methods:
+        meter = ProcessMeter()
+        images = [file.image for file in files.values()]
+        release = version("eap-appliance")
+        identity = {"release": release, "plant": self._handover.plant, "pid": os.getpid()}
+        return Methods(
+            identity,
+            files,
+            status=lambda: appliance_status(
+                self._folder.read_info(), images, self._counters.stats(), meter
+            ),
+            stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
+        )
+
+    def _watch_sockets(self) -> None:
+        now_ns = monotonic_ns()
+        for shared in self._handover.sockets:
+            if shared.kind is SocketKind.TCP:
+                continue
+            intake = FrameIntake(_stations_of(shared), self._counters, now_ns)
+            channel = UdpChannel(
+                socket.socket(fileno=shared.services_fd), self._batch, [intake.take]
+            )
+            self._resources.callback(channel.close)
+            watch_channel(channel)
+
+    def _doors(self) -> list[TcpDoor]:
+        return [
+            TcpDoor(
+                self._resources.enter_context(socket.socket(fileno=shared.services_fd)),
+                tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
+                self._link,
+                _Refusals(self._counters, _stations_of(shared)).count,
+            )
+            for shared in self._handover.sockets
+            if shared.kind is SocketKind.TCP
+        ]
+
+    def _takes_tcp(self, name: PortName) -> bool:
+        port = self._handover.port(name)
+        return port.tcp or InterfaceUri.parse(port.interface).scheme == "tcp"
+
+
+class _Refusals:
+    """Counts connections that were closed, at every station behind the listener."""
+
+    def __init__(self, counters: DiscardCounters, stations: list[str]) -> None:
+        self._counters = counters
+        self._stations = stations
+
+    def count(self, reason: Refusal) -> None:
+        for station in self._stations:
+            self._counters.count(station, reason)
+
+
+def _stations_of(shared: SharedSocket) -> list[str]:
+    return list(dict.fromkeys(owner.station for owner in shared.owners))
+
+
+def main() -> int:
+    """Return the exit code: 2 for what this machine or the specification lacks."""
+    handover = Handover.from_descriptor(int(sys.argv[1]))
+    realtime.die_with_parent(handover.supervisor)
+    logging.basicConfig(format="services: %(message)s", level=logging.INFO)
+    try:
+        with ExitStack() as resources:
+            asyncio.run(_serve(handover, resources))
+    except EapError as exc:
+        sys.stderr.write(f"services: {exc}\n")
+        return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
+    return 0
+
+
+async def _serve(handover: Handover, resources: ExitStack) -> None:
+    await Services(handover, resources).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""``status --json`` of one appliance: its processes from /proc, its stations from their images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns
+from typing import Any
+
+from eap.appliance.runtime import ApplianceInfo, ProcessInfo
+from eap.pd.image import Image
+from eap.pd.report import station_status
+
+VERSION = 1
+MIN_SAMPLE_NS = 200_000_000
+"""Two questions closer than this get the same CPU share: the kernel counts in ticks of 10 ms."""
+
+_TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+class ProcessMeter:
+    """CPU share and memory of processes, by pid, between one question and the next."""
+
+    def __init__(self) -> None:
+        self._samples: dict[int, tuple[int, int, float]] = {}
+
+    def measure(self, pid: int, now_ns: int) -> dict[str, Any]:
+        """Return *cpu* in percent of one core and *rss* in octets, both None for one that is gone.
+
+        The share is that since the last question, or since the process started; *now_ns* is on
+        the clock of process start times (CLOCK_BOOTTIME).
+        """
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
+        except (OSError, IndexError):
+            self._samples.pop(pid, None)
+            return {"cpu": None, "rss": None}
+        used_ns = (int(fields[11]) + int(fields[12])) * _TICK_NS
+        started_ns = int(fields[19]) * _TICK_NS
+        at_ns, before_ns, share = self._samples.get(pid, (started_ns, 0, 0.0))
+        if now_ns - at_ns >= MIN_SAMPLE_NS:
+            share = round(100 * (used_ns - before_ns) / (now_ns - at_ns), 1)
+            self._samples[pid] = (now_ns, used_ns, share)
+        return {"cpu": share, "rss": resident}
+
+
+def appliance_status(
+    info: ApplianceInfo,
+    images: Iterable[Image],
+    discarded: Mapping[str, Mapping[str, int]],
+    meter: ProcessMeter,
+) -> dict[str, Any]:
+    """Return the whole answer; *discarded* is what services turned away, by station."""
+    now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
+    stations = []
+    for image in images:
+        station = station_status(image, monotonic_ns())
+        counts = station["discarded"]
+        for reason, count in discarded.get(image.layout.station, {}).items():
+            if count:
+                counts[reason] = counts.get(reason, 0) + count
+        stations.append(station)
+    engine = _process(info.engine, meter, now_ns)
+    engine["realtime"] = info.engine.report.get("realtime", {})
+    return {
+        "version": VERSION,
+        "plant": info.plant,
+        "processes": {
+            "supervisor": {"pid": info.supervisor, **meter.measure(info.supervisor, now_ns)},
+            "engine": engine,
+            "services": _process(info.services, meter, now_ns),
+        },
+        "stations": stations,
+    }
+
+
+def _process(process: ProcessInfo, meter: ProcessMeter, now_ns: int) -> dict[str, Any]:
+    measured = meter.measure(process.pid, now_ns) if process.pid else {"cpu": None, "rss": None}
+    return {"pid": process.pid or None, **measured, "restarts": process.restarts}
