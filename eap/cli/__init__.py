@@ -1,1 +1,31 @@
-"""Placeholder."""
+"""The ``eapctl`` command: one module a subcommand, imported only when it is used.
+
+The front end owns no plant: it reads plant files, starts an appliance in the foreground, or talks
+to running ones through their control sockets.  ``group`` loads subcommands and is the one place
+where an error becomes a line on stderr and an exit code.
+"""
+
+from __future__ import annotations
+
+import click
+
+from eap.cli.group import LazyGroup
+
+
+@click.group(
+    cls=LazyGroup,
+    commands_at={
+        "check": "eap.cli.check:check",
+        "decode": "eap.cli.decode:decode",
+        "pd": "eap.cli.pd:pd",
+        "run": "eap.cli.run:run",
+        "status": "eap.cli.status:status",
+    },
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(package_name="eap-appliance", message="eapctl %(version)s")
+def main() -> None:
+    """EtherCAT Automation Protocol appliance.
+
+    Exit codes: 0 done, 1 refused or failed, 2 usage, configuration or environment.
+    """

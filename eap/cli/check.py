@@ -1,0 +1,58 @@
+"""``eapctl check``: is this file a plant, and if not, what is wrong with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from eap.cli.group import ExitCode
+from eap.cli.output import write_json, write_text
+from eap.cli.params import PLANT_FILE, json_option
+from eap.cli.words import count
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from eap.config.finding import Finding
+    from eap.config.load import Plant
+
+
+@click.command()
+@click.argument("plant", type=PLANT_FILE)
+@json_option("Print one object: ok, and all findings.")
+@click.pass_context
+def check(ctx: click.Context, plant: Path, as_json: bool) -> None:
+    """Check the plant file PLANT, and say at once all that is wrong with it.
+
+    Exits with 2 when anything is.
+    """
+    from eap.config.load import load  # yaml and msgspec; --help must not wait for them
+
+    result = load(plant)
+    if as_json:
+        write_json({"ok": not result.findings, "findings": result.findings})
+    elif result.plant:
+        write_text(f"{plant}: {summary(result.plant)}")
+    else:
+        report_findings(plant, result.findings)
+    if result.findings:
+        ctx.exit(ExitCode.UNUSABLE)
+
+
+def report_findings(plant: Path, findings: Sequence[Finding]) -> None:
+    """Print *findings* on stderr, one a line, and how many there are."""
+    for finding in findings:
+        click.echo(str(finding), err=True)
+    click.echo(f"{plant}: {count(len(findings), 'finding')}, not a plant yet", err=True)
+
+
+def summary(plant: Plant) -> str:
+    """Return what a plant holds, in numbers."""
+    sent = sum(len(frame.pds) for station in plant.stations for frame in station.frames)
+    received = sum(len(station.subscriptions) for station in plant.stations)
+    return (
+        f"plant {plant.name} is well: {count(len(plant.stations), 'station')},"
+        f" {count(sent, 'PD')} sent, {count(received, 'PD')} received"
+    )

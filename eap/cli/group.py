@@ -1,0 +1,103 @@
+"""The group behind ``eapctl``: subcommands by name, and one way out for every error.
+
+Rule: whatever goes wrong ends as one line on stderr and an exit code, never as a traceback;
+``EAP_DEBUG=1`` shows the traceback above that line.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from enum import IntEnum
+from importlib import import_module
+from typing import Any, NoReturn
+
+import click
+
+from eap.errors import ConfigError, EapError, EnvironmentalError
+
+DEBUG_VARIABLE = "EAP_DEBUG"
+
+
+class ExitCode(IntEnum):
+    """What the shell is told."""
+
+    DONE = 0
+    FAILED = 1
+    """Refused or failed."""
+    UNUSABLE = 2
+    """Usage, configuration or environment."""
+
+
+class LazyGroup(click.Group):
+    """Import a subcommand's module when it is asked for, not before.
+
+    Args:
+        commands_at: ``module:attribute`` of each subcommand.
+        **settings: As ``click.Group`` takes them.
+    """
+
+    def __init__(self, *, commands_at: Mapping[str, str], **settings: Any) -> None:
+        super().__init__(**settings)
+        self._commands_at = commands_at
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Name every subcommand without importing one."""
+        return sorted(self._commands_at)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import one subcommand."""
+        target = self._commands_at.get(cmd_name)
+        if target is None:
+            return None
+        module, _, attribute = target.partition(":")
+        command: click.Command = getattr(import_module(module), attribute)
+        return command
+
+    def main(self, *args: Any, **extra: Any) -> NoReturn:
+        """Run one command line and end the process; takes what ``click.Command.main`` takes."""
+        extra["standalone_mode"] = False
+        try:
+            code = super().main(*args, **extra)
+        except Exception as exc:  # noqa: BLE001  the outermost edge of the process
+            _report(exc)
+            sys.exit(exit_code_of(exc))
+        sys.exit(code if isinstance(code, int) else ExitCode.DONE)
+
+
+def exit_code_of(error: Exception) -> int:
+    """Return the exit code that an error stands for."""
+    if isinstance(error, click.ClickException):
+        return error.exit_code
+    if isinstance(error, (ConfigError, EnvironmentalError)):
+        return ExitCode.UNUSABLE
+    return ExitCode.FAILED
+
+
+def describe(error: Exception) -> str:
+    """Return an error as one line for a person."""
+    if isinstance(error, click.UsageError):
+        command = f"{error.ctx.command_path}: " if error.ctx else ""
+        hint = f" (see '{error.ctx.command_path} --help')" if error.ctx else ""
+        text = f"{command}{error.format_message()}{hint}"
+    elif isinstance(error, click.ClickException):
+        text = error.format_message()
+    elif isinstance(error, click.Abort):
+        text = "interrupted"
+    elif isinstance(error, (EapError, OSError)):
+        text = str(error) or type(error).__name__
+    else:
+        text = f"unexpected {type(error).__name__}: {error} ({DEBUG_VARIABLE}=1 shows where)"
+    return " ".join(text.split())
+
+
+def _report(error: Exception) -> None:
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        error.show()
+        return
+    if os.environ.get(DEBUG_VARIABLE, "0") not in {"", "0"}:
+        import traceback
+
+        traceback.print_exception(error)
+    click.echo(describe(error), err=True)

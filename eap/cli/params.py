@@ -1,0 +1,80 @@
+"""Options and parameter types that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import click
+
+CommandT = TypeVar("CommandT", bound=Callable[..., Any])
+
+PLANT_FILE = click.Path(dir_okay=False, path_type=Path)
+"""A plant file; whether it can be read is for the loader to say, in its own words."""
+
+
+class VariableName(NamedTuple):
+    """A variable of a station, written ``STATION/NAME``."""
+
+    station: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.station}/{self.name}"
+
+
+def json_option(text: str) -> Callable[[CommandT], CommandT]:
+    """Return the decorator that adds ``--json``; *text* says what comes out."""
+    return click.option("--json", "as_json", is_flag=True, help=text)
+
+
+def plant_option(command: CommandT) -> CommandT:
+    """Add ``--plant``, which chooses among running appliances."""
+    return click.option("--plant", metavar="NAME", help="Only the appliance that runs this plant.")(
+        command
+    )
+
+
+def station_option(command: CommandT) -> CommandT:
+    """Add ``--station``, which chooses among running stations."""
+    return click.option("--station", metavar="NAME", help="Only this station.")(command)
+
+
+def parse_names(words: tuple[str, ...]) -> dict[str, list[str]]:
+    """Read ``STATION [VAR…]`` or ``STATION/VAR…``, and return the variables of each station.
+
+    No variables means all of the station's.
+
+    Raises:
+        click.UsageError: a name without a station stands before any station.
+    """
+    names: dict[str, list[str]] = {}
+    current = ""
+    for word in words:
+        station, slash, name = word.partition("/")
+        if slash:
+            if not station or not name:
+                raise click.UsageError(f"{word!r} is not a variable (STATION/NAME)")
+            names.setdefault(station, []).append(name)
+        elif current:
+            names[current].append(word)
+        elif names:
+            raise click.UsageError(
+                f"{word!r} follows {words[0]!r} without its station: write STATION/{word}"
+            )
+        else:
+            current = word
+            names[current] = []
+    return names
+
+
+def parse_assignment(words: tuple[str, ...]) -> tuple[VariableName, str]:
+    """Read ``STATION VAR VALUE`` or ``STATION/VAR VALUE``; raise click.UsageError otherwise."""
+    if len(words) == 3 and "/" not in words[0]:
+        return VariableName(words[0], words[1]), words[2]
+    if len(words) == 2:
+        station, _, name = words[0].partition("/")
+        if station and name:
+            return VariableName(station, name), words[1]
+    raise click.UsageError("expected STATION VAR VALUE (or STATION/VAR VALUE)")

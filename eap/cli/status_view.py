@@ -1,0 +1,172 @@
+"""A status document as tables: processes, stations with their ports, process data, remarks.
+
+Pure: the document of ``eapctl status --json`` in, rich renderables out.  Tables hold what every row
+has; what is rare, and worth a look because it is, follows below them in words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from eap.cli import words
+
+Row = Mapping[str, Any]
+
+_GOOD, _BAD, _DIM = "green", "bold red", "dim"
+_STATE_STYLE = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
+_REASONS = {
+    "cycle": "cyclic",
+    "divider": "divider",
+    "change": "on change",
+    "change_timeout": "resend",
+    "event": "event",
+}
+
+
+def status_tables(document: Row) -> Iterator[RenderableType]:
+    """Yield what to print for a status *document*, top to bottom."""
+    stations = document["stations"]
+    for appliance in document["appliances"]:
+        yield _processes(appliance)
+    yield _stations(stations)
+    yield _process_data(stations)
+    remarks = [remark for station in stations for remark in _remarks(station)]
+    if remarks:
+        yield Text("Worth a look", style="bold")
+        yield from (Padding(Text(remark), (0, 0, 0, 1)) for remark in remarks)
+
+
+def _processes(appliance: Row) -> RenderableType:
+    table = Table(title=f"Plant {appliance['plant']}", title_justify="left", title_style="bold")
+    table.box, table.show_header, table.pad_edge = None, False, True
+    for _ in range(5):
+        table.add_column()
+    for name, process in appliance["processes"].items():
+        if not process["pid"]:
+            table.add_row(name, Text("restarting", style=_BAD))
+            continue
+        cpu, rss = process.get("cpu"), process.get("rss")
+        table.add_row(
+            name,
+            f"process {process['pid']}",
+            "" if cpu is None else f"{cpu:.1f} % of a core",
+            "" if rss is None else f"{rss / 1e6:.0f} MB",
+            Text(", ".join(_process_remarks(process))),
+        )
+    return table
+
+
+def _process_remarks(process: Row) -> Iterator[str]:
+    if restarts := process.get("restarts"):
+        yield f"restarted {words.times(restarts)}"
+    missing = [name for name, has in process.get("realtime", {}).items() if has is False]
+    if missing:
+        yield f"without {', '.join(missing)}".replace("_", " ")
+
+
+def _stations(stations: Sequence[Row]) -> RenderableType:
+    table = _table("Station", "State", "Cycle", "Port", "Interface", "NetID", "Link")
+    for station in stations:
+        own = (
+            station["name"],
+            _state(station["state"]),
+            words.duration(station["cycle_us"]) if "cycle_us" in station else "",
+        )
+        for port in station["ports"] or [{}]:
+            ports = (port.get(key) or "" for key in ("name", "interface", "net_id"))
+            table.add_row(*own, *ports, _state(port.get("link") or ""))
+            own = ("", Text(), "")
+    return table
+
+
+def _process_data(stations: Sequence[Row]) -> RenderableType:
+    table = _table("", "Process data", "State", "Frames", "Lost", "Quality", "Age")
+    table.add_column("Jitter µs\np50 / p99 / max")
+    for column in table.columns[3:]:
+        column.justify, column.no_wrap = "right", True
+    for station in stations:
+        pd = station["pd"]
+        if pd["tx"] or pd["rx"]:
+            table.add_row("", Text(station["name"], style="bold"))
+        for row in pd["tx"]:
+            why = row.get("last_reason") or next(reversed(row["reason"]), "silent")
+            table.add_row("→", row["name"], _REASONS.get(why, why), str(row["sent"]))
+        for row in pd["rx"]:
+            table.add_row(*_received(row))
+    return table
+
+
+def _received(row: Row) -> tuple[RenderableType, ...]:
+    lost, quality, age, jitter = row["lost"], row["quality"], row["age_us"], row["jitter_us"]
+    spread = [jitter[key] for key in ("p50", "p99", "max")]
+    return (
+        "←",
+        row["name"],
+        _state(row["state"]),
+        str(row["received"]),
+        Text("unknown", style=_DIM) if lost is None else Text(str(lost), style=_BAD * bool(lost)),
+        words.quality(quality),
+        "" if age is None else words.duration(age),
+        "" if None in spread else " / ".join(map(str, spread)),
+    )
+
+
+def _remarks(station: Row) -> Iterator[str]:
+    name = station["name"]
+    own = []
+    if overruns := station.get("overruns"):
+        own.append(f"left out {words.count(overruns, 'cycle')}")
+    if torn := station.get("torn"):
+        own.append(f"found {words.count(torn, 'torn write')}")
+    if discarded := _counts(station["discarded"]):
+        own.append(f"turned away: {discarded}")
+    if own:
+        yield f"{name}: {'; '.join(own)}"
+    for row in station["pd"]["tx"]:
+        if remark := "; ".join(_sent_remarks(row)):
+            yield f"{name} → {row['name']}: {remark}"
+    for row in station["pd"]["rx"]:
+        if remark := "; ".join(_received_remarks(row)):
+            yield f"{name} ← {row['name']}: {remark}"
+
+
+def _sent_remarks(row: Row) -> Iterator[str]:
+    if row["skipped"]:
+        yield f"skipped {words.times(row['skipped'])}"
+    if len(row["reason"]) > 1:
+        yield "sent " + ", ".join(
+            f"{_REASONS.get(why, why)} {words.times(count)}" for why, count in row["reason"].items()
+        )
+
+
+def _received_remarks(row: Row) -> Iterator[str]:
+    if row.get("timeouts"):
+        yield f"timed out {words.times(row['timeouts'])}"
+    for key in ("duplicated", "reordered", "late"):
+        if row[key]:
+            yield f"{row[key]} {key}"
+    if discarded := _counts(row["discarded"]):
+        yield f"discarded: {discarded}"
+
+
+def _counts(counts: Row) -> str:
+    words = (f"{count} {reason.replace('_', ' ')}" for reason, count in counts.items() if count)
+    return ", ".join(words)
+
+
+def _state(state: str) -> Text:
+    return Text(state, style=_STATE_STYLE.get(state, ""))
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for heading in headings:
+        table.add_column(heading, overflow="fold", vertical="top")
+    return table
