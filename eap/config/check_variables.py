@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
+from eap.codec.values import DataType
 from eap.config.check_ports import check_names
 from eap.config.finding import Report, near, one_of
 from eap.config.index import Index

@@ -10,7 +10,7 @@ from math import lcm
 from typing import NamedTuple, TypeVar
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
+from eap.codec.values import DataType
 from eap.config.structs import Frame, From, PlantFile, Port, Publish, Station, Subscribe
 from eap.ids import InterfaceUri
 from eap.pd.spec import PortKind

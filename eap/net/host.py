@@ -43,7 +43,7 @@ class Host:
             Measure.UPTIME: lambda _: self._uptime(),
             Measure.PROCESSES: lambda _: self._processes(),
             Measure.CONTEXT_SWITCHES: lambda _: self._stat("ctxt")[0],
-            Measure.TEMPERATURE: lambda zone: self._temperature(zone),
+            Measure.TEMPERATURE: self._temperature,
         }
 
     def read(self, measure: Measure, argument: str = "") -> Number:
