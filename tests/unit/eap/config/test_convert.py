@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "finding"),
+    [
+        (
+            "plant: pair",
+            "plnt: pair",
+            "1: unknown key 'plnt', did you mean 'plant'?; one of plant, stations, defaults",
+        ),
+        ("id: 1,", "id: 70000,", "15: id is 70000; a whole number from 0 to 65535"),
+        ("id: 1,", "id: true,", "15: id is True; a whole number from 0 to 65535"),
+        ("id: 1,", "id: 1.0,", "15: id is 1.0; a whole number from 0 to 65535"),
+        ("id: 1,", "id: ,", "15: id has no value; a whole number from 0 to 65535"),
+        ("id: 1, ", "", "15: 'state' has no id; the key id"),
+        ("timeout_ms: 50", "timeout_ms: [50]", "21: timeout_ms is a list; a whole number of"),
+        ("timeout_ms: 50", "substitute: old", "21: substitute is 'old'; one of hold, zero, defaul"),
+        ("timeout_ms: 50", "foreign: yes", "21: foreign is 'yes'; true or false"),
+        ("{kind: counter}", "{kind: count}", "11: unknown kind 'count', did you mean 'counter'?"),
+        ("{kind: counter}", "{step: 1}", "11: count is a mapping; a mapping with a kind (counter"),
+        ("{kind: counter}", "counter", "11: count is 'counter'; a mapping with a kind (counter"),
+        ("{kind: counter}", "{kind: counter, stp: 2}", "11: unknown key 'stp', did you mean 'step"),
+        ("{kind: counter}", "{kind: counter, variable: x}", "11: unknown key 'variable'"),
+        ("{kind: counter}", "{kind: ramp, low: 0, high: .inf, period_ms: 9}", "11: high is inf"),
+        ("count: UDINT", "count: [UDINT]", "9: count is a list; a mapping with type"),
+        ("default: 2.5", "default: {a: 1}", "8: default is a mapping; a value, or a list"),
+        ("variables: [speed, count]", "variables: speed", "15: variables is 'speed'; a list"),
+        ("    sources:", "    links: []\n    sources:", "10: links (links between ports): this"),
+        ("    sources:", "    routes: []\n    sources:", "10: routes (routes of the AoE router)"),
+        ("    sources:", "    access: []\n    sources:", "10: access (access rules): this version"),
+        ("plant: pair", "plant: pair\ny-note: 1", "2: unknown key 'y-note'; one of plant,"),
+    ],
+)
+def test_what_does_not_fit_is_named_with_its_line(findings, old, new, finding):
+    found = findings((old, new))
+    assert len(found) == 1
+    assert found[0].startswith(finding)
+
+
+def test_keys_of_anchors_are_free_at_the_top(load_plant):
+    assert load_plant(("plant: pair", "plant: pair\nx-note: {any: thing}")).plant is not None
+
+
+def test_empty_lists_and_mappings_may_be_left_blank(load_plant):
+    edits = [("    sources:\n      count: {kind: counter}\n", "    sources:\n")]
+    assert load_plant(*edits).plant is not None
+
+
+def test_numbers_are_texts_where_a_text_is_wanted(load_plant):
+    plant = load_plant(("unit: 1/min", "unit: 1, comment: 2.50")).plant
+    speed = plant.stations[0].variables[0]
+    assert (speed.unit, speed.comment) == ("1", "2.50")
+
+
+def test_errors_of_shape_and_of_sense_are_found_together_and_without_echo(findings):
+    found = findings(
+        ("id: 1,", "id: 70000,"),  # the PD is left out; its subscription is not blamed
+        ("count: UDINT", "count: UDIMT"),
+        ("    sources:", "    sorces:"),
+        ("net_id: 127.0.9.2.1.1", "net_id: 127.0.9.1.1.1"),
+    )
+    assert [line.split(";")[0] for line in found] == [
+        "9: count: 'UDIMT' is not a data type, did you mean UDINT?",
+        "10: unknown key 'sorces', did you mean 'sources'?",
+        "15: id is 70000",
+        "17: NetID 127.0.9.1.1.1 is used twice (first in line 4)",
+    ]
+
+
+def test_a_document_that_is_no_mapping_is_one_finding(tmp_path):
+    from eap.config.load import load
+
+    path = tmp_path / "list.yaml"
+    path.write_text("- plant")
+    [finding] = load(path).findings
+    assert finding.message == "plant is a list"
+    assert finding.expected == "a mapping with plant, stations"

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+from eap.config.finding import Finding, Report, near, one_of
+
+
+def test_a_finding_reads_as_file_line_what_and_what_was_expected():
+    finding = Finding("p.yaml", 7, "stations[0].publish[1].id", "id is 'x'", "a whole number")
+    assert str(finding) == "p.yaml:7: id is 'x'; expected a whole number"
+
+
+def test_a_finding_of_the_whole_file_has_no_line():
+    assert str(Finding("p.yaml", 0, "", "is a directory", "a file")).startswith("p.yaml: is")
+
+
+def test_a_path_without_a_line_of_its_own_has_that_of_what_holds_it():
+    report = Report("p.yaml")
+    report.lines |= {"": 1, "stations[0]": 4, "stations[0].ports[1]": 9}
+    assert report.line_of("stations[0].ports[1].vlan.id") == 9
+    assert report.line_of("stations[0].cycle_us") == 4
+    assert report.line_of("defaults") == 1
+
+
+def test_findings_are_in_the_order_of_the_file_and_told_once():
+    report = Report("p.yaml")
+    report.add("b", "second", "x", line=5)
+    report.add("a", "first", "x", line=2)
+    report.add("c", "second", "x", line=5)
+    assert [(f.line, f.path) for f in report.findings()] == [(2, "a"), (5, "b")]
+
+
+def test_near_suggests_only_what_is_near():
+    assert near("cylce_us", ["cycle_us", "name"]) == ", did you mean 'cycle_us'?"
+    assert near("xyz", ["cycle_us"]) == ""
+
+
+def test_one_of_nothing_says_so():
+    assert one_of(["a", "b"]) == "one of a, b"
+    assert one_of([]) == "none (there are none here)"
