@@ -28,6 +28,7 @@ import eap
 from eap.appliance.attach import AttachedStation
 from eap.appliance.runtime import VARIABLE, runtime_root
 from eap.errors import EapError
+from eap.pd.layout import FRAME_CTRL, VAR_CTRL
 
 PLANT = Path("config/demo.yaml")
 EAPCTL = Path(sys.executable).with_name("eapctl")
@@ -167,7 +168,7 @@ def subscriptions(station: AttachedStation) -> Table:
 def texts(station: AttachedStation) -> Iterator[tuple[str, str]]:
     """Yield the variables that say something to people, as text."""
     for name, value in station.read_all().items():
-        if "." not in name:  # NAME.VarCtrl and NAME.FrameCtrl are for programs
+        if not name.endswith((VAR_CTRL, FRAME_CTRL)):  # bits by which programs hold PDs back
             yield name, as_text(value)
 
 
