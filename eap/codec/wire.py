@@ -123,8 +123,11 @@ def decode(cls, data, offset=0):
     try:
         {words}, = unpack(data, offset)
         return cls({", ".join(reads)})
-    except error as exc:
-        raise TruncatedError(str(exc), layout=cls.__name__, offset=offset) from None
+    except error:
+        there = max(0, len(data) - offset)
+        raise TruncatedError(
+            f"needs {{cls.SIZE}} octets, but {{there}} follow", layout=cls.__name__, offset=offset
+        ) from None
     except ValueError as exc:
         raise MalformedError(str(exc), layout=cls.__name__, offset=offset) from None
 
