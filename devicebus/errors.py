@@ -1,0 +1,102 @@
+"""What can go wrong on the device bus.
+
+EapError
+└── BusError                    something on a bus did not go as asked
+    ├── FrameLostError          a frame did not come back, also not when sent again
+    ├── WorkingCounterError     fewer slaves answered than were addressed
+    ├── IdentityError           a slave is not the one that was expected
+    ├── AlStatusError           a slave refused a state
+    ├── StateTimeoutError       a slave did not reach a state in time
+    ├── SiiError                an EEPROM cannot be read, written or understood
+    ├── MailboxTimeoutError     a slave did not answer in its mailbox
+    ├── MailboxRefusedError     a slave answered with a mailbox error
+    ├── MailboxProtocolError    a slave's answer breaks the protocol
+    ├── SoeError                an SoE server refused
+    ├── FoeError                an FoE server refused
+    └── EoeError                a slave refused an Ethernet setting
+
+A refused SDO is :class:`eap.od.abort.SdoAbortError`.
+"""
+
+from __future__ import annotations
+
+from eap.errors import EapError
+
+
+class BusError(EapError):
+    """Base class of all errors of the device bus."""
+
+
+class FrameLostError(BusError):
+    """A frame did not come back, also not when it was sent again."""
+
+
+class WorkingCounterError(BusError):
+    """Fewer slaves answered a datagram than were addressed."""
+
+    def __init__(self, what: str, expected: int, received: int) -> None:
+        super().__init__(f"{what}: working counter {received}, expected {expected}")
+        self.expected = expected
+        self.received = received
+
+
+class IdentityError(BusError):
+    """A slave is not the one that was expected."""
+
+
+class AlStatusError(BusError):
+    """A slave refused a state; *code* is its AL status code, *state* where it stands now."""
+
+    def __init__(self, message: str, *, code: int, state: int) -> None:
+        super().__init__(message)
+        self.code = code
+        self.state = state
+
+
+class StateTimeoutError(BusError):
+    """A slave did not reach a state within the time the standard gives it."""
+
+
+class SiiError(BusError):
+    """An EEPROM cannot be read, written or understood."""
+
+
+class MailboxTimeoutError(BusError):
+    """A slave did not answer in its mailbox."""
+
+
+class MailboxRefusedError(BusError):
+    """A slave answered with a mailbox error; *detail* as ETG.1000.4 numbers it."""
+
+    def __init__(self, message: str, *, detail: int) -> None:
+        super().__init__(message)
+        self.detail = detail
+
+
+class MailboxProtocolError(BusError):
+    """A slave's answer breaks the protocol: nothing that was read can be trusted."""
+
+
+class SoeError(BusError):
+    """An SoE server refused; *code* as IEC 61800-7-300 numbers it."""
+
+    def __init__(self, message: str, *, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class FoeError(BusError):
+    """An FoE server refused; *code* as ETG.1000.6 numbers it, *text* in its own words."""
+
+    def __init__(self, message: str, *, code: int, text: str = "") -> None:
+        super().__init__(message)
+        self.code = code
+        self.text = text
+
+
+class EoeError(BusError):
+    """A slave refused an Ethernet setting; *result* as ETG.1000.6 numbers it."""
+
+    def __init__(self, message: str, *, result: int) -> None:
+        super().__init__(message)
+        self.result = result

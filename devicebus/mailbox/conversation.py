@@ -1,0 +1,67 @@
+"""A client's side of a mailbox protocol, written as a generator.
+
+    def read_twice() -> Conversation[bytes]:
+        first = yield Ask(MailboxType.COE, request)
+        more = yield Ask(MailboxType.COE, None)      # only listen for another message
+        return first.data + more.data
+
+The runner sends the request, waits, and resumes the generator with the reply.  It throws
+MailboxTimeoutError into it when none comes, MailboxRefusedError when the slave answers with a
+mailbox error, and closes it to cancel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from typing import NamedTuple, TypeAlias, TypeVar
+
+from eap.codec.mailbox import MailboxType
+
+T = TypeVar("T")
+
+RESPONSE_TIMEOUT_NS = 2_000_000_000
+"""How long a slave may take to answer, unless a protocol says otherwise (ESI default)."""
+
+
+def _accept_any(data: bytes) -> bool:
+    del data
+    return True
+
+
+class Ask(NamedTuple):
+    """What a conversation wants next."""
+
+    type: MailboxType
+    data: bytes | None
+    """What to send behind the mailbox header; None only listens."""
+    accepts: Callable[[bytes], bool] = _accept_any
+    """Whether a message of that type answers it; others are late or unsolicited and not for it."""
+    timeout_ns: int = RESPONSE_TIMEOUT_NS
+    delay_ns: int = 0
+    """Wait this long before sending, as after a busy reply."""
+    expects_reply: bool = True
+
+
+class Message(NamedTuple):
+    """A mailbox message without its header."""
+
+    type: MailboxType
+    data: bytes
+
+
+Conversation: TypeAlias = Generator[Ask, Message, T]
+
+
+class Progress:
+    """How far a transfer is; the runner's user may read it at any time.
+
+    Attributes:
+        done: Octets transferred.
+        total: Octets in all, None where the protocol does not tell.
+    """
+
+    __slots__ = ("done", "total")
+
+    def __init__(self, total: int | None = None) -> None:
+        self.done = 0
+        self.total = total

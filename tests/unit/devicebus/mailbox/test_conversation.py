@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress
+from eap.codec.mailbox import MailboxType
+
+
+def twice() -> Conversation[bytes]:
+    first = yield Ask(MailboxType.COE, b"a")
+    second = yield Ask(MailboxType.COE, None, accepts=lambda data: data != b"late")
+    return first.data + second.data
+
+
+def test_a_conversation_is_resumed_with_each_reply() -> None:
+    talk = twice()
+    ask = next(talk)
+    assert (ask.data, ask.accepts(b"anything")) == (b"a", True)
+    ask = talk.send(Message(MailboxType.COE, b"1"))
+    assert (ask.data, ask.accepts(b"late")) == (None, False)
+    with pytest.raises(StopIteration) as end:
+        talk.send(Message(MailboxType.COE, b"2"))
+    assert end.value.value == b"12"
+
+
+def test_progress_starts_at_nothing() -> None:
+    assert (Progress().done, Progress().total, Progress(5).total) == (0, None, 5)
