@@ -13,6 +13,7 @@ import fcntl
 import mmap
 import os
 import struct
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -103,21 +104,26 @@ class ImageFile:
     def wait_cycle(self, cycle: int, timeout_s: float) -> bool:
         """Sleep until the cycle counter differs from *cycle*; return False after *timeout_s*."""
         words = self.image.words
-        seconds = int(timeout_s)
-        limit = (ctypes.c_long * 2)(seconds, int((timeout_s - seconds) * 1e9))
+        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        # The kernel sleeps only while the futex still is what it was before we looked at the
+        # counter; an engine that was killed between the two words must not make us spin.
+        seen = self._futex.value
         while words[StationWord.CYCLE] == cycle:
-            words[StationWord.WAITERS] = 1
-            result = _libc.syscall(
+            remaining_ns = deadline_ns - time.monotonic_ns()
+            if remaining_ns <= 0:
+                return False
+            words[StationWord.WAITERS] = cycle
+            limit = (ctypes.c_long * 2)(*divmod(remaining_ns, 1_000_000_000))
+            _libc.syscall(
                 _SYS_FUTEX,
                 ctypes.byref(self._futex),
                 _FUTEX_WAIT,
-                ctypes.c_uint32(cycle & 0xFFFFFFFF),
+                ctypes.c_uint32(seen),
                 limit,
                 None,
                 0,
             )
-            if result < 0 and ctypes.get_errno() == errno.ETIMEDOUT:
-                return bool(words[StationWord.CYCLE] != cycle)
+            seen = self._futex.value
         return True
 
     def _holder(self, start: int) -> str:
@@ -138,28 +144,18 @@ def create_image(path: Path, layout: ImageLayout) -> ImageFile:
     Raises:
         EnvironmentalError: the folder cannot be written.
     """
-    generation = 1
     try:
         existing = open_image(path)
     except ImageError:
-        pass
-    else:
-        if existing.image.layout == layout:
-            return existing
-        generation = existing.generation + 1
-        existing.image.words[StationWord.RETIRED] = 1
-        existing.wake_waiters()
-        existing.close()
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-        os.ftruncate(descriptor, layout.size)
-        with mmap.mmap(descriptor, 0) as memory, memoryview(memory) as view:
-            _format(view, layout, generation)
-        fresh.rename(path)
-    except OSError as exc:
-        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
-    return ImageFile(path, descriptor)
+        return _make_image(path, layout, 1)
+    if existing.image.layout == layout:
+        return existing
+    fresh = _make_image(path, layout, existing.generation + 1)
+    # Only now: whoever sees the mark opens the path again, and must find the new file there.
+    existing.image.words[StationWord.RETIRED] = 1
+    existing.wake_waiters()
+    existing.close()
+    return fresh
 
 
 def open_image(path: Path) -> ImageFile:
@@ -177,6 +173,24 @@ def open_image(path: Path) -> ImageFile:
     except (ImageError, ValueError) as exc:
         os.close(descriptor)
         raise ImageError(f"{path}: {exc}") from None
+
+
+def _make_image(path: Path, layout: ImageLayout, generation: int) -> ImageFile:
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    except OSError as exc:
+        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
+    try:
+        os.ftruncate(descriptor, layout.size)
+        with mmap.mmap(descriptor, 0) as memory, memoryview(memory) as view:
+            _format(view, layout, generation)
+        fresh.rename(path)
+    except OSError as exc:
+        os.close(descriptor)
+        fresh.unlink(missing_ok=True)
+        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
+    return ImageFile(path, descriptor)
 
 
 def _format(view: memoryview, layout: ImageLayout, generation: int) -> None:

@@ -3,8 +3,9 @@
 Rule 1: PDs that have always arrived together share one account; they part when they first arrive
 apart.  All members of an account have the same history, so the copy that starts the new account
 is exact, and a frame of a hundred PDs costs one account, not a hundred.
-Rule 2: an older counter is a reordered frame and not taken, since newer data is here already, but
-the third in a row is a sender that counts anew, and is taken.
+Rule 2: an older counter is a reordered frame and not taken, since newer data is here already; what
+was counted as lost because of it is not lost any more.  The third in a row that nobody missed is a
+sender that counts anew, and is taken.
 Rule 3: the same counter again counts as duplicated and is taken: some terminals never count.
 """
 
@@ -23,6 +24,9 @@ _LAST_CYCLE = RxWord.LAST_CYCLE - ACCOUNT_START
 _ARRIVED_AT_NS = RxWord.ARRIVED_AT_NS - ACCOUNT_START
 _ARRIVED_IN_CYCLE = RxWord.ARRIVED_IN_CYCLE - ACCOUNT_START
 _BEHIND = RxWord.BEHIND - ACCOUNT_START
+_HOLES = RxWord.HOLES - ACCOUNT_START
+_HOLES_BELOW = RxWord.HOLES_BELOW - ACCOUNT_START
+_SENDER = RxWord.SENDER - ACCOUNT_START
 _JITTER_MAX_US = RxWord.JITTER_MAX_US - ACCOUNT_START
 _JITTER = RxWord.JITTER - ACCOUNT_START
 
@@ -78,6 +82,13 @@ class Account:
     def forget_sender(self) -> None:
         """Let the next frame be the first of a sender: nothing to compare it with."""
         self._words[_LAST_CYCLE] = -1
+        self._words[_HOLES] = 0
+
+    def follow(self, publisher: int) -> None:
+        """Note who sent the frame to be entered next: another sender has another counter."""
+        if self._words[_SENDER] != publisher:
+            self._words[_SENDER] = publisher
+            self.forget_sender()
 
     def time_out(self) -> None:
         """Enter that the sender went quiet."""
@@ -99,23 +110,26 @@ class Account:
         """
         words = self._words
         last = words[_LAST_CYCLE]
+        position = cycle
         if last >= 0:
             elapsed_ns = at_ns - words[_ARRIVED_AT_NS]
             gap = cycle - last & 0xFFFF
             if gap > 0x3FFF or elapsed_ns > self._wrap_ns:
                 gap = self._resolve(gap, elapsed_ns)
             if gap > 0:
+                position = last + gap  # unwrapped, so that holes are told from those of long ago
                 step = self._step
                 if step and gap >= 2 * step:
-                    words[_LOST] += gap // step - 1
+                    self._enter_loss(gap // step - 1, position)
                 if self._sender_cycle_ns:
                     self._enter_jitter(elapsed_ns - gap * self._sender_cycle_ns)
             elif gap == 0:
+                position = last
                 words[_DUPLICATED] += 1
-            elif self._is_reordered(-gap):
+            elif self._is_reordered(last + gap, -gap):
                 return False
         words[_RECEIVED] += 1
-        words[_LAST_CYCLE] = cycle
+        words[_LAST_CYCLE] = position
         words[_ARRIVED_AT_NS] = at_ns
         words[_ARRIVED_IN_CYCLE] = own_cycle
         words[_STATE] = _RUNNING
@@ -128,12 +142,35 @@ class Account:
             return gap - 0x10000 if gap > 0x7FFF else gap
         return gap + 0x10000 * round((elapsed_ns / self._sender_cycle_ns - gap) / 0x10000)
 
-    def _is_reordered(self, behind: int) -> bool:
+    def _enter_loss(self, lost: int, position: int) -> None:
+        """Count what did not come before the frame at *position*, and remember the nearest."""
         words = self._words
-        words[_BEHIND] += 1
-        restarted = behind > REORDER_WINDOW * max(self._step, 1)
-        if restarted or words[_BEHIND] >= RESTARTED_AFTER:
+        words[_LOST] += lost
+        holes = words[_HOLES]
+        if holes:
+            holes <<= min((position - words[_HOLES_BELOW]) // self._step, REORDER_WINDOW)
+        holes |= (1 << min(lost, REORDER_WINDOW)) - 1
+        words[_HOLES] = holes & (1 << REORDER_WINDOW) - 1
+        words[_HOLES_BELOW] = position
+
+    def _fills_hole(self, position: int) -> bool:
+        """Tell whether the frame at *position* was missed; its PD is not lost then."""
+        words = self._words
+        steps, rest = divmod(words[_HOLES_BELOW] - position, self._step or 1)
+        if rest or not 0 < steps <= REORDER_WINDOW or not words[_HOLES] >> steps - 1 & 1:
             return False
+        words[_HOLES] -= 1 << steps - 1
+        words[_LOST] -= 1
+        return True
+
+    def _is_reordered(self, position: int, behind: int) -> bool:
+        words = self._words
+        if not self._fills_hole(position):
+            words[_BEHIND] += 1
+            restarted = behind > REORDER_WINDOW * max(self._step, 1)
+            if restarted or words[_BEHIND] >= RESTARTED_AFTER:
+                words[_HOLES] = 0
+                return False
         words[_REORDERED] += 1
         return True
 

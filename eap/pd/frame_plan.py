@@ -48,9 +48,19 @@ class FramePlan:
         taken_words: First words of the RxPDs that take one of its PDs.
         refused: The PDs that nobody takes.
         roaming: Accounts that follow any publisher.
+        publisher: The frame's, as a number.
     """
 
-    __slots__ = ("end", "expected", "headers", "parts", "refused", "roaming", "taken_words")
+    __slots__ = (
+        "end",
+        "expected",
+        "headers",
+        "parts",
+        "publisher",
+        "refused",
+        "roaming",
+        "taken_words",
+    )
 
     def __init__(
         self,
@@ -58,7 +68,9 @@ class FramePlan:
         pds: Iterable[tuple[bytes, int]],
         taken: Iterable[Taken],
         refused: Iterable[Refused],
+        *,
         roaming: Iterable[Account] = (),
+        publisher: bytes = b"",
     ) -> None:
         """Build the plan from (header without quality, data length) of each PD and their fate."""
         pds = tuple(pds)
@@ -71,6 +83,7 @@ class FramePlan:
         self.taken_words = tuple(pd.words for pd in taken)
         self.refused = tuple(refused)
         self.roaming = tuple(roaming)
+        self.publisher = int.from_bytes(publisher)
 
 
 def _parts(taken: Iterable[Taken]) -> tuple[tuple[Account, tuple[Copy, ...]], ...]:

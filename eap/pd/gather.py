@@ -45,14 +45,23 @@ class Gather:
             for memory, source, target, size in runs
         ]
 
+    @property
+    def has_bits(self) -> bool:
+        """Whether :meth:`bits_into` has anything to do."""
+        return bool(self._bits)
+
+    def copies(self, offset: int) -> list[tuple[slice, memoryview]]:
+        """Return what to copy to where for the whole octets of a PD that starts at *offset*."""
+        return [(slice(offset + first, offset + last), data) for first, last, data in self._runs]
+
     def into(self, buffer: memoryview, offset: int) -> None:
         """Write the PD's data as it is now to *buffer* at *offset*."""
-        for first, last, source in self._runs:
-            buffer[offset + first : offset + last] = source
-        if self._bits:
-            self._gather_bits(buffer, offset)
+        for where, data in self.copies(offset):
+            buffer[where] = data
+        self.bits_into(buffer, offset)
 
-    def _gather_bits(self, buffer: memoryview, offset: int) -> None:
+    def bits_into(self, buffer: memoryview, offset: int) -> None:
+        """Write the bits among the variables, packed."""
         octets: dict[int, int] = {}
         for memory, source, target, length in self._bits:
             start, shift = divmod(source, 8)

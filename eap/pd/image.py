@@ -21,7 +21,8 @@ from eap.errors import ImageError, TornReadError
 from eap.pd.layout import HEADER, LAYOUT_VERSION, MAGIC, WORDS_OFFSET, ImageLayout, VariablePlace
 from eap.pd.spec import Writer
 
-READ_ATTEMPTS = 200
+READ_ATTEMPTS = 1000
+"""Spread over a tenth of a second by the pauses of a mapped file: a busy host stalls that long."""
 
 
 def _no_pause() -> None:
@@ -168,6 +169,8 @@ def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
         layout = msgspec.json.decode(memory[offset : offset + length], type=ImageLayout)
     except msgspec.MsgspecError as exc:
         raise ImageError(f"process image has a damaged directory: {exc}") from None
+    if layout.directory_offset != offset or WORDS_OFFSET + 8 * layout.word_count > offset:
+        raise ImageError("process image has a damaged directory: it contradicts the header")
     return layout, generation
 
 
@@ -184,7 +187,7 @@ def _end_octet(place: VariablePlace) -> int:
 def _decode(place: VariablePlace, data: bytes, first_bit: int) -> Any:
     kind = datatypes.parse(place.type)
     offset, bit = divmod(place.bit_offset - first_bit, 8)
-    if not bit:
+    if not kind.is_bits:
         return kind.decode(data, offset)
     word = int.from_bytes(data[offset : offset + 2], "little") >> bit
-    return kind.decode(bytes((word & 0xFF,)), 0)
+    return kind.decode(bytes((word & (1 << kind.bit_length) - 1,)), 0)

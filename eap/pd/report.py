@@ -168,7 +168,7 @@ def _rx(image: Image, place: RxPlace, now_ns: int) -> dict[str, Any]:
         "timeouts": words[first + RxWord.TIMEOUTS],
         "discarded": _discarded(image, place.words + RxWord.DISCARDED),
         "quality": quality(image, place) if received else None,
-        "cycle_index": words[first + RxWord.LAST_CYCLE] if received else None,
+        "cycle_index": words[first + RxWord.LAST_CYCLE] & 0xFFFF if received else None,
         "var_state": var_state(image, place),
         "age_us": max(age_ns, 0) // 1000 if received else None,
         "jitter_us": {

@@ -28,6 +28,9 @@ _WAITERS = int(StationWord.WAITERS)
 _LATENESS = int(StationWord.LATENESS)
 _LATENESS_MAX_NS = int(StationWord.LATENESS_MAX_NS)
 
+WAKE_FOR_CYCLES = 100
+"""Cycles after the last announcement of a waiting program in which waiters are woken."""
+
 
 class Station:
     """Runs the cycle of one station.
@@ -103,6 +106,7 @@ class Station:
         words[_SEQUENCE] += words[_SEQUENCE] % 2  # a killed engine may have left it odd
         for subscriber in self._subscribers.values():
             subscriber.open(now_ns)
+        self._wake()  # who sleeps since before a restart would be too far behind to count
         previous_ns = words[_CYCLE_AT_NS]
         if 0 < previous_ns <= now_ns:
             words[StationWord.RESTARTS] += 1
@@ -143,8 +147,7 @@ class Station:
         bin_ = BIN_OF_US[late_us] if 0 <= late_us < len(BIN_OF_US) else histogram_bin(late_us)
         words[_LATENESS + bin_] += 1
         words[_LATENESS_MAX_NS] = max(words[_LATENESS_MAX_NS], now_ns - due_ns)
-        waiting = words[_WAITERS]
-        words[_WAITERS] = 0
         words[_FUTEX] = cycle & 0xFFFFFFFF
-        if waiting:
+        # Never cleared here: whoever comes between the look and the clearing would sleep on.
+        if cycle - words[_WAITERS] <= WAKE_FOR_CYCLES:
             self._wake()

@@ -23,7 +23,10 @@ from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
 
 _KEY = struct.Struct("<10sH").unpack_from
 """EtherCAT header, publisher and count: what tells layouts apart; then the cycle counter."""
-_PLANS_KEPT = 1024
+_PDS_PLANNED = 16384
+"""PDs of all layouts kept; a plant has fewer, and who makes them up gets no more memory."""
+_PLANS_PER_KEY = 16
+"""Layouts that are told apart by trying; more are learned again as they come."""
 _NEVER = 1 << 62
 
 _CYCLE = int(StationWord.CYCLE)
@@ -77,11 +80,10 @@ class Subscriber:
             self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
             self._by_id.setdefault(place.pd_id, []).append(subscription)
         self._plans: dict[bytes, list[FramePlan]] = {}
-        self._plan_count = 0
+        self._pds_planned = 0
         self._open_from_ns = _NEVER
         self._closed_reason = Discard.SUPPRESSED
         self._next_timeout_ns = _NEVER
-        self._senders: dict[Account, bytes] = {}
         self._open_accounts(own_cycle_ns)
 
     def open(self, from_ns: int) -> None:
@@ -104,8 +106,8 @@ class Subscriber:
         if at_ns < self._open_from_ns:
             self._discard(self._closed_reason, len(plan.expected), plan.taken_words)
             return
-        if plan.roaming:
-            self._note_sender(bytes(data[PD_FRAME_START : PD_FRAME_START + 6]), plan.roaming)
+        for account in plan.roaming:
+            account.follow(plan.publisher)
         words, memory = self._words, self._memory
         # A frame taken outside the station's own cycle has to mark the region as changing itself.
         outside = not words[_SEQUENCE] & 1
@@ -173,10 +175,10 @@ class Subscriber:
         refused = []
         for header, offset in pds:
             match = self._match(publisher, header)
-            if isinstance(match, Subscription):
-                chosen.append((match, offset))
-            else:
+            if isinstance(match, Refused):
                 refused.append(match)
+            else:
+                chosen += [(subscription, offset) for subscription in match]
         if self._part_accounts({subscription for subscription, _ in chosen}):
             self._forget_plans()
         plan = FramePlan(
@@ -187,37 +189,32 @@ class Subscriber:
                 for s, offset in chosen
             ],
             refused,
-            {s.account for s, _ in chosen if not s.place.publisher},
+            roaming={s.account for s, _ in chosen if not s.place.publisher},
+            publisher=publisher,
         )
-        if self._plan_count >= _PLANS_KEPT:
+        if self._pds_planned > _PDS_PLANNED:
             self._forget_plans()
-        self._plan_count += 1
-        self._plans.setdefault(_KEY(data)[0], []).append(plan)
+        self._pds_planned += 1 + len(pds)
+        same_key = self._plans.setdefault(_KEY(data)[0], [])
+        if len(same_key) >= _PLANS_PER_KEY:
+            same_key.clear()
+        same_key.append(plan)
         return plan
 
     def _forget_plans(self) -> None:
         self._plans.clear()
-        self._plan_count = 0
+        self._pds_planned = 0
 
-    def _match(self, publisher: bytes, header: PdHeader) -> Subscription | Refused:
+    def _match(self, publisher: bytes, header: PdHeader) -> list[Subscription] | Refused:
         """Find who takes a PD, or what to count instead."""
-        key = header.pd_id
-        candidates = self._by_key.get((publisher, key), []) + self._by_key.get((b"", key), [])
-        discard = Discard.UNKNOWN_ID
-        for candidate in candidates:
-            reason = candidate.mismatch(header.version, header.length)
-            if reason is None:
-                return candidate
-            discard = reason
-        if not candidates and key in self._by_id:
-            discard = Discard.WRONG_PUBLISHER
-            candidates = self._by_id[key]
-        index = DISCARD_INDEX[discard]
-        counters = [StationWord.DISCARDED + index]
-        counters += [c.place.words + RxWord.DISCARDED + index for c in candidates]
-        bit = {Discard.VERSION: 1, Discard.LENGTH: 2}.get(discard, 0)
-        marked = [c.place.words for c in candidates] if bit else []
-        return Refused(tuple(counters), tuple((first, bit) for first in marked))
+        pd_id = header.pd_id
+        candidates = self._by_key.get((publisher, pd_id), []) + self._by_key.get((b"", pd_id), [])
+        if not candidates:
+            others = self._by_id.get(pd_id, [])
+            return _refuse_all([(other, Discard.WRONG_PUBLISHER) for other in others])
+        misfits = [(c, c.mismatch(header.version, header.length)) for c in candidates]
+        fitting = [candidate for candidate, reason in misfits if reason is None]
+        return fitting or _refuse_all([(c, reason) for c, reason in misfits if reason is not None])
 
     def _discard(self, reason: Discard, count: int, subscriptions: Iterable[int] = ()) -> None:
         index = DISCARD_INDEX[reason]
@@ -276,11 +273,19 @@ class Subscriber:
                 self._assign(subscription, new)
         return parted
 
-    def _note_sender(self, publisher: bytes, accounts: Iterable[Account]) -> None:
-        for account in accounts:
-            if self._senders.get(account) != publisher:
-                self._senders[account] = publisher
-                account.forget_sender()
+
+_UNKNOWN_ID = Refused((StationWord.DISCARDED + DISCARD_INDEX[Discard.UNKNOWN_ID],))
+_VAR_STATE = {Discard.VERSION: 1, Discard.LENGTH: 2}
+
+
+def _refuse_all(reasons: list[tuple[Subscription, Discard]]) -> Refused:
+    """Count a PD once for the station, and for each subscription under its own reason."""
+    if not reasons:
+        return _UNKNOWN_ID
+    counters = [StationWord.DISCARDED + DISCARD_INDEX[reasons[0][1]]]
+    counters += [s.place.words + RxWord.DISCARDED + DISCARD_INDEX[why] for s, why in reasons]
+    mismatches = [(s.place.words, _VAR_STATE[why]) for s, why in reasons if why in _VAR_STATE]
+    return Refused(tuple(counters), tuple(mismatches))
 
 
 def _walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | Discard:

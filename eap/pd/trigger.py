@@ -1,7 +1,7 @@
 """When a TxPD is sent, and why.  docs/triggers.md holds the truth table that this file follows.
 
-Rule 1: a frame's divider is a gate; nothing of the frame is sent while it is closed, and what
-became due meanwhile waits for it.
+Rule 1: a frame's divider is a gate; nothing of the frame is sent while it is closed.  Events and
+changes of that time wait for it; cycle time and divider only count in the cycles that it lets by.
 Rule 2: when several reasons hold at once the PD is sent once, for the first of: event, cycle or
 divider, change, change time-out.
 Rule 3: suppression beats every reason; what was due then counts as skipped, an event is used up.

@@ -50,21 +50,25 @@ class TxPd:
 class Selection:
     """A buffer for some of a frame's PDs, and where their data goes in it."""
 
-    __slots__ = ("_cycle_offset", "_gathers", "out", "pds")
+    __slots__ = ("_bits", "_copies", "_cycle_offset", "out", "pds")
 
     def __init__(self, out: OutFrame, pds: tuple[TxPd, ...]) -> None:
         self.out = out
         self.pds = pds
         self._cycle_offset = out.headroom + CYCLE_OFFSET
-        offsets = _data_offsets(pds, out.headroom)
-        self._gathers = [(pd.gather.into, at) for pd, at in zip(pds, offsets, strict=True)]
+        placed = list(zip(pds, _data_offsets(pds, out.headroom), strict=True))
+        # One flat list of all PDs' copies: a call for each PD would take longer than the copies.
+        self._copies = [copy for pd, offset in placed for copy in pd.gather.copies(offset)]
+        self._bits = [(pd.gather.bits_into, at) for pd, at in placed if pd.gather.has_bits]
 
     def patch(self, cycle: int) -> None:
         """Write the counter and the current data of all PDs."""
         view = self.out.view
         _put_u16(view, self._cycle_offset, cycle & 0xFFFF)
-        for into, offset in self._gathers:
-            into(view, offset)
+        for where, data in self._copies:
+            view[where] = data
+        for bits_into, offset in self._bits:
+            bits_into(view, offset)
 
 
 class TxFrame:

@@ -8,6 +8,7 @@ there is no second copy: that is why they survive the engine.
 from __future__ import annotations
 
 from enum import IntEnum, StrEnum, auto
+from itertools import accumulate
 
 
 class Discard(StrEnum):
@@ -55,7 +56,7 @@ class StationWord(IntEnum):
     FUTEX = 2
     """Low half: the cycle again, as the word that waiting programs sleep on."""
     WAITERS = 3
-    """Set by a program that is about to sleep, cleared by the engine that wakes it."""
+    """The cycle in which a program last went to sleep: whether anybody has to be woken."""
     ENGINE_SEQUENCE = 4
     """Odd while the engine writes its region; likewise the next two."""
     SERVICES_SEQUENCE = 5
@@ -118,22 +119,27 @@ class RxWord(IntEnum):
     MISMATCH_AT_NS = 2
     DISCARDED = 3
     RECEIVED = DISCARDED + len(DISCARDS)
-    DUPLICATED = 13
-    REORDERED = 14
-    LATE = 15
-    LOST = 16
-    TIMEOUTS = 17
-    STATE = 18
+    DUPLICATED = RECEIVED + 1
+    REORDERED = RECEIVED + 2
+    LATE = RECEIVED + 3
+    LOST = RECEIVED + 4
+    TIMEOUTS = RECEIVED + 5
+    STATE = RECEIVED + 6
     """RxState as a number."""
-    LAST_CYCLE = 19
-    """Cycle counter of the last frame taken (CycleIndex)."""
-    ARRIVED_AT_NS = 20
-    ARRIVED_IN_CYCLE = 21
+    LAST_CYCLE = RECEIVED + 7
+    """Cycle counter of the last frame taken (CycleIndex), not wrapped; -1 before the first."""
+    ARRIVED_AT_NS = RECEIVED + 8
+    ARRIVED_IN_CYCLE = RECEIVED + 9
     """Own cycle whose input image it refreshed: what quality counts from."""
-    BEHIND = 22
-    """Frames in a row that came with an older counter."""
-    JITTER_MAX_US = 23
-    JITTER = 24
+    BEHIND = RECEIVED + 10
+    """Frames in a row that came with an older counter and filled no hole."""
+    HOLES = RECEIVED + 11
+    """Bit n: of the PDs counted as lost, the one n + 1 steps before HOLES_BELOW may still come."""
+    HOLES_BELOW = RECEIVED + 12
+    SENDER = RECEIVED + 13
+    """With any publisher: the NetID that the account follows, as a number."""
+    JITTER_MAX_US = RECEIVED + 14
+    JITTER = RECEIVED + 15
     SIZE = JITTER + HISTOGRAM_BINS
 
 
@@ -180,9 +186,4 @@ def percentile(bins: list[int], share: float) -> int | None:
     if not total:
         return None
     wanted = total * share
-    seen = 0
-    for index, count in enumerate(bins):
-        seen += count
-        if seen >= wanted:
-            return bin_upper_edge(index)
-    return bin_upper_edge(HISTOGRAM_BINS - 1)  # unreachable but for rounding of a share above 1
+    return bin_upper_edge(next(i for i, seen in enumerate(accumulate(bins)) if seen >= wanted))
