@@ -95,11 +95,6 @@ def packet_filter(role: Role) -> list[Instruction]:
     ]
 
 
-def drop_all() -> list[Instruction]:
-    """Keep nothing: what a socket holds until its real filter is in place."""
-    return [(_RETURN, 0, 0, 0)]
-
-
 def attach(
     sock: socket.socket, program: Sequence[Instruction], option: int = SO_ATTACH_FILTER
 ) -> None:

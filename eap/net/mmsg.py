@@ -56,10 +56,11 @@ class ReceiveBatch:
     """The memory of one ``recvmmsg`` call, shared by all sockets of a process.
 
     *control_size* must be exactly what the kernel writes for one message, the time stamp first:
-    then it leaves every header as it was and nothing needs to be set up again.
+    then it leaves every header as it was and nothing needs to be set up again.  The views that
+    :meth:`arrivals` gives start behind *headroom* octets of each message.
     """
 
-    def __init__(self, control_size: int = STAMP_SIZE) -> None:
+    def __init__(self, control_size: int = STAMP_SIZE, headroom: int = 0) -> None:
         self._control_size = control_size
         self._buffers = bytearray(BATCH * BUFFER_SIZE)
         self._control = bytearray(BATCH * control_size)
@@ -78,8 +79,10 @@ class ReceiveBatch:
         self._stamps = memoryview(self._control).cast("q")
         self._stride = control_size // 8
         self.control = memoryview(self._control)
-        view = memoryview(self._buffers)
-        self.views = [view[n * BUFFER_SIZE : (n + 1) * BUFFER_SIZE] for n in range(BATCH)]
+        self.octets = memoryview(self._buffers)
+        self._views = [
+            self.octets[n * BUFFER_SIZE + headroom : (n + 1) * BUFFER_SIZE] for n in range(BATCH)
+        ]
 
     def reader(self, fd: int) -> Callable[[], int]:
         """Return the call that fills the batch from *fd* and returns how many came, or -1."""
@@ -87,7 +90,7 @@ class ReceiveBatch:
         return partial(_recvmmsg, fd, headers, BATCH, socket.MSG_DONTWAIT, None)
 
     def arrivals(self, count: int) -> Iterable[tuple[memoryview, int, int]]:
-        """Return view, size and arrival on the monotonic clock of the first *count* messages.
+        """Return view, whole size and monotonic arrival time of the first *count* messages.
 
         The kernel stamps with the wall clock; the distance of the two clocks is measured anew
         each time, so that a step of the wall clock spoils at most the batch it falls into.
@@ -97,14 +100,14 @@ class ReceiveBatch:
         words, stamps = self._words, self._stamps
         if count == 1 and words[5] == self._control_size:
             at_ns = stamps[2] * 1_000_000_000 + stamps[3] + offset
-            return ((self.views[0], words[7], min(at_ns, now_ns)),)
+            return ((self._views[0], words[7], min(at_ns, now_ns)),)
         sizes = words[7 : count * 8 : 8].tolist()
         times = self._times(count, offset)
         if words[5 : count * 8 : 8].tolist().count(self._control_size) != count:
             times = self._mend(times, now_ns)
         if times[0] > now_ns:  # the wall clock was set back since
             times = [now_ns] * count
-        return zip(self.views, sizes, times, strict=False)
+        return zip(self._views, sizes, times, strict=False)
 
     def _times(self, count: int, offset: int) -> list[int]:
         stride = self._stride

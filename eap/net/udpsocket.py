@@ -7,25 +7,19 @@ so nobody else may bind and nothing may be closed while the appliance runs.
 
 from __future__ import annotations
 
-import ctypes
 import errno
-import fcntl
 import socket
-import struct
 
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.net import bpf
+from eap.net.interface import foreign_address, interface_of
 from eap.net.mmsg import SO_TIMESTAMPNS
 from eap.net.portholder import describe_holder
 
 SO_RCVBUFFORCE = 33
 IP_MULTICAST_ALL = 49
 _RECEIVE_BUFFER = 8 << 20
-_SIOCGIFCONF = 0x8912
-_IFREQ_SIZE = 40
-_INTERFACES = 1024
-_LIMITED_BROADCAST = "255.255.255.255"
 
 
 def open_udp_pair(address: str, port: int = EAP_PORT) -> tuple[socket.socket, socket.socket]:
@@ -103,27 +97,6 @@ def prepare_receiver(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
 
 
-def interface_of(address: str) -> str:
-    """Return the name of the interface that has *address*.
-
-    Raises:
-        EnvironmentalError: none has it.
-    """
-    if address.startswith("127."):
-        return "lo"
-    memory = ctypes.create_string_buffer(_INTERFACES * _IFREQ_SIZE)
-    request = struct.pack("@iP", len(memory), ctypes.addressof(memory))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        size = struct.unpack("@iP", fcntl.ioctl(sock.fileno(), _SIOCGIFCONF, request))[0]
-    data = memory.raw
-    wanted = socket.inet_aton(address)
-    for offset in range(0, size, _IFREQ_SIZE):
-        if data[offset + 20 : offset + 24] == wanted:
-            label = data[offset : offset + 16].split(b"\0", 1)[0].decode()
-            return label.partition(":")[0]
-    raise EnvironmentalError(_not_ours(address))
-
-
 def _two_sockets() -> tuple[socket.socket, socket.socket]:
     first = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -150,15 +123,8 @@ def bind_failure(protocol: str, address: str, port: int, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         return describe_holder(protocol, address, port)
     if error.errno == errno.EADDRNOTAVAIL:
-        return _not_ours(address)
+        return foreign_address(address)
     return f"{protocol} {address}:{port} cannot be opened: {error.strerror}"
-
-
-def _not_ours(address: str) -> str:
-    return (
-        f"{address} is not an address of this machine: `ip -4 addr` lists those that are; "
-        "any of 127.0.0.0/8 works within this machine"
-    )
 
 
 def _is_multicast(address: str) -> bool:
@@ -171,7 +137,7 @@ def _join(sock: socket.socket, group: str, interface_address: str) -> None:
         sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
     except OSError as error:
         if error.errno == errno.ENODEV:
-            raise EnvironmentalError(_not_ours(interface_address)) from None
+            raise EnvironmentalError(foreign_address(interface_address)) from None
         raise EnvironmentalError(
             f"multicast group {group} cannot be joined at {interface_address}: {error.strerror}"
         ) from None

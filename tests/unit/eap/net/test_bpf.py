@@ -43,10 +43,6 @@ def test_services_gets_the_acyclic_types_and_nothing_else():
     assert exchange(bpf.udp_filter(bpf.Role.SERVICES)) == {2, 3, 5}
 
 
-def test_drop_all_drops_all():
-    assert exchange(bpf.drop_all()) == set()
-
-
 def test_kernel_refusal_is_an_os_error():
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with sock, pytest.raises(OSError, match="Invalid argument"):

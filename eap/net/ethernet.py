@@ -1,0 +1,187 @@
+"""The Ethernet driver: EtherType 0x88A4 through one AF_PACKET socket for all ports of a process."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import sys
+from collections import deque
+from collections.abc import Sequence
+
+from eap.codec.ethercat import ETHERTYPE
+from eap.ids import BROADCAST_MAC, EAP_MULTICAST_MAC, Destination, MacAddr
+from eap.net.mmsg import BATCH, BUFFER_SIZE, ReceiveBatch, SendBatch, note_receive_error
+from eap.net.packetsocket import PACKET_ADD_MEMBERSHIP, PACKET_MR_MULTICAST, SOL_PACKET
+from eap.pd.link import OutFrame, Taker
+
+ETHERNET_HEADER = 14
+MINIMUM_SIZE = 60
+"""Shortest frame without its check sequence (IEEE 802.3)."""
+
+_TPID = 0x8100
+_VID = 0x0FFF
+_CONTROL_SIZE = 72  # a time stamp, then the auxiliary data of a packet
+_TCI = 32  # of the 36 half words
+_BATCHES_PER_DRAIN = 4
+_LOCAL_LIMIT = 1024
+
+# The first word of a frame is its destination and two octets more.
+_MAC_MASK = int.from_bytes(b"\xff" * 6 + bytes(2), sys.byteorder)
+
+
+def packet_batch() -> ReceiveBatch:
+    """Return receive memory for the Ethernet interfaces of a process, which may share it."""
+    return ReceiveBatch(_CONTROL_SIZE, ETHERNET_HEADER)
+
+
+class EthernetInterface:
+    """One AF_PACKET socket and the ports of all stations that share it.
+
+    Attributes:
+        address: The interface's own MAC address.
+        errors: Failed system calls by errno name.
+        discarded: Frames taken from the wire and dropped here, by reason.
+    """
+
+    def __init__(self, sock: socket.socket, batch: ReceiveBatch) -> None:
+        sock.setblocking(False)
+        self.name, _, _, _, hardware = sock.getsockname()
+        self.address = MacAddr(hardware)
+        self.sender = SendBatch(sock)
+        self.errors = self.sender.errors
+        self.discarded = {"other_vlan": 0, "local_overflow": 0}
+        self._sock = sock
+        self._batch = batch
+        self._receive = batch.reader(sock.fileno())
+        self._heads = batch.octets.cast("Q")
+        self._tags = batch.control.cast("H")
+        self._routes: dict[int, dict[int, list[Taker]]] = {}
+        self._ports = 0
+        self._local: deque[tuple[Taker, memoryview, int]] = deque()
+
+    def port(
+        self, taker: Taker, *, vlan_id: int = 0, priority: int = 0, join: Sequence[str] = ()
+    ) -> EthernetPort:
+        """Return a new port that takes and sends frames of *vlan_id*; 0 is untagged.
+
+        It hears the interface's own address, broadcasts, the default multicast address of EAP and
+        the multicast MAC addresses of *join*.
+        """
+        groups = {EAP_MULTICAST_MAC, *(MacAddr.parse(text) for text in join)}
+        index = socket.if_nametoindex(self.name)
+        for group in groups:
+            membership = struct.pack("@iHH8s", index, PACKET_MR_MULTICAST, len(group), group)
+            self._sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
+        by_address = self._routes.setdefault(vlan_id, {})
+        for address in (self.address, BROADCAST_MAC, *groups):
+            by_address.setdefault(_key(address), []).append(taker)
+        self._ports += 1
+        return EthernetPort(self, taker, vlan_id, priority)
+
+    def drain(self) -> int:
+        """Hand every waiting frame to the ports it is for; return how many were handed over."""
+        total = self._drain_local() if self._local else 0
+        for _ in range(_BATCHES_PER_DRAIN):
+            count = self._receive()
+            if count <= 0:
+                if count:
+                    note_receive_error(self.errors)
+                break
+            total += self._dispatch(count)
+            if count < BATCH:
+                break
+        return total
+
+    def deliver(self, frames: Sequence[OutFrame], sender: EthernetPort, now_ns: int) -> None:
+        """Keep copies of *frames* for the other ports they are for, until they are drained.
+
+        A packet socket never receives what its own host sends.
+        """
+        if self._ports < 2:
+            return
+        by_address = self._routes[sender.vlan_id]
+        for frame in frames:
+            takers = by_address.get(_key(frame.buffer), ())
+            others = [taker for taker in takers if taker is not sender.taker]
+            if not others:
+                continue
+            data = memoryview(bytes(frame.view[frame.headroom :]))
+            for taker in others:
+                if len(self._local) >= _LOCAL_LIMIT:
+                    self.discarded["local_overflow"] += 1
+                else:
+                    self._local.append((taker, data, now_ns))
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when a frame waits."""
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._sock.close()
+
+    def _dispatch(self, count: int) -> int:
+        taken = 0
+        routes = self._routes
+        heads = self._heads[: count * BUFFER_SIZE // 8 : BUFFER_SIZE // 8].tolist()
+        tags = self._tags[_TCI : count * _CONTROL_SIZE // 2 : _CONTROL_SIZE // 2].tolist()
+        arrivals = self._batch.arrivals(count)
+        for (view, size, at_ns), head, tag in zip(arrivals, heads, tags, strict=True):
+            by_address = routes.get(tag & _VID)
+            if by_address is None:
+                self.discarded["other_vlan"] += 1
+                continue
+            takers = by_address.get(head & _MAC_MASK)
+            if takers is not None:
+                taken += 1
+                for take in takers:
+                    take(view, size - ETHERNET_HEADER, at_ns)
+        return taken
+
+    def _drain_local(self) -> int:
+        count = len(self._local)
+        for _ in range(count):
+            take, data, at_ns = self._local.popleft()
+            take(data, len(data), at_ns)
+        return count
+
+
+class EthernetPort:
+    """One station's port on a shared interface: a Channel of its own VLAN."""
+
+    minimum_size = MINIMUM_SIZE
+
+    def __init__(
+        self, interface: EthernetInterface, taker: Taker, vlan_id: int, priority: int
+    ) -> None:
+        self.interface = interface
+        self.taker = taker
+        self.vlan_id = vlan_id
+        tag = priority << 13 | vlan_id
+        self._tag = struct.pack("!HH", _TPID, tag) if tag else b""
+
+    def drain(self, now_ns: int) -> int:
+        """Hand over what waits at the interface, to this and to its other ports."""
+        del now_ns
+        return self.interface.drain()
+
+    def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
+        """Send *frames* to the wire and to this host's other ports; return those refused."""
+        failed = self.interface.sender.send(frames)
+        sent = [frame for frame in frames if frame not in failed] if failed else frames
+        self.interface.deliver(sent, self, now_ns)
+        return failed
+
+    def link_header(self, destination: str) -> bytes:
+        """Return destination, own address, the port's VLAN tag if it has one, and EtherType."""
+        target = MacAddr.parse(Destination.parse(destination).host)
+        return target + self.interface.address + self._tag + struct.pack("!H", ETHERTYPE)
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when a frame waits."""
+        return self.interface.fileno()
+
+
+def _key(address: bytes | bytearray) -> int:
+    """Return the first word of frames to *address*, masked as they are when they arrive."""
+    return int.from_bytes(address[:6] + bytes(2), sys.byteorder)

@@ -1,0 +1,216 @@
+"""The Ethernet driver on a veth pair: addresses, VLANs, neighbours on the same interface."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import time
+
+import pytest
+
+from eap.net.ethernet import EthernetInterface, packet_batch
+from eap.net.packetsocket import open_packet_pair
+from eap.pd.link import OutFrame
+from tests.unit.eap.net.conftest import ip
+
+pytestmark = [pytest.mark.net, pytest.mark.root]
+
+GROUP = "01:01:05:04:00:00"
+OTHER_GROUP = "01:01:05:04:00:77"
+
+
+class Listener:
+    """A station's side of a port."""
+
+    def __init__(self, interface, **options):
+        self.got = []
+        self.times = []
+        self.port = interface.port(self.take, **options)
+
+    def take(self, data, size, at_ns):
+        self.got.append(bytes(data[: min(size, 3)]))
+        self.times.append(at_ns)
+
+    def frame(self, number, destination=GROUP):
+        header = self.port.link_header(destination)
+        body = bytes([number, 0x40, number]).ljust(self.port.minimum_size - len(header), b"\0")
+        return OutFrame(bytearray(header + body), len(header), destination)
+
+
+def expect(number):
+    return bytes([number, 0x40, number])
+
+
+@pytest.fixture
+def ends(cable):
+    """The engine's interfaces at both ends of a cable."""
+    with contextlib.ExitStack() as stack:
+        batch = packet_batch()
+        found = []
+        for name in cable:
+            engine, services = open_packet_pair(name)
+            stack.callback(services.close)
+            found.append(EthernetInterface(engine, batch))
+            stack.callback(found[-1].close)
+        yield found
+
+
+@pytest.fixture
+def raw(cable):
+    """A plain socket on the right end, for frames that no port of ours would send."""
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as sock:
+        sock.bind(("right", 0))
+        yield sock
+
+
+def raw_frame(number, destination=GROUP, *, tag=b"", ethertype=b"\x88\xa4", frame_type=4):
+    head = bytes.fromhex(destination.replace(":", "")) + bytes.fromhex("020000000099")
+    body = bytes([number, frame_type << 4, number])
+    return (head + tag + ethertype + body).ljust(60, b"\0")
+
+
+def vlan(vid, priority=0):
+    return struct.pack("!HH", 0x8100, priority << 13 | vid)
+
+
+@pytest.mark.parametrize("count", [1, 3, 64, 100])
+def test_frames_cross_the_cable(ends, count):
+    sender, receiver = Listener(ends[0]), Listener(ends[1])
+    before = time.monotonic_ns()
+    frames = [sender.frame(n) for n in range(count)]
+    assert sender.port.send(frames, 0) == ()
+    assert receiver.port.drain(0) == count
+    assert receiver.got == [expect(n) for n in range(count)]
+    assert receiver.times == sorted(receiver.times)
+    assert before - 5_000_000 < receiver.times[0] < time.monotonic_ns()
+    assert sender.got == []
+    assert sender.port.drain(0) == 0
+
+
+def test_unicast_broadcast_and_joined_groups_are_taken(ends, raw):
+    receiver = Listener(ends[0], join=[OTHER_GROUP])
+    own, foreign = str(ends[0].address), "02:00:00:00:00:55"
+    joined = [own, "ff:ff:ff:ff:ff:ff", GROUP, OTHER_GROUP]
+    for number, mac in enumerate([*joined, foreign, "01:01:05:04:00:78"]):
+        raw.send(raw_frame(number, mac))
+    receiver.port.drain(0)
+    assert receiver.got == [expect(n) for n in range(4)]
+
+
+def test_group_of_one_port_is_not_heard_by_another(ends, raw):
+    joined, other = Listener(ends[0], join=[OTHER_GROUP]), Listener(ends[0])
+    raw.send(raw_frame(1, OTHER_GROUP))
+    raw.send(raw_frame(2))
+    joined.port.drain(0)
+    assert joined.got == [expect(1), expect(2)]
+    assert other.got == [expect(2)]
+
+
+def test_untagged_and_priority_tagged_are_one_network(ends, raw):
+    receiver = Listener(ends[0])
+    raw.send(raw_frame(1))
+    raw.send(raw_frame(2, tag=vlan(0, priority=5)))
+    raw.send(raw_frame(3, tag=vlan(10)))
+    assert receiver.port.drain(0) == 2
+    assert receiver.got == [expect(1), expect(2)]
+    assert ends[0].discarded["other_vlan"] == 1
+
+
+def test_port_of_a_vlan_takes_only_that(ends, raw):
+    tagged, untagged = Listener(ends[0], vlan_id=10), Listener(ends[0])
+    raw.send(raw_frame(1))
+    raw.send(raw_frame(2, tag=vlan(10, priority=6)))
+    raw.send(raw_frame(3, tag=vlan(11)))
+    tagged.port.drain(0)
+    assert tagged.got == [expect(2)]
+    assert untagged.got == [expect(1)]
+    assert ends[0].discarded["other_vlan"] == 1
+
+
+@pytest.mark.parametrize(
+    ("vid", "priority", "header"),
+    [
+        (0, 0, "88a4"),
+        (10, 0, "8100000a88a4"),
+        (10, 6, "8100c00a88a4"),
+        (0, 7, "8100e00088a4"),
+    ],
+)
+def test_frames_leave_with_the_tag_of_their_port(ends, vid, priority, header):
+    sender = Listener(ends[0], vlan_id=vid, priority=priority)
+    receiver = Listener(ends[1], vlan_id=vid)
+    frame = sender.frame(1)
+    start = bytes.fromhex(GROUP.replace(":", "")) + ends[0].address
+    assert bytes(frame.buffer[: frame.headroom]) == start + bytes.fromhex(header)
+    sender.port.send([frame], 0)
+    receiver.port.drain(0)
+    assert receiver.got == [expect(1)]
+
+
+def test_kernel_sorts_by_type_and_drops_foreign_protocols(cable, raw):
+    pair = open_packet_pair("left")
+    try:
+        for n in range(16):
+            raw.send(raw_frame(n, frame_type=n))
+        raw.send(raw_frame(99, ethertype=b"\x08\x00"))
+        raw.send(raw_frame(98, "02:00:00:00:00:55"))
+        for sock, types in zip(pair, ({*range(16)} - {2, 3, 5}, {2, 3, 5}), strict=True):
+            sock.setblocking(False)
+            got = set()
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    got.add(sock.recv(100)[14])
+            assert got == types
+    finally:
+        for sock in pair:
+            sock.close()
+
+
+def test_ports_of_one_interface_hear_each_other(ends):
+    first, second, third = (Listener(ends[0]) for _ in range(3))
+    tagged = Listener(ends[0], vlan_id=10)
+    far = Listener(ends[1])
+    frames = [first.frame(1), first.frame(2, str(ends[0].address)), first.frame(3, OTHER_GROUP)]
+    first.port.send(frames, 777)
+    frames[0].view[-1] = 0xEE  # what was sent does not change any more
+    assert second.port.drain(0) == 4
+    assert second.got == third.got == [expect(1), expect(2)]
+    assert second.times == [777, 777]
+    assert first.got == tagged.got == []
+    far.port.drain(0)
+    assert far.got == [expect(1)]
+
+
+def test_neighbours_that_are_never_drained_do_not_fill_the_memory(ends):
+    sender = Listener(ends[0])
+    Listener(ends[0])
+    frame = sender.frame(1)
+    for _ in range(1030):
+        sender.port.send((frame,), 0)
+    assert ends[0].discarded["local_overflow"] == 6
+    assert sender.port.drain(0) == 1024
+
+
+def test_interface_that_goes_down_is_counted_and_comes_back(ends):
+    sender, receiver = Listener(ends[0]), Listener(ends[1])
+    neighbour = Listener(ends[0])
+    ip("link set left down")
+    frames = [sender.frame(1), sender.frame(2)]
+    assert list(sender.port.send(frames, 0)) == frames
+    assert ends[0].errors["ENETDOWN"] == 2
+    sender.port.drain(0)
+    assert neighbour.got == []
+    ip("link set left up")
+    assert sender.port.send(frames, 0) == ()
+    assert receiver.port.drain(0) == 2
+
+
+def test_drain_is_bounded(ends):
+    sender, receiver = Listener(ends[0]), Listener(ends[1])
+    frame = sender.frame(1)
+    for _ in range(300):
+        sender.port.send((frame,), 0)
+    assert receiver.port.drain(0) == 256
+    assert receiver.port.drain(0) == 44
+    assert sender.port.fileno() == ends[0].fileno()

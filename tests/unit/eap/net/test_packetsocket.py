@@ -1,0 +1,93 @@
+"""Opening AF_PACKET sockets: what goes wrong, and what the message says about it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from eap.errors import EnvironmentalError
+from eap.net.packetsocket import missing_capability, open_packet_pair
+from tests.unit.eap.net.conftest import ip
+
+pytestmark = pytest.mark.net
+
+AS_NOBODY = """
+import os
+from eap.net.packetsocket import open_packet_pair
+from eap.errors import EnvironmentalError
+os.setgroups([])
+os.setresgid(65534, 65534, 65534)
+os.setresuid(65534, 65534, 65534)
+try:
+    open_packet_pair("lo")
+except EnvironmentalError as error:
+    print(error)
+"""
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+
+
+def test_missing_interface_is_named_with_those_that_exist():
+    with pytest.raises(EnvironmentalError, match=r"no interface 'eth77', expected one of .*\blo\b"):
+        open_packet_pair("eth77")
+
+
+@pytest.mark.root
+def test_interface_that_is_down_is_named_with_the_cure(cable):
+    ip("link set left down")
+    with pytest.raises(EnvironmentalError, match="left is down: `ip link set left up`"):
+        open_packet_pair("left")
+
+
+@pytest.mark.root
+def test_interface_without_a_cable_can_be_opened(cable):
+    ip("link set right down")
+    for sock in open_packet_pair("left"):
+        sock.close()
+
+
+@pytest.mark.root
+def test_interface_of_another_kind_is_refused(cable):
+    ip("tuntap add dev tunnel mode tun")
+    ip("link set tunnel up")
+    with pytest.raises(EnvironmentalError, match="tunnel is not an Ethernet interface"):
+        open_packet_pair("tunnel")
+
+
+@pytest.mark.root
+@as_root
+def test_ordinary_user_is_told_a_command_that_works():
+    done = subprocess.run(
+        [sys.executable, "-c", AS_NOBODY], capture_output=True, text=True, check=True
+    )
+    message = done.stdout.strip()
+    assert "\n" not in re.sub(r"'[^']*'", "", message)  # but for the script in its own quotes
+    assert message.startswith("ethernet://lo needs the capability CAP_NET_RAW; grant it to this")
+    assert "udp://" in message
+    assert "setcap" not in message
+    command = shlex.split(re.search(r"`(setpriv .*)`", message, re.DOTALL)[1])
+    prefix = command[: command.index(sys.executable)]
+    status = subprocess.run(
+        [*prefix, "cat", "/proc/self/status"], capture_output=True, text=True, check=True
+    ).stdout
+    assert re.search(r"^Uid:\s+65534\b", status, re.MULTILINE)
+    assert re.search(r"^CapEff:\s+0000000000002000$", status, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("uid", "cure"), [(0, "--cap-add=NET_RAW"), (1000, "--reuid=1000 ")])
+def test_refusal_of_the_kernel_becomes_one_message(monkeypatch, uid, cure):
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr("socket.socket", refuse)
+    monkeypatch.setattr("eap.net.packetsocket.check_interface", lambda _: None)
+    monkeypatch.setattr("os.geteuid", lambda: uid)
+    monkeypatch.setattr("os.getuid", lambda: uid)
+    with pytest.raises(EnvironmentalError) as caught:
+        open_packet_pair("eth0")
+    assert cure in str(caught.value)
+    assert str(caught.value) == missing_capability("eth0")
