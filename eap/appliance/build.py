@@ -9,9 +9,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
 
+from eap.appliance.discards import DiscardCounters, Tally
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.appliance.runtime import ApplianceFolder
 from eap.ids import InterfaceUri
+from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import ImageFile, create_image
 from eap.net.loopback import LoopbackLines
 from eap.net.mmsg import ReceiveBatch
@@ -47,7 +49,11 @@ class EnginePlant:
         self._files: dict[str, ImageFile] = {}
         self._stations: dict[str, Station] = {}
         self._batch = ReceiveBatch()
+        self._tallies: list[Tally] = []
         self._on_arrival: list[Channel] = []
+        self._counters = self._resources.enter_context(
+            DiscardCounters(folder.discards("engine"), [s.name for s in handover.stations])
+        )
         for spec in handover.stations:
             file = create_image(folder.image(spec.name), plan_layout(spec))
             self._resources.callback(file.close)
@@ -55,8 +61,10 @@ class EnginePlant:
             self._stations[spec.name] = Station(spec, file.image, file.wake_waiters)
         self._open_lines()
         for shared in handover.sockets:
-            if shared.kind is not SocketKind.TCP:
-                self._open_shared(shared)
+            if shared.kind is SocketKind.PACKET:
+                self._open_interface(shared)
+            elif shared.kind is not SocketKind.TCP:
+                self._open_datagrams(shared)
         self.engine = Engine(list(self._stations.values()))
         self.engine.drain_on_arrival(self._on_arrival)
 
@@ -65,6 +73,11 @@ class EnginePlant:
         for file in self._files.values():
             file.image.words[StationWord.ENGINE_PID] = os.getpid()
         self.engine.start(now_ns)
+
+    def publish_discards(self) -> None:
+        """Show what the interfaces dropped since the last time."""
+        for tally in self._tallies:
+            tally.publish()
 
     def stop(self) -> None:
         """Bring all stations out of Op and wake who waits for a cycle that will not come."""
@@ -87,7 +100,7 @@ class EnginePlant:
                 channel.takers.append(self._taker(name))
                 self._stations[name.station].connect(port.name, channel)
 
-    def _open_shared(self, shared: SharedSocket) -> None:
+    def _open_datagrams(self, shared: SharedSocket) -> None:
         channel = UdpChannel(
             socket.socket(fileno=shared.engine_fd),
             self._batch,
@@ -101,6 +114,22 @@ class EnginePlant:
             else:
                 station.drain_also(channel)
         self._wake_on_arrival(shared.owners, channel)
+
+    def _open_interface(self, shared: SharedSocket) -> None:
+        interface = EthernetInterface(socket.socket(fileno=shared.engine_fd), packet_batch())
+        self._resources.callback(interface.close)
+        stations = sorted({owner.station for owner in shared.owners})
+        self._tallies.append(Tally(self._counters, stations, interface.discarded))
+        for owner in shared.owners:
+            spec = self._handover.port(owner)
+            port = interface.port(
+                self._taker(owner),
+                vlan_id=spec.vlan_id,
+                priority=spec.vlan_priority,
+                join=spec.join,
+            )
+            self._stations[owner.station].connect(owner.port, port)
+        self._wake_on_arrival(shared.owners, port)
 
     def _wake_on_arrival(self, owners: Iterable[PortName], channel: SocketChannel) -> None:
         if any(self._handover.port(owner).wake is Wake.ARRIVAL for owner in owners):

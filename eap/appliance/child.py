@@ -19,7 +19,7 @@ from eap.appliance.handover import Handover, decode_report
 
 FIRST_BACKOFF_NS = 100_000_000
 LONGEST_BACKOFF_NS = 5_000_000_000
-HEALTHY_AFTER_NS = 5_000_000_000
+HEALTHY_AFTER_NS = 1_000_000_000
 """A process that lived this long is started again at once."""
 
 _LAST_LINES = 12

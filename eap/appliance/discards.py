@@ -1,10 +1,10 @@
-"""What the services process turned away, by station and reason, in a file that survives it."""
+"""What a process turned away before any subscription saw it, in a file that survives it."""
 
 from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum, auto
 from pathlib import Path
 from types import TracebackType
@@ -12,7 +12,7 @@ from typing import Self
 
 
 class Refusal(StrEnum):
-    """Why services did not take a frame or a connection."""
+    """Why a frame or a connection went no further."""
 
     MAILBOX = auto()
     """Type 5, and nothing in this release answers it."""
@@ -30,6 +30,10 @@ class Refusal(StrEnum):
     """More connections than there is room for."""
     ENGINE_BUSY = auto()
     """The engine did not take a connection that was meant for it."""
+    OTHER_VLAN = auto()
+    """An Ethernet frame of a VLAN that no port names."""
+    LOCAL_OVERFLOW = auto()
+    """Stations on one Ethernet interface sent each other more than they took."""
 
 
 _REFUSALS = tuple(Refusal)
@@ -37,7 +41,7 @@ _COLUMN = {reason: index for index, reason in enumerate(_REFUSALS)}
 
 
 class DiscardCounters:
-    """One 64-bit word for each station and reason; services is the only writer."""
+    """One 64-bit word for each station and reason; each process has its own file."""
 
     def __init__(self, path: Path, stations: Sequence[str]) -> None:
         size = 8 * len(_REFUSALS) * max(1, len(stations))
@@ -80,3 +84,24 @@ class DiscardCounters:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+class Tally:
+    """Carries what a driver counts in a dict of its own over to *counters* of all *stations*."""
+
+    def __init__(
+        self, counters: DiscardCounters, stations: Sequence[str], source: Mapping[str, int]
+    ) -> None:
+        self._counters = counters
+        self._stations = stations
+        self._source = source
+        self._seen = dict(source)
+
+    def publish(self) -> None:
+        """Add what has come since the last call."""
+        for name, total in self._source.items():
+            grown = total - self._seen[name]
+            if grown:
+                self._seen[name] = total
+                for station in self._stations:
+                    self._counters.count(station, Refusal(name), grown)

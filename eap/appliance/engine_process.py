@@ -19,8 +19,8 @@ from eap.errors import ConfigError, EapError, EnvironmentalError
 from eap.net import realtime
 from eap.net.ticker import Ticker
 
-LINK_PERIOD_NS = 20_000_000
-"""How often the engine looks whether services has passed it a connection: at most one a look."""
+LOOK_PERIOD_NS = 20_000_000
+"""How often the engine looks beyond its cycles, and takes at most one connection from services."""
 
 
 class StopFlag:
@@ -49,7 +49,8 @@ def run_cycles(plant: EnginePlant, link: socket.socket, stop: StopFlag) -> None:
             now_ns = monotonic_ns()
             engine.handle_timeout(now_ns)
             if now_ns >= look_ns:
-                look_ns = now_ns + LINK_PERIOD_NS
+                look_ns = now_ns + LOOK_PERIOD_NS
+                plant.publish_discards()
                 if passed := take_connection(link):
                     plant.add_connection(*passed)
     finally:

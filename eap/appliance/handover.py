@@ -25,7 +25,7 @@ class SocketKind(StrEnum):
     GROUP = "group"
     """A pair bound to one multicast group, or to the broadcast address, at one interface."""
     PACKET = "packet"
-    """A pair of AF_PACKET sockets on one Ethernet interface and VLAN."""
+    """A pair of AF_PACKET sockets on one Ethernet interface."""
     TCP = "tcp"
     """One listener, for services."""
 
@@ -47,7 +47,6 @@ class SharedSocket(Record, frozen=True):
     address: str
     port: int = 0
     group: str = ""
-    vlan_id: int = 0
     owners: tuple[PortName, ...] = ()
     """Whose frames arrive here; several share a group, a broadcast or an Ethernet interface."""
     engine_fd: int = NO_DESCRIPTOR

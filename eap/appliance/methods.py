@@ -19,7 +19,7 @@ from eap.errors import ControlError, WriterConflictError
 from eap.net.image_file import ImageFile
 from eap.pd.image import Image
 from eap.pd.layout import VariablePlace
-from eap.pd.report import pd_list, quality
+from eap.pd.report import account_word, pd_list, quality
 from eap.pd.spec import Writer
 from eap.pd.words import RxWord, StationWord
 
@@ -210,8 +210,8 @@ def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
     """Return the quality of those of *names* that are received, None before the first time."""
     qualities: dict[str, int | None] = {}
     for rx in image.layout.rx:
-        account = image.words[rx.words + RxWord.ACCOUNT]
-        value = quality(image, rx) if image.words[account + RxWord.RECEIVED] else None
+        received = image.words[account_word(image, rx) + RxWord.RECEIVED]
+        value = quality(image, rx) if received else None
         qualities.update((name, value) for name in rx.variables if name in names)
     return qualities
 

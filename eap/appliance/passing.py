@@ -31,8 +31,10 @@ def pass_connection(
 ) -> bool:
     """Send *connection*, which the caller then closes; return whether there was room for it."""
     message = msgspec.json.encode(description)
+    rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [connection.fileno()]))
     try:
-        socket.send_fds(link, [message], [connection.fileno()], socket.MSG_DONTWAIT)
+        # socket.send_fds() of Python 3.11 forgets its flags, and would wait here.
+        link.sendmsg([message], [rights], socket.MSG_DONTWAIT)
     except OSError:
         return False
     return True

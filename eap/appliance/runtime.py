@@ -108,10 +108,9 @@ class ApplianceFolder:
         """Where clients connect."""
         return self.path / "control"
 
-    @property
-    def discards(self) -> Path:
-        """The counters of the services process."""
-        return self.path / "discards"
+    def discards(self, process: str) -> Path:
+        """Return the file of what *process* turned away before any subscription saw it."""
+        return self.path / f"{process}.discards"
 
     def image(self, station: str) -> Path:
         """Return the file of one station's process image."""

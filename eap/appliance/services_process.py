@@ -29,6 +29,7 @@ from eap.appliance.tcp_door import TcpDoor
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.ids import InterfaceUri
 from eap.net import realtime
+from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import ImageFile, open_image
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
@@ -46,7 +47,7 @@ class Services:
         self._folder = ApplianceFolder(Path(handover.folder))
         self._names = [station.name for station in handover.stations]
         self._counters = resources.enter_context(
-            DiscardCounters(self._folder.discards, self._names)
+            DiscardCounters(self._folder.discards("services"), self._names)
         )
         self._link = resources.enter_context(socket.socket(fileno=handover.link_fd))
         self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
@@ -83,6 +84,9 @@ class Services:
 
     def _methods(self, files: dict[str, ImageFile]) -> Methods:
         meter = ProcessMeter()
+        engine = self._resources.enter_context(
+            DiscardCounters(self._folder.discards("engine"), self._names)
+        )
         images = [file.image for file in files.values()]
         release = version("eap-appliance")
         identity = {"release": release, "plant": self._handover.plant, "pid": os.getpid()}
@@ -90,7 +94,7 @@ class Services:
             identity,
             files,
             status=lambda: appliance_status(
-                self._folder.read_info(), images, self._counters.stats(), meter
+                self._folder.read_info(), images, (engine.stats(), self._counters.stats()), meter
             ),
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
         )
@@ -98,14 +102,24 @@ class Services:
     def _watch_sockets(self) -> None:
         now_ns = monotonic_ns()
         for shared in self._handover.sockets:
-            if shared.kind is SocketKind.TCP:
-                continue
-            intake = FrameIntake(_stations_of(shared), self._counters, now_ns)
-            channel = UdpChannel(
-                socket.socket(fileno=shared.services_fd), self._batch, [intake.take]
-            )
-            self._resources.callback(channel.close)
-            watch_channel(channel)
+            if shared.kind is SocketKind.PACKET:
+                self._watch_interface(shared, now_ns)
+            elif shared.kind is not SocketKind.TCP:
+                intake = FrameIntake(_stations_of(shared), self._counters, now_ns)
+                channel = UdpChannel(
+                    socket.socket(fileno=shared.services_fd), self._batch, [intake.take]
+                )
+                self._resources.callback(channel.close)
+                watch_channel(channel)
+
+    def _watch_interface(self, shared: SharedSocket, now_ns: int) -> None:
+        interface = EthernetInterface(socket.socket(fileno=shared.services_fd), packet_batch())
+        self._resources.callback(interface.close)
+        for owner in shared.owners:
+            intake = FrameIntake([owner.station], self._counters, now_ns)
+            spec = self._handover.port(owner)
+            port = interface.port(intake.take, vlan_id=spec.vlan_id, join=spec.join)
+        watch_channel(port)
 
     def _doors(self) -> list[TcpDoor]:
         return [

@@ -20,6 +20,7 @@ from eap.appliance.handover import NO_DESCRIPTOR, PortName, SharedSocket, Socket
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
+from eap.net.packetsocket import open_packet_pair
 from eap.net.udpsocket import bind_failure, open_udp_group_pair, open_udp_pair
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
@@ -47,7 +48,7 @@ def _sockets_of(port: PortSpec) -> Iterator[SharedSocket]:
     uri = InterfaceUri.parse(port.interface)
     number = uri.port or EAP_PORT
     if uri.scheme == "ethernet":
-        yield SharedSocket(SocketKind.PACKET, uri.host, vlan_id=port.vlan_id)
+        yield SharedSocket(SocketKind.PACKET, uri.host)
     if uri.scheme == "udp":
         yield SharedSocket(SocketKind.UDP, uri.host, number)
         for group in port.join:
@@ -120,6 +121,8 @@ def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:
 def _open_pair(planned: SharedSocket) -> tuple[socket.socket, socket.socket]:
     if planned.kind is SocketKind.UDP:
         return open_udp_pair(planned.address, planned.port)
+    if planned.kind is SocketKind.PACKET:
+        return open_packet_pair(planned.address)
     return open_udp_group_pair(planned.group, planned.address, planned.port)
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns
 from typing import Any
 
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
+from eap.errors import EnvironmentalError
+from eap.ids import InterfaceUri
+from eap.net.interface import interface_of, link_is_up
 from eap.pd.image import Image
 from eap.pd.report import station_status
 
@@ -50,17 +53,19 @@ class ProcessMeter:
 def appliance_status(
     info: ApplianceInfo,
     images: Iterable[Image],
-    discarded: Mapping[str, Mapping[str, int]],
+    discarded: Sequence[Mapping[str, Mapping[str, int]]],
     meter: ProcessMeter,
 ) -> dict[str, Any]:
-    """Return the whole answer; *discarded* is what services turned away, by station."""
+    """Return the whole answer; *discarded* is what each process turned away, by station."""
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
     stations = []
     for image in images:
         station = station_status(image, monotonic_ns())
+        for port in station["ports"]:
+            port["link"] = link_state(port["interface"])
         counts = station["discarded"]
-        for reason, count in discarded.get(image.layout.station, {}).items():
-            if count:
+        for by_station in discarded:
+            for reason, count in by_station.get(image.layout.station, {}).items():
                 counts[reason] = counts.get(reason, 0) + count
         stations.append(station)
     engine = _process(info.engine, meter, now_ns)
@@ -75,6 +80,18 @@ def appliance_status(
         },
         "stations": stations,
     }
+
+
+def link_state(interface: str) -> str:
+    """Return ``up`` or ``down`` for the network interface behind a port's URI."""
+    uri = InterfaceUri.parse(interface)
+    if uri.scheme == "loop":
+        return "up"
+    try:
+        name = uri.host if uri.scheme == "ethernet" else interface_of(uri.host)
+    except EnvironmentalError:
+        return "down"  # the address has been taken from this machine
+    return "up" if link_is_up(name) else "down"
 
 
 def _process(process: ProcessInfo, meter: ProcessMeter, now_ns: int) -> dict[str, Any]:
