@@ -53,7 +53,8 @@ def decode(ctx: click.Context, source: tuple[str, ...], as_json: bool) -> None:
     """Decode one frame given as HEX, or all frames of a pcap or pcapng FILE.
 
     HEX starts at the EtherCAT header or at the Ethernet header; spaces are allowed.  A file whose
-    name is hexadecimal digits is written ./NAME.  In a file, frames are found under EtherType 0x88A4 and on UDP and TCP port 34980.
+    name is hexadecimal digits is written ./NAME.  In a file, frames are found under EtherType
+    0x88A4 and on UDP and TCP port 34980.
 
     Exit code 1 means that a frame had an error, 2 that the input cannot be read.
     """

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import dpkt
-
-TYPE_4 = ("tc_nv.publisher", "tc_nv.count", "tc_nv.cycleindex")
 
 
 def write_pcap(path: Path, frames: Iterable[bytes]) -> Path:
@@ -22,45 +20,89 @@ def write_pcap(path: Path, frames: Iterable[bytes]) -> Path:
     return path
 
 
-def dissect(path: Path, *options: str) -> list[dict[str, Any]]:
-    """Return the layers of each packet in a capture, as ``tshark -T json -x`` names their fields.
+def dissect(path: Path) -> list[dict[str, Any]]:
+    """Return what tshark sees in each packet of a capture that holds an EtherCAT frame.
 
-    Fields that occur several times in a layer are lists.  UDP and TCP checksums are not checked:
-    local captures hold checksums that a network card would have filled in.
+    A packet is a dict of ``number``, ``transport``, ``type``, ``length``, ``malformed`` and the
+    raw ``layers``; beside them ``publisher``, ``count``, ``cycle`` and ``pds`` (``id``,
+    ``version``, ``length``, ``quality``, ``data``) in type 4, and ``mailbox`` in type 5.
+
+    tshark puts no TCP stream together: it reads one frame at the start of each segment.  To have
+    it read the frames of a stream that was cut otherwise, write them from ``iter_capture`` into a
+    file of their own.
     """
-    command = ["tshark", "-r", str(path), "-T", "json", "--no-duplicate-keys", "-n"]
-    done = subprocess.run([*command, *options], capture_output=True, text=True, check=True)
-    return [packet["_source"]["layers"] for packet in json.loads(done.stdout)]
+    command = ["tshark", "-n", "-r", str(path), "-T", "json", "--no-duplicate-keys"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    packets = [packet["_source"]["layers"] for packet in json.loads(done.stdout)]
+    return [_fields(layers) for layers in packets if "ecatf" in layers]
 
 
-def is_malformed(layers: dict[str, Any]) -> bool:
-    """Whether tshark marked anything in the packet as malformed or as an error."""
-    text = json.dumps(layers)
-    return (
-        '"_ws.malformed"' in text
-        or '"_ws.short"' in text
-        or '"_ws.expert.severity": "8388608"' in text
-    )
+def _fields(layers: dict[str, Any]) -> dict[str, Any]:
+    names = layers["frame"]["frame.protocols"].split(":")
+    fields = {
+        "number": int(layers["frame"]["frame.number"]),
+        "transport": next((name for name in ("udp", "tcp") if name in names), "ethernet"),
+        "type": _number(layers["ecatf"]["ecatf.type"]),
+        "length": _number(layers["ecatf"]["ecatf.length"]),
+        "malformed": _is_malformed(layers),
+        "layers": layers,
+    }
+    if content := layers.get("tc_nv"):
+        fields |= _process_data(content)
+    if content := layers.get("ecat_mailbox"):
+        fields["mailbox"] = _mailbox(content)
+    return fields
 
 
-def process_data(layers: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return each type-4 frame of a packet in the form of ``eap.appliance.decode``.
+def _process_data(content: dict[str, Any]) -> dict[str, Any]:
+    header = content["tc_nv.header"]
+    return {
+        "publisher": ".".join(str(octet) for octet in _octets(header["tc_nv.publisher"])),
+        "count": _number(header["tc_nv.count"]),
+        "cycle": _number(header["tc_nv.cycleindex"]),
+        "pds": [
+            {
+                "id": _number(pd["tc_nv.varheader"]["tc_nv.id"]),
+                "version": _number(pd["tc_nv.varheader"]["tc_nv.hash"]),
+                "length": _number(pd["tc_nv.varheader"]["tc_nv.length"]),
+                "quality": _number(pd["tc_nv.varheader"]["tc_nv.quality"]),
+                "data": _octets(pd.get("tc_nv.data", "")).hex(),
+            }
+            for pd in _listed(content.get("tc_nv.variable_tree", []))
+        ],
+    }
 
-    A TCP packet may hold several; one that is cut by segments has none.
-    """
-    found = []
-    for frame, content in zip(_listed(layers, "ecatf"), _listed(layers, "tc_nv"), strict=True):
-        header = content["tc_nv.header"]
-        variables = [
-            value
-            for name, values in content.items()
-            if name.startswith("tc_nv.variable") or "Variable" in name
-            for value in (values if isinstance(values, list) else [values])
-        ]
-        found.append((frame, header, variables))
-    return found
+
+def _mailbox(content: dict[str, Any]) -> dict[str, Any]:
+    names = ("length", "address", "priority", "type", "counter")
+    found = dict(_walk(content))
+    return {name: _number(found[f"ecat_mailbox.{name}"]) for name in names}
 
 
-def _listed(layers: dict[str, Any], name: str) -> list[Any]:
-    value = layers.get(name, [])
+def _is_malformed(layers: dict[str, Any]) -> bool:
+    found = dict(_walk(layers))
+    invalid = any(name.endswith(".invalid") for name in found)
+    reserved = _number(layers["ecatf"].get("ecatf.reserved", "0")) != 0
+    return invalid or reserved or bool({"_ws.malformed", "_ws.short"} & set(found))
+
+
+def _walk(value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, list):
+        for item in value:
+            yield from _walk(item)
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            yield name, item
+            yield from _walk(item)
+
+
+def _listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
+
+
+def _number(text: str) -> int:
+    return int(text, 0)
+
+
+def _octets(text: str) -> bytes:
+    return bytes.fromhex(text.replace(":", ""))
