@@ -6,7 +6,8 @@ Importing this module binds the layers to EtherType 0x88A4 and to UDP and TCP po
     >>> from tools.scapy_layers import *
     >>> sniff(offline="line.pcap", session=TCPSession)
 
-shows them; TCPSession cuts TCP streams into frames.  Building fills in the lengths and the count.
+shows them; TCPSession cuts TCP streams into frames (scapy 2.8 loses its place when two frames end
+in one segment and a third begins).  Building fills in the lengths and the count.
 Scapy is GPL-2.0: nothing that is installed imports this.
 """
 

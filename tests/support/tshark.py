@@ -25,7 +25,8 @@ def dissect(path: Path) -> list[dict[str, Any]]:
 
     A packet is a dict of ``number``, ``transport``, ``type``, ``length``, ``malformed`` and the
     raw ``layers``; beside them ``publisher``, ``count``, ``cycle`` and ``pds`` (``id``,
-    ``version``, ``length``, ``quality``, ``data``) in type 4, and ``mailbox`` in type 5.
+    ``version``, ``length``, ``quality``, ``data``) in type 4, ``mailbox`` in type 5 and
+    ``datagrams`` in type 1 (``command`` as a number).
 
     tshark puts no TCP stream together: it reads one frame at the start of each segment.  To have
     it read the frames of a stream that was cut otherwise, write them from ``iter_capture`` into a
@@ -51,6 +52,9 @@ def _fields(layers: dict[str, Any]) -> dict[str, Any]:
         fields |= _process_data(content)
     if content := layers.get("ecat_mailbox"):
         fields["mailbox"] = _mailbox(content)
+    if content := layers.get("ecat"):
+        items = [item for value in content.values() for item in _listed(value)]
+        fields["datagrams"] = [_datagram(item) for item in items if "Header" in item]
     return fields
 
 
@@ -74,9 +78,24 @@ def _process_data(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _mailbox(content: dict[str, Any]) -> dict[str, Any]:
-    names = ("length", "address", "priority", "type", "counter")
+    # Not the priority: Wireshark 4.0 reads it from the two lowest bits, which are the channel's.
+    names = ("length", "address", "type", "counter")
     found = dict(_walk(content))
     return {name: _number(found[f"ecat_mailbox.{name}"]) for name in names}
+
+
+def _datagram(content: dict[str, Any]) -> dict[str, Any]:
+    names = {
+        "command": "ecat.cmd",
+        "index": "ecat.idx",
+        "adp": "ecat.adp",
+        "ado": "ecat.ado",
+        "address": "ecat.lad",
+        "length": "ecat.subframe.length",
+        "wkc": "ecat.cnt",
+    }
+    found = dict(_walk(content))
+    return {name: _number(found[key]) for name, key in names.items() if key in found}
 
 
 def _is_malformed(layers: dict[str, Any]) -> bool:
