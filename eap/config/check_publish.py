@@ -42,7 +42,8 @@ def check_port_reference(
 def _check_frame(index: Index, report: Report, station: Station, frame: Frame) -> None:
     _check_modulo(frame, report)
     pds = [pd for pd in station.publish if pd.frame == frame.name]
-    if not pds and not report.broken:
+    known = {each.name for each in station.frames}
+    if not pds and not report.broken and all(pd.frame in known for pd in station.publish):
         expected = f"a PD under publish with frame: {frame.name}"
         report.add(frame.at, f"frame {frame.name!r} carries no PD", expected)
     uri = index.uris.get((station.name, frame.port))

@@ -82,7 +82,7 @@ def _check_source(
         return
     period = getattr(source, "period_ms", 1)
     if period <= 0:
-        report.add(f"{path}.period_ms", f"period_ms is {period}", "more than 0")
+        report.add(f"{path}.period_ms", f"period_ms is {period:g}", "more than 0")
     try:
         kind = datatypes.parse(station.variables[name].type)
     except ValueError:

@@ -40,8 +40,6 @@ class _Converter:
     def value(self, node: Node, kind: inspect.Type, path: str, key: str) -> Any:
         """Read *node* as *kind*; raise _BrokenError after having reported why not."""
         match kind:
-            case inspect.Metadata():
-                return self.value(node, kind.type, path, key)
             case inspect.UnionType():
                 return self._union(node, kind, path, key)
             case inspect.StructType():

@@ -27,6 +27,9 @@ import pytest
         ("{kind: counter}", "{kind: ramp, low: 0, high: .inf, period_ms: 9}", "11: high is inf"),
         ("count: UDINT", "count: [UDINT]", "9: count is a list; a mapping with type"),
         ("default: 2.5", "default: {a: 1}", "8: default is a mapping; a value, or a list"),
+        ("{kind: counter}", "{kind: counter, step: 1.5}", "11: step is 1.5; a whole number"),
+        ("variables: {a: REAL, b: UDINT}", "variables: [a, b]", "21: variables is a list; a map"),
+        ("variables: {a: REAL, b: UDINT}", "variables: {a: REAL, b: {}}", "21: b has no type; th"),
         ("variables: [speed, count]", "variables: speed", "15: variables is 'speed'; a list"),
         ("    sources:", "    links: []\n    sources:", "10: links (links between ports): this"),
         ("    sources:", "    routes: []\n    sources:", "10: routes (routes of the AoE router)"),
@@ -45,7 +48,9 @@ def test_keys_of_anchors_are_free_at_the_top(load_plant):
 
 
 def test_empty_lists_and_mappings_may_be_left_blank(load_plant):
-    edits = [("    sources:\n      count: {kind: counter}\n", "    sources:\n")]
+    edits = [
+        ("    sources:\n      count: {kind: counter}\n", "    sources:\n    subscribe:\n"),
+    ]
     assert load_plant(*edits).plant is not None
 
 
@@ -78,3 +83,10 @@ def test_a_document_that_is_no_mapping_is_one_finding(tmp_path):
     [finding] = load(path).findings
     assert finding.message == "plant is a list"
     assert finding.expected == "a mapping with plant, stations"
+
+
+def test_arrays_and_blocks_have_defaults(load_plant):
+    pair = "pair: {type: 'REAL[2]', default: [1, 2.5]}"
+    new = f"count: UDINT\n      {pair}\n      raw: {{type: BLOCK(2), default: 'beef'}}"
+    plant = load_plant(("count: UDINT", new)).plant
+    assert [v.default for v in plant.stations[0].variables] == [2.5, None, [1, 2.5], "beef"]

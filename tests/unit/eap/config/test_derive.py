@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import pytest
+
+from eap.pd.spec import OnChangeSpec, Substitute, TriggerSpec, Wake, Writer
+
+PD = "id: 1, version: 3,"
+FROM = "from: left/state"
+VARIABLES = ", variables: {a: REAL, b: UDINT}}"
+RIGHT_PORT = "net_id: 127.0.9.2.2.1"
+
+
+@pytest.fixture
+def stations(load_plant):
+    def of(*edits):
+        result = load_plant(*edits)
+        assert result.findings == ()
+        return result.plant.stations
+
+    return of
+
+
+def test_every_variable_has_its_writer(stations, tmp_path):
+    (tmp_path / "oven.csv").write_text("heat\n1\n")
+    left, right = stations(
+        ("count: UDINT", "count: UDINT\n      load: REAL\n      heat: real32"),
+        (
+            "count: {kind: counter}",
+            (
+                "count: {kind: counter}\n      load: {kind: host, measure: load1}\n"
+                "      heat: {kind: csv, file: oven.csv, column: heat}"
+            ),
+        ),
+    )
+    assert {v.name: v.writer for v in left.variables} == {
+        "speed": Writer.APPLICATION,
+        "count": Writer.ENGINE,
+        "load": Writer.SERVICES,
+        "heat": Writer.SERVICES,
+    }
+    assert {v.name: v.writer for v in right.variables} == {"a": Writer.ENGINE, "b": Writer.ENGINE}
+    assert left.variables[3].type == "REAL"
+    assert left.sources[2].file == str(tmp_path / "oven.csv")
+
+
+def test_variables_taken_over_keep_type_unit_and_order(stations):
+    _, right = stations((VARIABLES, "}"))
+    assert [(v.name, v.type, v.unit, v.default) for v in right.variables] == [
+        ("seen.speed", "REAL", "1/min", None),
+        ("seen.count", "UDINT", "", None),
+    ]
+    assert right.subscriptions[0].variables == ("seen.speed", "seen.count")
+
+
+def test_a_subscription_knows_its_publisher(stations):
+    _, right = stations((PD, f"{PD} cycle_us: 20000,"), ("timeout_ms: 50", "timeout_ms: 60"))
+    [rx] = right.subscriptions
+    assert (rx.publisher, rx.pd_id, rx.version) == ("127.0.9.1.2.1", 1, 3)
+    assert (rx.sender_cycle_us, rx.step, rx.timeout_ms) == (10000, 2, 60)
+    assert rx.substitute is Substitute.HOLD
+
+
+@pytest.mark.parametrize(
+    ("source", "facts"),
+    [
+        ("from: {publisher: any, id: 1}", ("", 1, 3, 1, 10000)),
+        ("from: {publisher: any, id: 7}, foreign: true", ("", 7, 0, 0, 0)),
+        (
+            (
+                "foreign: true, version: 4, "
+                "from: {publisher: 9.9.9.9.9.9, id: 7, cycle_us: 500, step: 2}"
+            ),
+            ("9.9.9.9.9.9", 7, 4, 2, 500),
+        ),
+    ],
+)
+def test_what_is_known_of_a_publisher_by_numbers(stations, source, facts):
+    [rx] = stations((FROM, source))[1].subscriptions
+    assert (rx.publisher, rx.pd_id, rx.version, rx.step, rx.sender_cycle_us) == facts
+
+
+def test_of_several_publishers_only_the_common_pace_is_known(stations):
+    more = "\n      - {name: more, frame: more, id: 1, divider: 2, variables: [speed, count]}"
+    second_port = "{name: eap1, kind: eap, interface: tcp://127.0.9.3, net_id: 127.0.9.1.3.1}"
+    _, right = stations(
+        ("variables: [speed, count]}", "variables: [speed, count]}" + more),
+        ("to: 127.0.9.2}", "to: 127.0.9.2}\n      - {name: more, port: eap1, to: tcp://127.0.9.2}"),
+        ("net_id: 127.0.9.1.2.1}", f"net_id: 127.0.9.1.2.1}}\n      - {second_port}"),
+        (FROM, "from: {publisher: any, id: 1}"),
+    )
+    assert (right.subscriptions[0].step, right.subscriptions[0].sender_cycle_us) == (0, 10000)
+
+
+def test_triggers_arrive_as_written(stations):
+    def trigger(text):
+        left, _ = stations((PD, f"{PD} {text}"), ("timeout_ms: 50, ", ""))
+        return left.frames[0].pds[0].trigger
+
+    assert trigger("") == TriggerSpec()
+    assert trigger("divider: 4, modulo: 3,") == TriggerSpec(divider=4, modulo=3)
+    assert trigger("on_change: {timeout_ms: 9},") == TriggerSpec(on_change=OnChangeSpec(9, 0))
+    assert trigger("cycle_us: 20000, event: true,") == TriggerSpec(cycle_us=20000, event=True)
+
+
+def test_a_port_joins_what_its_subscriptions_need(stations):
+    _, right = stations(
+        ("to: 127.0.9.2", "to: 239.1.1.1"),
+        (RIGHT_PORT, f"{RIGHT_PORT}, join: [239.1.1.2, 239.1.1.1], wake: arrival"),
+    )
+    assert right.ports[0].join == ("239.1.1.2", "239.1.1.1")
+    assert right.ports[0].wake is Wake.ARRIVAL
+    assert not right.ports[0].broadcast
+    left, right = stations(("to: 127.0.9.2", "to: broadcast"))
+    assert right.ports[0].broadcast
+    assert not left.ports[0].broadcast
+    assert left.frames[0].destination == "255.255.255.255"
+
+
+def test_ethernet_ports_join_groups_and_keep_their_tag(stations):
+    tagged = "ethernet://b, vlan: {id: 7, priority: 5}, join: [01-01-05-04-00-08]"
+    _, right = stations(
+        ('"udp://127.0.9.1"', "ethernet://a, vlan: {id: 7}"),
+        ('"udp://127.0.9.2"', tagged),
+        ("to: 127.0.9.2", "to: 01:01:05:04:00:07"),
+    )
+    assert right.ports[0].join == ("01:01:05:04:00:08", "01:01:05:04:00:07")
+    assert (right.ports[0].vlan_id, right.ports[0].vlan_priority) == (7, 5)
+
+
+def test_stations_are_staggered_unless_they_say_when(stations):
+    assert [s.phase_us for s in stations()] == [0, 5000]
+    fast = ("plant: pair", "plant: pair\ndefaults: {cycle_us: 400}")
+    assert [s.phase_us for s in stations(fast)] == [0, 250]
+    own = ("net_id: 127.0.9.2.1.1", "net_id: 127.0.9.2.1.1\n    phase_us: 7\n    cycle_us: 500")
+    right = stations(own)[1]
+    assert (right.phase_us, right.cycle_us) == (7, 500)

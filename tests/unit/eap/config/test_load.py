@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec import datatypes, pdo
+from eap.config.load import load
+from eap.pd.layout import plan_layout
+from eap.pd.spec import StationSpec
+
+PLANTS = Path(__file__).parents[4] / "config"
+
+
+@pytest.fixture(params=sorted(PLANTS.glob("*.yaml")), ids=lambda path: path.name)
+def shipped(request):
+    result = load(request.param)
+    assert [str(finding) for finding in result.findings] == []
+    return result.plant
+
+
+def test_shipped_plants_have_no_findings_and_a_process_image(shipped):
+    for station in shipped.stations:
+        assert plan_layout(station).size > 0
+
+
+def test_a_station_travels_as_json(shipped):
+    for station in shipped.stations:
+        assert msgspec.json.decode(msgspec.json.encode(station), type=StationSpec) == station
+
+
+def test_the_demo_is_the_ring_that_the_contract_describes():
+    plant = load(PLANTS / "demo.yaml").plant
+    assert [s.name for s in plant.stations] == ["island-01", "island-02", "island-03"]
+    assert [s.ports[0].interface for s in plant.stations] == [
+        f"udp://127.0.1.{n}" for n in (1, 2, 3)
+    ]
+    assert "setpoint" in {v.name for v in plant.stations[0].variables if v.writer == "application"}
+    assert plant.stations[0].ports[0].join == ("239.88.164.1",)
+
+
+def test_the_solar_line_has_the_sizes_of_the_contract():
+    plant = load(PLANTS / "solar-line.yaml").plant
+    sizes = {600: 0, 1024: 0}
+    received = 0
+    for station in plant.stations:
+        assert station.cycle_us == 10_000
+        types = {v.name: datatypes.parse(v.type) for v in station.variables}
+        for pd in (pd for frame in station.frames for pd in frame.pds):
+            sizes[pdo.layout(types[name] for name in pd.variables).size] += 1
+        received += len(station.subscriptions)
+        assert all(rx.step == 1 for rx in station.subscriptions)
+    assert sizes == {600: 26, 1024: 28}
+    assert received == 54
+    assert [s.name for s in plant.stations] == [f"island-{n:02}" for n in range(1, 15)] + [
+        "control"
+    ]
+    hosts = [s.ports[0].interface.removeprefix("udp://127.0.1.") for s in plant.stations]
+    assert hosts == [*map(str, range(1, 15)), "100"]
+
+
+def test_findings_carry_everything_that_the_contract_names(load_plant):
+    [finding] = load_plant(("id: 1,", "id: 70000,")).findings
+    assert msgspec.to_builtins(finding) == {
+        "file": finding.file,
+        "line": 15,
+        "path": "stations[0].publish[0].id",
+        "message": "id is 70000",
+        "expected": "a whole number from 0 to 65535",
+    }
+    assert Path(finding.file).name == "plant.yaml"
+
+
+def test_all_findings_come_at_once_in_the_order_of_the_file(load_plant):
+    result = load_plant(
+        ("count: UDINT", "count: UDIMT"),
+        ("to: 127.0.9.2", "to: nowhere"),
+        ("net_id: 127.0.9.2.2.1", "net_id: 127.0.9.1.2.1"),
+        ("timeout_ms: 50", "timeout_ms: 5"),
+    )
+    assert result.plant is None
+    assert [finding.line for finding in result.findings] == [9, 13, 19, 21]
+
+
+WORDS = (PLANTS / "demo.yaml").read_text().split(" ")
+ODD = [
+    "-1",
+    "{}",
+    "[]",
+    "null",
+    "x:",
+    "[a]",
+    "1e99",
+    "udp://x",
+    "0.0.0.0",
+    "true,",
+    "/",
+    "&a",
+    "*a",
+]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, len(WORDS) - 1), st.sampled_from(ODD + WORDS)), max_size=4)
+)
+def test_no_content_is_a_traceback(tmp_path_factory, changes):
+    words = WORDS.copy()
+    for position, word in changes:
+        words[position] = word
+    path = tmp_path_factory.getbasetemp() / "odd.yaml"
+    path.write_text(" ".join(words))
+    result = load(path)
+    assert (result.plant is None) == bool(result.findings)
