@@ -22,6 +22,9 @@ _UNITS = {"us": " of microseconds", "ms": " of milliseconds"}
 class _BrokenError(Exception):
     """The value was reported and cannot be used."""
 
+    number: int | None = None
+    """The number if it is only out of range: good enough to go on checking with."""
+
 
 def convert(root: Node, report: Report) -> PlantFile | None:
     """Return what *root* describes without the items that were reported; None if it is no plant."""
@@ -124,8 +127,11 @@ class _Converter:
                 continue
             try:
                 values[field.name] = self.value(given[name], field.type, where, name)
-            except _BrokenError:
-                broken |= field.required
+            except _BrokenError as exc:
+                if field.required and exc.number is not None:
+                    values[field.name] = exc.number
+                else:
+                    broken |= field.required
         if broken:
             raise _BrokenError
         return kind.cls(**values)
@@ -202,6 +208,9 @@ class _Converter:
                 low, high = kind.ge, kind.le
                 if (low is None or value >= low) and (high is None or value <= high):
                     return value
+                out_of_range = self._refuse(node, path, key, _describe(kind, key))
+                out_of_range.number = value
+                raise out_of_range
             case inspect.FloatType() if isinstance(value, int | float):
                 if not isinstance(value, bool) and isfinite(value):
                     return float(value)

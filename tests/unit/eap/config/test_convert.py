@@ -60,9 +60,14 @@ def test_numbers_are_texts_where_a_text_is_wanted(load_plant):
     assert (speed.unit, speed.comment) == ("1", "2.50")
 
 
+def test_what_depends_on_an_item_that_cannot_be_read_is_not_blamed(findings):
+    assert findings(("id: 1,", "id: one,")) == ["15: id is 'one'; a whole number from 0 to 65535"]
+
+
 def test_errors_of_shape_and_of_sense_are_found_together_and_without_echo(findings):
     found = findings(
-        ("id: 1,", "id: 70000,"),  # the PD is left out; its subscription is not blamed
+        ("id: 1, version: 3,", "id: 70000, version: 3, cycle_us: 15000,"),
+        ("frame: out", "frmae: uot"),
         ("count: UDINT", "count: UDIMT"),
         ("    sources:", "    sorces:"),
         ("net_id: 127.0.9.2.1.1", "net_id: 127.0.9.1.1.1"),
@@ -70,7 +75,10 @@ def test_errors_of_shape_and_of_sense_are_found_together_and_without_echo(findin
     assert [line.split(";")[0] for line in found] == [
         "9: count: 'UDIMT' is not a data type, did you mean UDINT?",
         "10: unknown key 'sorces', did you mean 'sources'?",
+        "15: unknown key 'frmae', did you mean 'frame'?",
         "15: id is 70000",
+        "15: station left has no frame 'uot', did you mean 'out'?",
+        "15: cycle_us 15000 of PD 'state' is no multiple of the device cycle, 10000",
         "17: NetID 127.0.9.1.1.1 is used twice (first in line 4)",
     ]
 
