@@ -33,9 +33,11 @@ from eap.pd.layout import FRAME_CTRL, VAR_CTRL
 PLANT = Path("config/demo.yaml")
 EAPCTL = Path(sys.executable).with_name("eapctl")
 REFRESH_S = 0.5
-LINE_S = 1.0
+LINE_S = 0.7
 ENDS_WITHIN_S = 3.0
-WIDTH = 32
+VALUE_LENGTH = 32
+COLUMN = 42
+"""Columns of the terminal that the tables of one station take."""
 
 
 def main() -> int:
@@ -108,7 +110,7 @@ def show(
     stations: list[AttachedStation], appliance: subprocess.Popen[str], seconds: float | None
 ) -> None:
     """Show what the stations hold until the appliance ends or *seconds* are over."""
-    console = Console()
+    console = Console(markup=False)
     end = monotonic() + seconds if seconds is not None else float("inf")
     if not console.is_terminal:
         while goes_on(appliance, end, LINE_S):
@@ -117,7 +119,7 @@ def show(
         return
     with Live(console=console, auto_refresh=False) as live:
         while goes_on(appliance, end, REFRESH_S):
-            live.update(as_tables(stations), refresh=True)
+            live.update(as_view(stations, console.width), refresh=True)
 
 
 def goes_on(appliance: subprocess.Popen[str], end: float, pause_s: float) -> bool:
@@ -137,8 +139,10 @@ def as_line(station: AttachedStation) -> str:
     return f"{station.name} cycle {station.cycle}: {values}"
 
 
-def as_tables(stations: list[AttachedStation]) -> Columns:
-    """Lay out the stations side by side, as far as the terminal is wide."""
+def as_view(stations: list[AttachedStation], width: int) -> Columns | Group:
+    """Lay out tables side by side, or a paragraph a station where the terminal is too narrow."""
+    if width < COLUMN * len(stations):
+        return Group(*(f"{as_line(station)}\n" for station in stations))
     return Columns([Group(variables(station), subscriptions(station)) for station in stations])
 
 
@@ -177,7 +181,7 @@ def as_text(value: Any) -> str:
     text = f"{value:.3f}" if isinstance(value, float) else str(value)
     if isinstance(value, bytes):
         text = value.hex(" ")
-    return text if len(text) <= WIDTH else f"{text[: WIDTH - 1]}…"
+    return text if len(text) <= VALUE_LENGTH else f"{text[: VALUE_LENGTH - 1]}…"
 
 
 if __name__ == "__main__":
