@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+from eap.codec.pd import FIRST_PD
+from eap.pd.account import Account, Timing
+from eap.pd.frame_plan import FramePlan, Refused, Taken
+from eap.pd.words import RxWord
+from tests.support.cyclic import PEER, octets
+
+TIMING = Timing(step=1, sender_cycle_ns=0, own_cycle_ns=1)
+
+
+def account() -> Account:
+    return Account(memoryview(bytearray(8 * RxWord.SIZE)).cast("q"), 0, TIMING)
+
+
+def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
+    one = account()
+    pds = [(b"\x01\0\0\0\x02\0", 2), (b"\x02\0\0\0\x04\0", 4), (b"\x03\0\0\0\x01\0", 1)]
+    plan = FramePlan(
+        100,
+        pds,
+        [
+            Taken(one, 0, source=14, target=200, size=10),
+            Taken(one, 0, source=24, target=210, size=12),
+            Taken(one, 0, source=36, target=300, size=9),
+        ],
+        [],
+    )
+    assert plan.parts == (
+        (one, ((slice(14, 36), slice(200, 222)), (slice(36, 45), slice(300, 309)))),
+    )
+
+
+def test_each_account_has_its_own_copies():
+    one, other = account(), account()
+    plan = FramePlan(
+        100,
+        [(b"\x01\0\0\0\0\0", 0), (b"\x02\0\0\0\0\0", 0)],
+        [Taken(one, 3, 14, 200, 8), Taken(other, 4, 22, 208, 8)],
+        [Refused((1,))],
+        roaming=[other],
+        publisher=bytes([5, 23, 91, 23, 1, 1]),
+    )
+    assert [part for part, _ in plan.parts] == [one, other]
+    assert plan.taken_words == (3, 4)
+    assert plan.roaming == (other,)
+    assert plan.publisher == 0x05175B170101
+
+
+def test_headers_are_compared_without_their_quality():
+    frame = octets([(1, b"ab", 7, 500), (2, b"", 3, 0)], publisher=PEER)
+    plan = FramePlan(
+        len(frame),
+        [(b"\x01\0\x07\0\x02\0", 2), (b"\x02\0\x03\0\0\0", 0)],
+        [],
+        [],
+    )
+    assert plan.headers(frame, FIRST_PD) == plan.expected
+    other = octets([(1, b"ab", 7, 0), (2, b"", 4, 0)], publisher=PEER)
+    assert plan.headers(other, FIRST_PD) != plan.expected

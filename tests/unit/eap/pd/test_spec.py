@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from eap.pd.spec import (
+    INTERFACE_MEASURES,
+    CounterSource,
+    HostSource,
+    Measure,
+    OnChangeSpec,
+    RandomSource,
+    RxPdSpec,
+    SineSource,
+    StationSpec,
+    Substitute,
+    TriggerSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
+from tests.support.cyclic import eap_port
+
+STATION = StationSpec(
+    "island-01",
+    "5.1.1.1.1.1",
+    10_000,
+    (eap_port(),),
+    variables=(
+        VariableSpec("load", "REAL", Writer.SERVICES, unit="1"),
+        VariableSpec("n", "UINT", Writer.ENGINE, default=7),
+        VariableSpec("matrix", "INT[2]", default=[1, -1]),
+    ),
+    sources=(
+        CounterSource("n"),
+        HostSource("load", Measure.LOAD1),
+        SineSource("s", 1.0, 100.0),
+        RandomSource("r", seed=3),
+    ),
+    frames=(
+        TxFrameSpec(
+            "f",
+            "eap0",
+            "239.0.0.1",
+            (TxPdSpec("p", 1, ("n",), trigger=TriggerSpec(on_change=OnChangeSpec(5, 10))),),
+        ),
+    ),
+    subscriptions=(RxPdSpec("r", "eap0", 9, ("x",), timeout_ms=30, substitute=Substitute.DEFAULT),),
+)
+
+
+def test_a_station_crosses_to_the_engine_as_json_unchanged():
+    text = msgspec.json.encode(STATION)
+    assert msgspec.json.decode(text, type=StationSpec) == STATION
+
+
+def test_a_field_of_another_release_is_refused():
+    text = msgspec.json.encode(STATION).replace(b'"phase_us"', b'"phase_ms"')
+    with pytest.raises(msgspec.ValidationError, match="phase_ms"):
+        msgspec.json.decode(text, type=StationSpec)
+
+
+def test_measures_of_interfaces_are_those_of_octets_and_packets():
+    assert {measure.value for measure in INTERFACE_MEASURES} == {
+        f"{way}_{what}" for way in ("rx", "tx") for what in ("octets", "packets")
+    }
