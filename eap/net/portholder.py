@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PROC = Path("/proc")
-_LISTEN = "0A"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ def describe_holder(protocol: str, address: str, port: int, *, proc: Path = _PRO
     holders = find_holders(protocol, address, port, proc=proc)
     if not holders:
         return f"{start} by an unknown process: `ss -lnp` as root shows it"
-    holder = holders[0]
+    holder = min(holders, key=lambda found: bool(found.remote))  # a server before its clients
     text = f"{start} by {holder}"
     if "eapctl" in holder.command or "eap.appliance" in holder.command:
         return f"{text}: stop that appliance or give this one another address"

@@ -1,0 +1,92 @@
+"""A port with datagrams and connections: each frame goes the way its destination asks for."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from eap.ids import InterfaceUri
+from eap.net.loopback import LoopbackLines
+from eap.net.tcp import TcpReceiver, open_tcp_listener
+from eap.net.tcpport import TcpPort
+from eap.pd.link import OutFrame
+
+pytestmark = pytest.mark.net
+
+HERE, THERE = "127.0.3.22", "127.0.3.23"
+TCP = f"tcp://{THERE}"
+
+
+class Listener:
+    def __init__(self):
+        self.got = []
+
+    def take(self, data, size, _at_ns):
+        self.got.append(bytes(data[:size]))
+
+
+def frame(number, destination):
+    return OutFrame(bytearray([1, 0x40, number]), 0, destination)
+
+
+@pytest.fixture
+def plant():
+    """A port with a line beside it, and the far port with a connection from the first."""
+    lines = LoopbackLines()
+    line, far_line = (lines.open(InterfaceUri.parse("loop://line")) for _ in range(2))
+    heard = Listener()
+    far_line.takers.append(heard.take)
+    near, far = TcpPort(HERE, line), TcpPort(THERE, far_line)
+    with open_tcp_listener(THERE) as listener:
+        listener.settimeout(5)
+        assert near.link_header(TCP) == near.link_header(TCP) == b""
+        near.drain(0)
+        taken = Listener()
+        far.accept(TcpReceiver(listener.accept()[0], [taken.take]))
+        near.drain(0)
+        yield near, far, heard, taken
+    near.close()
+    far.close()
+
+
+def drain_until(port, done):
+    limit = time.monotonic() + 5
+    while not done():
+        assert time.monotonic() < limit
+        port.drain(0)
+
+
+def test_each_frame_goes_its_way(plant):
+    near, far, heard, taken = plant
+    frames = [frame(1, TCP), frame(2, "127.0.3.24"), frame(3, TCP)]
+    assert list(near.send(frames, 0)) == []
+    drain_until(far, lambda: len(taken.got) == 2)
+    assert taken.got == [b"\x01\x40\x01", b"\x01\x40\x03"]
+    assert heard.got == [b"\x01\x40\x02"]
+    assert near.errors == {}
+
+
+def test_frames_that_find_no_connection_are_returned_and_counted():
+    port = TcpPort(HERE)
+    port.link_header(TCP)
+    frames = [frame(1, TCP), frame(2, "127.0.3.24")]
+    assert list(port.send(frames, 0)) == frames
+    assert port.errors == {"not_connected": 1}
+    assert port.drain(0) == 0
+    port.close()
+
+
+def test_connection_that_ends_is_counted_under_its_reason_and_forgotten(plant):
+    near, far, _, _ = plant
+    near.close()
+    drain_until(far, lambda: far.closed)
+    far.drain(0)
+    assert far.closed == {"closed by the peer": 1}
+
+
+def test_port_needs_no_headroom():
+    port = TcpPort(HERE)
+    assert port.link_header("127.0.3.24") == b""
+    assert port.minimum_size == 0
+    assert port.drain(0) == 0
