@@ -69,7 +69,7 @@ class Gather:
             first, shift = divmod(target, 8)
             value = (value & (1 << length) - 1) << shift
             octets[first] = octets.get(first, 0) | value & 0xFF
-            if value > 0xFF:
+            if shift + length > 8:  # also when its upper bits are zero now
                 octets[first + 1] = octets.get(first + 1, 0) | value >> 8
         for octet, value in octets.items():
             buffer[offset + octet] = value
