@@ -1,0 +1,94 @@
+"""Measure speed and memory: ``python -m tools.bench [NAME…] [--quick] [--json FILE] [--markdown]``.
+
+Every figure is a ratio to a named reference that ran in the same minute on the same machine, or
+says what it is.  docs/performance.md explains them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tools.bench import machine
+from tools.bench.figures import (
+    Figure,
+    SkippedError,
+    Verdict,
+    markdown_table,
+    replace_between,
+    skipped,
+    text_table,
+)
+from tools.bench.network import ROOT
+from tools.bench.settings import Settings, quick
+
+NAMES = ("throughput", "latency", "lateness", "solar", "limits", "receive", "startup")
+PAGE = ROOT / "docs" / "performance.md"
+BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"
+
+
+class Section(msgspec.Struct, frozen=True):
+    """What one benchmark found."""
+
+    name: str
+    title: str
+    figures: list[Figure]
+
+
+def main(arguments: list[str]) -> int:
+    """Run the benchmarks that were asked for; return 0 even when a target was missed."""
+    options = _parse(arguments)
+    settings = quick() if options.quick else Settings()
+    about = machine.describe()
+    print(about)
+    sections = []
+    for name in options.names or NAMES:
+        section = _run(name, settings)
+        sections.append(section)
+        print(f"\n{section.title}\n{text_table(section.figures)}", flush=True)
+    if options.json:
+        data = {"machine": about, "quick": options.quick, "sections": sections}
+        Path(options.json).write_bytes(msgspec.json.format(msgspec.json.encode(data)) + b"\n")
+    if options.markdown:
+        _write_page(about, sections)
+    missed = [f.name for s in sections for f in s.figures if f.verdict is Verdict.MISSED]
+    print(f"\n{len(missed)} targets missed" + "".join(f"\n  {name}" for name in missed))
+    return 0
+
+
+def _parse(arguments: list[str]) -> Any:
+    parser = argparse.ArgumentParser(prog="python -m tools.bench", description="Measure the speed.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(NAMES)}")
+    parser.add_argument("--quick", action="store_true", help="two minutes, rough figures")
+    parser.add_argument("--json", metavar="FILE", help="write all figures to FILE")
+    parser.add_argument("--markdown", action="store_true", help=f"put the tables into {PAGE.name}")
+    options = parser.parse_args(arguments)
+    for name in options.names:
+        if name not in NAMES:
+            parser.error(f"there is no benchmark {name!r}, expected any of {', '.join(NAMES)}")
+    return options
+
+
+def _run(name: str, settings: Settings) -> Section:
+    module = importlib.import_module(f"tools.bench.{name}")
+    try:
+        figures = module.run(settings)
+    except SkippedError as reason:
+        figures = [skipped(name, reason)]
+    return Section(name, module.TITLE, figures)
+
+
+def _write_page(about: str, sections: list[Section]) -> None:
+    tables = [f"### {s.title}\n\n{markdown_table(s.figures)}" for s in sections]
+    new = "\n\n".join([f"Machine: {about}. Made by `make bench ARGS=--markdown`.", *tables])
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(replace_between(text, BEGIN, END, f"\n{new}\n"), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

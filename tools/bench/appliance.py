@@ -1,0 +1,125 @@
+"""A whole appliance under measurement: ``eapctl run`` in a namespace, asked through ``status``."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec
+
+from eap.appliance.runtime import VARIABLE
+from tools.bench.machine import ProcessSample, memory_folder
+from tools.bench.network import ROOT, Cable
+from tools.bench.pacing import wait
+
+PROCESSES = ("supervisor", "engine", "services")
+_READY_WITHIN_S = 60.0
+_END_WITHIN_S = 10.0
+_WARM_UP_S = 1.0
+_EAPCTL = (sys.executable, "-m", "eap")
+
+
+class Observation(msgspec.Struct, frozen=True):
+    """What an appliance did in *seconds*.
+
+    Attributes:
+        cpu: Share of one core of each process.
+        rss: Octets of each process.
+        lost: Frames lost, over all subscriptions.
+        received: PDs received, likewise.
+        overruns: Cycles left out because the engine came too late.
+        cycles: Cycles due, of all stations.
+        lateness_us: That of the station that was worst.
+    """
+
+    seconds: float
+    cpu: dict[str, float]
+    rss: dict[str, int]
+    lost: int
+    received: int
+    overruns: int
+    cycles: int
+    lateness_us: dict[str, int]
+
+
+@contextmanager
+def running(plant: Path, link: Cable | None) -> Iterator[dict[str, str]]:
+    """Run *plant* until the block ends; yield the environment in which ``eapctl`` finds it.
+
+    Raises:
+        RuntimeError: it does not get ready.
+    """
+    with TemporaryDirectory(dir=memory_folder()) as folder:
+        environment = os.environ | {VARIABLE: folder}
+        process = subprocess.Popen(
+            _command(link, "run", str(plant)),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+            cwd=ROOT,
+        )
+        try:
+            output = process.stdout
+            assert output is not None  # noqa: S101  it was asked for
+            fired, _, _ = select.select([output], [], [], _READY_WITHIN_S)
+            if not fired or b'"ready"' not in output.readline():
+                raise RuntimeError(f"eapctl run {plant.name} does not get ready")
+            yield environment
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.communicate(timeout=_END_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.communicate()
+
+
+def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
+    """Run *plant* for *seconds* and return what it did."""
+    with running(plant, link) as environment:
+        wait(_WARM_UP_S)
+        first = _status(link, environment)
+        pids = {name: int(first["processes"][name]["pid"]) for name in PROCESSES}
+        before = {name: ProcessSample(pid) for name, pid in pids.items()}
+        wait(seconds)
+        after = {name: ProcessSample(pid) for name, pid in pids.items()}
+        last = _status(link, environment)
+    return Observation(
+        seconds=seconds,
+        cpu={
+            name: (after[name].cpu_ns - before[name].cpu_ns) / seconds / 1e9 for name in PROCESSES
+        },
+        rss={name: after[name].rss for name in PROCESSES},
+        lost=sum(pd["lost"] or 0 for station in last["stations"] for pd in station["pd"]["rx"]),
+        received=sum(pd["received"] for station in last["stations"] for pd in station["pd"]["rx"]),
+        overruns=sum(s["overruns"] for s in last["stations"]),
+        cycles=sum(s["cycle"] for s in last["stations"]),
+        lateness_us={
+            key: max(station["lateness_us"][key] for station in last["stations"])
+            for key in ("p50", "p99", "max")
+        },
+    )
+
+
+def _status(link: Cable | None, environment: dict[str, str]) -> dict[str, Any]:
+    done = subprocess.run(
+        _command(link, "status", "--json"),
+        capture_output=True,
+        check=True,
+        env=environment,
+        cwd=ROOT,
+    )
+    return msgspec.json.decode(done.stdout, type=dict[str, Any])
+
+
+def _command(link: Cable | None, *words: str) -> Sequence[str]:
+    command = [*_EAPCTL, *words]
+    return link.command(0, *command) if link else command

@@ -1,0 +1,98 @@
+"""The machine that a benchmark runs on: what it is, and what it tells about a process."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import shutil
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tools.bench.figures import SkippedError
+
+_PM_QOS = Path("/dev/cpu_dma_latency")
+_RUNTIME_FOLDERS = ("/dev/shm", "/run", "/tmp")  # noqa: S108  the first in memory is taken
+
+
+class ProcessSample:
+    """Processor time and memory of one process at one moment."""
+
+    def __init__(self, pid: int) -> None:
+        tasks = Path(f"/proc/{pid}/task").iterdir()
+        self.cpu_ns = sum(int((task / "schedstat").read_text().split()[0]) for task in tasks)
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+        self.rss = pages * os.sysconf("SC_PAGE_SIZE")
+        """Octets."""
+
+
+def describe() -> str:
+    """Return one line: processors, kernel, Python."""
+    info = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    models = [line.partition(":")[2].strip() for line in info.splitlines() if "model name" in line]
+    model = models[0] if models else platform.machine()
+    virtual = ", virtual machine" if " hypervisor" in info else ""
+    return (
+        f"{os.cpu_count()} cores of {model}{virtual}; Linux {os.uname().release}; "
+        f"{platform.python_implementation()} {platform.python_version()}"
+    )
+
+
+def require_root() -> None:
+    """Raise SkippedError unless namespaces can be made."""
+    if os.geteuid() != 0:
+        raise SkippedError("needs root, for network namespaces")
+    require_program("ip", "iproute2")
+
+
+def require_cores() -> None:
+    """Raise SkippedError unless two processes can have a core each."""
+    if len(os.sched_getaffinity(0)) < 2:
+        raise SkippedError("needs two cores")
+
+
+def require_program(name: str, package: str) -> str:
+    """Return the path of a program; raise SkippedError if it is not installed."""
+    path = shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
+    if path is None:
+        raise SkippedError(f"needs {name} (Debian package {package})")
+    return path
+
+
+def cores() -> tuple[int, int]:
+    """Return the two cores to pin to."""
+    first, second, *_ = sorted(os.sched_getaffinity(0))
+    return first, second
+
+
+def memory_folder() -> str:
+    """Return a folder for temporary files, in memory if there is one."""
+    return next(folder for folder in _RUNTIME_FOLDERS if os.access(folder, os.W_OK))
+
+
+@contextmanager
+def pm_qos(*, on: bool) -> Iterator[None]:
+    """Keep all processors out of idle states that take time to leave, while the block runs.
+
+    Raises:
+        SkippedError: this machine does not let us.
+    """
+    if not on:
+        yield
+        return
+    try:
+        fd = os.open(_PM_QOS, os.O_WRONLY)
+    except OSError as error:
+        raise SkippedError(f"{_PM_QOS}: {error.strerror}") from None
+    try:
+        os.write(fd, struct.pack("=i", 0))
+        yield
+    finally:
+        os.close(fd)
+
+
+def set_timer_slack(slack_ns: int) -> None:
+    """Let timers of this thread be late by no more than *slack_ns*."""
+    ctypes.CDLL(None).prctl(29, slack_ns, 0, 0, 0)  # PR_SET_TIMERSLACK
