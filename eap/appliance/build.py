@@ -9,14 +9,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
 
-from eap.appliance.discards import DiscardCounters, Tally
+from eap.appliance.discards import DiscardCounters, Refusal, Tally
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.appliance.passing import PassedConnection
 from eap.appliance.runtime import ApplianceFolder
-from eap.ids import InterfaceUri
+from eap.ids import Destination, DestinationKind, InterfaceUri
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import ImageFile, create_image
 from eap.net.loopback import LoopbackLines
 from eap.net.mmsg import ReceiveBatch
+from eap.net.tcp import TcpReceiver
+from eap.net.tcpport import TcpPort
 from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
@@ -50,6 +53,7 @@ class EnginePlant:
         self._stations: dict[str, Station] = {}
         self._batch = ReceiveBatch()
         self._tallies: list[Tally] = []
+        self._tcp_ports: dict[PortName, TcpPort] = {}
         self._on_arrival: list[Channel] = []
         self._counters = self._resources.enter_context(
             DiscardCounters(folder.discards("engine"), [s.name for s in handover.stations])
@@ -59,7 +63,7 @@ class EnginePlant:
             self._resources.callback(file.close)
             self._files[spec.name] = file
             self._stations[spec.name] = Station(spec, file.image, file.wake_waiters)
-        self._open_lines()
+        self._open_own()
         for shared in handover.sockets:
             if shared.kind is SocketKind.PACKET:
                 self._open_interface(shared)
@@ -73,6 +77,15 @@ class EnginePlant:
         for file in self._files.values():
             file.image.words[StationWord.ENGINE_PID] = os.getpid()
         self.engine.start(now_ns)
+
+    def add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
+        """Take frames from a connection that services accepted, for all ports behind it."""
+        try:
+            receiver = TcpReceiver(connection, [self._taker(owner) for owner in passed.owners])
+        except OSError:
+            connection.close()  # the peer has left again
+            return
+        self._tcp_ports[passed.owners[0]].accept(receiver)
 
     def publish_discards(self) -> None:
         """Show what the interfaces dropped since the last time."""
@@ -90,12 +103,16 @@ class EnginePlant:
         """Let go of all sockets and images."""
         self._resources.close()
 
-    def _open_lines(self) -> None:
-        """Connect the ports that stay in this process."""
+    def _open_own(self) -> None:
+        """Connect the ports that need no shared socket."""
         lines = LoopbackLines()
         for name, port in self._ports():
             uri = InterfaceUri.parse(port.interface)
-            if port.kind is PortKind.EAP and uri.scheme == "loop":
+            if port.kind is not PortKind.EAP:
+                continue
+            if uri.scheme == "tcp":
+                self._connect(name, None)
+            elif uri.scheme == "loop":
                 channel = lines.open(uri)
                 channel.takers.append(self._taker(name))
                 self._stations[name.station].connect(port.name, channel)
@@ -108,18 +125,35 @@ class EnginePlant:
         )
         self._resources.callback(channel.close)
         for owner in shared.owners:
-            station = self._stations[owner.station]
             if shared.kind is SocketKind.UDP:
-                station.connect(owner.port, channel)
+                self._connect(owner, channel)
             else:
-                station.drain_also(channel)
+                self._stations[owner.station].drain_also(channel)
         self._wake_on_arrival(shared.owners, channel)
+
+    def _connect(self, name: PortName, datagrams: Channel | None) -> None:
+        """Connect a port to its datagrams, to TCP, or to both."""
+        spec = self._handover.port(name)
+        station = self._stations[name.station]
+        sends_tcp = any(
+            Destination.parse(frame.destination).kind is DestinationKind.TCP
+            for frame in station.spec.frames
+            if frame.port == name.port
+        )
+        if datagrams is not None and not spec.tcp and not sends_tcp:
+            station.connect(name.port, datagrams)
+            return
+        port = TcpPort(InterfaceUri.parse(spec.interface).host, datagrams)
+        self._resources.callback(port.close)
+        self._tcp_ports[name] = port
+        self._tallies.append(Tally(self._counters, [name.station], port.closed, _tcp_reason))
+        station.connect(name.port, port)
 
     def _open_interface(self, shared: SharedSocket) -> None:
         interface = EthernetInterface(socket.socket(fileno=shared.engine_fd), packet_batch())
         self._resources.callback(interface.close)
         stations = sorted({owner.station for owner in shared.owners})
-        self._tallies.append(Tally(self._counters, stations, interface.discarded))
+        self._tallies.append(Tally(self._counters, stations, interface.discarded, Refusal))
         for owner in shared.owners:
             spec = self._handover.port(owner)
             port = interface.port(
@@ -143,3 +177,8 @@ class EnginePlant:
         for station in self._handover.stations:
             for port in station.ports:
                 yield PortName(station.name, port.name), port
+
+
+def _tcp_reason(closed: str) -> Refusal | None:
+    """Return what to count for a connection that ended; one that was just closed is no refusal."""
+    return Refusal.TCP_TYPE if closed.startswith("frame of type") else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum, auto
 from pathlib import Path
 from types import TracebackType
@@ -28,6 +28,8 @@ class Refusal(StrEnum):
     """A connection that sent no frame header in time."""
     TCP_FULL = auto()
     """More connections than there is room for."""
+    TCP_TYPE = auto()
+    """A type-4 connection that went on with a frame of another type, and was closed."""
     ENGINE_BUSY = auto()
     """The engine did not take a connection that was meant for it."""
     OTHER_VLAN = auto()
@@ -87,21 +89,31 @@ class DiscardCounters:
 
 
 class Tally:
-    """Carries what a driver counts in a dict of its own over to *counters* of all *stations*."""
+    """Carries what a driver counts by name in a dict over to *counters* of all *stations*.
+
+    *reason_of* says which counter a name belongs to, None for none.
+    """
 
     def __init__(
-        self, counters: DiscardCounters, stations: Sequence[str], source: Mapping[str, int]
+        self,
+        counters: DiscardCounters,
+        stations: Sequence[str],
+        source: Mapping[str, int],
+        reason_of: Callable[[str], Refusal | None],
     ) -> None:
         self._counters = counters
         self._stations = stations
         self._source = source
-        self._seen = dict(source)
+        self._reason_of = reason_of
+        self._seen: dict[str, int] = {}
 
     def publish(self) -> None:
         """Add what has come since the last call."""
         for name, total in self._source.items():
-            grown = total - self._seen[name]
-            if grown:
-                self._seen[name] = total
+            grown = total - self._seen.get(name, 0)
+            if not grown:
+                continue
+            self._seen[name] = total
+            if reason := self._reason_of(name):
                 for station in self._stations:
-                    self._counters.count(station, Refusal(name), grown)
+                    self._counters.count(station, reason, grown)

@@ -21,12 +21,12 @@ from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.packetsocket import open_packet_pair
-from eap.net.udpsocket import bind_failure, open_udp_group_pair, open_udp_pair
+from eap.net.tcp import open_tcp_listener
+from eap.net.udpsocket import open_udp_group_pair, open_udp_pair
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 BROADCAST = "255.255.255.255"
 CONTROL_BACKLOG = 64
-_TCP_BACKLOG = 64
 _ORDER = tuple(SocketKind)
 
 
@@ -108,7 +108,7 @@ class SharedSockets:
 
 def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:
     if planned.kind is SocketKind.TCP:
-        listener = opened.enter_context(_open_listener(planned.address, planned.port))
+        listener = opened.enter_context(open_tcp_listener(planned.address, planned.port))
         return msgspec.structs.replace(planned, services_fd=listener.fileno())
     engine, services = _open_pair(planned)
     opened.enter_context(engine)
@@ -124,18 +124,6 @@ def _open_pair(planned: SharedSocket) -> tuple[socket.socket, socket.socket]:
     if planned.kind is SocketKind.PACKET:
         return open_packet_pair(planned.address)
     return open_udp_group_pair(planned.group, planned.address, planned.port)
-
-
-def _open_listener(address: str, port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((address, port))
-        listener.listen(_TCP_BACKLOG)
-    except OSError as exc:
-        listener.close()
-        raise EnvironmentalError(bind_failure("TCP", address, port, exc)) from None
-    return listener
 
 
 def _open_control(path: Path, opened: ExitStack) -> socket.socket:

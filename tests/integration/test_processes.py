@@ -1,0 +1,358 @@
+"""The processes of an appliance: started, killed one by one, ended, and refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eap.appliance.client import Client, connect
+from eap.codec.ethercat import EAP_PORT, EtherCatHeader
+from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
+from eap.errors import ControlError
+from eap.ids import NetId
+
+pytestmark = pytest.mark.net
+
+PLANT = """\
+plant: processes
+defaults: {cycle_us: 5000}
+stations:
+  - name: left
+    net_id: 127.9.1.1.1.1
+    ports:
+      - {name: eap0, kind: eap, interface: "udp://127.9.1.1", net_id: 127.9.1.1.2.1, tcp: TCP}
+    variables:
+      ticks: UDINT
+      load: REAL
+      setpoint: UINT
+    sources:
+      ticks: {kind: counter}
+      load: {kind: host, measure: cpu_percent, period_ms: 100}
+    frames:
+      - {name: out, port: eap0, to: right/eap0}
+    publish:
+      - {name: state, frame: out, id: 1, variables: [ticks, load, setpoint]}
+  - name: right
+    net_id: 127.9.1.2.1.1
+    ports:
+      - {name: eap0, kind: eap, interface: "udp://127.9.1.2", net_id: 127.9.1.2.2.1}
+    subscribe:
+      - {name: left-state, port: eap0, from: left/state, timeout_ms: 100}
+"""
+TICKS, SETPOINT = "left-state.ticks", "left-state.setpoint"
+LEFT = ("127.9.1.1", EAP_PORT)
+FOREIGN_PD = encode_frame(
+    PdFrameHeader(NetId.parse("9.9.9.9.9.9"), 1, 0), [(PdHeader(99, 0, 2), b"\1\2")]
+)
+MAILBOX = EtherCatHeader(6, 0, 5).encode() + bytes(6)
+
+
+class Appliance:
+    """One running ``eapctl run``."""
+
+    def __init__(self, plant: Path, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "eap", "run", str(plant), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def wait_ready(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, self.process.communicate()[1]
+        return json.loads(line)
+
+    def finish(self, timeout_s: float = 5) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=timeout_s)
+        return self.process.returncode, out, err
+
+    def stop(self) -> tuple[int, str, str]:
+        self.process.send_signal(signal.SIGTERM)
+        return self.finish()
+
+
+@pytest.fixture
+def plant(monkeypatch) -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix="eap-"))  # short enough for a socket's path
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(folder / "run"))
+    path = folder / "plant.yaml"
+    path.write_text(PLANT.replace("TCP", "true"))
+    yield path
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def appliance(plant) -> Iterator[Appliance]:
+    running = Appliance(plant)
+    try:
+        running.wait_ready()
+        yield running
+    finally:
+        running.process.kill()
+        running.process.communicate()
+
+
+def status() -> dict[str, Any]:
+    (client,) = connect()
+    with client:
+        return client.request("status")
+
+
+def station(document: dict[str, Any], name: str) -> dict[str, Any]:
+    return next(s for s in document["stations"] if s["name"] == name)
+
+
+def discarded(name: str = "left") -> dict[str, int]:
+    return station(status(), name)["discarded"]
+
+
+def received() -> int:
+    return station(status(), "right")["pd"]["rx"][0]["received"]
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 5.0) -> float:
+    """Return the seconds it took."""
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() < start + timeout_s, "did not happen in time"
+        time.sleep(0.01)
+    return time.monotonic() - start
+
+
+def send(frame: bytes, count: int = 1) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        for _ in range(count):
+            sock.sendto(frame, LEFT)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def assert_sorted_by_the_kernel() -> None:
+    """Both processes get the frames of their own type, and no others."""
+    before = discarded()
+    send(FOREIGN_PD, 20)
+    send(MAILBOX, 30)
+    wait_until(lambda: discarded().get("mailbox", 0) >= before.get("mailbox", 0) + 30)
+    wait_until(
+        lambda: discarded().get("wrong_publisher", 0) + discarded().get("unknown_id", 0) >= 20
+    )
+    assert discarded().get("wrong_type", 0) == 0
+
+
+def test_life_of_an_appliance(plant):
+    running = Appliance(plant)
+    assert running.wait_ready() == {"ready": True, "stations": ["left", "right"]}
+    document = status()
+    assert document["version"] == 1
+    assert set(document["processes"]) == {"supervisor", "engine", "services"}
+    pids = [process["pid"] for process in document["processes"].values()]
+    assert pids[0] == running.process.pid
+    for process in document["processes"].values():
+        assert process["rss"] > 1_000_000
+        assert process["cpu"] >= 0
+    assert document["processes"]["engine"]["realtime"]["scheduler"]
+    assert [s["state"] for s in document["stations"]] == ["OP", "OP"]
+    assert station(document, "left")["ports"][0]["link"] == "up"
+    wait_until(lambda: received() > 20)
+    rx = station(status(), "right")["pd"]["rx"][0]
+    assert (rx["lost"], rx["duplicated"], rx["reordered"]) == (0, 0, 0)
+
+    start = time.monotonic()
+    code, out, err = running.stop()
+    assert time.monotonic() - start < 2
+    assert (code, out, err) == (0, "", "")
+    assert not any(map(is_running, pids))
+    assert list(Path(os.environ["EAP_RUNTIME_DIR"]).iterdir()) == []
+
+
+def test_values_move_and_can_be_set(appliance):
+    (client,) = connect(station="right")
+    with client:
+        assert client.request("write", station="left", values={"setpoint": 77}) == {"written": 1}
+        events = client.events(station="right", names=[TICKS, SETPOINT], period_ms=20)
+        seen = [next(events)["values"] for _ in range(10)]
+        assert seen[-1][TICKS] > seen[0][TICKS]
+        assert seen[-1][SETPOINT] == 77
+    (other,) = connect()
+    with other:
+        loads = [other.request("read", station="left")["values"]["load"] for _ in range(1)]
+        assert 0 <= loads[0] <= 100
+
+
+def test_a_killed_engine_is_back_within_a_second_and_counts_on(appliance):
+    before = status()
+    engine = before["processes"]["engine"]["pid"]
+    wait_until(lambda: received() > 10)
+    count = received()
+    os.kill(engine, signal.SIGSTOP)  # what comes now waits in its socket
+    send(FOREIGN_PD, 3)
+    os.kill(engine, signal.SIGKILL)
+    wait_until(lambda: received() > count + 5, timeout_s=1.0)
+    after = status()
+    assert after["processes"]["engine"]["restarts"] == 1
+    assert after["processes"]["engine"]["pid"] != engine
+    assert after["processes"]["services"]["pid"] == before["processes"]["services"]["pid"]
+    rx = station(after, "right")["pd"]["rx"][0]
+    elapsed = station(after, "right")["cycle"]
+    assert rx["lost"] > 0
+    assert abs(rx["received"] + rx["lost"] - elapsed) <= 3  # a gap of its true length
+    assert discarded()["stale"] >= 3
+    assert_sorted_by_the_kernel()
+
+
+def test_killed_services_do_not_disturb_publishing(appliance):
+    before = status()
+    services = before["processes"]["services"]["pid"]
+    send(MAILBOX, 2)
+    wait_until(lambda: discarded().get("mailbox") == 2)
+    os.kill(services, signal.SIGSTOP)
+    send(MAILBOX, 4)
+    os.kill(services, signal.SIGKILL)
+    after = status()  # the client waits in the backlog of the listener
+    assert after["processes"]["services"]["pid"] != services
+    wait_until(lambda: discarded().get("stale") == 4)
+    assert discarded()["mailbox"] == 2
+    after = status()
+    assert after["processes"]["services"]["restarts"] == 1
+    assert after["processes"]["engine"]["pid"] == before["processes"]["engine"]["pid"]
+    rx = station(after, "right")["pd"]["rx"][0]
+    assert (rx["lost"], rx["timeouts"]) == (0, 0)
+    assert_sorted_by_the_kernel()
+
+
+def test_a_killed_supervisor_takes_all_along_and_the_next_start_succeeds(appliance, plant):
+    pids = [process["pid"] for process in status()["processes"].values()]
+    appliance.process.kill()
+    appliance.process.wait()
+    wait_until(lambda: not any(map(is_running, pids)), timeout_s=1.0)
+    again = Appliance(plant)
+    again.wait_ready()
+    assert received() >= 0
+    assert again.stop()[0] == 0
+
+
+def test_an_interrupt_ends_it_too(appliance):
+    appliance.process.send_signal(signal.SIGINT)
+    assert appliance.finish(timeout_s=2)[0] == 0
+
+
+def test_a_second_start_is_refused_by_name(appliance, plant):
+    second = Appliance(plant)
+    code, out, err = second.finish()
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert str(appliance.process.pid) in err
+    assert status()["processes"]["supervisor"]["pid"] == appliance.process.pid
+
+
+def test_stations_of_one_plant_run_in_two_appliances(plant):
+    left, right = Appliance(plant, "--station", "left"), Appliance(plant, "--station", "right")
+    try:
+        assert left.wait_ready()["stations"] == ["left"]
+        assert right.wait_ready()["stations"] == ["right"]
+        clients = connect(plant="processes")
+        assert sorted(client.info.stations[0] for client in clients) == ["left", "right"]
+        for client in clients:
+            client.close()
+        (client,) = connect(station="right")
+        with client:
+            wait_until(
+                lambda: client.request("status")["stations"][0]["pd"]["rx"][0]["received"] > 10
+            )
+        overlap = Appliance(plant)  # of another name, but with the same addresses
+        code, out, err = overlap.finish()
+        assert (code, out, err.splitlines()[1:]) == (2, "", [])
+        assert "127.9.1.1" in err
+    finally:
+        assert left.stop()[0] == 0
+        assert right.stop()[0] == 0
+
+
+@pytest.mark.parametrize("kind", [socket.SOCK_DGRAM, socket.SOCK_STREAM])
+def test_a_port_in_use_is_refused_in_one_line_and_nothing_stays(plant, kind):
+    with socket.socket(socket.AF_INET, kind) as squatter:
+        squatter.bind(("127.9.1.2", EAP_PORT))
+        if kind == socket.SOCK_STREAM:
+            squatter.listen()
+        code, out, err = Appliance(plant).finish()
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert "127.9.1.2:34980" in err
+    assert list(Path(os.environ["EAP_RUNTIME_DIR"]).iterdir()) == []
+
+
+def test_stop_by_the_control_protocol(appliance):
+    (client,) = connect()
+    with client:
+        assert client.request("stop") == {"stopping": True}
+    assert appliance.finish(timeout_s=2)[0] == 0
+
+
+def read_to_end(connection: socket.socket) -> bytes:
+    connection.settimeout(5)
+    try:
+        return connection.recv(16)
+    except ConnectionResetError:
+        return b""
+
+
+def test_tcp_connections_go_where_their_first_frame_belongs(appliance):
+    with socket.create_connection(LEFT) as connection:
+        connection.sendall(MAILBOX)
+        assert read_to_end(connection) == b""
+    assert discarded()["mailbox"] == 1
+    with socket.create_connection(("127.9.1.2", EAP_PORT)) as connection:
+        connection.sendall(FOREIGN_PD)
+        assert read_to_end(connection) == b""
+    assert discarded("right") == {"tcp_off": 1}
+    with socket.create_connection(LEFT) as connection:
+        connection.sendall(FOREIGN_PD[:1])
+        time.sleep(0.1)
+        connection.sendall(FOREIGN_PD[1:] + FOREIGN_PD)
+        wait_until(
+            lambda: discarded().get("wrong_publisher", 0) + discarded().get("unknown_id", 0) == 2
+        )
+        connection.sendall(MAILBOX)
+        assert read_to_end(connection) == b""
+    wait_until(lambda: discarded().get("tcp_type") == 1)
+
+
+def test_a_wrong_plant_starts_nothing(plant):
+    plant.write_text(PLANT.replace("TCP", "perhaps"))
+    code, out, err = Appliance(plant).finish()
+    assert (code, out) == (2, "")
+    assert f"{plant}:7" in err
+    assert not Path(os.environ["EAP_RUNTIME_DIR"]).exists()
+
+
+def test_a_client_of_a_dead_appliance_is_told(appliance):
+    (client,) = connect()
+    appliance.process.kill()
+    appliance.process.wait()
+    with client, pytest.raises(ControlError, match="does not answer"):
+        ask_for(client, seconds=2)
+
+
+def ask_for(client: Client, *, seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        client.request("hello")
