@@ -46,7 +46,7 @@ def run(settings: Settings) -> list[Figure]:
                     _measure(link, program, cycle_us, settings.lateness_s, placed, pm_qos=pm_qos)
                     for placed in (machine.cores(), machine.cores()[::-1])
                 ]
-                figures += _figures(name, pairs, 1_000_000 // cycle_us)
+                figures += figures_of(name, pairs, 1_000_000 // cycle_us)
     return figures
 
 
@@ -76,11 +76,16 @@ def _measure(
             reference = subprocess.run(command.split(), capture_output=True, check=True)
             late_ns = engine.answer()["late_ns"]
     cold = int(_COLD_S * 1e6 / cycle_us)
-    samples = [int(value) for value in _SAMPLE.findall(reference.stdout)]
-    return Pair(late_ns[cold:], samples[cold:])
+    return Pair(late_ns[cold:], samples_of(reference.stdout)[cold:])
 
 
-def _figures(name: str, pairs: Sequence[Pair], per_second: int) -> list[Figure]:
+def samples_of(output: bytes) -> list[int]:
+    """Return the nanoseconds that a verbose cyclictest printed, in their order."""
+    return [int(value) for value in _SAMPLE.findall(output)]
+
+
+def figures_of(name: str, pairs: Sequence[Pair], per_second: int) -> list[Figure]:
+    """Compare all samples of both sides; *per_second* is how many make a window."""
     engine = [value for pair in pairs for value in pair.engine]
     reference = [value for pair in pairs for value in pair.cyclictest]
     ours, theirs = percentile(engine, 0.5), percentile(reference, 0.5)
