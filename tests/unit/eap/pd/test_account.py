@@ -269,9 +269,7 @@ def test_every_pd_sent_between_the_first_and_the_last_is_accounted_for(fates, fi
     """Received, lost and reordered add up, whatever is dropped, doubled and overtaken."""
     book = Book(step=step)
     arrivals = [(0, first)]
-    position = 0
-    for fate in fates:
-        position += 1
+    for position, fate in enumerate(fates, 1):
         key = position + (shift + 0.5 if position % 7 == 3 else 0)
         arrivals += [(key, first + position * step)] * {"arrive": 1, "drop": 0, "twice": 2}[fate]
     arrivals.sort(key=lambda arrival: arrival[0])

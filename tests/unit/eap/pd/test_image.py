@@ -1,0 +1,221 @@
+from __future__ import annotations
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.errors import ImageError, TornReadError
+from eap.pd.image import READ_ATTEMPTS, Image, default_value, format_image, read_header
+from eap.pd.layout import HEADER, plan_layout
+from eap.pd.spec import RxPdSpec, VariableSpec, Writer
+from eap.pd.words import StationWord
+from tests.support.cyclic import image_of, received, station
+
+VALUES = {
+    "BOOL": st.booleans(),
+    "BIT3": st.integers(0, 7),
+    "BIT8": st.integers(0, 255),
+    "SINT": st.integers(-128, 127),
+    "UINT24": st.integers(0, (1 << 24) - 1),
+    "REAL": st.floats(width=32, allow_nan=False),
+    "INT[3]": st.tuples(*[st.integers(-32768, 32767)] * 3),
+    "STRING(7)": st.text("aß", max_size=3),
+    "BLOCK(4)": st.binary(min_size=4, max_size=4),
+}
+
+
+def packed() -> Image:
+    """A received PD with bits at odd offsets: on 0, mode 1-3, wide 4-11, off 12."""
+    names = ("on", "mode", "wide", "off", "speed")
+    variables = received("on:BOOL", "mode:BIT3", "wide:BIT8", "off:BOOL", "speed:UINT")
+    return image_of(station(variables=variables, subscriptions=(RxPdSpec("r", "eap0", 1, names),)))
+
+
+@given(st.data())
+def test_what_is_written_is_read_and_nothing_else_changes(data):
+    kinds = data.draw(st.lists(st.sampled_from(sorted(VALUES)), min_size=1, max_size=8))
+    names = tuple(f"v{i}" for i in range(len(kinds)))
+    variables = received(*(f"v{i}:{kind}" for i, kind in enumerate(kinds)))
+    image = image_of(station(variables=variables, subscriptions=(RxPdSpec("r", "eap0", 1, names),)))
+    expected = image.read_all()
+    for i in data.draw(st.lists(st.integers(0, len(kinds) - 1), max_size=10)):
+        value = data.draw(VALUES[kinds[i]])
+        with image.writing(Writer.ENGINE):
+            image.write(f"v{i}", value)
+        expected[f"v{i}"] = value
+    assert image.read_all() == expected
+    assert {name: image.read(name) for name in names} == expected
+
+
+def test_bits_are_read_from_where_they_were_packed():
+    image = packed()
+    start = image.layout.rx[0].offset + 8
+    image.memory[start : start + 4] = bytes([0b0011_1010, 0b1111_0101, 0x34, 0x12])
+    assert image.read_all() == {"on": False, "mode": 5, "wide": 0x53, "off": True, "speed": 0x1234}
+
+
+def test_a_value_that_does_not_fit_is_refused_and_nothing_written():
+    image = packed()
+    with pytest.raises(ValueError, match="BIT3"):
+        image.write("mode", 8)
+    assert image.read("mode") == 0
+
+
+def test_an_unknown_name_is_refused_by_station_and_name():
+    with pytest.raises(ImageError, match="station a has no variable 'sped'"):
+        packed().read("sped")
+
+
+def test_defaults_are_there_from_the_start():
+    image = image_of(
+        station(
+            variables=(
+                VariableSpec("s", "STRING(4)", default="abc"),
+                VariableSpec("raw", "BLOCK(2)", default="beef"),
+                VariableSpec("a", "INT[2]", default=[1, -2]),
+                VariableSpec("zero", "REAL"),
+            )
+        )
+    )
+    assert image.read_all() == {"s": "abc", "raw": b"\xbe\xef", "a": (1, -2), "zero": 0.0}
+    assert default_value(image.places["zero"]) == 0.0
+
+
+def test_a_region_is_live():
+    image = image_of(station(variables=(VariableSpec("x", "UINT"),)))
+    image.region(Writer.APPLICATION)[:2] = b"\x07\0"
+    assert image.read("x") == 7
+
+
+def test_the_sequence_word_is_odd_while_writing_also_when_the_writer_fails():
+    image = packed()
+    sequence = StationWord.ENGINE_SEQUENCE
+    with image.writing(Writer.ENGINE):
+        assert image.words[sequence] % 2
+    with pytest.raises(ValueError, match="BIT3"), image.writing(Writer.ENGINE):
+        image.write("mode", 99)
+    assert image.words[sequence] % 2 == 0
+
+
+def test_an_odd_word_left_by_a_dead_writer_is_repaired_by_the_next():
+    image = packed()
+    image.words[StationWord.ENGINE_SEQUENCE] = 7
+    with pytest.raises(TornReadError):
+        image.read("speed")
+    with image.writing(Writer.ENGINE):
+        assert image.words[StationWord.ENGINE_SEQUENCE] % 2
+        image.write("speed", 5)
+    assert image.read("speed") == 5
+
+
+def test_a_writer_that_stopped_in_the_middle_is_named_after_bounded_attempts():
+    image = image_of(station(variables=(VariableSpec("x", "UINT", Writer.SERVICES),)))
+    pauses = []
+    reader = Image(image.memory, image.layout, pause=lambda: pauses.append(1))
+    image.words[StationWord.SERVICES_SEQUENCE] = 1
+    with pytest.raises(TornReadError, match="station a: the services stopped") as error:
+        reader.read_all()
+    assert error.value.writer == "services"
+    assert len(pauses) == READ_ATTEMPTS
+
+
+def test_a_reader_waits_for_a_writer_that_goes_on():
+    image = image_of(station(variables=(VariableSpec("x", "UINT"),)))
+    context = image.writing(Writer.APPLICATION)
+    context.__enter__()
+    image.write("x", 5)
+    reader = Image(image.memory, image.layout, pause=lambda: context.__exit__(None, None, None))
+    assert reader.read("x") == 5
+
+
+def test_a_copy_that_a_writer_changed_meanwhile_is_made_again():
+    image = image_of(station(variables=(VariableSpec("x", "UINT"),)))
+    looks = []
+
+    class Moving:
+        def __getitem__(self, index: int) -> int:
+            looks.append(index)
+            if len(looks) == 2:
+                with image.writing(Writer.APPLICATION):
+                    image.write("x", 8)
+            return image.words[index]
+
+    reader = Image(image.memory, image.layout)
+    reader.words = Moving()
+    assert reader.read("x") == 8
+    assert len(looks) == 4
+
+
+def test_a_formatted_image_says_what_it_holds():
+    layout = plan_layout(station(variables=(VariableSpec("x", "UINT"),)))
+    memory = memoryview(bytearray(layout.size))
+    format_image(memory, layout, 5)
+    assert read_header(memory) == (layout, 5)
+
+
+def damaged(change: str) -> memoryview:
+    layout = plan_layout(station(variables=(VariableSpec("x", "UINT"),)))
+    memory = memoryview(bytearray(layout.size))
+    format_image(memory, layout, 1)
+    fields = list(HEADER.unpack_from(memory))
+    if change == "short":
+        return memory[:63]
+    if change == "cut":
+        return memory[:-1]
+    if change == "magic":
+        fields[0] = bytes(8)
+    if change == "version":
+        fields[1] += 1
+    if change == "length":
+        fields[4] += 1
+    if change == "directory":
+        memory[fields[3]] = 0xFF
+    if change == "shifted":
+        text = bytes(memory[fields[3] : fields[3] + fields[4]])
+        memory[fields[3] : fields[3] + fields[4]] = text.replace(
+            f'"directory_offset":{fields[3]}'.encode(),
+            f'"directory_offset":{fields[3] + 1}'.encode(),
+        )
+    if change == "words":
+        count = f'"word_count":{layout.word_count}'.encode()
+        text = bytes(memory[fields[3] : fields[3] + fields[4]])
+        more = text.replace(count, b'"word_count":9' + count[14:])
+        memory[fields[3] : fields[3] + fields[4]] = more
+    HEADER.pack_into(memory, 0, *fields)
+    return memory
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("short", "shorter than the header"),
+        ("magic", "magic is missing"),
+        ("version", "layout version 2, this program knows 1"),
+        ("cut", "cut off"),
+        ("length", "cut off"),
+        ("directory", "damaged directory"),
+        ("shifted", "contradicts the header"),
+        ("words", "contradicts the header"),
+    ],
+)
+def test_a_damaged_image_is_refused_by_what_is_wrong(change, message):
+    with pytest.raises(ImageError, match=message):
+        read_header(damaged(change))
+
+
+@given(st.binary(max_size=200), st.binary(max_size=60))
+def test_any_octets_are_an_image_or_an_image_error(noise, directory):
+    head = HEADER.pack(b"EAPIMAGE", 1, 1, 64, len(directory), 64 + len(directory))
+    for octets in (noise, head.ljust(64, b"\0") + directory + noise):
+        with pytest.raises(ImageError):
+            read_header(memoryview(octets))
+
+
+def test_the_header_is_where_other_languages_expect_it():
+    layout = plan_layout(station())
+    memory = memoryview(bytearray(layout.size))
+    format_image(memory, layout, 3)
+    assert bytes(memory[:8]) == b"EAPIMAGE"
+    assert struct.unpack_from("<IIQ", memory, 8) == (1, 3, layout.directory_offset)
