@@ -15,7 +15,7 @@ def test_a_line_of_any_length_is_a_plant(tmp_path: Path, islands: int) -> None:
     file = tmp_path / "line.yaml"
     file.write_bytes(line(islands, 500))
     result = load(file)
-    assert result.findings == []
+    assert not result.findings
     assert result.plant is not None
     assert [s.cycle_us for s in result.plant.stations] == [500] * (islands + 1)
     received = sum(len(station.subscriptions) for station in result.plant.stations)
