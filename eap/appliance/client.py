@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
@@ -68,7 +69,9 @@ class Client:
             yield event
 
     def close(self) -> None:
-        """Hang up."""
+        """Hang up, also while another thread waits for an event."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
         self._reader.close()
         self._socket.close()
 

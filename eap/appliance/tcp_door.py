@@ -78,6 +78,9 @@ class TcpDoor:
             self._close(connection, peer, Refusal.TCP_SILENT)
         except OSError:
             connection.close()  # it left before it said anything
+        except asyncio.CancelledError:
+            connection.close()
+            raise
         else:
             self._dispatch(connection, peer, frame_type)
         finally:

@@ -1,0 +1,60 @@
+"""Frames that services does not take, by reason."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from time import monotonic_ns
+
+import pytest
+
+from eap.appliance.discards import DiscardCounters
+from eap.appliance.intake import FrameIntake, watch_channel
+from eap.codec.ethercat import EtherCatHeader
+from eap.net.mmsg import ReceiveBatch
+from eap.net.udp import UdpChannel
+from eap.net.udpsocket import prepare_receiver
+
+MAILBOX = memoryview(EtherCatHeader(6, 0, 5).encode() + bytes(6))
+UNKNOWN = memoryview(EtherCatHeader(0, 0, 7).encode())
+
+
+@pytest.fixture
+def counters(tmp_path):
+    with DiscardCounters(tmp_path / "discards", ["a", "b"]) as counters:
+        yield counters
+
+
+def test_each_frame_is_counted_once_at_every_station(counters):
+    intake = FrameIntake(["a", "b"], counters, from_ns=100)
+    intake.take(MAILBOX, 8, 99)
+    intake.take(MAILBOX, 8, 100)
+    intake.take(MAILBOX, 8, 101)
+    intake.take(UNKNOWN, 2, 100)
+    intake.take(UNKNOWN, 1, 100)
+    expected = {"mailbox": 2, "stale": 1, "wrong_type": 1, "truncated": 1}
+    assert counters.stats() == {"a": expected, "b": expected}
+
+
+@pytest.mark.net
+def test_a_socket_is_drained_at_once_and_on_arrival(counters):
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        prepare_receiver(receiver)
+        receiver.bind(("127.0.0.1", 0))
+        sender.connect(receiver.getsockname())
+        sender.send(MAILBOX)
+
+        async def serve():
+            intake = FrameIntake(["a"], counters, monotonic_ns())
+            watch_channel(UdpChannel(receiver, ReceiveBatch(), [intake.take]))
+            assert counters.stats()["a"] == {"stale": 1}
+            sender.send(MAILBOX)
+            async with asyncio.timeout(5):
+                while "mailbox" not in counters.stats()["a"]:  # noqa: ASYNC110  it is a file
+                    await asyncio.sleep(0.001)
+
+        asyncio.run(serve())
+    assert counters.stats()["a"] == {"stale": 1, "mailbox": 1}
