@@ -43,11 +43,7 @@ def station_status(image: Image, now_ns: int) -> dict[str, Any]:
         "overruns": words[StationWord.OVERRUNS],
         "restarts": words[StationWord.RESTARTS],
         "torn": words[StationWord.TORN],
-        "lateness_us": {
-            "p50": percentile(lateness, 0.5),
-            "p99": percentile(lateness, 0.99),
-            "max": words[StationWord.LATENESS_MAX_NS] // 1000,
-        },
+        "lateness_us": _spread(lateness, words[StationWord.LATENESS_MAX_NS] // 1000),
         "ports": [
             {"name": p.name, "kind": p.kind, "net_id": p.net_id, "interface": p.interface}
             for p in layout.ports
@@ -126,6 +122,14 @@ def var_state(image: Image, place: RxPlace) -> int:
     return int(words[place.words + RxWord.MISMATCH])
 
 
+def _spread(bins: list[int], largest: int) -> dict[str, int | None]:
+    """Return percentiles of a histogram; bins are wider than the largest value is exact."""
+    p50, p99 = percentile(bins, 0.5), percentile(bins, 0.99)
+    if p50 is None or p99 is None:
+        return {"p50": None, "p99": None, "max": None}
+    return {"p50": min(p50, largest), "p99": min(p99, largest), "max": largest}
+
+
 def _discarded(image: Image, first: int) -> dict[str, int]:
     counts = image.words[first : first + len(DISCARDS)].tolist()
     return {reason.value: count for reason, count in zip(DISCARDS, counts, strict=True) if count}
@@ -155,7 +159,6 @@ def _rx(image: Image, place: RxPlace, now_ns: int) -> dict[str, Any]:
     first = account_word(image, place)
     received = words[first + RxWord.RECEIVED]
     bins = words[first + RxWord.JITTER : first + RxWord.JITTER + HISTOGRAM_BINS].tolist()
-    jitter_known = any(bins)
     age_ns = now_ns - words[first + RxWord.ARRIVED_AT_NS]
     return {
         "name": place.name,
@@ -171,10 +174,6 @@ def _rx(image: Image, place: RxPlace, now_ns: int) -> dict[str, Any]:
         "cycle_index": words[first + RxWord.LAST_CYCLE] & 0xFFFF if received else None,
         "var_state": var_state(image, place),
         "age_us": max(age_ns, 0) // 1000 if received else None,
-        "jitter_us": {
-            "p50": percentile(bins, 0.5),
-            "p99": percentile(bins, 0.99),
-            "max": words[first + RxWord.JITTER_MAX_US] if jitter_known else None,
-        },
+        "jitter_us": _spread(bins, words[first + RxWord.JITTER_MAX_US]),
         "state": RxState(words[first + RxWord.STATE]).name.lower(),
     }
