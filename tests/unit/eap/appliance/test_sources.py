@@ -1,0 +1,93 @@
+"""Sources that services plays into the images."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from contextlib import suppress
+
+import msgspec
+import pytest
+
+from eap.appliance.sources import fit, play_sources
+from eap.codec import datatypes
+from eap.errors import WriterConflictError
+from eap.pd.spec import CsvSource, HostSource, Measure
+from tests.unit.eap.appliance.conftest import left
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "fitted"),
+    [(3.6, "USINT", 4), (300, "USINT", 255), (-1, "UINT", 0), (1.5, "REAL", 1.5), (7, "LREAL", 7)],
+)
+def test_a_number_is_fitted_to_its_type(number, kind, fitted):
+    assert fit(number, datatypes.parse(kind)) == fitted
+
+
+def play(file, *sources, seconds: float = 0.2) -> None:
+    async def run():
+        async with asyncio.timeout(seconds):
+            await play_sources(msgspec.structs.replace(left(), sources=sources), file)
+
+    with suppress(TimeoutError):
+        asyncio.run(run())
+
+
+def test_a_measurement_arrives(files):
+    play(files["left"], HostSource("load", Measure.PROCESSES, period_ms=10))
+    assert files["left"].image.read("load") > 0
+
+
+def test_a_column_is_replayed_from_the_start_again(files, tmp_path):
+    (tmp_path / "data.csv").write_text("time,load\n0,17\n1,18\n")
+    file = files["left"]
+    seen = set()
+
+    async def run():
+        source = CsvSource("load", str(tmp_path / "data.csv"), "load", period_ms=10)
+        station = msgspec.structs.replace(left(), sources=(source,))
+        async with asyncio.timeout(5), asyncio.TaskGroup() as group:
+            task = group.create_task(play_sources(station, file))
+            while seen != {17, 18}:
+                await asyncio.sleep(0.001)
+                seen.add(file.image.read("load"))
+                seen.discard(0)
+            task.cancel()
+
+    asyncio.run(run())
+
+
+def test_what_cannot_be_read_keeps_its_value_and_is_said_once(files, tmp_path, caplog):
+    (tmp_path / "data.csv").write_text("load\nmany\n")
+    play(
+        files["left"],
+        HostSource("load", Measure.RX_OCTETS, "nosuch0", period_ms=10),
+        CsvSource("load", str(tmp_path / "data.csv"), "load", period_ms=10),
+        CsvSource("load", str(tmp_path / "gone.csv"), "load"),
+    )
+    assert files["left"].image.read("load") == 0
+    assert sorted(record.args[1] for record in caplog.records) == ["load"] * 3
+
+
+def test_without_sources_nothing_is_claimed(files):
+    play(files["left"])
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from eap.net.image_file import open_image\n"
+        "from eap.pd.spec import Writer\n"
+        "file = open_image(Path(sys.argv[1]))\n"
+        "file.acquire_writer(Writer.SERVICES)\n"
+        "print('holding', flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(files["left"].path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as other:
+        assert other.stdout.readline() == b"holding\n"
+        with pytest.raises(WriterConflictError, match=str(other.pid)):
+            play(files["left"], HostSource("load", Measure.LOAD1))
+        other.stdin.close()
