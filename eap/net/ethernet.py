@@ -83,9 +83,10 @@ class EthernetInterface:
         total = self._drain_local() if self._local else 0
         for _ in range(_BATCHES_PER_DRAIN):
             count = self._receive()
-            if count <= 0:
-                if count:
-                    note_receive_error(self.errors)
+            if count == 1:
+                return total + self._dispatch_one()
+            if count < 0:
+                note_receive_error(self.errors)
                 break
             total += self._dispatch(count)
             if count < BATCH:
@@ -120,23 +121,37 @@ class EthernetInterface:
         """Close the socket."""
         self._sock.close()
 
+    def _dispatch_one(self) -> int:
+        takers = self._takers(self._heads[0], self._tags[_TCI])
+        if not takers:
+            return 0
+        view, size, at_ns = self._batch.arrival()
+        for take in takers:
+            take(view, size - ETHERNET_HEADER, at_ns)
+        return 1
+
     def _dispatch(self, count: int) -> int:
         taken = 0
-        routes = self._routes
         heads = self._heads[: count * BUFFER_SIZE // 8 : BUFFER_SIZE // 8].tolist()
         tags = self._tags[_TCI : count * _CONTROL_SIZE // 2 : _CONTROL_SIZE // 2].tolist()
-        arrivals = self._batch.arrivals(count)
-        for (view, size, at_ns), head, tag in zip(arrivals, heads, tags, strict=True):
-            by_address = routes.get(tag & _VID)
-            if by_address is None:
-                self.discarded["other_vlan"] += 1
-                continue
-            takers = by_address.get(head & _MAC_MASK)
-            if takers is not None:
+        sizes, times = self._batch.arrivals(count)
+        find = self._takers
+        for view, size, at_ns, head, tag in zip(
+            self._batch.views, sizes, times, heads, tags, strict=False
+        ):
+            if takers := find(head, tag):
                 taken += 1
                 for take in takers:
                     take(view, size - ETHERNET_HEADER, at_ns)
         return taken
+
+    def _takers(self, head: int, tag: int) -> Sequence[Taker]:
+        """Return who takes a frame of this first word and VLAN tag; count one of no port's VLAN."""
+        by_address = self._routes.get(tag & _VID)
+        if by_address is None:
+            self.discarded["other_vlan"] += 1
+            return ()
+        return by_address.get(head & _MAC_MASK, ())
 
     def _drain_local(self) -> int:
         count = len(self._local)

@@ -11,9 +11,9 @@ import ctypes
 import errno
 import socket
 import struct
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from time import monotonic_ns, time_ns
 
 from eap.pd.link import OutFrame
 
@@ -29,6 +29,7 @@ STAMP_SIZE = 32
 _MMSGHDR = struct.Struct("@QQQQQQQQ")  # name, namelen, iov, iovlen, control, controllen, flags, len
 _IOVEC = struct.Struct("@QQ")
 _CACHED_BATCHES = 256
+_CLOCK_NOISE_NS = 1000
 
 _library = ctypes.CDLL(None, use_errno=True)
 _recvmmsg = _library["recvmmsg"]
@@ -56,8 +57,12 @@ class ReceiveBatch:
     """The memory of one ``recvmmsg`` call, shared by all sockets of a process.
 
     *control_size* must be exactly what the kernel writes for one message, the time stamp first:
-    then it leaves every header as it was and nothing needs to be set up again.  The views that
-    :meth:`arrivals` gives start behind *headroom* octets of each message.
+    then it leaves every header as it was and nothing needs to be set up again.
+
+    Attributes:
+        views: The messages, each from behind *headroom* octets to the end of its memory.
+        octets: All of that memory, BUFFER_SIZE for each message.
+        control: All control data, *control_size* for each message.
     """
 
     def __init__(self, control_size: int = STAMP_SIZE, headroom: int = 0) -> None:
@@ -78,9 +83,10 @@ class ReceiveBatch:
         self._words = memoryview(self._headers).cast("Q")
         self._stamps = memoryview(self._control).cast("q")
         self._stride = control_size // 8
+        self._offset = monotonic_ns() - time_ns()
         self.control = memoryview(self._control)
         self.octets = memoryview(self._buffers)
-        self._views = [
+        self.views = [
             self.octets[n * BUFFER_SIZE + headroom : (n + 1) * BUFFER_SIZE] for n in range(BATCH)
         ]
 
@@ -89,25 +95,42 @@ class ReceiveBatch:
         headers = ctypes.c_void_p(_address(self._headers))
         return partial(_recvmmsg, fd, headers, BATCH, socket.MSG_DONTWAIT, None)
 
-    def arrivals(self, count: int) -> Iterable[tuple[memoryview, int, int]]:
-        """Return view, whole size and monotonic arrival time of the first *count* messages.
-
-        The kernel stamps with the wall clock; the distance of the two clocks is measured anew
-        each time, so that a step of the wall clock spoils at most the batch it falls into.
-        """
-        now_ns = time.monotonic_ns()
-        offset = now_ns - time.time_ns()
+    def arrival(self) -> tuple[memoryview, int, int]:
+        """Return view, whole size and monotonic arrival time of the only message of a batch."""
+        now_ns = self._read_clocks()
         words, stamps = self._words, self._stamps
-        if count == 1 and words[5] == self._control_size:
-            at_ns = stamps[2] * 1_000_000_000 + stamps[3] + offset
-            return ((self._views[0], words[7], min(at_ns, now_ns)),)
-        sizes = words[7 : count * 8 : 8].tolist()
-        times = self._times(count, offset)
+        if words[5] != self._control_size:
+            words[5] = self._control_size
+            return self.views[0], words[7], now_ns
+        at_ns = stamps[2] * 1_000_000_000 + stamps[3] + self._offset
+        if at_ns > now_ns:  # noqa: PLR1730  the wall clock was set back; min() takes longer
+            at_ns = now_ns
+        return self.views[0], words[7], at_ns
+
+    def arrivals(self, count: int) -> tuple[list[int], list[int]]:
+        """Return the whole sizes and the monotonic arrival times of the first *count* messages."""
+        now_ns = self._read_clocks()
+        words = self._words
+        times = self._times(count, self._offset)
         if words[5 : count * 8 : 8].tolist().count(self._control_size) != count:
             times = self._mend(times, now_ns)
         if times[0] > now_ns:  # the wall clock was set back since
             times = [now_ns] * count
-        return zip(self._views, sizes, times, strict=False)
+        return words[7 : count * 8 : 8].tolist(), times
+
+    def _read_clocks(self) -> int:
+        """Return the monotonic time and see how far the wall clock, which stamps, is from it.
+
+        The distance changes only when the wall clock is set.  An interruption between the two
+        readings makes it look smaller: what is smaller is believed when it is measured again.
+        """
+        now_ns = monotonic_ns()
+        offset = now_ns - time_ns()
+        if offset > self._offset:
+            self._offset = offset
+        elif offset < self._offset - _CLOCK_NOISE_NS:
+            self._offset = max(offset, *(monotonic_ns() - time_ns() for _ in range(3)))
+        return now_ns
 
     def _times(self, count: int, offset: int) -> list[int]:
         stride = self._stride

@@ -41,19 +41,18 @@ class UdpChannel:
         total = 0
         for _ in range(_BATCHES_PER_DRAIN):
             count = self._receive()
-            if count <= 0:
-                if count:
-                    note_receive_error(self.errors)
-                break
-            takers = self.takers
-            if len(takers) == 1:
-                take = takers[0]
-                for view, size, at_ns in self._batch.arrivals(count):
+            if count == 1:
+                view, size, at_ns = self._batch.arrival()
+                for take in self.takers:
                     take(view, size, at_ns)
-            else:
-                for view, size, at_ns in self._batch.arrivals(count):
-                    for take in takers:
-                        take(view, size, at_ns)
+                return total + 1
+            if count < 0:
+                note_receive_error(self.errors)
+                break
+            sizes, times = self._batch.arrivals(count)
+            for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):
+                for take in self.takers:
+                    take(view, size, at_ns)
             total += count
             if count < BATCH:
                 break

@@ -5,9 +5,12 @@ from __future__ import annotations
 import ctypes
 import os
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
+
+from eap.net.interface import link_is_up
 
 CLONE_NEWNET = 0x40000000
 
@@ -15,6 +18,12 @@ CLONE_NEWNET = 0x40000000
 def ip(command):
     """Run ``ip`` in the network namespace of this thread."""
     subprocess.run(["ip", *command.split()], check=True, capture_output=True)
+
+
+def wait_for_links(*names):
+    limit = time.monotonic() + 5
+    while not all(link_is_up(name) for name in names):
+        assert time.monotonic() < limit
 
 
 @pytest.fixture
@@ -29,6 +38,7 @@ def cable():
             ip("link add left type veth peer name right")
             ip("link set left up")
             ip("link set right up")
+            wait_for_links("left", "right")  # until then the kernel drops what is sent
             yield "left", "right"
         finally:
             library.setns(home.fileno(), CLONE_NEWNET)

@@ -12,7 +12,7 @@ import pytest
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.packetsocket import open_packet_pair
 from eap.pd.link import OutFrame
-from tests.unit.eap.net.conftest import ip
+from tests.unit.eap.net.conftest import ip, wait_for_links
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
 
@@ -31,6 +31,14 @@ class Listener:
     def take(self, data, size, at_ns):
         self.got.append(bytes(data[: min(size, 3)]))
         self.times.append(at_ns)
+
+    def drain(self, count):
+        """Drain until *count* frames have been taken: under load they come a little later."""
+        limit = time.monotonic() + 5
+        while len(self.got) < count:
+            assert time.monotonic() < limit, self.got
+            self.port.drain(0)
+        return self.got
 
     def frame(self, number, destination=GROUP):
         header = self.port.link_header(destination)
@@ -80,8 +88,7 @@ def test_frames_cross_the_cable(ends, count):
     before = time.monotonic_ns()
     frames = [sender.frame(n) for n in range(count)]
     assert sender.port.send(frames, 0) == ()
-    assert receiver.port.drain(0) == count
-    assert receiver.got == [expect(n) for n in range(count)]
+    assert receiver.drain(count) == [expect(n) for n in range(count)]
     assert receiver.times == sorted(receiver.times)
     assert before - 5_000_000 < receiver.times[0] < time.monotonic_ns()
     assert sender.got == []
@@ -91,39 +98,37 @@ def test_frames_cross_the_cable(ends, count):
 def test_unicast_broadcast_and_joined_groups_are_taken(ends, raw):
     receiver = Listener(ends[0], join=[OTHER_GROUP])
     own, foreign = str(ends[0].address), "02:00:00:00:00:55"
-    joined = [own, "ff:ff:ff:ff:ff:ff", GROUP, OTHER_GROUP]
-    for number, mac in enumerate([*joined, foreign, "01:01:05:04:00:78"]):
+    for number, mac in enumerate([own, "ff:ff:ff:ff:ff:ff", OTHER_GROUP]):
         raw.send(raw_frame(number, mac))
-    receiver.port.drain(0)
-    assert receiver.got == [expect(n) for n in range(4)]
+    for mac in (foreign, "01:01:05:04:00:78"):
+        raw.send(raw_frame(99, mac))
+    raw.send(raw_frame(3))
+    assert receiver.drain(4) == [expect(n) for n in range(4)]
 
 
 def test_group_of_one_port_is_not_heard_by_another(ends, raw):
     joined, other = Listener(ends[0], join=[OTHER_GROUP]), Listener(ends[0])
     raw.send(raw_frame(1, OTHER_GROUP))
     raw.send(raw_frame(2))
-    joined.port.drain(0)
-    assert joined.got == [expect(1), expect(2)]
+    assert joined.drain(2) == [expect(1), expect(2)]
     assert other.got == [expect(2)]
 
 
 def test_untagged_and_priority_tagged_are_one_network(ends, raw):
     receiver = Listener(ends[0])
     raw.send(raw_frame(1))
-    raw.send(raw_frame(2, tag=vlan(0, priority=5)))
     raw.send(raw_frame(3, tag=vlan(10)))
-    assert receiver.port.drain(0) == 2
-    assert receiver.got == [expect(1), expect(2)]
+    raw.send(raw_frame(2, tag=vlan(0, priority=5)))
+    assert receiver.drain(2) == [expect(1), expect(2)]
     assert ends[0].discarded["other_vlan"] == 1
 
 
 def test_port_of_a_vlan_takes_only_that(ends, raw):
     tagged, untagged = Listener(ends[0], vlan_id=10), Listener(ends[0])
     raw.send(raw_frame(1))
-    raw.send(raw_frame(2, tag=vlan(10, priority=6)))
     raw.send(raw_frame(3, tag=vlan(11)))
-    tagged.port.drain(0)
-    assert tagged.got == [expect(2)]
+    raw.send(raw_frame(2, tag=vlan(10, priority=6)))
+    assert tagged.drain(1) == [expect(2)]
     assert untagged.got == [expect(1)]
     assert ends[0].discarded["other_vlan"] == 1
 
@@ -144,24 +149,23 @@ def test_frames_leave_with_the_tag_of_their_port(ends, vid, priority, header):
     start = bytes.fromhex(GROUP.replace(":", "")) + ends[0].address
     assert bytes(frame.buffer[: frame.headroom]) == start + bytes.fromhex(header)
     sender.port.send([frame], 0)
-    receiver.port.drain(0)
-    assert receiver.got == [expect(1)]
+    assert receiver.drain(1) == [expect(1)]
 
 
 def test_kernel_sorts_by_type_and_drops_foreign_protocols(cable, raw):
     pair = open_packet_pair("left")
     try:
-        for n in range(16):
-            raw.send(raw_frame(n, frame_type=n))
         raw.send(raw_frame(99, ethertype=b"\x08\x00"))
         raw.send(raw_frame(98, "02:00:00:00:00:55"))
+        for n in range(16):
+            raw.send(raw_frame(n, frame_type=n))
         for sock, types in zip(pair, ({*range(16)} - {2, 3, 5}, {2, 3, 5}), strict=True):
-            sock.setblocking(False)
-            got = set()
-            with contextlib.suppress(BlockingIOError):
-                while True:
-                    got.add(sock.recv(100)[14])
+            sock.settimeout(5)
+            got = {sock.recv(100)[14] for _ in types}
             assert got == types
+            sock.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                sock.recv(100)
     finally:
         for sock in pair:
             sock.close()
@@ -178,8 +182,7 @@ def test_ports_of_one_interface_hear_each_other(ends):
     assert second.got == third.got == [expect(1), expect(2)]
     assert second.times == [777, 777]
     assert first.got == tagged.got == []
-    far.port.drain(0)
-    assert far.got == [expect(1)]
+    assert far.drain(1) == [expect(1)]
 
 
 def test_neighbours_that_are_never_drained_do_not_fill_the_memory(ends):
@@ -202,8 +205,9 @@ def test_interface_that_goes_down_is_counted_and_comes_back(ends):
     sender.port.drain(0)
     assert neighbour.got == []
     ip("link set left up")
+    wait_for_links("left", "right")
     assert sender.port.send(frames, 0) == ()
-    assert receiver.port.drain(0) == 2
+    assert receiver.drain(2) == [expect(1), expect(2)]
 
 
 def test_drain_is_bounded(ends):
@@ -211,6 +215,6 @@ def test_drain_is_bounded(ends):
     frame = sender.frame(1)
     for _ in range(300):
         sender.port.send((frame,), 0)
-    assert receiver.port.drain(0) == 256
-    assert receiver.port.drain(0) == 44
+    assert receiver.port.drain(0) <= 256
+    receiver.drain(300)
     assert sender.port.fileno() == ends[0].fileno()

@@ -44,7 +44,14 @@ def frames_to(sock, count, size=20):
 
 def receive(batch, sock):
     count = batch.reader(sock.fileno())()
-    return [(bytes(view[:size]), at_ns) for view, size, at_ns in batch.arrivals(count)]
+    if count == 1:
+        view, size, at_ns = batch.arrival()
+        return [(bytes(view[:size]), at_ns)]
+    sizes, times = batch.arrivals(count)
+    return [
+        (bytes(view[:size]), at_ns)
+        for view, size, at_ns in zip(batch.views, sizes, times, strict=False)
+    ]
 
 
 @pytest.mark.parametrize("count", [1, 2, BATCH])
@@ -111,11 +118,28 @@ def test_missing_stamp_falls_back_to_now_and_the_batch_recovers(pair):
 def test_wall_clock_set_back_gives_no_time_in_the_future(pair, monkeypatch):
     sender, receiver = pair
     out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
-    real = time.time_ns
-    monkeypatch.setattr("time.time_ns", lambda: real() - 3600 * 10**9)
+    monkeypatch.setattr("eap.net.mmsg.time_ns", lambda: time.time_ns() - 3600 * 10**9)
     for count in (1, 2):
         out.send(frames_to(receiver, count))
         assert all(at_ns <= time.monotonic_ns() for _, at_ns in receive(batch, receiver))
+
+
+def test_interruption_between_the_clocks_moves_no_arrival(pair, monkeypatch):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    stalls = iter([250_000])
+    monkeypatch.setattr("eap.net.mmsg.time_ns", lambda: time.time_ns() + next(stalls, 0))
+    before = time.monotonic_ns()
+    out.send(frames_to(receiver, 2))
+    assert receive(batch, receiver)[0][1] > before - 100_000
+
+
+def test_wall_clock_set_ahead_is_followed(pair, monkeypatch):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    monkeypatch.setattr("eap.net.mmsg.time_ns", lambda: time.time_ns() + 3600 * 10**9)
+    out.send(frames_to(receiver, 1))
+    assert receive(batch, receiver)[0][1] < time.monotonic_ns() - 3599 * 10**9
 
 
 def test_batch_across_a_second_keeps_every_time():
