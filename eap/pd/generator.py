@@ -19,7 +19,6 @@ from eap.pd.image import Image
 from eap.pd.layout import VariablePlace
 from eap.pd.spec import CounterSource, EngineSource, RampSource, RandomSource, SineSource
 
-
 _CODES = {
     (int, 1): "b", (int, 2): "h", (int, 4): "i", (int, 8): "q", (float, 4): "f", (float, 8): "d",
 }  # fmt: skip
