@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterable
 
 from eap.codec.ethercat import EtherCatHeader, FrameType
-from eap.codec.pd import FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
+from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
 from eap.errors import TruncatedError
 from eap.ids import NetId
 from eap.pd.account import Account, Timing
@@ -21,8 +21,11 @@ from eap.pd.spec import RxPdSpec
 from eap.pd.substitute import SubstituteValue
 from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
 
-_KEY = struct.Struct("<10sH").unpack_from
-"""EtherCAT header, publisher and count: what tells layouts apart; then the cycle counter."""
+_KEY = struct.Struct("<10s4xH").unpack_from
+"""EtherCAT header, publisher and count, and the id of the first PD: what tells layouts apart."""
+_SHORTEST = FIRST_PD + 2
+"""Octets that a frame with a PD has at least for its key."""
+_CYCLE_COUNTER = struct.Struct("<H").unpack_from
 _PDS_PLANNED = 16384
 """PDs of all layouts kept; a plant has fewer, and who makes them up gets no more memory."""
 _PLANS_PER_KEY = 16
@@ -79,7 +82,7 @@ class Subscriber:
             publisher = NetId.parse(place.publisher) if place.publisher else b""
             self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
             self._by_id.setdefault(place.pd_id, []).append(subscription)
-        self._plans: dict[bytes, list[FramePlan]] = {}
+        self._plans: dict[tuple[bytes, int], list[FramePlan]] = {}
         self._pds_planned = 0
         self._open_from_ns = _NEVER
         self._closed_reason = Discard.SUPPRESSED
@@ -100,7 +103,7 @@ class Subscriber:
 
     def receive_frame(self, data: memoryview, size: int, at_ns: int) -> None:
         """Take one EtherCAT frame of *size* octets that arrived at *at_ns*."""
-        plan = self._find_plan(data, size)
+        plan = self._find_plan(data, size) or self._learn(data, size)
         if plan is None:
             return
         if at_ns < self._open_from_ns:
@@ -113,7 +116,7 @@ class Subscriber:
         outside = not words[_SEQUENCE] & 1
         if outside:
             words[_SEQUENCE] += 1
-        cycle = _KEY(data)[1]
+        (cycle,) = _CYCLE_COUNTER(data, CYCLE_OFFSET)
         own_cycle = words[_CYCLE] + outside
         for account, copies in plan.parts:
             if account.arrived(cycle, at_ns, own_cycle):
@@ -158,11 +161,11 @@ class Subscriber:
         self._next_timeout_ns = following
 
     def _find_plan(self, data: memoryview, size: int) -> FramePlan | None:
-        if size >= FIRST_PD:
-            for plan in self._plans.get(_KEY(data)[0], ()):
+        if size >= _SHORTEST:
+            for plan in self._plans.get(_KEY(data), ()):
                 if plan.end <= size and plan.headers(data, FIRST_PD) == plan.expected:
                     return plan
-        return self._learn(data, size)
+        return None
 
     def _learn(self, data: memoryview, size: int) -> FramePlan | None:
         """Make the plan of a layout not seen before; count and drop what is no PD frame."""
@@ -192,10 +195,12 @@ class Subscriber:
             roaming={s.account for s, _ in chosen if not s.place.publisher},
             publisher=publisher,
         )
+        if size < _SHORTEST:
+            return plan
         if self._pds_planned > _PDS_PLANNED:
             self._forget_plans()
         self._pds_planned += 1 + len(pds)
-        same_key = self._plans.setdefault(_KEY(data)[0], [])
+        same_key = self._plans.setdefault(_KEY(data), [])
         if len(same_key) >= _PLANS_PER_KEY:
             same_key.clear()
         same_key.append(plan)
