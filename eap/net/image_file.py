@@ -102,7 +102,10 @@ class ImageFile:
         _libc.syscall(_SYS_FUTEX, ctypes.byref(self._futex), _FUTEX_WAKE, _EVERYBODY, None, None, 0)
 
     def wait_cycle(self, cycle: int, timeout_s: float) -> bool:
-        """Sleep until the cycle counter differs from *cycle*; return False after *timeout_s*."""
+        """Sleep until the cycle counter differs from *cycle*.
+
+        Return False after *timeout_s*, or when a newer layout has taken this file's place.
+        """
         words = self.image.words
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         # The kernel sleeps only while the futex still is what it was before we looked at the
@@ -110,7 +113,7 @@ class ImageFile:
         seen = self._futex.value
         while words[StationWord.CYCLE] == cycle:
             remaining_ns = deadline_ns - time.monotonic_ns()
-            if remaining_ns <= 0:
+            if remaining_ns <= 0 or words[StationWord.RETIRED]:
                 return False
             words[StationWord.WAITERS] = cycle
             limit = (ctypes.c_long * 2)(*divmod(remaining_ns, 1_000_000_000))

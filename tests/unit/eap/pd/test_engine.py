@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from eap.pd.engine import Engine
+from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
+from eap.pd.station import Station
+from eap.pd.words import StationWord
+from tests.support.cyclic import MS, PEER, Wire, image_of, octets, received, station, written
+
+
+def make(name: str = "a", **options: object) -> tuple[Station, Wire]:
+    spec = station(
+        name,
+        variables=written("x:UINT"),
+        frames=(TxFrameSpec("f", "eap0", "10.0.0.1", (TxPdSpec("p", 1, ("x",)),)),),
+        **options,
+    )
+    wire = Wire()
+    made = Station(spec, image_of(spec), lambda: None)
+    made.connect("eap0", wire)
+    return made, wire
+
+
+def run(engine: Engine, until_ns: int) -> list[int]:
+    times = []
+    while (now := engine.next_timeout()) <= until_ns:
+        engine.handle_timeout(now)
+        times.append(now)
+    return times
+
+
+def test_stations_run_on_their_own_grid_and_phase():
+    fast, fast_wire = make("fast")
+    slow, slow_wire = make("slow", cycle_us=4000, phase_us=500)
+    engine = Engine([fast, slow])
+    engine.start(10 * MS + 1)
+    assert run(engine, 16 * MS) == [11 * MS, 12 * MS, 12_500_000, *(n * MS for n in range(13, 17))]
+    assert (len(fast_wire.sent), len(slow_wire.sent)) == (6, 1)
+
+
+def test_a_start_before_the_phase_of_this_cycle_does_not_wait_for_the_next():
+    made, _ = make(phase_us=700)
+    engine = Engine([made])
+    engine.start(5 * MS + 100_000)
+    assert engine.next_timeout() == 5 * MS + 700_000
+
+
+def test_early_calls_do_nothing():
+    made, wire = make()
+    engine = Engine([made])
+    engine.start(0)
+    engine.handle_timeout(MS - 1)
+    assert wire.sent == []
+
+
+def test_cycles_that_are_missed_are_counted_and_left_out_and_the_grid_stays():
+    made, wire = make()
+    engine = Engine([made])
+    engine.start(0)
+    engine.handle_timeout(MS)
+    engine.handle_timeout(5 * MS + MS // 2)  # 2 runs late, 3, 4 and 5 are left out
+    assert made.image.words[StationWord.OVERRUNS] == 3
+    assert engine.next_timeout() == 6 * MS
+    engine.handle_timeout(6 * MS)
+    assert [frame[10] for frame in wire.sent] == [1, 2, 3]
+
+
+def test_the_stop_ends_sending_and_receiving():
+    made, wire = make()
+    engine = Engine([made])
+    engine.start(0)
+    run(engine, 3 * MS)
+    engine.stop()
+    assert made.image.words[StationWord.STATE] == 2
+    assert len(wire.sent) == 3
+
+
+def test_frames_are_taken_as_they_arrive_where_that_is_wanted():
+    spec = station(
+        variables=received("x:UINT"), subscriptions=(RxPdSpec("r", "eap0", 7, ("x",), PEER),)
+    )
+    made = Station(spec, image_of(spec), lambda: None)
+    wire = Wire()
+    wire.takers.append(made.takers["eap0"])
+    made.connect("eap0", wire)
+    engine = Engine([made])
+    engine.drain_on_arrival([wire])
+    engine.start(0)
+    engine.handle_timeout(MS)
+    wire.waiting.append((octets([(7, b"\x05\0")]), MS + 100))
+    engine.receive(MS + 200)
+    assert made.image.words[StationWord.ENGINE_SEQUENCE] % 2 == 0
+    assert made.image.read("x") == 5

@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.pd.report import pd_list, quality, station_status
+from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, Writer
+from eap.pd.words import RxWord, StationWord
+from tests.support.cyclic import (
+    MS,
+    OWN,
+    PEER,
+    Receiver,
+    image_of,
+    octets,
+    received,
+    station,
+    written,
+)
+
+
+def receiver(**options: object) -> Receiver:
+    cycle_us = options.pop("cycle_us", 1000)
+    options = {"step": 1, "sender_cycle_us": 1000} | options
+    return Receiver(
+        RxPdSpec("r", "eap0", 7, ("x",), PEER, **options),
+        variables=received("x:UINT"),
+        cycle_us=cycle_us,
+    )
+
+
+class NaiveQuality:
+    """Each receiver cycle it grows by the cycle time, before the input image is refreshed."""
+
+    def __init__(self, cycle_us: int) -> None:
+        self.cycle_us = cycle_us
+        self.value = 0
+        self.remainder_us = 0
+
+    def cycle(self) -> None:
+        self.remainder_us += self.cycle_us
+        self.value = min(self.value + self.remainder_us // 100, 0xFFFF)
+        self.remainder_us %= 100
+
+    def arrive(self, sent: int) -> None:
+        self.value = sent
+        self.remainder_us = 0
+
+
+@pytest.mark.parametrize("cycle_us", [100, 250, 333, 1000, 10_000])
+@given(
+    steps=st.lists(
+        st.one_of(st.none(), st.integers(0, 0xFFFF), st.just(0)), min_size=1, max_size=60
+    ),
+    idle=st.integers(0, 100),
+)
+def test_quality_is_what_counting_in_every_cycle_gives(cycle_us, steps, idle):
+    r = receiver(cycle_us=cycle_us)
+    naive = NaiveQuality(cycle_us)
+    arrived = False
+    words = r.image.words
+    for counter, sent in enumerate([0, *steps, *[None] * idle]):
+        words[StationWord.ENGINE_SEQUENCE] += 1
+        words[StationWord.CYCLE] += 1
+        naive.cycle()
+        if sent is not None:
+            r.give(octets([(7, b"ab", 0, sent)], cycle=counter), counter * cycle_us * 1000)
+            naive.arrive(sent)
+            arrived = True
+        words[StationWord.ENGINE_SEQUENCE] += 1
+        assert arrived
+        assert quality(r.image, r.place("r")) == naive.value
+
+
+def test_quality_saturates():
+    r = receiver()
+    r.give(octets([(7, b"ab", 0, 65_000)]), 0)
+    r.image.words[StationWord.CYCLE] += 53
+    assert quality(r.image, r.place("r")) == 65_000 + 520
+    r.image.words[StationWord.CYCLE] += 2
+    assert quality(r.image, r.place("r")) == 65_535
+    r.image.words[StationWord.CYCLE] += 10**9
+    assert quality(r.image, r.place("r")) == 65_535
+
+
+def test_what_arrives_between_two_cycles_is_fresh_in_the_next():
+    r = receiver()
+    r.image.words[StationWord.CYCLE] = 5
+    r.give(octets([(7, b"ab", 0, 30)]), 0)
+    assert quality(r.image, r.place("r")) == 30
+    r.image.words[StationWord.CYCLE] = 6
+    assert quality(r.image, r.place("r")) == 30
+    r.image.words[StationWord.CYCLE] = 7
+    assert quality(r.image, r.place("r")) == 40
+
+
+def test_a_subscription_that_waits_knows_nothing():
+    row = station_status(receiver().image, 99 * MS)["pd"]["rx"][0]
+    assert row == {
+        "name": "r",
+        "port": "eap0",
+        "received": 0,
+        "lost": 0,
+        "duplicated": 0,
+        "reordered": 0,
+        "late": 0,
+        "timeouts": 0,
+        "discarded": {},
+        "quality": None,
+        "cycle_index": None,
+        "var_state": 0,
+        "age_us": None,
+        "jitter_us": {"p50": None, "p99": None, "max": None},
+        "state": "waiting",
+    }
+
+
+def test_a_subscription_that_runs_tells_it_all():
+    r = receiver()
+    for cycle, at_us in ((65_534, 0), (65_535, 1004), (2, 4000)):
+        r.give(octets([(7, b"ab")], cycle=cycle), at_us * 1000)
+    r.give(octets([(7, b"abc")]), 5 * MS)
+    row = station_status(r.image, 9 * MS)["pd"]["rx"][0]
+    assert (row["received"], row["lost"], row["cycle_index"]) == (3, 2, 2)
+    assert (row["age_us"], row["state"], row["var_state"]) == (5000, "running", 2)
+    assert row["jitter_us"] == {"p50": 4, "p99": 4, "max": 4}
+    assert row["discarded"] == {"length": 1}
+
+
+def test_lost_is_null_where_the_step_is_unknown():
+    r = receiver(step=0)
+    r.give(octets([(7, b"ab")], cycle=1), 0)
+    r.give(octets([(7, b"ab")], cycle=900), MS)
+    assert station_status(r.image, 0)["pd"]["rx"][0]["lost"] is None
+
+
+def test_a_station_before_its_start_is_in_init():
+    image = receiver().image
+    status = station_status(image, 0)
+    assert (status["state"], status["cycle"], status["discarded"]) == ("INIT", 0, {})
+    assert status["lateness_us"] == {"p50": None, "p99": None, "max": None}
+    image.words[StationWord.STATE] = 8
+    assert station_status(image, 0)["state"] == "OP"
+
+
+def test_members_of_one_account_report_the_same_counters_and_their_own_discards():
+    r = Receiver(
+        RxPdSpec("r", "eap0", 1, ("x",), PEER, step=1),
+        RxPdSpec("s", "eap0", 2, ("y",), PEER, step=1),
+        variables=received("x:UINT", "y:UINT"),
+    )
+    r.give(octets([(1, b"ab"), (2, b"cd")], cycle=3), MS)
+    assert r.image.words[r.place("s").words + RxWord.ACCOUNT] == r.place("r").words
+    r.give(octets([(2, b"toolong")], cycle=4), MS)
+    rows = station_status(r.image, MS)["pd"]["rx"]
+    assert [row["received"] for row in rows] == [1, 1]
+    assert [row["discarded"] for row in rows] == [{}, {"length": 1}]
+
+
+def test_the_list_names_every_pd_with_its_variables():
+    spec = station(
+        variables=(*written("x:UINT"), *received("y:REAL")),
+        frames=(TxFrameSpec("f", "eap0", "10.0.0.9", (TxPdSpec("p", 1, ("x",), version=4),)),),
+        subscriptions=(RxPdSpec("r", "eap0", 2, ("y",)),),
+    )
+    sent, taken = pd_list(image_of(spec))
+    assert sent == {
+        "station": "a",
+        "direction": "tx",
+        "name": "p",
+        "id": 1,
+        "version": 4,
+        "length": 2,
+        "port": "eap0",
+        "publisher": OWN,
+        "frame": "f",
+        "destination": "10.0.0.9",
+        "variables": [{"name": "x", "type": "UINT", "unit": "", "writer": Writer.APPLICATION}],
+    }
+    assert (taken["direction"], taken["publisher"], taken["length"]) == ("rx", None, 4)
+    assert msgspec.json.encode([sent, taken])
