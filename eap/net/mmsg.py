@@ -29,6 +29,7 @@ STAMP_SIZE = 32
 _MMSGHDR = struct.Struct("@QQQQQQQQ")  # name, namelen, iov, iovlen, control, controllen, flags, len
 _IOVEC = struct.Struct("@QQ")
 _CACHED_BATCHES = 256
+_CACHED_FRAMES = 4096
 _CLOCK_NOISE_NS = 1000
 
 _library = ctypes.CDLL(None, use_errno=True)
@@ -223,11 +224,13 @@ class SendBatch:
 
     def _prepare(self, frames: tuple[OutFrame, ...]) -> tuple[Callable[[], int], bytearray]:
         known = self._headers
+        if len(self._batches) >= _CACHED_BATCHES or len(known) >= _CACHED_FRAMES:
+            # Together: a batch points into the descriptions of its frames.
+            self._batches.clear()
+            known.clear()
         headers = bytearray().join(
             (known.get(frame) or self._describe(frame))[0] for frame in frames
         )
-        if len(self._batches) >= _CACHED_BATCHES:
-            self._batches.clear()
         batch = self._batches[frames] = self._call(headers, 0), headers
         return batch
 

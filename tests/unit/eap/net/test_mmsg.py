@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from eap.net import mmsg
 from eap.net.mmsg import (
     BATCH,
     SO_TIMESTAMPNS,
@@ -209,3 +210,17 @@ def test_unknown_errno_is_counted_by_number():
     count_error(errors, errno.ENOBUFS)
     count_error(errors, errno.ENOBUFS)
     assert errors == {"99999": 1, "ENOBUFS": 2}
+
+
+def test_what_is_kept_of_frames_that_come_and_go_is_bounded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mmsg, "_CACHED_FRAMES", 8)
+    left, right = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with left, right:
+        batch = SendBatch(left)
+        for number in range(20):
+            pair = [OutFrame(bytearray((number, n)), 0, "") for n in (1, 2)]
+            assert batch.send(pair) == ()
+            assert [right.recv(9) for _ in pair] == [bytes((number, 1)), bytes((number, 2))]
+            assert len(batch._headers) <= 10
