@@ -1,0 +1,86 @@
+"""docs/control.md tells the truth: its plant runs and its exchanges happen as they are printed."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import pytest
+
+from eap.appliance.client import connect
+
+pytestmark = pytest.mark.net
+
+PAGE = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
+PLANT = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0]
+LINES = [
+    line
+    for block in re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
+    for line in block.splitlines()
+]
+OF_THIS_MACHINE = {"realtime", "release"}
+
+
+def outline(value: Any) -> Any:
+    """Reduce an answer to what is the same on every machine and in every run."""
+    if isinstance(value, dict):
+        return {
+            key: "..." if key in OF_THIS_MACHINE else outline(item) for key, item in value.items()
+        }
+    if isinstance(value, list):
+        return [outline(item) for item in value]
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return "a number"
+    return value
+
+
+@pytest.fixture
+def control(monkeypatch):
+    folder = Path(tempfile.mkdtemp(prefix="eap-"))  # short enough for a socket's path
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(folder))
+    (folder / "kiln.yaml").write_text(PLANT)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "eap", "run", str(folder / "kiln.yaml")], stdout=subprocess.PIPE
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        yield folder / "kiln" / "control"
+        assert process.wait(5) == 0  # the last exchange of the page stops it
+    finally:
+        process.kill()
+        process.communicate()
+        shutil.rmtree(folder)
+
+
+def wait_for_data() -> None:
+    (client,) = connect()
+    deadline = monotonic() + 5
+    with client:
+        while client.request("read", station="panel")["values"]["flame"] < 10:
+            assert monotonic() < deadline
+            sleep(0.01)
+
+
+def test_every_exchange_happens_as_printed(control):
+    wait_for_data()
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(5)
+        connection.connect(str(control))
+        reader = connection.makefile("rb")
+        for line in LINES:
+            if line.startswith("> "):
+                connection.sendall(line[2:].encode() + b"\n")
+            else:
+                told = outline(json.loads(line.removeprefix("< ")))
+                assert outline(json.loads(reader.readline())) == told, line
+        reader.close()
+    assert len(LINES) > 30
