@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec.soe import (
+    Display,
+    Element,
+    Idn,
+    ListHead,
+    SoeAttribute,
+    SoeHeader,
+    SoeOpcode,
+    decode_list,
+    decode_message,
+    encode_fragments,
+    encode_list,
+    encode_message,
+    error_code_of,
+)
+from eap.errors import CodecError, MalformedError, TruncatedError
+from tests.support.records import records
+
+
+def test_read_request_lies_as_on_the_wire() -> None:
+    octets = encode_message(SoeOpcode.READ_REQUEST, Idn.parse("S-0-0032").number, drive=1)
+    assert octets == bytes.fromhex("21 40 2000")
+
+
+def test_refusal_lies_as_on_the_wire() -> None:
+    octets = encode_message(
+        SoeOpcode.READ_RESPONSE, 0x8064, b"\x01\x10", elements=Element.NAME, error=True
+    )
+    assert octets == bytes.fromhex("12 02 6480 0110")
+    header, body = decode_message(octets)
+    assert header == SoeHeader(SoeOpcode.READ_RESPONSE, 0, 1, 0, Element.NAME, 0x8064)
+    assert error_code_of(body) == 0x1001
+
+
+def test_error_code_is_the_last_two_octets() -> None:
+    assert error_code_of(b"\0\0\x09\x70") == 0x7009
+    with pytest.raises(TruncatedError, match="an error of 1 octets"):
+        error_code_of(b"\1")
+
+
+def test_attribute_lies_as_on_the_wire() -> None:
+    attribute = SoeAttribute(
+        factor=1, length=1, is_list=1, display=Display.IDN, decimals=3, protected_op=1
+    )
+    assert attribute.encode() == bytes.fromhex("0100 5543")
+    assert attribute.size == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [("S-0-0032", 32), ("P-0-0100", 0x8064), ("S-7-4095", 0x7FFF), ("P-3-0001", 0xB001)],
+)
+def test_idn_has_a_written_form(text: str, number: int) -> None:
+    assert Idn.parse(text).number == number
+    assert str(Idn.of(number)) == text
+
+
+@given(st.integers(0, 0xFFFF))
+def test_every_number_has_an_idn(number: int) -> None:
+    idn = Idn.of(number)
+    assert idn.number == number
+    assert Idn.parse(str(idn).lower()) == idn
+
+
+@pytest.mark.parametrize("text", ["", "S-0-4096", "S-8-0001", "X-0-1", "32", "S-0-", "S-0-00001"])
+def test_other_text_is_no_idn(text: str) -> None:
+    with pytest.raises(ValueError, match="is not an IDN"):
+        Idn.parse(text)
+
+
+@given(st.binary(max_size=60), st.integers(1, 20), st.integers(0, 0xFFFF))
+def test_fragments_count_down_and_hold_everything(body: bytes, room: int, idn: int) -> None:
+    header = SoeHeader(SoeOpcode.WRITE_REQUEST, 0, 0, 3, Element.VALUE, idn)
+    read = [decode_message(message) for message in encode_fragments(header, body, room)]
+    assert b"".join(bytes(part) for _, part in read) == body
+    assert all(len(part) <= room for _, part in read)
+    assert [head.incomplete for head, _ in read] == [1] * (len(read) - 1) + [0]
+    assert [head.idn for head, _ in read] == [*range(len(read) - 1, 0, -1), idn]
+    assert {(head.opcode, head.drive, head.elements) for head, _ in read} == {(3, 3, 0x40)}
+
+
+@given(st.binary(max_size=30), st.integers(0, 9))
+def test_list_round_trip(octets: bytes, more: int) -> None:
+    head, read = decode_list(encode_list(octets, len(octets) + more) + b"surplus")
+    assert (head, read) == (ListHead(len(octets), len(octets) + more), octets)
+    assert decode_list(encode_list(octets))[0].max_length == len(octets)
+
+
+def test_list_that_contradicts_its_head_is_refused() -> None:
+    with pytest.raises(TruncatedError, match="length 4, but 3 octets follow"):
+        decode_list(bytes.fromhex("0400 0400 010203"))
+    with pytest.raises(MalformedError, match="length 2 of at most 1"):
+        decode_list(bytes.fromhex("0200 0100 0102"))
+
+
+@pytest.mark.parametrize("record", [SoeHeader, SoeAttribute, ListHead])
+@given(data=st.data())
+def test_round_trip_and_every_prefix_is_truncated(record: type, data: st.DataObject) -> None:
+    value = data.draw(records(record))
+    octets = value.encode()
+    assert len(octets) == 4
+    assert record.decode(octets) == value
+    with pytest.raises(TruncatedError, match=record.__name__):
+        record.decode(octets[: data.draw(st.integers(0, 3))])
+
+
+@given(st.binary(max_size=20))
+def test_garbage_decodes_or_raises_codec_error(noise: bytes) -> None:
+    try:
+        header, body = decode_message(noise)
+    except CodecError:
+        return
+    assert header.encode() + body == noise
