@@ -11,6 +11,8 @@ Rule 3: the same counter again counts as duplicated and is taken: some terminals
 
 from __future__ import annotations
 
+import struct
+
 from eap.pd.words import ACCOUNT_START, BIN_OF_US, RxState, RxWord, histogram_bin
 
 _RECEIVED = RxWord.RECEIVED - ACCOUNT_START
@@ -31,6 +33,11 @@ _JITTER_MAX_US = RxWord.JITTER_MAX_US - ACCOUNT_START
 _JITTER = RxWord.JITTER - ACCOUNT_START
 
 _RUNNING = int(RxState.RUNNING)
+# Words that lie side by side, in one call: each access of its own to a memoryview costs 40 ns.
+_read_last = struct.Struct("2q").unpack_from  # LAST_CYCLE, ARRIVED_AT_NS
+_LAST_OFFSET = 8 * _LAST_CYCLE
+_write_taken = struct.Struct("5q").pack_into  # STATE to BEHIND
+_TAKEN_OFFSET = 8 * _STATE
 REORDER_WINDOW = 32
 """Sender steps by which a frame can be out of order; further back the sender has restarted."""
 RESTARTED_AFTER = 3
@@ -109,10 +116,10 @@ class Account:
             own_cycle: The own cycle whose input image it refreshes.
         """
         words = self._words
-        last = words[_LAST_CYCLE]
+        last, last_at_ns = _read_last(words, _LAST_OFFSET)
         position = cycle
         if last >= 0:
-            elapsed_ns = at_ns - words[_ARRIVED_AT_NS]
+            elapsed_ns = at_ns - last_at_ns
             gap = cycle - last & 0xFFFF
             if gap > 0x3FFF or elapsed_ns > self._wrap_ns:
                 gap = self._resolve(gap, elapsed_ns)
@@ -129,11 +136,7 @@ class Account:
             elif self._is_reordered(last + gap, -gap):
                 return False
         words[_RECEIVED] += 1
-        words[_LAST_CYCLE] = position
-        words[_ARRIVED_AT_NS] = at_ns
-        words[_ARRIVED_IN_CYCLE] = own_cycle
-        words[_STATE] = _RUNNING
-        words[_BEHIND] = 0
+        _write_taken(words, _TAKEN_OFFSET, _RUNNING, position, at_ns, own_cycle, 0)
         return True
 
     def _resolve(self, gap: int, elapsed_ns: int) -> int:
@@ -183,4 +186,5 @@ class Account:
             words[_JITTER + BIN_OF_US[micros]] += 1
         else:
             words[_JITTER + histogram_bin(micros)] += 1
-        words[_JITTER_MAX_US] = max(words[_JITTER_MAX_US], micros)
+        if micros > words[_JITTER_MAX_US]:  # noqa: PLR1730  a call of max() is five times as slow
+            words[_JITTER_MAX_US] = micros
