@@ -1,0 +1,245 @@
+"""The slave information interface: what a slave's EEPROM tells about it (ETG.1000.6, ETG.2010).
+
+An image is 64 fixed words, then categories; each is a type, a length in words, and its data.  The
+end is the type 0xFFFF.  Categories that nobody here needs are kept as octets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import IntEnum, IntFlag
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import msgspec
+
+from devicebus.wire.siirecord import (
+    SiiDc,
+    SiiFixed,
+    SiiGeneral,
+    SiiPdoEntry,
+    SiiPdoHeader,
+    SiiSyncManager,
+)
+from eap.codec.wire import Buffer, Scalar, WireStruct, u16
+from eap.errors import CodecError, TruncatedError
+
+T = TypeVar("T", bound=WireStruct)
+
+CHECKED = 14
+"""Octets at the start that the check sum covers."""
+_END = 0xFFFF
+
+
+class SiiCategory(IntEnum):
+    """ETG.2010 table 7: category types."""
+
+    STRINGS = 10
+    DATA_TYPES = 20
+    GENERAL = 30
+    FMMU = 40
+    SYNC_MANAGER = 41
+    TX_PDO = 50
+    RX_PDO = 51
+    DC = 60
+
+
+class SiiProtocol(IntFlag):
+    """The mailbox protocols of word 0x1C."""
+
+    AOE = 0x01
+    EOE = 0x02
+    COE = 0x04
+    FOE = 0x08
+    SOE = 0x10
+    VOE = 0x20
+
+
+class CategoryHeader(WireStruct, frozen=True):
+    """ETG.2010: what stands in front of each category; *length* is in words."""
+
+    type: u16
+    length: u16
+
+
+class StringCount(WireStruct, frozen=True):
+    """A count of strings, or the octets of one."""
+
+    value: Annotated[int, Scalar("B")]
+
+
+class SiiPdo(NamedTuple):
+    """One PDO and what it maps."""
+
+    header: SiiPdoHeader
+    entries: tuple[SiiPdoEntry, ...] = ()
+
+    @property
+    def bit_length(self) -> int:
+        """Bits of all entries."""
+        return sum(entry.bit_length for entry in self.entries)
+
+
+class Sii(msgspec.Struct, frozen=True, kw_only=True):
+    """A whole image; *other* are categories that stay octets, by type."""
+
+    fixed: SiiFixed
+    strings: tuple[str, ...] = ()
+    general: SiiGeneral | None = None
+    fmmus: tuple[int, ...] = ()
+    """What each FMMU is for: 1 outputs, 2 inputs, 3 mailbox state."""
+    sync_managers: tuple[SiiSyncManager, ...] = ()
+    tx_pdos: tuple[SiiPdo, ...] = ()
+    rx_pdos: tuple[SiiPdo, ...] = ()
+    dc: tuple[SiiDc, ...] = ()
+    other: tuple[tuple[int, bytes], ...] = ()
+
+    def string(self, number: int) -> str:
+        """Return a string as other categories refer to it: 0 and unknown numbers are empty."""
+        return self.strings[number - 1] if 0 < number <= len(self.strings) else ""
+
+    @property
+    def name(self) -> str:
+        """The device's name, or nothing."""
+        return self.string(self.general.name) if self.general else ""
+
+
+def checksum(data: Buffer) -> int:
+    """Return the CRC-8 of *data*: polynomial 0x07, initial value 0xFF (ESC data sheet, SII)."""
+    crc = 0xFF
+    for octet in data:
+        crc ^= octet
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x07) & 0xFF if crc & 0x80 else crc << 1
+    return crc
+
+
+def is_intact(data: Buffer) -> bool:
+    """Whether the check sum of the first words fits, so that an ESC would load them."""
+    return len(data) > CHECKED and checksum(data[:CHECKED]) == data[CHECKED]
+
+
+def iter_categories(data: Buffer) -> Iterator[tuple[int, memoryview]]:
+    """Yield type and data of each category of a whole image.
+
+    Raises:
+        TruncatedError: a category reaches past the image, or the end mark is missing.
+    """
+    view = memoryview(data)
+    offset = SiiFixed.SIZE
+    while True:
+        if offset + 2 <= len(view) and view[offset] == view[offset + 1] == 0xFF:
+            return
+        header = CategoryHeader.decode(view, offset)
+        start = offset + CategoryHeader.SIZE
+        offset = start + 2 * header.length
+        if offset > len(view):
+            raise TruncatedError(
+                f"category {header.type} has {header.length} words, but"
+                f" {len(view) - start} octets follow",
+                layout="CategoryHeader",
+                offset=start,
+            )
+        yield header.type, view[start:offset]
+
+
+def decode(data: Buffer) -> Sii:
+    """Read a whole image; the check sum is not judged (:func:`is_intact`).
+
+    Raises:
+        TruncatedError: the image, a category or a list in it is shorter than it says.
+    """
+    found: dict[str, Any] = {"fixed": SiiFixed.decode(data)}
+    other = []
+    for kind, body in iter_categories(data):
+        match kind:
+            case SiiCategory.STRINGS:
+                found["strings"] = _decode_strings(body)
+            case SiiCategory.GENERAL:
+                found["general"] = SiiGeneral.decode(body)
+            case SiiCategory.FMMU:
+                found["fmmus"] = tuple(body)
+            case SiiCategory.SYNC_MANAGER:
+                found["sync_managers"] = _decode_records(SiiSyncManager, body)
+            case SiiCategory.TX_PDO:
+                found["tx_pdos"] = (*found.get("tx_pdos", ()), *_iter_pdos(body))
+            case SiiCategory.RX_PDO:
+                found["rx_pdos"] = (*found.get("rx_pdos", ()), *_iter_pdos(body))
+            case SiiCategory.DC:
+                found["dc"] = _decode_records(SiiDc, body)
+            case _:
+                other.append((kind, bytes(body)))
+    return Sii(other=tuple(other), **found)
+
+
+def encode(sii: Sii) -> bytes:
+    """Return the image; the check sum is set.
+
+    Raises:
+        CodecError: a value does not fit its field.
+    """
+    fixed = sii.fixed.encode()
+    image = bytearray(fixed)
+    image[CHECKED : CHECKED + 2] = bytes((checksum(fixed[:CHECKED]), 0))
+    parts = [
+        (SiiCategory.STRINGS, _encode_strings(sii.strings) if sii.strings else b""),
+        (SiiCategory.GENERAL, sii.general.encode() if sii.general else b""),
+        (SiiCategory.FMMU, bytes(sii.fmmus)),
+        (SiiCategory.SYNC_MANAGER, b"".join(each.encode() for each in sii.sync_managers)),
+        (SiiCategory.TX_PDO, b"".join(map(_encode_pdo, sii.tx_pdos))),
+        (SiiCategory.RX_PDO, b"".join(map(_encode_pdo, sii.rx_pdos))),
+        (SiiCategory.DC, b"".join(each.encode() for each in sii.dc)),
+        *sii.other,
+    ]
+    for kind, body in parts:
+        if body:
+            padded = body + bytes(len(body) % 2)
+            image += CategoryHeader(kind, len(padded) // 2).encode() + padded
+    return bytes(image + _END.to_bytes(2, "little"))
+
+
+def _decode_strings(body: memoryview) -> tuple[str, ...]:
+    strings = []
+    offset = 1
+    for _ in range(StringCount.decode(body).value):
+        size = StringCount.decode(body, offset).value
+        octets = body[offset + 1 : offset + 1 + size]
+        if len(octets) < size:
+            raise TruncatedError(
+                f"a string of {size} octets, but {len(octets)} follow", layout="StringCount"
+            )
+        strings.append(bytes(octets).decode("latin-1"))
+        offset += 1 + size
+    return tuple(strings)
+
+
+def _encode_strings(strings: tuple[str, ...]) -> bytes:
+    body = StringCount(len(strings)).encode()
+    for text in strings:
+        try:
+            octets = text.encode("latin-1")
+        except UnicodeEncodeError:
+            raise CodecError(f"{text!r} is not Latin-1", layout="StringCount") from None
+        body += StringCount(len(octets)).encode() + octets
+    return body
+
+
+def _decode_records(record: type[T], body: memoryview) -> tuple[T, ...]:
+    return tuple(
+        record.decode(body, at) for at in range(0, len(body) - record.SIZE + 1, record.SIZE)
+    )
+
+
+def _iter_pdos(body: memoryview) -> Iterator[SiiPdo]:
+    offset = 0
+    while offset < len(body):
+        header = SiiPdoHeader.decode(body, offset)
+        offset += SiiPdoHeader.SIZE
+        end = offset + header.entries * SiiPdoEntry.SIZE
+        places = range(offset, end, SiiPdoEntry.SIZE)
+        yield SiiPdo(header, tuple(SiiPdoEntry.decode(body, at) for at in places))
+        offset = end
+
+
+def _encode_pdo(pdo: SiiPdo) -> bytes:
+    header = msgspec.structs.replace(pdo.header, entries=len(pdo.entries))
+    return header.encode() + b"".join(entry.encode() for entry in pdo.entries)
