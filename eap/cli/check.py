@@ -42,10 +42,11 @@ def check(ctx: click.Context, plant: Path, as_json: bool) -> None:
 
 
 def report_findings(plant: Path, findings: Sequence[Finding]) -> None:
-    """Print *findings* on stderr, one a line, and how many there are."""
+    """Print *findings* on stderr, one a line, and how many there are if there are several."""
     for finding in findings:
         click.echo(str(finding), err=True)
-    click.echo(f"{plant}: {count(len(findings), 'finding')}, not a plant yet", err=True)
+    if len(findings) > 1:
+        click.echo(f"{plant}: {len(findings)} findings, not a plant yet", err=True)
 
 
 def summary(plant: Plant) -> str:

@@ -1,7 +1,7 @@
 """The group behind ``eapctl``: subcommands by name, and one way out for every error.
 
-Rule: whatever goes wrong ends as one line on stderr and an exit code, never as a traceback;
-``EAP_DEBUG=1`` shows the traceback above that line.
+Rule: whatever goes wrong ends as one line on stderr (the findings of a plant file as one each) and
+an exit code, never as a traceback; ``EAP_DEBUG=1`` shows the traceback above that line.
 """
 
 from __future__ import annotations
@@ -55,6 +55,22 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(import_module(module), attribute)
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the subcommand that *args* start with; raise UsageError with one that comes near."""
+        if args[0] not in self._commands_at and not ctx.resilient_parsing:
+            from difflib import get_close_matches
+
+            near = get_close_matches(args[0], self._commands_at, n=1)
+            hint = (
+                f"did you mean {near[0]!r}?"
+                if near
+                else f"there are {', '.join(self.list_commands(ctx))}"
+            )
+            raise click.UsageError(f"no command {args[0]!r}: {hint}", ctx)
+        return super().resolve_command(ctx, args)
+
     def main(self, *args: Any, **extra: Any) -> NoReturn:
         """Run one command line and end the process; takes what ``click.Command.main`` takes."""
         extra["standalone_mode"] = False
@@ -76,7 +92,9 @@ def exit_code_of(error: Exception) -> int:
 
 
 def describe(error: Exception) -> str:
-    """Return an error as one line for a person."""
+    """Return an error in words for a person: one line, or one for each finding of a plant file."""
+    if isinstance(error, ConfigError):
+        return str(error)
     if isinstance(error, click.UsageError):
         command = f"{error.ctx.command_path}: " if error.ctx else ""
         hint = f" (see '{error.ctx.command_path} --help')" if error.ctx else ""

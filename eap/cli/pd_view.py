@@ -30,35 +30,39 @@ def pd_rows(station: str, pds: Sequence[Row], variables: Sequence[Row]) -> Itera
 
 
 def pd_tables(rows: Sequence[Row]) -> Iterator[RenderableType]:
-    """Yield one table for each station of *rows*."""
-    from rich import box
-    from rich.table import Table
+    """Yield the stations of *rows*, each with its PDs and their variables."""
+    from rich.text import Text
 
     for station in dict.fromkeys(row["station"] for row in rows):
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        table.title, table.title_justify, table.title_style = station, "left", "bold"
-        for heading in ("", "PD", "Id", "Version", "Port", "From / to", "Variable", "Type"):
-            table.add_column(heading, overflow="fold")
-        table.add_column("Writer")
-        for row in rows:
-            if row["station"] == station:
-                _add_pd(table.add_row, row)
-        yield table
+        text = Text()
+        text.append(f"{station}\n", style="bold")
+        pds = [row for row in rows if row["station"] == station]
+        variables = [variable for pd in pds for variable in pd["variables"]]
+        name_width = max(len(variable["name"]) for variable in variables)
+        type_width = max(len(_typed(variable)) for variable in variables)
+        for pd in pds:
+            text.append(f" {_heading(pd)}\n", style="cyan")
+            for variable in pd["variables"]:
+                text.append(
+                    f"     {variable['name']:<{name_width}}  {_typed(variable):<{type_width}}"
+                    f"  {variable['writer']}\n"
+                )
+        yield text
 
 
-def _add_pd(add_row: Any, row: Row) -> None:
-    """Add a line for each variable; what identifies the PD stands in the first."""
-    if row["direction"] is None:
-        own = ["", "(in no PD)", "", "", "", ""]
+def _heading(pd: Row) -> str:
+    """Say what identifies a PD, and where it comes from or goes to."""
+    if pd["direction"] is None:
+        return "·  in no PD"
+    if pd["direction"] == "tx":
+        arrow, way = "→", f"to {pd['destination']}"
     else:
-        is_sent = row["direction"] == "tx"
-        peer = row["destination"] if is_sent else row["publisher"] or "any"
-        arrow = "→" if is_sent else "←"
-        own = [arrow, row["name"], str(row["id"]), str(row["version"]), row["port"], peer]
-    for variable in row["variables"]:
-        unit = f" [{variable['unit']}]" if variable["unit"] else ""
-        add_row(*own, variable["name"] + unit, variable["type"], variable["writer"])
-        own = [""] * 6
+        arrow, way = "←", f"from {pd['publisher'] or 'any publisher'}"
+    return f"{arrow}  {pd['name']}  id {pd['id']}, version {pd['version']}, {pd['port']} {way}"
+
+
+def _typed(variable: Row) -> str:
+    return f"{variable['type']} {variable['unit']}".rstrip()
 
 
 def change_line(change: Row) -> str:
@@ -74,5 +78,11 @@ def change_line(change: Row) -> str:
 
 
 def _short(value: Any) -> str:
-    text = str(value).lower() if isinstance(value, bool) else str(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.7g}"  # what a REAL is exact to
+    if isinstance(value, list):
+        value = f"[{', '.join(map(_short, value))}]"
+    text = str(value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}… ({len(text)} characters)"

@@ -21,6 +21,7 @@ Row = Mapping[str, Any]
 
 _GOOD, _BAD, _DIM = "green", "bold red", "dim"
 _STATE_STYLE = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
+_NOT_ASKED = "other: not asked for"
 _REASONS = {
     "cycle": "cyclic",
     "divider": "divider",
@@ -37,7 +38,8 @@ def status_tables(document: Row) -> Iterator[RenderableType]:
         yield _processes(appliance)
     yield _stations(stations)
     yield _process_data(stations)
-    remarks = [remark for station in stations for remark in _remarks(station)]
+    remarks = [remark for appliance in document["appliances"] for remark in _denied(appliance)]
+    remarks += [remark for station in stations for remark in _remarks(station)]
     if remarks:
         yield Text("Worth a look", style="bold")
         yield from (Padding(Text(remark), (0, 0, 0, 1)) for remark in remarks)
@@ -58,17 +60,17 @@ def _processes(appliance: Row) -> RenderableType:
             f"process {process['pid']}",
             "" if cpu is None else f"{cpu:.1f} % of a core",
             "" if rss is None else f"{rss / 1e6:.0f} MB",
-            Text(", ".join(_process_remarks(process))),
+            f"restarted {words.times(process['restarts'])}" if process.get("restarts") else "",
         )
     return table
 
 
-def _process_remarks(process: Row) -> Iterator[str]:
-    if restarts := process.get("restarts"):
-        yield f"restarted {words.times(restarts)}"
-    missing = [name for name, has in process.get("realtime", {}).items() if has is False]
-    if missing:
-        yield f"without {', '.join(missing)}".replace("_", " ")
+def _denied(appliance: Row) -> Iterator[str]:
+    """Yield what the engine asked for, to be on time, and was not given."""
+    for what, outcome in appliance["processes"]["engine"].get("realtime", {}).items():
+        if isinstance(outcome, str) and not outcome.startswith("fifo") and outcome != _NOT_ASKED:
+            reason = outcome.removeprefix("other: ")
+            yield f"{appliance['plant']} engine, {what.replace('_', ' ')}: {reason}"
 
 
 def _stations(stations: Sequence[Row]) -> RenderableType:

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from eap.cli import main
+
+PLANT = """\
+plant: line
+stations:
+  - name: mixer
+    net_id: 1.1.1.1.1.1
+    ports:
+      - {name: eap0, kind: eap, interface: "udp://127.0.9.1", net_id: 1.1.1.1.2.1}
+    variables: {speed: INT}
+    frames:
+      - {name: out, port: eap0, to: 239.1.2.3}
+    publish:
+      - {name: state, frame: out, id: 7, variables: [speed]}
+"""
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Path:
+    path = tmp_path / "plant.yaml"
+    path.write_text(PLANT)
+    return path
+
+
+def break_plant(path: Path) -> None:
+    path.write_text(PLANT.replace("speed: INT", "speed: INTT").replace("id: 7", "id: -7"))
+
+
+def test_a_plant_that_is_well(plant: Path) -> None:
+    result = CliRunner().invoke(main, ["check", str(plant)])
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout == (f"{plant}: plant line is well: 1 station, 1 PD sent, 0 PDs received\n")
+    result = CliRunner().invoke(main, ["check", str(plant), "--json"])
+    assert (result.exit_code, result.stdout) == (0, '{"ok":true,"findings":[]}\n')
+
+
+def test_all_findings_at_once(plant: Path) -> None:
+    break_plant(plant)
+    result = CliRunner().invoke(main, ["check", str(plant)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    first, second, total = result.stderr.splitlines()
+    assert first.startswith(f"{plant}:7: ")
+    assert second.startswith(f"{plant}:11: ")
+    assert "; expected " in first
+    assert total == f"{plant}: 2 findings, not a plant yet"
+
+
+def test_findings_for_programs(plant: Path) -> None:
+    break_plant(plant)
+    result = CliRunner().invoke(main, ["check", str(plant), "--json"])
+    assert (result.exit_code, result.stderr) == (2, "")
+    answer = json.loads(result.stdout)
+    assert answer["ok"] is False
+    assert [finding["line"] for finding in answer["findings"]] == [7, 11]
+    keys = {"file", "line", "path", "message", "expected"}
+    assert all(set(finding) == keys for finding in answer["findings"])
+
+
+def test_missing_file_is_one_line(tmp_path: Path) -> None:
+    result = CliRunner().invoke(main, ["check", str(tmp_path / "none.yaml")])
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert "does not exist" in result.stderr

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import os
+
+import pytest
+from rich.table import Table
+
+from eap.cli.output import WIDTH, write_json, write_tables, write_text
+
+
+def test_json_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    write_json({"name": "µ", "values": [1, None]})
+    assert capfd.readouterr().out == '{"name":"µ","values":[1,null]}\n'
+
+
+def test_text_goes_out_at_once(capfd: pytest.CaptureFixture[str]) -> None:
+    write_text("a", end="")
+    assert capfd.readouterr() == ("a", "")
+
+
+def wide_table() -> Table:
+    table = Table("a", "b", expand=True)
+    table.add_row("x " * 100, "[red]y[/red]")
+    return table
+
+
+def test_tables_fit_without_a_terminal(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    write_tables([wide_table()])
+    out = capfd.readouterr().out
+    assert max(map(len, out.splitlines())) == WIDTH
+    assert "\x1b" not in out
+
+
+def test_tables_obey_columns(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    write_tables([wide_table()])
+    assert max(map(len, capfd.readouterr().out.splitlines())) == 80
+
+
+def test_a_reader_that_left_ends_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        monkeypatch.setattr("sys.stdout", closed)
+        with pytest.raises(SystemExit) as end:
+            write_text("a")
+    assert end.value.code == 0

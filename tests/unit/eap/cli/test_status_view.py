@@ -1,0 +1,179 @@
+"""Tables from a literal status document, in the shape that docs/control.md promises."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from eap.cli.status_view import status_tables
+
+
+def rx(name: str, **more: Any) -> dict[str, Any]:
+    row = {
+        "name": name,
+        "port": "eap0",
+        "received": 123_400,
+        "lost": 0,
+        "duplicated": 0,
+        "reordered": 0,
+        "late": 0,
+        "timeouts": 0,
+        "discarded": {},
+        "quality": 0,
+        "age_us": 4200,
+        "jitter_us": {"p50": 55, "p99": 111, "max": 2222},
+        "state": "running",
+    }
+    return row | more
+
+
+def tx(name: str, **more: Any) -> dict[str, Any]:
+    row = {"name": name, "port": "eap0", "sent": 9, "skipped": 0, "reason": {"cycle": 9}}
+    return row | more
+
+
+def document(*, tx: list[Any] = [], rx: list[Any] = [], **station: Any) -> dict[str, Any]:  # noqa: B006
+    processes: dict[str, Any] = {
+        "supervisor": {"pid": 100, "cpu": 0.0, "rss": 21_000_000},
+        "engine": {"pid": 101, "cpu": 4.25, "rss": 35_400_000, "realtime": {}, "restarts": 0},
+        "services": {"pid": 102, "cpu": None, "rss": None, "restarts": 0},
+    }
+    port = {
+        "name": "eap0",
+        "kind": "eap",
+        "net_id": "5.1.1.1.2.1",
+        "interface": "udp://127.0.1.1",
+        "link": "up",
+    }
+    mixer = {
+        "name": "mixer",
+        "net_id": "5.1.1.1.1.1",
+        "state": "OP",
+        "cycle_us": 10_000,
+        "ports": [port],
+        "discarded": {},
+        "pd": {"tx": tx, "rx": rx},
+    }
+    stations = [mixer | station]
+    appliance = {"plant": "line", "stations": ["mixer"], "processes": processes}
+    return {
+        "version": 1,
+        "processes": processes,
+        "stations": stations,
+        "appliances": [appliance],
+    }
+
+
+def show(status: dict[str, Any], *, width: int = 100, color: bool = False) -> str:
+    stream = io.StringIO()
+    system = "standard" if color else None
+    console = Console(file=stream, width=width, force_terminal=color, color_system=system)
+    for part in status_tables(status):
+        console.print(part)
+    return stream.getvalue()
+
+
+def row_of(text: str, word: str) -> str:
+    return " ".join(next(line for line in text.splitlines() if word in line).split())
+
+
+def test_processes_and_stations() -> None:
+    text = show(document())
+    assert row_of(text, "engine") == "engine process 101 4.2 % of a core 35 MB"
+    assert row_of(text, "services") == "services process 102"
+    assert row_of(text, "mixer") == "mixer OP 10.0 ms eap0 udp://127.0.1.1 5.1.1.1.2.1 up"
+    assert "Worth a look" not in text
+
+
+def test_process_that_was_restarted_and_one_that_is_being() -> None:
+    status = document()
+    status["processes"]["engine"]["restarts"] = 2
+    status["processes"]["services"]["pid"] = None
+    text = show(status)
+    assert row_of(text, "engine").endswith("35 MB restarted 2 times")
+    assert row_of(text, "services") == "services restarting"
+
+
+def test_what_the_engine_was_denied() -> None:
+    status = document()
+    status["processes"]["engine"]["realtime"] = {
+        "scheduler": "other: needs CAP_SYS_NICE",
+        "cpus": [0, 1],
+        "memory_locked": "needs CAP_IPC_LOCK",
+        "pm_qos": True,
+    }
+    _, _, remarks = show(status).partition("Worth a look\n")
+    assert [line.strip() for line in remarks.splitlines()] == [
+        "line engine, scheduler: needs CAP_SYS_NICE",
+        "line engine, memory locked: needs CAP_IPC_LOCK",
+    ]
+
+
+@pytest.mark.parametrize("scheduler", ["fifo 50", "other: not asked for"])
+def test_engine_that_got_what_it_asked_for(scheduler: str) -> None:
+    status = document()
+    status["processes"]["engine"]["realtime"] = {"scheduler": scheduler, "pm_qos": True}
+    assert "Worth a look" not in show(status)
+
+
+def test_received_pds() -> None:
+    silent = {"received": 0, "lost": None, "quality": None, "age_us": None, "state": "waiting"}
+    silent["jitter_us"] = {"p50": None, "p99": None, "max": None}
+    text = show(document(rx=[rx("left"), rx("quiet", **silent)]))
+    assert row_of(text, "left") == "← left running 123400 0 0 4.2 ms 55 / 111 / 2222"
+    assert row_of(text, "quiet") == "← quiet waiting 0 unknown"
+
+
+def test_sent_pds() -> None:
+    alarm = tx("alarm", reason={"change": 1, "change_timeout": 8}, last_reason="change_timeout")
+    text = show(document(tx=[tx("state"), alarm, tx("mute", sent=0, reason={})]))
+    assert row_of(text, "→  state") == "→ state cyclic 9"
+    assert row_of(text, "→  alarm") == "→ alarm resend 9"
+    assert row_of(text, "mute") == "→ mute silent 0"
+    assert "mixer → alarm: sent on change once, resend 8 times" in text
+
+
+def test_remarks_name_all_that_is_rare() -> None:
+    left = rx(
+        "left", timeouts=1, duplicated=2, reordered=3, late=4, discarded={"version": 5, "length": 6}
+    )
+    status = document(
+        tx=[tx("state", skipped=7)],
+        rx=[left],
+        discarded={"unknown_id": 8},
+        overruns=1,
+        torn=2,
+    )
+    _, _, remarks = show(status).partition("Worth a look\n")
+    first, second, third = (line.strip() for line in remarks.splitlines())
+    assert first == "mixer: left out 1 cycle; found 2 torn writes; turned away: 8 unknown id"
+    assert second == "mixer → state: skipped 7 times"
+    heading, _, reasons = third.partition(": ")
+    assert heading == "mixer ← left"
+    assert reasons.split("; ") == [
+        "timed out once",
+        "2 duplicated",
+        "3 reordered",
+        "4 late",
+        "discarded: 5 version, 6 length",
+    ]
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_tables_keep_their_width_and_lose_no_number(width: int) -> None:
+    name = "island-01.production-state"
+    status = document(rx=[rx(name, lost=12_345, quality=65535, age_us=65_000_000, late=3)])
+    text = show(status, width=width)
+    assert max(map(len, text.splitlines())) <= width
+    for number in ("123400", "12345", "> 6.5 s", "65.0 s", "55 / 111 / 2222"):
+        assert number in text
+    assert "…" not in text
+
+
+def test_state_has_a_colour_on_a_terminal_only() -> None:
+    status = document(rx=[rx("left", state="stale")])
+    assert "\x1b[1;31mstale" in show(status, color=True)
+    assert "\x1b" not in show(status)
