@@ -250,22 +250,22 @@ def test_made_up_layouts_cost_bounded_memory_and_do_not_disturb_real_ones():
     r = receiver()
     tracemalloc.start()
     try:
-        for n in range(1500):
+        for n in range(400):
             made_up = [((n * 97 + k) & 0xFFFF, b"", n & 0xFFFF) for k in range(100 + n % 80)]
             r.give(octets(made_up), 0)
             r.give(octets([(7, b"ab", 3)], cycle=n), n * MS)
         assert tracemalloc.get_traced_memory()[1] < 4_000_000
     finally:
         tracemalloc.stop()
-    assert (r.word("r", RxWord.RECEIVED), r.word("r", RxWord.LOST)) == (1500, 0)
+    assert (r.word("r", RxWord.RECEIVED), r.word("r", RxWord.LOST)) == (400, 0)
 
 
-def test_layouts_of_equal_size_are_told_apart_however_many_there_are():
+def test_layouts_that_differ_late_are_told_apart_however_many_there_are():
     r = receiver()
     for n in range(100):
-        r.give(octets([(7 if n % 3 else 1000 + n, b"ab", 3)], cycle=n), n * MS)
+        r.give(octets([(1, b""), (7 if n % 3 else 1000 + n, b"ab", 3)], cycle=n), n * MS)
     assert r.word("r", RxWord.RECEIVED) == 66
-    assert r.discarded() == {"unknown_id": 34}
+    assert r.discarded() == {"unknown_id": 134}
 
 
 @given(st.binary(max_size=80), st.integers(0, 0xF), st.booleans())
