@@ -186,5 +186,5 @@ class Account:
             words[_JITTER + BIN_OF_US[micros]] += 1
         else:
             words[_JITTER + histogram_bin(micros)] += 1
-        if micros > words[_JITTER_MAX_US]:  # noqa: PLR1730  a call of max() is five times as slow
+        if micros > words[_JITTER_MAX_US]:  # noqa: PLR1730  max() takes five times as long
             words[_JITTER_MAX_US] = micros

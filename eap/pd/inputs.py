@@ -11,6 +11,8 @@ from eap.pd.spec import Writer
 from eap.pd.words import StationWord
 
 _TORN = int(StationWord.TORN)
+_SERVICES = int(StationWord.SERVICES_SEQUENCE)
+_APPLICATION = int(StationWord.APPLICATION_SEQUENCE)
 
 
 class Inputs:
@@ -31,11 +33,26 @@ class Inputs:
             if writer is not Writer.ENGINE and place.size
         ]
         self._seen = [-1] * len(self._regions)
+        self._settled: tuple[int, ...] = ()
+        """Both sequence words, when all that they guard has been copied."""
         for _, region in self._regions:
             self.memory[region] = image.memory[region]
 
     def refresh(self) -> bool:
         """Copy what changed; return whether anything did."""
+        words = self._words
+        sequences = words[_SERVICES], words[_APPLICATION]
+        if sequences == self._settled:
+            return False
+        changed = self._copy_changed()
+        if all(
+            seen == sequences[sequence - _SERVICES]
+            for (sequence, _), seen in zip(self._regions, self._seen, strict=True)
+        ):
+            self._settled = sequences
+        return changed
+
+    def _copy_changed(self) -> bool:
         words = self._words
         changed = False
         for index, (sequence, region) in enumerate(self._regions):

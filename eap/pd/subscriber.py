@@ -127,6 +127,11 @@ class Subscriber:
         if plan.refused:
             self._refuse(plan, at_ns)
 
+    @property
+    def has_timeouts(self) -> bool:
+        """Whether any subscription has one: otherwise handle_timeout() need not be called."""
+        return any(subscription.timeout_ns for subscription in self._subscriptions)
+
     def next_timeout(self) -> int | None:
         """Return when handle_timeout() has to be called, None for never."""
         return None if self._next_timeout_ns == _NEVER else self._next_timeout_ns
