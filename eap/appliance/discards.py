@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from eap.errors import EnvironmentalError
+
 
 class Refusal(StrEnum):
     """Why a frame or a connection went no further."""
@@ -43,16 +45,23 @@ _COLUMN = {reason: index for index, reason in enumerate(_REFUSALS)}
 
 
 class DiscardCounters:
-    """One 64-bit word for each station and reason; each process has its own file."""
+    """One 64-bit word for each station and reason; each process has its own file.
+
+    Raises:
+        EnvironmentalError: the file cannot be made.
+    """
 
     def __init__(self, path: Path, stations: Sequence[str]) -> None:
         size = 8 * len(_REFUSALS) * max(1, len(stations))
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
-            os.ftruncate(fd, size)
-            self._map = mmap.mmap(fd, size)
-        finally:
-            os.close(fd)
+            with path.open("ab") as file:
+                os.ftruncate(file.fileno(), size)
+            with path.open("r+b") as file:
+                self._map = mmap.mmap(file.fileno(), size)
+        except OSError as exc:
+            raise EnvironmentalError(
+                f"{path}: the counters cannot be made: {exc.strerror}"
+            ) from None
         self._words = memoryview(self._map).cast("Q")
         self._row = {name: row * len(_REFUSALS) for row, name in enumerate(stations)}
 

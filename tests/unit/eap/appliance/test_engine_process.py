@@ -1,0 +1,110 @@
+"""The engine process: its loop in this process, its ends in one of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from time import monotonic_ns
+
+import msgspec
+import pytest
+
+from eap.appliance.build import EnginePlant
+from eap.appliance.engine_process import StopFlag, run_cycles
+from eap.appliance.handover import EngineOptions, Handover
+from eap.net.image_file import open_image
+from eap.pd.words import StationWord
+from tests.unit.eap.appliance.conftest import eap_port, left, right
+
+pytestmark = pytest.mark.net
+
+LINE = (left(eap_port(1, "loop://line")), right(eap_port(2, "loop://line")))
+
+
+def handover(folder, **more) -> Handover:
+    options = EngineOptions(realtime=False)
+    return Handover(
+        os.getpid(), str(folder), "demo", "demo.yaml", LINE, (), options=options, **more
+    )
+
+
+def cycle_of(folder, station: str) -> int:
+    with open_image(folder / f"{station}.image") as file:
+        return file.image.words[StationWord.CYCLE]
+
+
+def test_every_cycle_runs_until_the_signal(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    engine, services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    plant = EnginePlant(handover(tmp_path))
+    try:
+        stop = StopFlag()
+        signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        plant.start(monotonic_ns())
+        with engine, services:
+            run_cycles(plant, engine, stop)
+        assert stop.is_set
+    finally:
+        plant.close()
+        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    assert cycle_of(tmp_path, "left") >= 10  # of 20
+    assert cycle_of(tmp_path, "right") >= 10
+
+
+class Engine:
+    """The engine as the supervisor starts it."""
+
+    def __init__(self, given: Handover) -> None:
+        self.link, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ready, ready_end = os.pipe()
+        given = msgspec.structs.replace(given, link_fd=theirs.fileno(), ready_fd=ready_end)
+        fd = given.to_descriptor()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "eap.appliance.engine_process", str(fd)],
+            pass_fds=(fd, ready_end, theirs.fileno()),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        os.close(fd)
+        os.close(ready_end)
+        theirs.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.communicate()
+        self.link.close()
+        os.close(self.ready)
+
+
+def test_it_says_that_it_is_ready_and_ends_when_asked(tmp_path):
+    with Engine(handover(tmp_path)) as engine:
+        report = msgspec.json.decode(os.read(engine.ready, 4096))
+        assert report == {"realtime": {"scheduler": "other: not asked for"}}
+        engine.process.terminate()
+        assert engine.process.communicate(timeout=5)[1] == ""
+        assert engine.process.returncode == 0
+
+
+def test_what_is_missing_is_one_line_and_exit_code_2(tmp_path):
+    with Engine(handover(tmp_path / "nowhere")) as engine:
+        error = engine.process.communicate(timeout=10)[1]
+        assert engine.process.returncode == 2
+        assert os.read(engine.ready, 1) == b""
+    assert error.startswith("engine: ")
+    assert len(error.splitlines()) == 1
+
+
+def test_an_orphan_does_not_start(tmp_path):
+    orphan = msgspec.structs.replace(handover(tmp_path), supervisor=1)
+    with Engine(orphan) as engine:
+        engine.process.communicate(timeout=10)
+        assert engine.process.returncode == -signal.SIGKILL
+    assert list(tmp_path.iterdir()) == []

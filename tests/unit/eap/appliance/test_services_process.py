@@ -1,0 +1,92 @@
+"""The services process on images and sockets of the test."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import msgspec
+import pytest
+
+from eap.appliance.client import Client
+from eap.appliance.handover import Handover
+from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
+from eap.appliance.sockets import SharedSockets
+from eap.codec.ethercat import EtherCatHeader
+
+pytestmark = pytest.mark.net
+
+
+class Services:
+    """Services as the supervisor starts it."""
+
+    def __init__(self, tmp_path, stations, supervisor: int) -> None:
+        self.folder = ApplianceFolder(tmp_path)
+        self.info = ApplianceInfo(
+            "demo", "demo.yaml", [s.name for s in stations], "2026-01-01T00:00:00+00:00", 1
+        )
+        self.folder.write_info(self.info)
+        self.sockets = SharedSockets(stations, self.folder.control_socket)
+        self.ready, ready_end = os.pipe()
+        fd = Handover(
+            supervisor,
+            str(tmp_path),
+            "demo",
+            "demo.yaml",
+            stations,
+            self.sockets.descriptions,
+            ready_fd=ready_end,
+            link_fd=self.sockets.services_link,
+            control_fd=self.sockets.control,
+        ).to_descriptor()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "eap.appliance.services_process", str(fd)],
+            pass_fds=(fd, ready_end, *self.sockets.services_descriptors()),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        os.close(fd)
+        os.close(ready_end)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.communicate()
+        self.sockets.close()
+        os.close(self.ready)
+
+    def connect(self) -> Client:
+        connection = socket.socket(socket.AF_UNIX)
+        connection.connect(str(self.folder.control_socket))
+        return Client(connection, self.info)
+
+
+@pytest.mark.usefixtures("files")
+def test_it_answers_counts_and_ends_when_asked(tmp_path, stations):
+    with Services(tmp_path, stations, os.getpid()) as services:
+        with services.connect() as client:  # before it runs: the listener is the supervisor's
+            assert client.request("hello")["stations"] == ["left", "right"]
+            assert msgspec.json.decode(os.read(services.ready, 100)) == {}
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.sendto(EtherCatHeader(0, 0, 5).encode(), ("127.9.2.1", 34980))
+            for _ in range(1000):
+                left, right = client.request("status")["stations"]
+                if left["discarded"]:
+                    break
+            assert left["discarded"] == {"mailbox": 1}
+            assert right["discarded"] == {}
+        services.process.terminate()
+        assert services.process.communicate(timeout=5)[1] == ""
+        assert services.process.returncode == 0
+
+
+@pytest.mark.usefixtures("files")
+def test_an_orphan_does_not_start(tmp_path, stations):
+    with Services(tmp_path, stations, supervisor=1) as services:
+        services.process.communicate(timeout=10)
+        assert services.process.returncode == -signal.SIGKILL
