@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Sequence
 
 from eap.ids import NetId
@@ -11,12 +12,30 @@ from eap.pd.inputs import Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, TxPlace
 from eap.pd.link import Channel, OutFrame
 from eap.pd.spec import TxFrameSpec
-from eap.pd.trigger import EVENT_BIT, SUPPRESS_BIT, Trigger, plan_schedule
+from eap.pd.trigger import EVENT_BIT, SUPPRESS_BIT, Schedule, Trigger, plan_schedule
 from eap.pd.txframe import Selection, TxFrame, TxPd
 from eap.pd.words import FrameWord, TxWord
 
 _NOT_SENT = 1
-_WHOLE, _SENT_AT, _STATE = int(FrameWord.WHOLE), int(FrameWord.SENT_AT_NS), int(FrameWord.STATE)
+_put_sent = struct.Struct("2q").pack_into
+"""Writes STATE and SENT_AT_NS of a frame, which lie side by side."""
+
+
+class _Group:
+    """Frames that go whole, all in the same cycles: nothing is left to decide but when."""
+
+    __slots__ = ("counters", "frames", "out", "patches", "phase", "step")
+
+    def __init__(self, schedule: Schedule, frames: list[TxFrame]) -> None:
+        self.step = schedule.step
+        self.phase = schedule.phase
+        self.frames = frames
+        self.out = [frame.whole.out for frame in frames]
+        self.patches = [frame.whole.patch for frame in frames]
+        self.counters = [
+            (frame.place.words + FrameWord.WHOLE, 8 * (frame.place.words + FrameWord.STATE))
+            for frame in frames
+        ]
 
 
 class Publisher:
@@ -55,7 +74,8 @@ class Publisher:
             )
             self.frames.append(TxFrame(place, publisher, pds, gate, channel))
         self._controls: dict[str, int] = {}
-        self._plain: list[TxFrame] = []
+        self._groups: list[_Group] = []
+        self._due: list[_Group] = []
         self._others: list[TxFrame] = []
         self._sending: list[tuple[TxFrame, Selection]] = []
         self.read_controls()
@@ -73,43 +93,62 @@ class Publisher:
                 pd.trigger.suppressed = bool(control & SUPPRESS_BIT)
                 if control & ~before & EVENT_BIT and pd.trigger.takes_events:
                     pd.trigger.raise_event()
-        self._plain = [frame for frame in self.frames if frame.is_plain]
+        plain: dict[Schedule, list[TxFrame]] = {}
+        for frame in self.frames:
+            if frame.is_plain and frame.schedule is not None:
+                plain.setdefault(frame.schedule, []).append(frame)
+        self._groups = [_Group(schedule, frames) for schedule, frames in plain.items()]
         self._others = [frame for frame in self.frames if not frame.is_plain]
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the frames due in this cycle, patched; :meth:`sent` must follow."""
-        sending = self._sending
-        sending.clear()
-        for frame in self._plain:
-            schedule = frame.schedule
-            if schedule is not None and cycle % schedule.step == schedule.phase:
-                selection = frame.whole
-                selection.patch(cycle)
-                sending.append((frame, selection))
+        self._due = due = [group for group in self._groups if cycle % group.step == group.phase]
+        for group in due:
+            for patch in group.patches:
+                patch(cycle)
+        self._sending.clear()
+        if self._others:
+            self._select_others(cycle, now_ns)
+        elif len(due) == 1:
+            return due[0].out
+        frames = [out for group in due for out in group.out]
+        return frames + [selection.out for _, selection in self._sending]
+
+    def _select_others(self, cycle: int, now_ns: int) -> None:
+        """Patch those that have to be looked at one by one, and note them as being sent."""
         for frame in self._others:
             chosen, skipped = frame.select(cycle, now_ns)
             if skipped:
                 self._skip(frame, skipped)
             if chosen is not None:
                 chosen.patch(cycle)
-                sending.append((frame, chosen))
-        return [selection.out for _, selection in sending]
+                self._sending.append((frame, chosen))
 
     def sent(self, failed: Sequence[OutFrame], now_ns: int) -> None:
         """Count what was sent since :meth:`frames_to_send`, all but *failed*."""
         words = self._words
+        if failed:
+            self._split_groups()
+        for group in self._due:
+            for whole, state in group.counters:
+                words[whole] += 1
+                _put_sent(words, state, 0, now_ns)
         for frame, selection in self._sending:
-            first = frame.place.words
             if failed and selection.out in failed:
                 self._fail(frame, selection)
                 continue
-            words[first + _STATE] = 0
-            words[first + _SENT_AT] = now_ns
+            first = frame.place.words
+            _put_sent(words, 8 * (first + FrameWord.STATE), 0, now_ns)
             if frame.schedule is not None and selection is frame.whole:
-                words[first + _WHOLE] += 1
+                words[first + FrameWord.WHOLE] += 1
             else:
                 words[first + FrameWord.PARTIAL] += 1
                 self._count(selection, now_ns)
+
+    def _split_groups(self) -> None:
+        """Have each frame that is being sent looked at by itself, because some were refused."""
+        self._sending += [(frame, frame.whole) for group in self._due for frame in group.frames]
+        self._due = []
 
     def _count(self, selection: Selection, now_ns: int) -> None:
         words = self._words
