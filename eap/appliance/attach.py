@@ -15,7 +15,7 @@ import os
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from time import monotonic_ns
+from time import monotonic_ns, time_ns
 from types import TracebackType
 from typing import Any, Self
 
@@ -130,7 +130,7 @@ class AttachedStation:
 
     def status(self) -> dict[str, Any]:
         """Return the counters and states of the station, shaped as in ``eapctl status``."""
-        return station_status(self._current(), monotonic_ns())
+        return station_status(self._current(), monotonic_ns(), time_ns())
 
     def _current(self) -> Image:
         """Return the image, of the newest layout and with an engine behind it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns
+from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
 from typing import Any
 
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
@@ -60,7 +60,7 @@ def appliance_status(
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
     stations = []
     for image in images:
-        station = station_status(image, monotonic_ns())
+        station = station_status(image, monotonic_ns(), time_ns())
         for port in station["ports"]:
             port["link"] = link_state(port["interface"])
         counts = station["discarded"]

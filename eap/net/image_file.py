@@ -8,7 +8,6 @@ as retired, which tells the programs that still map it to open the new one.
 from __future__ import annotations
 
 import ctypes
-import errno
 import fcntl
 import mmap
 import os
@@ -29,6 +28,11 @@ _SYS_FUTEX = {"x86_64": 202, "aarch64": 98, "armv7l": 240, "riscv64": 98}.get(os
 _FUTEX_WAIT, _FUTEX_WAKE = 0, 1
 _EVERYBODY = 0x7FFFFFFF
 _FLOCK = struct.Struct("hhqqi4x")
+_PID_WORD = {
+    Writer.ENGINE: StationWord.ENGINE_PID,
+    Writer.SERVICES: StationWord.SERVICES_PID,
+    Writer.APPLICATION: StationWord.APPLICATION_PID,
+}
 
 
 class ImageFile:
@@ -74,28 +78,28 @@ class ImageFile:
         return bool(self.image.words[StationWord.RETIRED])
 
     def acquire_writer(self, writer: Writer) -> None:
-        """Become the one process that writes the region of *writer*, until :meth:`close`.
+        """Become the one who writes the region of *writer*, until release or :meth:`close`.
 
         Raises:
-            WriterConflictError: another process is it already.
+            WriterConflictError: someone else is it already, in this process or another.
         """
-        # Record locks end with their process, however it ends, and the kernel knows the holder.
-        start = list(Writer).index(writer)
+        # A lock of the open file, not of the process: it ends with this object or its process,
+        # however that ends, and a second attachment of one program is a second writer too.
+        word = _PID_WORD[writer]
         try:
-            fcntl.lockf(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, start)
-        except OSError as exc:
-            if exc.errno not in {errno.EAGAIN, errno.EACCES}:
-                raise
-            holder = self._holder(start)
+            fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, _lock_of(writer, fcntl.F_WRLCK))
+        except BlockingIOError:
+            holder = _describe(self.image.words[word])
             raise WriterConflictError(
                 f"station {self.image.layout.station}: the {writer} variables are being written "
                 f"by {holder}; end it first",
                 holder=holder,
             ) from None
+        self.image.words[word] = os.getpid()
 
     def release_writer(self, writer: Writer) -> None:
         """Give up the right to write the region of *writer*."""
-        fcntl.lockf(self._fd, fcntl.LOCK_UN, 1, list(Writer).index(writer))
+        fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, _lock_of(writer, fcntl.F_UNLCK))
 
     def wake_waiters(self) -> None:
         """Wake every process that sleeps in :meth:`wait_cycle`."""
@@ -128,17 +132,6 @@ class ImageFile:
             )
             seen = self._futex.value
         return True
-
-    def _holder(self, start: int) -> str:
-        query = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, start, 1, 0)
-        pid = _FLOCK.unpack(fcntl.fcntl(self._fd, fcntl.F_GETLK, query))[4]
-        try:
-            command = (
-                Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
-            )
-        except (OSError, UnicodeDecodeError):
-            command = "unknown program"
-        return f"process {pid} ({command[:80]})"
 
 
 def create_image(path: Path, layout: ImageLayout) -> ImageFile:
@@ -205,3 +198,16 @@ def _format(view: memoryview, layout: ImageLayout, generation: int) -> None:
 def _pause() -> None:
     """Let a writer that was interrupted in the middle go on."""
     _libc.usleep(100)
+
+
+def _lock_of(writer: Writer, kind: int) -> bytes:
+    """Return the request for the octet that stands for *writer*."""
+    return _FLOCK.pack(kind, os.SEEK_SET, list(Writer).index(writer), 1, 0)
+
+
+def _describe(pid: int) -> str:
+    try:
+        command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+    except (OSError, UnicodeDecodeError):
+        command = "unknown program"
+    return f"process {pid} ({command[:80]})"

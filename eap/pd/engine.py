@@ -43,8 +43,8 @@ class Engine:
             station = self._stations[index]
             station.cycle(due_ns, now_ns)
             following_ns = due_ns + station.cycle_ns
-            if following_ns <= now_ns:
-                missed = (now_ns - following_ns) // station.cycle_ns + 1
+            if following_ns < now_ns:
+                missed = -(-(now_ns - following_ns) // station.cycle_ns)
                 station.image.words[StationWord.OVERRUNS] += missed
                 following_ns += missed * station.cycle_ns
             heapreplace(self._due, (following_ns, index))

@@ -5,6 +5,7 @@ The shapes are a contract: docs/control.md describes them.
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Any
 
 from eap.codec.pd import PdHeader
@@ -29,8 +30,14 @@ _QUALITY_NS = 100_000
 _QUALITY_MAX = 0xFFFF
 
 
-def station_status(image: Image, now_ns: int) -> dict[str, Any]:
-    """Return one station's entry of ``eapctl status``; *now_ns* on the monotonic clock."""
+def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dict[str, Any]:
+    """Return one station's entry of ``eapctl status``.
+
+    Args:
+        image: The station's image.
+        now_ns: The time on the monotonic clock.
+        wall_ns: The same moment since 1970, UTC; without it nothing is dated.
+    """
     layout, words = image.layout, image.words
     state = words[StationWord.STATE]
     lateness = words[StationWord.LATENESS : StationWord.LATENESS + HISTOGRAM_BINS].tolist()
@@ -51,7 +58,7 @@ def station_status(image: Image, now_ns: int) -> dict[str, Any]:
         "discarded": _discarded(image, StationWord.DISCARDED),
         "pd": {
             "tx": [_tx(image, place) for place in layout.tx],
-            "rx": [_rx(image, place, now_ns) for place in layout.rx],
+            "rx": [_rx(image, place, now_ns, wall_ns) for place in layout.rx],
         },
     }
 
@@ -122,6 +129,11 @@ def var_state(image: Image, place: RxPlace) -> int:
     return int(words[place.words + RxWord.MISMATCH])
 
 
+def _timestamp(wall_ns: int) -> str:
+    moment = datetime.fromtimestamp(wall_ns / 1e9, tz=UTC)
+    return moment.isoformat(timespec="milliseconds")
+
+
 def _spread(bins: list[int], largest: int) -> dict[str, int | None]:
     """Return percentiles of a histogram; bins are wider than the largest value is exact."""
     p50, p99 = percentile(bins, 0.5), percentile(bins, 0.99)
@@ -154,7 +166,7 @@ def _tx(image: Image, place: TxPlace) -> dict[str, Any]:
     }
 
 
-def _rx(image: Image, place: RxPlace, now_ns: int) -> dict[str, Any]:
+def _rx(image: Image, place: RxPlace, now_ns: int, wall_ns: int | None) -> dict[str, Any]:
     words = image.words
     first = account_word(image, place)
     received = words[first + RxWord.RECEIVED]
@@ -174,6 +186,7 @@ def _rx(image: Image, place: RxPlace, now_ns: int) -> dict[str, Any]:
         "cycle_index": words[first + RxWord.LAST_CYCLE] & 0xFFFF if received else None,
         "var_state": var_state(image, place),
         "age_us": max(age_ns, 0) // 1000 if received else None,
+        "last_good": _timestamp(wall_ns - age_ns) if received and wall_ns else None,
         "jitter_us": _spread(bins, words[first + RxWord.JITTER_MAX_US]),
         "state": RxState(words[first + RxWord.STATE]).name.lower(),
     }

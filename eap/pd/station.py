@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from eap.ids import NetId
-from eap.pd.device import Device, Request
+from eap.pd.device import Device, DeviceState, Request
 from eap.pd.generator import Generators
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
@@ -107,7 +107,9 @@ class Station:
         The cycle counter of an earlier engine goes on as if it had never stopped.
         """
         words = self._words
-        for request in (Request.START, Request.SAFEOP, Request.OP):
+        if self.device.state is DeviceState.INIT:
+            self.device.request(Request.START)
+        for request in (Request.SAFEOP, Request.OP):
             self.device.request(request)
         words[StationWord.STATE] = self.device.state
         words[StationWord.STARTED_AT_NS] = now_ns

@@ -62,19 +62,22 @@ class StationWord(IntEnum):
     SERVICES_SEQUENCE = 5
     APPLICATION_SEQUENCE = 6
     ENGINE_PID = 7
-    RETIRED = 8
+    """Who writes each region, or last did."""
+    SERVICES_PID = 8
+    APPLICATION_PID = 9
+    RETIRED = 10
     """1 when a file of a newer generation has taken this one's place."""
-    STATE = 9
+    STATE = 11
     """Device state as AL status numbers it: 1 Init, 2 PreOp, 4 SafeOp, 8 Op."""
-    STARTED_AT_NS = 10
+    STARTED_AT_NS = 12
     """When this engine reached Op, on the monotonic clock."""
-    RESTARTS = 11
-    OVERRUNS = 12
+    RESTARTS = 13
+    OVERRUNS = 14
     """Cycles left out because the engine came too late for them."""
-    TORN = 13
+    TORN = 15
     """Cycles in which a writer had stopped in the middle of writing."""
-    LATENESS_MAX_NS = 14
-    DISCARDED = 15
+    LATENESS_MAX_NS = 16
+    DISCARDED = 17
     LATENESS = DISCARDED + len(DISCARDS)
     SIZE = LATENESS + HISTOGRAM_BINS
 

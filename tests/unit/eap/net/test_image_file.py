@@ -183,7 +183,7 @@ def test_a_lock_that_fails_for_another_reason_is_not_a_conflict(engine, monkeypa
     def no_locks(*_: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(image_file.fcntl, "lockf", no_locks)
+    monkeypatch.setattr(image_file.fcntl, "fcntl", no_locks)
     with pytest.raises(OSError, match="No locks available"):
         engine.acquire_writer(Writer.APPLICATION)
 

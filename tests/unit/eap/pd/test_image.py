@@ -181,7 +181,7 @@ def damaged(change: str) -> memoryview:
     if change == "words":
         count = f'"word_count":{layout.word_count}'.encode()
         text = bytes(memory[fields[3] : fields[3] + fields[4]])
-        more = text.replace(count, b'"word_count":9' + count[14:])
+        more = text.replace(count, b'"word_count":' + b"9" * (len(count) - 13))
         memory[fields[3] : fields[3] + fields[4]] = more
     HEADER.pack_into(memory, 0, *fields)
     return memory

@@ -112,6 +112,7 @@ def test_a_subscription_that_waits_knows_nothing():
         "cycle_index": None,
         "var_state": 0,
         "age_us": None,
+        "last_good": None,
         "jitter_us": {"p50": None, "p99": None, "max": None},
         "state": "waiting",
     }
