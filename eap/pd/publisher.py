@@ -75,6 +75,8 @@ class Publisher:
             self.frames.append(TxFrame(place, publisher, pds, gate, channel))
         self._controls: dict[str, int] = {}
         self._groups: list[_Group] = []
+        self._always: _Group | None = None
+        """All frames, when there is nothing to decide at all."""
         self._due: list[_Group] = []
         self._others: list[TxFrame] = []
         self._sending: list[tuple[TxFrame, Selection]] = []
@@ -98,10 +100,19 @@ class Publisher:
             if frame.is_plain and frame.schedule is not None:
                 plain.setdefault(frame.schedule, []).append(frame)
         self._groups = [_Group(schedule, frames) for schedule, frames in plain.items()]
+        self._always = None
         self._others = [frame for frame in self.frames if not frame.is_plain]
+        if not self._others and len(self._groups) == 1 and self._groups[0].step == 1:
+            self._always = self._groups[0]
+            self._due = self._groups
+            self._sending.clear()
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the frames due in this cycle, patched; :meth:`sent` must follow."""
+        if (always := self._always) is not None:
+            for patch in always.patches:
+                patch(cycle)
+            return always.out
         self._due = due = [group for group in self._groups if cycle % group.step == group.phase]
         for group in due:
             for patch in group.patches:
@@ -126,14 +137,15 @@ class Publisher:
 
     def sent(self, failed: Sequence[OutFrame], now_ns: int) -> None:
         """Count what was sent since :meth:`frames_to_send`, all but *failed*."""
-        words = self._words
-        if failed:
-            self._split_groups()
-        for group in self._due:
+        words, due, sending = self._words, self._due, self._sending
+        if failed:  # then each frame has to be looked at by itself
+            sending = sending + [(frame, frame.whole) for group in due for frame in group.frames]
+            due = []
+        for group in due:
             for whole, state in group.counters:
                 words[whole] += 1
                 _put_sent(words, state, 0, now_ns)
-        for frame, selection in self._sending:
+        for frame, selection in sending:
             if failed and selection.out in failed:
                 self._fail(frame, selection)
                 continue
@@ -144,11 +156,6 @@ class Publisher:
             else:
                 words[first + FrameWord.PARTIAL] += 1
                 self._count(selection, now_ns)
-
-    def _split_groups(self) -> None:
-        """Have each frame that is being sent looked at by itself, because some were refused."""
-        self._sending += [(frame, frame.whole) for group in self._due for frame in group.frames]
-        self._due = []
 
     def _count(self, selection: Selection, now_ns: int) -> None:
         words = self._words

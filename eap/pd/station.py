@@ -32,6 +32,9 @@ _LATENESS_MAX_NS = int(StationWord.LATENESS_MAX_NS)
 WAKE_FOR_CYCLES = 100
 """Cycles after the last announcement of a waiting program in which waiters are woken."""
 
+_UNREAD_FOR_US = 10_000
+"""How long frames may wait at a port without subscriptions: they will only be counted."""
+
 
 class Station:
     """Runs the cycle of one station.
@@ -52,12 +55,14 @@ class Station:
         self._words = image.words
         self._wake = wake
         self._inputs = Inputs(image)
-        self._generators = Generators(
-            image, [s for s in spec.sources if isinstance(s, EngineSource)]
-        )
+        generated = [s for s in spec.sources if isinstance(s, EngineSource)]
+        self._generators = Generators(image, generated)
+        self._has_own_variables = bool(generated)
         self._publishers: list[tuple[Publisher, Channel]] = []
         self._channels: list[Channel] = []
         self._drains: list[Callable[[int], int]] = []
+        self._rarely: list[Callable[[int], int]] = []
+        self._rarely_every = max(1, _UNREAD_FOR_US // spec.cycle_us)
         layout = image.layout
         self._subscribers = {
             port.name: Subscriber(
@@ -82,14 +87,20 @@ class Station:
         """By port: who takes the frames that its channel receives."""
 
     def connect(self, port: str, channel: Channel) -> None:
-        """Send the frames of *port* through *channel*, and drain it in each cycle."""
+        """Send the frames of *port* through *channel*, and drain it.
+
+        That is done in each cycle, or now and then if nothing is subscribed to there.
+        """
         layout = self.image.layout
         frames = [
             (frame, place, tuple(pd for pd in layout.tx if pd.frame == frame.name))
             for frame, place in zip(self.spec.frames, layout.frames, strict=True)
             if frame.port == port
         ]
-        self.drain_also(channel)
+        if any(pd.port == port for pd in self.spec.subscriptions):
+            self.drain_also(channel)
+        else:
+            self._rarely.append(channel.drain)
         if frames:
             net_id = next(p.net_id for p in self.spec.ports if p.name == port)
             publisher = Publisher(self.image, self._inputs, NetId.parse(net_id), channel, frames)
@@ -100,6 +111,7 @@ class Station:
         if channel not in self._channels:
             self._channels.append(channel)
             self._drains.append(channel.drain)
+            self._has_own_variables = True
 
     def start(self, now_ns: int) -> int:
         """Go to Op; return when the first cycle is due.
@@ -137,15 +149,10 @@ class Station:
         """Run one cycle that was due at *due_ns*."""
         words = self._words
         cycle = words[_CYCLE] + 1
-        words[_SEQUENCE] += 1
         words[_CYCLE] = cycle
         words[_CYCLE_AT_NS] = due_ns
-        for drain in self._drains:
-            drain(now_ns)
-        for apply_timeouts in self._supervisors:
-            apply_timeouts(now_ns)
-        self._generators.run(cycle)
-        words[_SEQUENCE] += 1
+        if self._has_own_variables or not cycle % self._rarely_every:
+            self._write_own_variables(cycle, now_ns)
         if self._inputs.refresh():
             for publisher, _ in self._publishers:
                 publisher.read_controls()
@@ -163,3 +170,17 @@ class Station:
         # Never cleared here: whoever comes between the look and the clearing would sleep on.
         if cycle - words[_WAITERS] <= WAKE_FOR_CYCLES:
             self._wake()
+
+    def _write_own_variables(self, cycle: int, now_ns: int) -> None:
+        """Take what arrived, apply time-outs, compute what is generated."""
+        words = self._words
+        words[_SEQUENCE] += 1
+        for drain in self._drains:
+            drain(now_ns)
+        if not cycle % self._rarely_every:
+            for drain in self._rarely:
+                drain(now_ns)
+        for apply_timeouts in self._supervisors:
+            apply_timeouts(now_ns)
+        self._generators.run(cycle)
+        words[_SEQUENCE] += 1
