@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PROC = Path("/proc")
+_OWN_COMMANDS = ("eapctl", "eap.appliance", "-m eap ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,7 @@ def describe_holder(protocol: str, address: str, port: int, *, proc: Path = _PRO
         return f"{start} by an unknown process: `ss -lnp` as root shows it"
     holder = min(holders, key=lambda found: bool(found.remote))  # a server before its clients
     text = f"{start} by {holder}"
-    if "eapctl" in holder.command or "eap.appliance" in holder.command:
+    if any(own in holder.command for own in _OWN_COMMANDS):
         return f"{text}: stop that appliance or give this one another address"
     if not _is_ephemeral(port, proc):
         return f"{text}: stop it or choose another address"
