@@ -1,0 +1,172 @@
+"""``eapctl run`` as a process of the test: started, asked, killed in parts, ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Self
+from unittest import mock
+
+from eap.appliance.client import connect
+from eap.appliance.runtime import VARIABLE
+
+EAPCTL = [sys.executable, "-m", "eap"]
+READY_S = 15.0
+
+
+class Appliance:
+    """A running appliance with a runtime directory of its own, wherever its network is."""
+
+    def __init__(
+        self, plant: Path, *arguments: str, runtime: Path, prefix: Sequence[str] = ()
+    ) -> None:
+        self.runtime = runtime
+        self._prefix = prefix
+        self.process = subprocess.Popen(
+            [*prefix, *EAPCTL, "run", str(plant), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=self._environment(),
+            text=True,
+        )
+
+    def wait_ready(self) -> list[str]:
+        """Return the stations of the ready line."""
+        assert self.process.stdout is not None
+        waiting, _, _ = select.select([self.process.stdout], [], [], READY_S)
+        line = self.process.stdout.readline() if waiting else ""
+        if not line:
+            self.process.kill()
+            raise AssertionError(f"not ready: {self.process.communicate()[1]}")
+        ready = json.loads(line)
+        assert ready["ready"] is True
+        return list(ready["stations"])
+
+    def finish(self, timeout_s: float = 5.0) -> tuple[int, str, str]:
+        """Wait for its end; return exit code, stdout and stderr."""
+        out, err = self.process.communicate(timeout=timeout_s)
+        return self.process.returncode, out, err
+
+    def stop(self) -> tuple[int, str, str]:
+        """End it as a service manager does."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.finish()
+
+    def close(self) -> None:
+        """Make sure that nothing of it is left."""
+        self.process.kill()
+        self.process.communicate()
+
+    def command(self, *words: str) -> str:
+        """Return what ``eapctl`` prints about this appliance."""
+        done = subprocess.run(
+            [*EAPCTL, *words], env=self._environment(), capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def request(self, method: str, **params: Any) -> Any:
+        """Ask over the control protocol: much cheaper than a command, for what is asked often."""
+        with mock.patch.dict(os.environ, {VARIABLE: str(self.runtime)}):
+            (client,) = connect()
+        with client:
+            return client.request(method, **params)
+
+    def status(self) -> dict[str, Any]:
+        """Return the whole status."""
+        document: dict[str, Any] = self.request("status")
+        return document
+
+    def station(self, name: str) -> dict[str, Any]:
+        """Return the status of one station."""
+        return next(s for s in self.status()["stations"] if s["name"] == name)
+
+    def rx(self, station: str, pd: str) -> dict[str, Any]:
+        """Return the status of one subscription."""
+        return next(rx for rx in self.station(station)["pd"]["rx"] if rx["name"] == pd)
+
+    def tx(self, station: str, pd: str) -> dict[str, Any]:
+        """Return the status of one PD to send."""
+        return next(tx for tx in self.station(station)["pd"]["tx"] if tx["name"] == pd)
+
+    def values(self, station: str) -> dict[str, Any]:
+        """Return all variables of a station."""
+        values: dict[str, Any] = self.request("read", station=station)["values"]
+        return values
+
+    def pid(self, process: str) -> int:
+        """Return the process id of ``engine``, ``services`` or ``supervisor``."""
+        return int(self.status()["processes"][process]["pid"])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _environment(self) -> dict[str, str]:
+        return os.environ | {VARIABLE: str(self.runtime)}
+
+
+class Plants:
+    """A short-lived folder for plant files and runtime directories; ends what runs from it."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.folder = folder
+        self._stack = stack
+        self._count = 0
+
+    def write(self, text: str, name: str = "plant.yaml") -> Path:
+        """Write a plant file."""
+        path = self.folder / name
+        path.write_text(text)
+        return path
+
+    def start(self, plant: Path, *arguments: str, prefix: Sequence[str] = ()) -> Appliance:
+        """Start an appliance and return at once."""
+        self._count += 1
+        runtime = self.folder / f"run{self._count}"
+        return self._stack.enter_context(
+            Appliance(plant, *arguments, runtime=runtime, prefix=prefix)
+        )
+
+    def run(self, plant: Path, *arguments: str, prefix: Sequence[str] = ()) -> Appliance:
+        """Start an appliance and wait until it is ready."""
+        appliance = self.start(plant, *arguments, prefix=prefix)
+        appliance.wait_ready()
+        return appliance
+
+
+@contextmanager
+def plants() -> Iterator[Plants]:
+    """Make a folder whose paths are short enough for sockets, and clear up afterwards."""
+    folder = Path(tempfile.mkdtemp(prefix="eap-"))
+    try:
+        with ExitStack() as stack:
+            yield Plants(folder, stack)
+    finally:
+        shutil.rmtree(folder)
+
+
+def wait_until(condition: Callable[[], object], timeout_s: float = 5.0) -> float:
+    """Return the seconds it took until *condition* held."""
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() < start + timeout_s, "did not happen in time"
+        time.sleep(0.01)
+    return time.monotonic() - start
+
+
+def troubles(rx: dict[str, Any]) -> tuple[int, int, int]:
+    """Return how many frames of a subscription were lost, duplicated and reordered."""
+    return rx["lost"], rx["duplicated"], rx["reordered"]

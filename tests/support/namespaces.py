@@ -1,0 +1,105 @@
+"""Network namespaces with a cable between them, made for one test and gone after it."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from eap.ids import MacAddr
+
+_NUMBERS = itertools.count()
+_CLONE_NEWNET = 0x40000000
+_library = ctypes.CDLL(None, use_errno=True)
+
+
+class Namespace:
+    """One namespace; its loopback is up, and its end of a cable is called ``eth0``.
+
+    Attributes:
+        prefix: Words that run a command inside, as the process that is started.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.prefix = ["ip", "netns", "exec", name]
+
+    def ip(self, *words: str) -> None:
+        """Run ``ip`` on what is inside."""
+        _run("ip", "-netns", self.name, *words)
+
+    def plug(self) -> None:
+        """Switch ``eth0`` on."""
+        self.ip("link", "set", "eth0", "up")
+
+    def unplug(self) -> None:
+        """Switch ``eth0`` off, which takes the carrier from the other end, too."""
+        self.ip("link", "set", "eth0", "down")
+
+    def socket(self, *kind: int) -> socket.socket:
+        """Return a socket of this test that belongs to the namespace."""
+        with Path("/proc/self/ns/net").open() as home, Path(f"/run/netns/{self.name}").open() as ns:
+            _enter(ns.fileno())
+            try:
+                return socket.socket(*kind)
+            finally:
+                _enter(home.fileno())
+
+    def mac(self) -> str:
+        """Return the address of ``eth0``."""
+        with self.socket(socket.AF_PACKET, socket.SOCK_RAW) as sock:
+            sock.bind(("eth0", 0))
+            return str(MacAddr(sock.getsockname()[4]))
+
+
+@contextmanager
+def namespace() -> Iterator[Namespace]:
+    """Make a namespace and delete it with all that is in it, whatever happens."""
+    name = f"eap-test-{os.getpid()}-{next(_NUMBERS)}"
+    _run("ip", "netns", "add", name)
+    try:
+        inside = Namespace(name)
+        # Nothing but the test speaks here: no neighbour discovery between the frames.
+        path = "/proc/sys/net/ipv6/conf/{}/disable_ipv6"
+        for scope in ("default", "all"):
+            words = f"echo 1 > {path.format(scope)}"
+            subprocess.run([*inside.prefix, "sh", "-c", words], check=False, capture_output=True)
+        inside.ip("link", "set", "lo", "up")
+        yield inside
+    finally:
+        _run("ip", "netns", "del", name)
+
+
+@contextmanager
+def cable(*, addresses: bool = False) -> Iterator[tuple[Namespace, Namespace]]:
+    """Make two namespaces whose ``eth0`` are the ends of one cable.
+
+    With *addresses* they are 10.88.164.1/24 and 10.88.164.2/24.
+    """
+    with ExitStack() as stack:
+        ends = stack.enter_context(namespace()), stack.enter_context(namespace())
+        left, right = (end.name for end in ends)
+        _run(
+            *("ip", "link", "add", "eth0", "netns", left, "type", "veth"),
+            *("peer", "name", "eth0", "netns", right),
+        )
+        for number, end in enumerate(ends, 1):
+            if addresses:
+                end.ip("addr", "add", f"10.88.164.{number}/24", "broadcast", "+", "dev", "eth0")
+            end.plug()
+        yield ends
+
+
+def _enter(descriptor: int) -> None:
+    if _library.setns(descriptor, _CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), "setns")
+
+
+def _run(*words: str) -> None:
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
