@@ -1,0 +1,282 @@
+"""Accesses become datagrams, datagrams frames, and frames that come back answers.
+
+Every datagram of a frame carries the frame's index; a frame that comes back is taken only if its
+index is awaited and each datagram is the one that was sent, so that late, foreign and damaged
+frames never answer anything.
+
+Cyclic accesses go first.  Once cycles run, acyclic ones share a budget that each cycle refills: a
+cycle sends at most the budget and one frame of them, however much is waiting.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import msgspec
+
+from devicebus.errors import FrameLostError
+from devicebus.master.access import Access, Reply
+from devicebus.wire.datagram import OVERHEAD, Command, DatagramHeader
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.wire import Buffer
+
+TIMEOUT_NS = 2_000_000
+MAX_DATAGRAMS = 15
+"""Datagrams of a frame; some slaves and masters know no more."""
+MAX_BODY = 1498
+"""Octets of a frame behind its header, as many as an Ethernet frame carries."""
+MAX_DATA = MAX_BODY - OVERHEAD
+"""Octets of one access."""
+MIN_COST = 64
+"""What a datagram takes of the budget at least: a short one costs as much time as this many."""
+MAX_ACYCLIC_FRAMES = 8
+"""Acyclic frames under way at once; more would only wait in somebody's buffer."""
+
+Done: TypeAlias = Callable[[list[Reply] | FrameLostError, int], None]
+
+_LAYOUT = DatagramHeader.LAYOUT
+_MORE = 0x8000
+_LENGTH = 0x07FF
+_BY_STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW))
+_FIXED_ADP = _BY_STATION | {Command.LRD, Command.LWR, Command.LRW}
+
+
+class LinkStats(msgspec.Struct, frozen=True):
+    """Counters since the start."""
+
+    sent: int
+    """Frames."""
+    received: int
+    """Frames that answered something."""
+    lost: int
+    """Frames that did not come back in time."""
+    late: int
+    """Frames that nobody waited for any more, or that nobody sent."""
+    malformed: int
+    """Frames that came back as something else."""
+
+
+class Exchange:
+    """Accesses that are answered together."""
+
+    __slots__ = ("cancelled", "done", "missing", "replies")
+
+    def __init__(self, count: int, done: Done) -> None:
+        self.done = done
+        self.missing = count
+        self.replies: list[Reply] = [Reply(b"", 0)] * count
+        self.cancelled = False
+
+    def cancel(self) -> None:
+        """Forget it: nothing more is sent, and *done* is not called."""
+        self.cancelled = True
+
+
+class _Item:
+    """One access on its way."""
+
+    __slots__ = ("access", "exchange", "number", "tries")
+
+    def __init__(self, access: Access, exchange: Exchange, number: int) -> None:
+        self.access = access
+        self.exchange = exchange
+        self.number = number
+        self.tries = 0
+
+
+class _Flight:
+    """A frame that is under way."""
+
+    __slots__ = ("cyclic", "deadline_ns", "items")
+
+    def __init__(self, items: list[_Item], deadline_ns: int, *, cyclic: bool) -> None:
+        self.items = items
+        self.deadline_ns = deadline_ns
+        self.cyclic = cyclic
+
+
+class Link:
+    """The wire as its users see it.
+
+    Args:
+        timeout_ns: How long a frame may be under way.
+        acyclic_octets: Budget of acyclic accesses in a cycle, datagram headers included.
+    """
+
+    def __init__(self, *, timeout_ns: int = TIMEOUT_NS, acyclic_octets: int = 1536) -> None:
+        self._timeout_ns = timeout_ns
+        self._budget = acyclic_octets
+        self._credit: int | None = None  # None while no cycles run
+        self._cyclic: deque[_Item] = deque()
+        self._acyclic: deque[_Item] = deque()
+        self._flights: dict[int, _Flight] = {}  # in the order of sending, so of deadlines
+        self._acyclic_flights = 0
+        self._index = 0
+        self._sent = self._received = self._lost = self._late = self._malformed = 0
+
+    def submit(self, accesses: Sequence[Access], done: Done, *, cyclic: bool = False) -> Exchange:
+        """Queue accesses; *done* is called once with all replies, or with what went wrong.
+
+        They go out in order, as many as fit in one frame; a frame that is lost is sent again.
+
+        Raises:
+            ValueError: there is none, or one does not fit a frame.
+        """
+        if not accesses or max(len(access.data) for access in accesses) > MAX_DATA:
+            raise ValueError(f"accesses of at most {MAX_DATA} octets are needed, at least one")
+        exchange = Exchange(len(accesses), done)
+        queue = self._cyclic if cyclic else self._acyclic
+        queue.extend(_Item(access, exchange, n) for n, access in enumerate(accesses))
+        return exchange
+
+    def start_cycle(self) -> None:
+        """A new cycle begins: refill the budget; what was overdrawn is taken off."""
+        credit = self._credit or 0
+        self._credit = min(credit, 0) + self._budget
+
+    def stop_cycles(self) -> None:
+        """No cycles run any more: acyclic accesses go out as they come."""
+        self._credit = None
+
+    def frames_to_send(self, now_ns: int) -> list[bytes]:
+        """Take the frames that are ready to go out."""
+        frames: list[bytes] = []
+        while self._cyclic and len(self._flights) < 256:
+            self._send(self._cyclic, frames, now_ns, cyclic=True)
+        while self._may_send_acyclic():
+            self._send(self._acyclic, frames, now_ns, cyclic=False)
+        return frames
+
+    def receive_frame(self, data: Buffer, now_ns: int) -> None:
+        """Take a frame that came back; one that answers nothing is counted."""
+        index = data[3] if len(data) > EtherCatHeader.SIZE + DatagramHeader.SIZE else -1
+        flight = self._flights.get(index)
+        if flight is None:
+            self._late += 1
+            return
+        results = _match(data, index, flight.items)
+        if results is None:
+            self._malformed += 1
+            return
+        self._received += 1
+        self._land(index)
+        for item, (reply, wkc) in zip(flight.items, results, strict=True):
+            exchange = item.exchange
+            exchange.replies[item.number] = Reply(reply, wkc, item.tries)
+            exchange.missing -= 1
+            if not exchange.missing and not exchange.cancelled:
+                exchange.done(exchange.replies, now_ns)
+
+    def next_timeout(self) -> int | None:
+        """When the oldest frame under way counts as lost."""
+        for flight in self._flights.values():
+            return flight.deadline_ns
+        return None
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Send lost frames again, or give them up."""
+        due = [index for index, each in self._flights.items() if each.deadline_ns <= now_ns]
+        again: list[_Item] = []
+        for index in due:
+            flight = self._land(index)
+            self._lost += 1
+            for item in flight.items:
+                if item.tries < item.access.tries:
+                    again.append(item)
+                elif not item.exchange.cancelled:
+                    item.exchange.cancel()
+                    item.exchange.done(_lost(item), now_ns)
+        self._acyclic.extendleft(reversed(again))
+
+    def stats(self) -> LinkStats:
+        """Return a snapshot of the counters."""
+        return LinkStats(self._sent, self._received, self._lost, self._late, self._malformed)
+
+    def _may_send_acyclic(self) -> bool:
+        return (
+            bool(self._acyclic)
+            and self._acyclic_flights < MAX_ACYCLIC_FRAMES
+            and (self._credit is None or self._credit > 0)
+            and len(self._flights) < 256
+        )
+
+    def _send(self, queue: deque[_Item], frames: list[bytes], now_ns: int, *, cyclic: bool) -> None:
+        items = self._take(queue, cyclic=cyclic)
+        if not items:
+            return
+        while self._index in self._flights:
+            self._index = (self._index + 1) & 0xFF
+        index = self._index
+        self._index = (index + 1) & 0xFF
+        self._flights[index] = _Flight(items, now_ns + self._timeout_ns, cyclic=cyclic)
+        self._acyclic_flights += not cyclic
+        self._sent += 1
+        frames.append(_encode(items, index))
+
+    def _take(self, queue: deque[_Item], *, cyclic: bool) -> list[_Item]:
+        items: list[_Item] = []
+        size = 0
+        while queue and len(items) < MAX_DATAGRAMS:
+            octets = OVERHEAD + len(queue[0].access.data)
+            if size + octets > MAX_BODY:
+                break
+            item = queue.popleft()
+            if item.exchange.cancelled:
+                continue
+            item.tries += 1
+            items.append(item)
+            size += octets
+            if not cyclic and self._credit is not None:
+                self._credit -= max(octets, MIN_COST)
+                if self._credit <= 0:
+                    break
+        return items
+
+    def _land(self, index: int) -> _Flight:
+        flight = self._flights.pop(index)
+        self._acyclic_flights -= not flight.cyclic
+        return flight
+
+
+def _encode(items: list[_Item], index: int) -> bytes:
+    parts = [b""]
+    length = 0
+    last = len(items) - 1
+    for number, item in enumerate(items):
+        command, adp, ado, data, _ = item.access
+        word = len(data) | (_MORE if number < last else 0)
+        parts += (_LAYOUT.pack(command, index, adp, ado, word, 0), data, b"\0\0")
+        length += OVERHEAD + len(data)
+    parts[0] = EtherCatHeader(length, type=FrameType.DATAGRAM).encode()
+    return b"".join(parts)
+
+
+def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, int]] | None:
+    """Return data and working counter of each item, or None if this is not the frame."""
+    results = []
+    offset = EtherCatHeader.SIZE
+    need = offset + sum(OVERHEAD + len(item.access.data) for item in items)
+    if len(data) < need or EtherCatHeader.decode(data).type != FrameType.DATAGRAM:
+        return None
+    for item in items:
+        command, adp, ado, sent, _ = item.access
+        there = _LAYOUT.unpack_from(data, offset)
+        same = (command, index, ado, len(sent)) == (*there[:2], there[3], there[4] & _LENGTH)
+        if not same or (command in _FIXED_ADP and adp != there[2]):
+            return None
+        start = offset + DatagramHeader.SIZE
+        offset = start + len(sent)
+        wkc = data[offset] | data[offset + 1] << 8
+        results.append((bytes(data[start:offset]), wkc))
+        offset += 2
+    return results
+
+
+def _lost(item: _Item) -> FrameLostError:
+    command, adp, ado, _, tries = item.access
+    return FrameLostError(
+        f"{command.name} 0x{adp:04X}:0x{ado:04X}: no frame came back, sent {tries} times;"
+        " check the cable to the first slave and its power"
+    )

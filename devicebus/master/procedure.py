@@ -1,0 +1,131 @@
+"""What the master does, written as generators; see :mod:`runner` for who runs them.
+
+    def read_twice(station: int) -> Procedure[bytes]:
+        first = yield from read(station, Register.TYPE, 1)
+        yield Sleep(1_000_000)
+        (reply,), now_ns = yield [fprd(station, Register.TYPE, 1)]
+        return first + reply.data
+
+A procedure yields accesses that are answered together, or a Sleep.  It has FrameLostError thrown
+in when frames do not come back, and is closed to cancel it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from typing import Generic, NamedTuple, TypeAlias, TypeVar
+
+from devicebus.errors import FrameLostError, WorkingCounterError
+from devicebus.master.access import Access, Reply, fprd, fpwr
+from eap.errors import EapError
+
+T = TypeVar("T")
+
+
+class Sleep(NamedTuple):
+    """Resume after this long."""
+
+    duration_ns: int
+
+
+class Answer(NamedTuple):
+    """What a procedure is resumed with: one reply an access, and the time."""
+
+    replies: Sequence[Reply]
+    now_ns: int
+
+
+Step: TypeAlias = Sequence[Access] | Sleep
+Procedure: TypeAlias = Generator[Step, Answer, T]
+
+
+def read(station: int, ado: int, size: int, what: str = "") -> Procedure[bytes]:
+    """Read registers or memory of one slave.
+
+    Raises:
+        WorkingCounterError: the slave did not answer.
+        FrameLostError: nothing came back.
+    """
+    (reply,), _ = yield [fprd(station, ado, size)]
+    if reply.wkc != 1:
+        raise WorkingCounterError(f"slave {station}: reading {what or hex(ado)}", 1, reply.wkc)
+    return reply.data
+
+
+def write(station: int, ado: int, data: bytes, what: str = "") -> Procedure[None]:
+    """Write registers or memory of one slave; raises as :func:`read` does."""
+    (reply,), _ = yield [fpwr(station, ado, data)]
+    if reply.wkc != 1:
+        raise WorkingCounterError(f"slave {station}: writing {what or hex(ado)}", 1, reply.wkc)
+
+
+def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]]:
+    """Run procedures in step, so that their accesses share frames.
+
+    Returns what each returned, or the error that ended it.
+    """
+    _, now_ns = yield Sleep(0)
+    children = [_Child(procedure, now_ns) for procedure in procedures]
+    try:
+        while running := [child for child in children if child.is_running]:
+            asking = [child for child in running if child.accesses]
+            if asking:
+                now_ns = yield from _ask_for(asking, now_ns)
+            else:
+                pause_ns = min(child.wake_ns for child in running) - now_ns
+                _, now_ns = yield Sleep(pause_ns)
+            for child in running:
+                if not child.accesses and child.is_running and child.wake_ns <= now_ns:
+                    child.resume(Answer((), now_ns))
+    finally:
+        for child in children:
+            child.procedure.close()
+    return [child.result for child in children]
+
+
+class _Child(Generic[T]):
+    """One of several procedures that run in step."""
+
+    def __init__(self, procedure: Procedure[T], now_ns: int) -> None:
+        self.procedure = procedure
+        self.is_running = True
+        self.result: T | EapError
+        self.accesses: Sequence[Access] = ()
+        self.wake_ns = 0
+        self._advance(lambda: next(procedure), now_ns)
+
+    def resume(self, answer: Answer) -> None:
+        self._advance(lambda: self.procedure.send(answer), answer.now_ns)
+
+    def fail(self, error: EapError, now_ns: int) -> None:
+        self._advance(lambda: self.procedure.throw(error), now_ns)
+
+    def _advance(self, action: Callable[[], Step], now_ns: int) -> None:
+        self.accesses = ()
+        try:
+            step = action()
+        except StopIteration as end:
+            self.is_running, self.result = False, end.value
+        except EapError as error:
+            self.is_running, self.result = False, error
+        else:
+            if isinstance(step, Sleep):
+                self.wake_ns = now_ns + step.duration_ns
+            else:
+                self.accesses = step
+
+
+def _ask_for(asking: Sequence[_Child[T]], now_ns: int) -> Procedure[int]:
+    """Send what the children want and tell them what came back; return the time."""
+    try:
+        replies, now_ns = yield [access for child in asking for access in child.accesses]
+    except FrameLostError as error:
+        for child in asking:
+            child.fail(error, now_ns)
+        return now_ns
+    start = 0
+    for child in asking:
+        end = start + len(child.accesses)
+        child.resume(Answer(replies[start:end], now_ns))
+        start = end
+    return now_ns

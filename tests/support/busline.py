@@ -1,0 +1,127 @@
+"""A master's parts against a simulated segment: in memory, on a virtual clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from devicebus.master.access import Access
+from devicebus.master.link import Link
+from devicebus.master.procedure import Procedure
+from devicebus.master.runner import Runner
+from devicebus.master.task import Task
+from devicebus.sim.segment import Segment
+from devicebus.sim.wiring import Side
+from devicebus.wire.datagram import Datagram, encode_frame, iter_datagrams
+
+US = 1_000
+MS = 1_000_000
+TRIP_NS = 20 * US
+"""How long a frame is under way."""
+
+
+class Core(Protocol):
+    """What is driven: a master, or a link with a runner."""
+
+    def frames_to_send(self, now_ns: int) -> list[bytes]: ...
+    def receive_frame(self, data: bytes, now_ns: int) -> None: ...
+    def next_timeout(self) -> int | None: ...
+    def handle_timeout(self, now_ns: int) -> None: ...
+
+
+class Bench:
+    """A link with a runner, as a core."""
+
+    def __init__(self, **options: int) -> None:
+        self.link = Link(**options)
+        self.runner = Runner(self.link)
+
+    def frames_to_send(self, now_ns):
+        return self.link.frames_to_send(now_ns)
+
+    def receive_frame(self, data, now_ns):
+        self.link.receive_frame(data, now_ns)
+
+    def next_timeout(self):
+        times = (self.link.next_timeout(), self.runner.next_timeout())
+        return min((at for at in times if at is not None), default=None)
+
+    def handle_timeout(self, now_ns):
+        self.link.handle_timeout(now_ns)
+        self.runner.handle_timeout(now_ns)
+
+
+class Line:
+    """The wire between *core* and *segment*.
+
+    Attributes:
+        lose_out, lose_back: Say which frames are lost, by their number from 0.
+    """
+
+    def __init__(self, core: Core, segment: Segment) -> None:
+        self.core = core
+        self.segment = segment
+        self.now_ns = 1_000 * MS
+        self.lose_out: Callable[[int], bool] = lambda number: False
+        self.lose_back: Callable[[int], bool] = lambda number: False
+        self.frames = 0
+        self.octets = 0
+
+    def step(self, until_ns: int) -> None:
+        """Let frames go round and come back, or else the time pass to what happens next."""
+        frames = self.core.frames_to_send(self.now_ns)
+        if not frames:
+            times = (self.core.next_timeout(), self.segment.next_timeout(), until_ns)
+            due = [at for at in times if at is not None]
+            self.now_ns = max(self.now_ns, min(due))
+            self.segment.handle_timeout(self.now_ns)
+            self.core.handle_timeout(self.now_ns)
+            return
+        self.now_ns += TRIP_NS
+        for frame in frames:
+            number, self.frames = self.frames, self.frames + 1
+            self.octets += len(frame)
+            octets = bytearray(frame)
+            if self.lose_out(number):
+                continue
+            if self.segment.process_frame(octets, self.now_ns) is not Side.PRIMARY:
+                continue
+            if not self.lose_back(number):
+                self.core.receive_frame(bytes(octets), self.now_ns)
+
+    def elapse(self, duration_ns: int) -> None:
+        """Run for that long."""
+        until_ns = self.now_ns + duration_ns
+        while self.now_ns < until_ns:
+            self.step(until_ns)
+
+    def wait(self, task: Task, limit_ns: int = 60_000 * MS):
+        """Run until *task* is done; return its result or raise its error."""
+        until_ns = self.now_ns + limit_ns
+        while not task.is_done:
+            assert self.now_ns < until_ns, f"{task.name} does not end"
+            self.step(until_ns)
+        return task.result()
+
+
+def run(line: Line, procedure: Procedure):
+    """Run one procedure on a line whose core is a :class:`Bench`."""
+    return line.wait(line.core.runner.start(procedure, line.now_ns))
+
+
+def answer(frame: bytes, *, wkc: int = 1, data: bytes | None = None) -> bytes:
+    """What comes back of a frame from slaves that put *data* into each datagram."""
+    return encode_frame(
+        [
+            Datagram(header, (data or bytes(there))[: len(there)].ljust(len(there), b"\0"), wkc)
+            for header, there, _ in iter_datagrams(frame)
+        ]
+    )
+
+
+def accesses_of(frame: bytes) -> list[Access]:
+    """What a frame asks for."""
+    return [
+        Access(header.command, header.adp, header.ado, bytes(data))
+        for header, data, _ in iter_datagrams(frame)
+    ]

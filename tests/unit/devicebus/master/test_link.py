@@ -1,0 +1,233 @@
+"""Packing, matching, losses and the budget of a cycle."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devicebus.errors import FrameLostError
+from devicebus.master.access import Reply, fprd, fpwr, logical
+from devicebus.master.link import MAX_BODY, MAX_DATA, MAX_DATAGRAMS, Link
+from devicebus.wire.datagram import Command
+from tests.support.busline import MS, accesses_of, answer
+
+READ = fprd(1001, 0x130, 6)
+
+
+class Client:
+    """Somebody who asks."""
+
+    def __init__(self, link: Link):
+        self.link = link
+        self.outcomes: list = []
+
+    def ask(self, *accesses, **options):
+        return self.link.submit(accesses, lambda out, now: self.outcomes.append((out, now)),
+                                **options)  # fmt: skip
+
+
+@pytest.fixture
+def link():
+    return Link()
+
+
+def test_accesses_of_several_share_a_frame_and_each_gets_its_own_answer(link):
+    one, two = Client(link), Client(link)
+    one.ask(READ, fpwr(1001, 0x120, b"\2\0"))
+    two.ask(READ)
+    (frame,) = link.frames_to_send(0)
+    assert accesses_of(frame) == [READ, fpwr(1001, 0x120, b"\2\0"), READ]
+    assert link.frames_to_send(1) == []
+    link.receive_frame(answer(frame, data=b"abcdef"), 50)
+    assert one.outcomes == [([Reply(b"abcdef", 1), Reply(b"ab", 1)], 50)]
+    assert two.outcomes == [([Reply(b"abcdef", 1)], 50)]
+    assert (link.stats().sent, link.stats().received) == (1, 1)
+
+
+def test_an_exchange_larger_than_a_frame_is_answered_when_all_of_it_is(link):
+    client = Client(link)
+    client.ask(*[fprd(1001, 0x1000, 1000)] * 3)
+    frames = link.frames_to_send(0)
+    assert len(frames) == 3
+    for frame in reversed(frames[1:]):
+        link.receive_frame(answer(frame), 1)
+        assert client.outcomes == []
+    link.receive_frame(answer(frames[0]), 2)
+    assert [reply.wkc for reply in client.outcomes[0][0]] == [1, 1, 1]
+
+
+def test_frames_hold_no_more_than_a_frame_holds(link):
+    client = Client(link)
+    client.ask(*[fprd(1001, 0, 1)] * 40)
+    client.ask(fprd(1001, 0x1000, MAX_DATA))
+    frames = link.frames_to_send(0)
+    assert [len(accesses_of(frame)) for frame in frames] == [MAX_DATAGRAMS] * 2 + [10, 1]
+    assert max(len(frame) for frame in frames) == MAX_BODY + 2
+
+
+@pytest.mark.parametrize("accesses", [(), (fprd(1001, 0x1000, MAX_DATA + 1),)])
+def test_what_fits_no_frame_is_refused(link, accesses):
+    with pytest.raises(ValueError, match=str(MAX_DATA)):
+        Client(link).ask(*accesses)
+
+
+def test_a_lost_frame_is_sent_again_and_given_up_after_three_times(link):
+    client = Client(link)
+    client.ask(READ)
+    for attempt in range(3):
+        assert len(link.frames_to_send(attempt * 2 * MS)) == 1
+        assert link.next_timeout() == (attempt + 1) * 2 * MS
+        link.handle_timeout((attempt + 1) * 2 * MS - 1)
+        assert link.frames_to_send(0) == []
+        link.handle_timeout((attempt + 1) * 2 * MS)
+    ((error, now),) = client.outcomes
+    assert isinstance(error, FrameLostError)
+    assert "FPRD 0x03E9:0x0130" in str(error)
+    assert "sent 3 times" in str(error)
+    assert (now, link.next_timeout(), link.frames_to_send(now)) == (6 * MS, None, [])
+    assert (link.stats().sent, link.stats().lost) == (3, 3)
+
+
+def test_an_answer_says_how_often_it_was_asked_for(link):
+    client = Client(link)
+    client.ask(READ)
+    link.frames_to_send(0)
+    link.handle_timeout(2 * MS)
+    (frame,) = link.frames_to_send(2 * MS)
+    link.receive_frame(answer(frame, data=b"abcdef"), 2 * MS)
+    assert client.outcomes == [([Reply(b"abcdef", 1, 2)], 2 * MS)]
+
+
+def test_a_late_frame_answers_nothing(link):
+    client = Client(link)
+    client.ask(READ)
+    (late,) = link.frames_to_send(0)
+    link.handle_timeout(2 * MS)
+    (again,) = link.frames_to_send(2 * MS)
+    link.receive_frame(answer(late, data=b"late!!"), 2 * MS)
+    assert (client.outcomes, link.stats().late) == ([], 1)
+    link.receive_frame(answer(again, data=b"abcdef"), 2 * MS)
+    link.receive_frame(answer(again, data=b"abcdef"), 2 * MS)
+    assert client.outcomes[0][0][0].data == b"abcdef"
+    assert (len(client.outcomes), link.stats().late) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        fprd(1002, 0x130, 6),
+        fprd(1001, 0x131, 6),
+        fprd(1001, 0x130, 7),
+        fpwr(1001, 0x130, bytes(6)),
+    ],
+)
+def test_a_frame_with_the_right_index_but_of_something_else_answers_nothing(link, other):
+    client = Client(link)
+    client.ask(READ)
+    link.frames_to_send(0)
+    elsewhere = Link()
+    Client(elsewhere).ask(other)
+    link.receive_frame(answer(elsewhere.frames_to_send(0)[0]), 1)
+    assert (client.outcomes, link.stats().malformed) == ([], 1)
+
+
+def test_positions_change_on_the_way_and_still_match(link):
+    client = Client(link)
+    client.ask(READ._replace(command=Command.APRD, adp=0xFFFF))
+    frame = bytearray(link.frames_to_send(0)[0])
+    frame[4:6] = b"\2\0"
+    link.receive_frame(bytes(frame), 1)
+    assert len(client.outcomes) == 1
+
+
+@given(st.binary(max_size=40))
+def test_nothing_that_comes_back_does_harm(octets):
+    link = Link()
+    client = Client(link)
+    client.ask(READ)
+    (frame,) = link.frames_to_send(0)
+    link.receive_frame(octets, 1)
+    link.receive_frame(frame[: len(frame) - 1], 1)
+    assert client.outcomes == []
+    link.receive_frame(answer(frame) + octets, 1)
+    assert len(client.outcomes) == 1
+
+
+def test_what_is_cancelled_is_not_sent_and_not_answered(link):
+    client = Client(link)
+    waiting = client.ask(READ)
+    waiting.cancel()
+    assert link.frames_to_send(0) == []
+    under_way = client.ask(READ)
+    (frame,) = link.frames_to_send(0)
+    under_way.cancel()
+    link.receive_frame(answer(frame), 1)
+    lost = client.ask(READ._replace(tries=1))
+    link.frames_to_send(1)
+    lost.cancel()
+    link.handle_timeout(9 * MS)
+    assert (client.outcomes, link.frames_to_send(9 * MS)) == ([], [])
+
+
+def test_acyclic_frames_under_way_are_few(link):
+    client = Client(link)
+    for _ in range(20):
+        client.ask(fprd(1001, 0x1000, MAX_DATA))
+    frames = link.frames_to_send(0)
+    assert len(frames) == 8
+    link.receive_frame(answer(frames[3]), 1)
+    assert len(link.frames_to_send(1)) == 1
+
+
+def test_indexes_go_round_and_pass_by_those_that_are_awaited(link):
+    client = Client(link)
+    client.ask(READ)
+    link.frames_to_send(0)
+    seen = []
+    for _ in range(256):
+        client.ask(READ)
+        (frame,) = link.frames_to_send(0)
+        seen.append(frame[3])
+        link.receive_frame(answer(frame), 1)
+    assert (seen[254], seen[255], 0 in seen) == (255, 1, False)
+
+
+def test_cyclic_frames_go_first_and_alone():
+    link = Link(acyclic_octets=100)
+    client = Client(link)
+    client.ask(READ)
+    link.start_cycle()
+    client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
+    first, second = link.frames_to_send(0)
+    assert accesses_of(first)[0].command is Command.LRW
+    assert accesses_of(second) == [READ]
+
+
+def test_a_cycle_sends_no_more_acyclic_octets_than_its_budget_and_one_datagram():
+    link = Link(acyclic_octets=400)
+    client = Client(link)
+    for _ in range(10):
+        client.ask(fprd(1001, 0x1000, 500))
+    sent = []
+    for cycle in range(20):
+        link.start_cycle()
+        frames = link.frames_to_send(cycle)
+        sent.append(sum(len(data) for frame in frames for *_, data, _ in accesses_of(frame)))
+        for frame in frames:
+            link.receive_frame(answer(frame), cycle)
+    assert len(client.outcomes) == 10
+    assert sent[:6] == [500, 500, 500, 500, 0, 500]
+    link.stop_cycles()
+    for _ in range(3):
+        client.ask(fprd(1001, 0x1000, 500))
+    assert len(link.frames_to_send(99)) == 2
+
+
+def test_short_datagrams_cost_more_of_the_budget_than_their_octets():
+    link = Link(acyclic_octets=256)
+    for _ in range(10):
+        Client(link).ask(fprd(1001, 0x80D, 1))
+    link.start_cycle()
+    (frame,) = link.frames_to_send(0)
+    assert len(accesses_of(frame)) == 4
