@@ -38,6 +38,9 @@ _read_last = struct.Struct("2q").unpack_from  # LAST_CYCLE, ARRIVED_AT_NS
 _LAST_OFFSET = 8 * _LAST_CYCLE
 _write_taken = struct.Struct("5q").pack_into  # STATE to BEHIND
 _TAKEN_OFFSET = 8 * _STATE
+_BINS_KNOWN = len(BIN_OF_US)
+_NEAR = 0x3FFF
+"""Counter steps that can only mean what they say, unless a long time has passed."""
 REORDER_WINDOW = 32
 """Sender steps by which a frame can be out of order; further back the sender has restarted."""
 RESTARTED_AFTER = 3
@@ -64,13 +67,28 @@ class Timing:
 class Account:
     """The account in the block of words that starts at *first_word*."""
 
-    __slots__ = ("_sender_cycle_ns", "_step", "_timing", "_words", "_wrap_ns", "first_word")
+    __slots__ = (
+        "_own_cycle_ns",
+        "_sender_cycle_ns",
+        "_step",
+        "_timing",
+        "_usual_gap",
+        "_usual_ns",
+        "_words",
+        "_wrap_ns",
+        "first_word",
+    )
 
     def __init__(self, words: memoryview, first_word: int, timing: Timing) -> None:
         self.first_word = first_word
         self._timing = timing
         self._step = timing.step
         self._sender_cycle_ns = timing.sender_cycle_ns
+        self._own_cycle_ns = timing.own_cycle_ns
+        # What a sender of known step and cycle does nearly always.
+        self._usual_ns = timing.step * timing.sender_cycle_ns
+        known = self._usual_ns > 0 and timing.step <= _NEAR
+        self._usual_gap = timing.step if known else -1
         self._wrap_ns = timing.sender_cycle_ns << 14 or 1 << 62
         self._words = words[first_word + ACCOUNT_START : first_word + RxWord.SIZE]
         if not self._words[_RECEIVED]:
@@ -121,22 +139,31 @@ class Account:
         if last >= 0:
             elapsed_ns = at_ns - last_at_ns
             gap = cycle - last & 0xFFFF
-            if gap > 0x3FFF or elapsed_ns > self._wrap_ns:
-                gap = self._resolve(gap, elapsed_ns)
-            if gap > 0:
-                position = last + gap  # unwrapped, so that holes are told from those of long ago
-                step = self._step
-                if step and gap >= 2 * step:
-                    self._enter_loss(gap // step - 1, position)
-                if self._sender_cycle_ns:
-                    self._enter_jitter(elapsed_ns - gap * self._sender_cycle_ns)
-            elif gap == 0:
-                position = last
-                words[_DUPLICATED] += 1
-            elif self._is_reordered(last + gap, -gap):
-                return False
+            if gap == self._usual_gap and elapsed_ns <= self._wrap_ns:
+                self._enter_jitter(elapsed_ns - self._usual_ns)
+            else:
+                if gap > _NEAR or elapsed_ns > self._wrap_ns:
+                    gap = self._resolve(gap, elapsed_ns)
+                if not self._enter_gap(gap, last, elapsed_ns):
+                    return False
+            # Unwrapped, so that holes are told from those of long ago.
+            position = last + gap if gap >= 0 else cycle
         words[_RECEIVED] += 1
         _write_taken(words, _TAKEN_OFFSET, _RUNNING, position, at_ns, own_cycle, 0)
+        return True
+
+    def _enter_gap(self, gap: int, last: int, elapsed_ns: int) -> bool:
+        """Enter a frame that did not come just as expected; return whether it is to be taken."""
+        if gap == 0:
+            self._words[_DUPLICATED] += 1
+        if gap < 0:
+            return not self._is_reordered(last + gap, -gap)
+        if gap > 0:
+            step = self._step
+            if step and gap >= 2 * step:
+                self._enter_loss(gap // step - 1, last + gap)
+            if self._sender_cycle_ns:
+                self._enter_jitter(elapsed_ns - gap * self._sender_cycle_ns)
         return True
 
     def _resolve(self, gap: int, elapsed_ns: int) -> int:
@@ -179,10 +206,10 @@ class Account:
 
     def _enter_jitter(self, deviation_ns: int) -> None:
         words = self._words
-        if deviation_ns > self._timing.own_cycle_ns:
+        if deviation_ns > self._own_cycle_ns:
             words[_LATE] += 1
         micros = abs(deviation_ns) // 1000
-        if micros < len(BIN_OF_US):
+        if micros < _BINS_KNOWN:
             words[_JITTER + BIN_OF_US[micros]] += 1
         else:
             words[_JITTER + histogram_bin(micros)] += 1

@@ -44,6 +44,7 @@ class FramePlan:
         headers: Reads all PD headers but their quality from a frame, at offset FIRST_PD.
         expected: What it must return for this plan to apply.
         end: Octets of the frame by its Length.
+        is_single: Whether there is one PD in it.
         parts: For each account that the frame concerns, the copies to make if it agrees.
         taken_words: First words of the RxPDs that take one of its PDs.
         refused: The PDs that nobody takes.
@@ -55,6 +56,7 @@ class FramePlan:
         "end",
         "expected",
         "headers",
+        "is_single",
         "parts",
         "publisher",
         "refused",
@@ -78,6 +80,7 @@ class FramePlan:
         self.headers: Callable[..., tuple[Any, ...]] = layout.unpack_from
         self.expected: tuple[Any, ...] = tuple(header for header, _ in pds)
         self.end = end
+        self.is_single = len(pds) == 1
         taken = tuple(taken)
         self.parts = _parts(taken)
         self.taken_words = tuple(pd.words for pd in taken)

@@ -21,10 +21,13 @@ from eap.pd.spec import RxPdSpec
 from eap.pd.substitute import SubstituteValue
 from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
 
-_KEY = struct.Struct("<10s4xH").unpack_from
-"""EtherCAT header, publisher and count, and the id of the first PD: what tells layouts apart."""
-_SHORTEST = FIRST_PD + 2
-"""Octets that a frame with a PD has at least for its key."""
+_KEY = struct.Struct("<10s4x6s").unpack_from
+"""EtherCAT header, publisher and count, and the header of the first PD: what tells layouts apart.
+
+With one PD in the frame that is all there is to compare.
+"""
+_SHORTEST = FIRST_PD + PdHeader.SIZE
+"""Octets of a frame with a PD."""
 _CYCLE_COUNTER = struct.Struct("<H").unpack_from
 _PDS_PLANNED = 16384
 """PDs of all layouts kept; a plant has fewer, and who makes them up gets no more memory."""
@@ -82,7 +85,7 @@ class Subscriber:
             publisher = NetId.parse(place.publisher) if place.publisher else b""
             self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
             self._by_id.setdefault(place.pd_id, []).append(subscription)
-        self._plans: dict[tuple[bytes, int], list[FramePlan]] = {}
+        self._plans: dict[tuple[bytes, bytes], list[FramePlan]] = {}
         self._pds_planned = 0
         self._open_from_ns = _NEVER
         self._closed_reason = Discard.SUPPRESSED
@@ -168,7 +171,9 @@ class Subscriber:
     def _find_plan(self, data: memoryview, size: int) -> FramePlan | None:
         if size >= _SHORTEST:
             for plan in self._plans.get(_KEY(data), ()):
-                if plan.end <= size and plan.headers(data, FIRST_PD) == plan.expected:
+                if plan.end <= size and (
+                    plan.is_single or plan.headers(data, FIRST_PD) == plan.expected
+                ):
                     return plan
         return None
 
