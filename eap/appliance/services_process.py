@@ -56,8 +56,9 @@ class Services:
 
     async def run(self) -> None:
         """Serve until SIGTERM."""
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
         files = {name: await self._open_image(name) for name in self._names}
+        # Not before: whoever waits for images of an engine that failed just ends.
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
         self._watch_sockets()
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(ControlServer(self._methods(files)).serve(self._listener))]

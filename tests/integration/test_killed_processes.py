@@ -7,6 +7,7 @@ of ours keeps every frame of the wire.
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import signal
 import time
@@ -116,3 +117,21 @@ def test_killed_services_leave_no_gap(both: tuple[Appliance, Appliance], witness
     processes = own.status()["processes"]
     assert processes["engine"]["pid"] == engine
     assert (processes["engine"]["restarts"], processes["services"]["restarts"]) == (0, 3)
+
+
+def test_an_engine_that_does_not_get_up_ends_the_start_in_one_line(farm: Plants) -> None:
+    appliance = farm.start(farm.write(PLANT))
+    engine = 0
+    while not engine:
+        for info in appliance.runtime.glob("*/appliance.json"):
+            engine = json.loads(info.read_text())["engine"]["pid"]
+    os.kill(engine, signal.SIGSTOP)
+    time.sleep(0.5)  # services wait for its images meanwhile
+    start = time.monotonic()
+    os.kill(engine, signal.SIGKILL)
+    assert appliance.finish() == (
+        1,
+        "",
+        "supervisor: engine was killed by SIGKILL while starting\n",
+    )
+    assert time.monotonic() - start < 0.9
