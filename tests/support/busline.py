@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from devicebus.master.access import Access
+from devicebus.master.access import Access, Reply
 from devicebus.master.link import Link
-from devicebus.master.procedure import Procedure
+from devicebus.master.procedure import Answer, Procedure, Sleep
 from devicebus.master.runner import Runner
 from devicebus.master.task import Task
+from devicebus.sim.devices.build import build_segment
 from devicebus.sim.segment import Segment
+from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec
 from devicebus.sim.wiring import Side
 from devicebus.wire.datagram import Datagram, encode_frame, iter_datagrams
 
@@ -125,3 +127,34 @@ def accesses_of(frame: bytes) -> list[Access]:
         Access(header.command, header.adp, header.ado, bytes(data))
         for header, data, _ in iter_datagrams(frame)
     ]
+
+
+def drive(procedure: Procedure, respond: Callable[[Access], Reply], now_ns: int = 0):
+    """Run a procedure against *respond* alone; sleeps take as long as they say."""
+    step = next(procedure)
+    while True:
+        if isinstance(step, Sleep):
+            now_ns += step.duration_ns
+            outcome = Answer((), now_ns)
+        else:
+            now_ns += TRIP_NS
+            outcome = Answer([respond(access) for access in step], now_ns)
+        try:
+            step = procedure.send(outcome)
+        except StopIteration as end:
+            return end.value
+
+
+def slave(name: str, kind: str = "digital", **options) -> SlaveSpec:
+    """A slave with one input *in* and one output *out*, unless told otherwise."""
+    if kind == "digital":
+        options = {
+            "inputs": (ChannelSpec(name="in"),),
+            "outputs": (ChannelSpec(name="out"),),
+        } | options
+    return SlaveSpec(name=name, kind=DeviceKind(kind), **({"product": 7} | options))
+
+
+def segment(*slaves: SlaveSpec) -> Segment:
+    """A simulated bus of these slaves."""
+    return build_segment(BusSpec(bus="test", slaves=slaves))

@@ -1,0 +1,130 @@
+"""A slave's EEPROM through the registers of its controller (ETG.1000.4, SII)."""
+
+from __future__ import annotations
+
+from devicebus.errors import SiiError
+from devicebus.master.procedure import Procedure, Sleep, read, write
+from devicebus.wire.register import EepromCommand, EepromControl, Register
+from devicebus.wire.sii import CategoryHeader
+from devicebus.wire.siirecord import SiiFixed
+
+BUSY_TIMEOUT_NS = 20_000_000
+"""How long the EEPROM may work on one command."""
+POLL_NS = 100_000
+TRIES = 4
+"""How often a command is given that the EEPROM does not acknowledge."""
+MIN_LIMIT = 4096
+"""Octets that an EEPROM may fill whatever size it gives: many give none."""
+MAX_SIZE = 0x20000
+"""Octets that word addresses of 16 bits reach."""
+
+_ADDRESS_AND_DATA = 14
+_END = b"\xff\xff"
+
+
+def take_over(station: int) -> Procedure[None]:
+    """Take the EEPROM from the slave's application, which may have left it assigned to itself."""
+    yield from write(station, Register.EEPROM_CONFIGURATION, b"\2", "EEPROM configuration")
+    yield from write(station, Register.EEPROM_CONFIGURATION, b"\0", "EEPROM configuration")
+
+
+def read_words(station: int, word: int) -> Procedure[bytes]:
+    """Read four or eight octets, as many as the controller gives, from a word address on.
+
+    Raises:
+        SiiError: the EEPROM stays busy or does not acknowledge.
+        WorkingCounterError: the slave did not answer.
+    """
+    request = EepromControl(command=EepromCommand.READ).encode() + word.to_bytes(4, "little")
+    octets = yield from _command(station, request, f"reading word 0x{word:04X}")
+    size = 8 if EepromControl.decode(octets).read_eight else 4
+    return octets[6 : 6 + size]
+
+
+def write_word(station: int, word: int, data: bytes) -> Procedure[None]:
+    """Write two octets at a word address; raises as :func:`read_words` does."""
+    control = EepromControl(write_enable=1, command=EepromCommand.WRITE).encode()
+    request = control + word.to_bytes(4, "little") + data
+    yield from _command(station, request, f"writing word 0x{word:04X}")
+
+
+def reload(station: int) -> Procedure[None]:
+    """Let the controller take over its settings from the EEPROM, as after power-on."""
+    request = EepromControl(command=EepromCommand.RELOAD).encode() + bytes(4)
+    yield from _command(station, request, "reloading")
+
+
+def read_image(station: int) -> Procedure[bytes]:
+    """Read the EEPROM up to the end of its categories, end mark included.
+
+    Raises:
+        SiiError: there is no end within the size that the EEPROM says it has.
+        WorkingCounterError: the slave did not answer.
+    """
+    yield from take_over(station)
+    image = bytearray()
+    yield from _extend(station, image, SiiFixed.SIZE)
+    size = min(max((SiiFixed.decode(image).size + 1) * 128, MIN_LIMIT), MAX_SIZE)
+    offset = SiiFixed.SIZE
+    while True:
+        if offset + CategoryHeader.SIZE > size:
+            raise SiiError(f"slave {station}: no end of the EEPROM within its {size} octets")
+        yield from _extend(station, image, offset + CategoryHeader.SIZE)
+        if image[offset : offset + 2] == _END:
+            return bytes(image[: offset + 2])
+        header = CategoryHeader.decode(image, offset)
+        end = offset + CategoryHeader.SIZE + 2 * header.length
+        if end > size:
+            raise SiiError(
+                f"slave {station}: EEPROM category {header.type} ends at octet {end}, expected at"
+                f" most {size}"
+            )
+        yield from _extend(station, image, end)
+        offset = end
+
+
+def write_image(station: int, image: bytes) -> Procedure[None]:
+    """Write a whole image word by word, those that already fit excepted.
+
+    Raises:
+        SiiError: the image is of odd length, or the EEPROM does not take it.
+        WorkingCounterError: the slave did not answer.
+    """
+    if len(image) % 2 or len(image) > MAX_SIZE:
+        raise SiiError(f"an image of {len(image)} octets, expected whole words up to {MAX_SIZE}")
+    yield from take_over(station)
+    there = bytearray()
+    yield from _extend(station, there, len(image))
+    for offset in range(0, len(image), 2):
+        word = image[offset : offset + 2]
+        if there[offset : offset + 2] != word:
+            yield from write_word(station, offset // 2, word)
+
+
+def _extend(station: int, image: bytearray, size: int) -> Procedure[None]:
+    while len(image) < size:
+        image += yield from read_words(station, len(image) // 2)
+
+
+def _command(station: int, request: bytes, what: str) -> Procedure[bytes]:
+    """Give a command, also again when it is not acknowledged; return registers from 0x0502 on."""
+    for _ in range(TRIES):
+        yield from write(station, Register.EEPROM_CONTROL, request, "EEPROM control")
+        octets = yield from _wait_idle(station, what)
+        if not EepromControl.decode(octets).command_error:
+            return octets
+    raise SiiError(f"slave {station}: EEPROM, {what}: not acknowledged, tried {TRIES} times")
+
+
+def _wait_idle(station: int, what: str) -> Procedure[bytes]:
+    deadline_ns: int | None = None
+    while True:
+        octets = yield from read(
+            station, Register.EEPROM_CONTROL, _ADDRESS_AND_DATA, "EEPROM control"
+        )
+        if not EepromControl.decode(octets).busy:
+            return octets
+        _, now_ns = yield Sleep(0 if deadline_ns is None else POLL_NS)
+        deadline_ns = deadline_ns or now_ns + BUSY_TIMEOUT_NS
+        if now_ns >= deadline_ns:
+            raise SiiError(f"slave {station}: EEPROM, {what}: busy for longer than 20 ms")

@@ -1,0 +1,101 @@
+"""The bus that is expected, and what is different on the one that is there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from difflib import SequenceMatcher
+
+import msgspec
+
+from devicebus.errors import IdentityError
+from devicebus.master.scan import FoundSlave, Identity
+
+
+class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
+    """A slave that a configuration names; what is None may be anything."""
+
+    name: str
+    vendor: int
+    product: int
+    revision: int | None = None
+    serial: int | None = None
+    alias: int | None = None
+
+
+def fits(expected: ExpectedSlave, identity: Identity) -> bool:
+    """Whether a slave may stand for the expected one."""
+    return (
+        (expected.vendor, expected.product) == (identity.vendor, identity.product)
+        and expected.revision in {None, identity.revision}
+        and expected.serial in {None, identity.serial}
+    )
+
+
+def check_bus(expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]) -> None:
+    """Compare the bus with what was found; raise IdentityError that lists every difference."""
+    lines = list(iter_differences(expected, found))
+    if lines:
+        text = "\n  ".join(lines)
+        raise IdentityError(
+            f"the bus is not as configured ({len(expected)} slaves expected, {len(found)} found):"
+            f"\n  {text}"
+        )
+
+
+def iter_differences(
+    expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]
+) -> Iterator[str]:
+    """Yield one line a difference; a missing slave does not make all behind it different.
+
+    With as many slaves as expected, position is compared with position.
+    """
+    if len(expected) == len(found):
+        for each, slave in zip(expected, found, strict=True):
+            yield from _compare(each, slave)
+        return
+    matcher = SequenceMatcher(
+        None,
+        [(each.vendor, each.product) for each in expected],
+        [(each.identity.vendor, each.identity.product) for each in found],
+        autojunk=False,
+    )
+    for tag, start, end, there, there_end in matcher.get_opcodes():
+        pairs = min(end - start, there_end - there)
+        for offset in range(pairs):
+            yield from _compare(expected[start + offset], found[there + offset])
+        if tag == "equal":
+            continue
+        for missing in expected[start + pairs : end]:
+            before = f"after {found[there - 1 + pairs].name}" if there + pairs else "at the start"
+            yield f"{missing.name} is missing {before}, expected {_describe(missing)}"
+        for slave in found[there + pairs : there_end]:
+            yield f"{_place(slave)}: {slave.fault or slave.identity}, expected no slave here"
+
+
+def _compare(expected: ExpectedSlave, slave: FoundSlave) -> Iterator[str]:
+    if slave.fault:
+        yield f"{_place(slave)}: {slave.fault}, expected {expected.name}"
+    elif not fits(expected, slave.identity):
+        serial = f", serial {slave.identity.serial}" if expected.serial is not None else ""
+        yield (
+            f"{_place(slave)}: {slave.identity}{serial},"
+            f" expected {expected.name} with {_describe(expected)}"
+        )
+    elif expected.alias not in {None, slave.alias}:
+        yield (
+            f"{_place(slave)}: alias {slave.alias}, expected {expected.name} with alias"
+            f" {expected.alias}"
+        )
+
+
+def _place(slave: FoundSlave) -> str:
+    return f"position {slave.position} (station {slave.station})"
+
+
+def _describe(expected: ExpectedSlave) -> str:
+    text = f"vendor 0x{expected.vendor:08X}, product 0x{expected.product:08X}"
+    if expected.revision is not None:
+        text += f", revision 0x{expected.revision:08X}"
+    if expected.serial is not None:
+        text += f", serial {expected.serial}"
+    return text

@@ -1,0 +1,208 @@
+"""Finding the slaves: how many, which, and how they are wired."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from devicebus.errors import BusError, WorkingCounterError
+from devicebus.master.access import Access, Reply, aprd, apwr, brd, fprd
+from devicebus.master.eeprom import read_image, read_words, take_over
+from devicebus.master.procedure import Procedure, together
+from devicebus.master.topology import Joint, find_joints
+from devicebus.wire import sii
+from devicebus.wire.register import AlStatus, DlStatus, Register
+from devicebus.wire.sii import Sii
+from devicebus.wire.siirecord import SiiFixed
+from eap.codec.wire import WireStruct, u8, u16, u32
+from eap.errors import EapError
+
+FIRST_STATION = 1001
+"""Station address of the first slave, as TwinCAT counts."""
+MAX_SLAVES = 0xFFFF - FIRST_STATION
+_IDENTITY_WORD = 8
+_PER_STEP = 60
+"""Accesses that are under way at once while slaves are looked at one by one."""
+
+
+class EscInfo(WireStruct, frozen=True):
+    """ETG.1000.4: what a controller says about itself, from 0x0000 on."""
+
+    type: u8
+    revision: u8
+    build: u16
+    fmmus: u8
+    sync_managers: u8
+    ram: u8
+    """KiB of process data memory."""
+    port_descriptor: u8
+    features: u16
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether it takes part in distributed clocks."""
+        return bool(self.features & 0x04)
+
+    @property
+    def knows_lrw(self) -> bool:
+        """Whether it may be read and written by one logical datagram."""
+        return not self.features & 0x0200
+
+
+class Identity(WireStruct, frozen=True):
+    """ETG.2010: who a slave is, from word 8 of the EEPROM on."""
+
+    vendor: u32
+    product: u32
+    revision: u32
+    serial: u32 = 0
+
+    def __str__(self) -> str:
+        return (
+            f"vendor 0x{self.vendor:08X}, product 0x{self.product:08X},"
+            f" revision 0x{self.revision:08X}"
+        )
+
+
+class FoundSlave(NamedTuple):
+    """A slave as a scan finds it."""
+
+    position: int
+    station: int
+    alias: int
+    esc: EscInfo
+    al_status: AlStatus
+    joint: Joint
+    identity: Identity
+    sii: Sii
+    fault: str = ""
+    """Why the EEPROM says nothing: identity and *sii* are empty then."""
+
+    @property
+    def name(self) -> str:
+        """What the slave calls itself."""
+        return self.sii.name or f"slave {self.station}"
+
+
+class _Registers(NamedTuple):
+    esc: EscInfo
+    alias: int
+    dl_status: DlStatus
+    al_status: AlStatus
+
+
+def count_slaves() -> Procedure[int]:
+    """Return how many slaves a frame passes."""
+    (reply,), _ = yield [brd(Register.TYPE, 1)]
+    return reply.wkc
+
+
+def scan(first_station: int = FIRST_STATION) -> Procedure[tuple[FoundSlave, ...]]:
+    """Give each slave its station address by position, and read all that it says about itself.
+
+    States and configuration of the slaves stay as they are.
+
+    Raises:
+        WorkingCounterError: a slave went away meanwhile.
+        FrameLostError: nothing comes back.
+    """
+    count = yield from count_slaves()
+    if count > MAX_SLAVES:
+        raise BusError(f"{count} slaves answered, a bus has at most {MAX_SLAVES}")
+    stations = range(first_station, first_station + count)
+    yield from assign_stations(list(enumerate(stations)))
+    registers = yield from _read_registers(stations)
+    joints = find_joints([each.dl_status for each in registers])
+    images = yield from together([read_image(station) for station in stations])
+    return tuple(
+        _found(position, stations[position], registers[position], joints[position], image)
+        for position, image in enumerate(images)
+    )
+
+
+def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
+    """Give the slaves at some positions their station addresses.
+
+    Raises WorkingCounterError if nobody is at a position.
+    """
+    replies = yield from _in_pieces(
+        [apwr(at, Register.STATION_ADDRESS, to.to_bytes(2, "little")) for at, to in places]
+    )
+    for (position, _), reply in zip(places, replies, strict=True):
+        if reply.wkc != 1:
+            raise WorkingCounterError(f"station address for position {position}", 1, reply.wkc)
+
+
+def read_stations(count: int) -> Procedure[list[int]]:
+    """Return the station addresses at the first *count* positions; 0 where there is none."""
+    replies = yield from _in_pieces([aprd(at, Register.STATION_ADDRESS, 2) for at in range(count)])
+    return [int.from_bytes(reply.data, "little") if reply.wkc else 0 for reply in replies]
+
+
+def read_identity(station: int) -> Procedure[Identity]:
+    """Read from the EEPROM only who a slave is.
+
+    Raises:
+        SiiError: the EEPROM cannot be read.
+        WorkingCounterError: the slave did not answer.
+    """
+    yield from take_over(station)
+    octets = b""
+    while len(octets) < Identity.SIZE:
+        octets += yield from read_words(station, _IDENTITY_WORD + len(octets) // 2)
+    return Identity.decode(octets)
+
+
+def _read_registers(stations: Sequence[int]) -> Procedure[list[_Registers]]:
+    replies = yield from _in_pieces(
+        [
+            access
+            for station in stations
+            for access in (
+                fprd(station, Register.TYPE, EscInfo.SIZE),
+                fprd(station, Register.STATION_ALIAS, 2),
+                fprd(station, Register.DL_STATUS, DlStatus.SIZE),
+                fprd(station, Register.AL_STATUS, AlStatus.SIZE),
+            )
+        ]
+    )
+    found = []
+    for number, station in enumerate(stations):
+        info, alias, dl_status, al_status = replies[4 * number : 4 * number + 4]
+        for reply in (info, alias, dl_status, al_status):
+            if reply.wkc != 1:
+                raise WorkingCounterError(f"slave {station}: reading registers", 1, reply.wkc)
+        found.append(
+            _Registers(
+                EscInfo.decode(info.data),
+                int.from_bytes(alias.data, "little"),
+                DlStatus.decode(dl_status.data),
+                AlStatus.decode(al_status.data),
+            )
+        )
+    return found
+
+
+def _found(
+    position: int, station: int, registers: _Registers, joint: Joint, image: bytes | EapError
+) -> FoundSlave:
+    fault = ""
+    content = Sii(fixed=SiiFixed())
+    try:
+        if isinstance(image, EapError):
+            raise image
+        content = sii.decode(image)
+    except EapError as exc:
+        fault = f"slave {station}: its EEPROM cannot be used: {exc}"
+    fixed = content.fixed
+    identity = Identity(fixed.vendor, fixed.product, fixed.revision, fixed.serial)
+    esc, alias, _, al_status = registers
+    return FoundSlave(position, station, alias, esc, al_status, joint, identity, content, fault)
+
+
+def _in_pieces(accesses: Sequence[Access]) -> Procedure[list[Reply]]:
+    replies: list[Reply] = []
+    for start in range(0, len(accesses), _PER_STEP):
+        answers, _ = yield accesses[start : start + _PER_STEP]
+        replies += answers
+    return replies

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import SiiError, WorkingCounterError
+from devicebus.master import eeprom
+from devicebus.master.access import Reply
+from devicebus.master.scan import assign_stations
+from devicebus.wire import sii
+from devicebus.wire.datagram import Command
+from devicebus.wire.register import EepromControl, Register
+from devicebus.wire.sii import Sii
+from devicebus.wire.siirecord import SiiFixed
+from tests.support.busline import Bench, Line, drive, run, segment, slave
+
+
+@pytest.fixture
+def line():
+    line = Line(Bench(), segment(slave("a", serial=0x12345678)))
+    run(line, assign_stations([(0, 1001)]))
+    return line
+
+
+class Chip:
+    """An EEPROM made by hand: four octets a read, and what else goes wrong."""
+
+    def __init__(self, image, *, busy=0, refuse=0, wkc=1):
+        self.image = image
+        self.busy = busy
+        self.refuse = refuse
+        self.wkc = wkc
+        self.commands = []
+        self.pending = 0
+
+    def __call__(self, access):
+        if access.command is Command.FPWR:
+            if access.ado == Register.EEPROM_CONTROL:
+                self.commands.append(access.data)
+                self.pending = self.busy
+            return Reply(access.data, self.wkc)
+        failed = int(self.refuse > 0)
+        if self.pending:
+            self.pending -= 1
+            return Reply(EepromControl(busy=1).encode() + bytes(12), self.wkc)
+        self.refuse -= failed
+        at = 2 * int.from_bytes(self.commands[-1][2:6], "little")
+        data = self.image[at : at + 4].ljust(8, b"\xff")
+        control = EepromControl(command_error=failed).encode()
+        return Reply(control + self.commands[-1][2:6] + data, self.wkc)
+
+
+def test_an_image_is_read_up_to_its_end(line):
+    image = run(line, eeprom.read_image(1001))
+    assert line.segment.slaves[0].esc.image.startswith(image)
+    assert image.endswith(b"\xff\xff")
+    assert sii.decode(image).fixed.serial == 0x12345678
+
+
+def test_controllers_that_give_four_octets_are_read_as_well():
+    image = sii.encode(Sii(fixed=SiiFixed(vendor=5), strings=("one",)))
+    chip = Chip(image)
+    assert drive(eeprom.read_image(1001), chip) == image
+    assert len(chip.commands) == len(image) // 4 + 1
+
+
+def test_an_image_is_written_where_it_differs(line):
+    image = bytearray(run(line, eeprom.read_image(1001)))
+    image[8:10] = b"\x34\x12"
+    image[14] = sii.checksum(image[:14])
+    before = line.frames
+    run(line, eeprom.write_image(1001, bytes(image)))
+    assert line.segment.slaves[0].esc.eeprom.image[: len(image)] == image
+    writes = line.frames - before - 2 - len(image) // 4
+    assert writes <= 6
+    run(line, eeprom.reload(1001))
+    assert run(line, eeprom.read_image(1001)) == image
+
+
+def test_odd_images_are_refused():
+    with pytest.raises(SiiError, match="3 octets, expected whole words"):
+        drive(eeprom.write_image(1001, b"abc"), Chip(b""))
+
+
+def test_a_busy_chip_is_waited_for_up_to_twenty_milliseconds():
+    assert drive(eeprom.read_words(1001, 0), Chip(b"abcd", busy=100)) == b"abcd"
+    with pytest.raises(SiiError, match="slave 1001: EEPROM, reading word 0x0004: busy"):
+        drive(eeprom.read_words(1001, 4), Chip(b"abcd", busy=300))
+
+
+def test_commands_that_are_not_acknowledged_are_given_again():
+    chip = Chip(b"abcd", refuse=3)
+    assert drive(eeprom.read_words(1001, 0), chip) == b"abcd"
+    assert len(chip.commands) == 4
+    with pytest.raises(SiiError, match="writing word 0x0002: not acknowledged, tried 4 times"):
+        drive(eeprom.write_word(1001, 2, b"ab"), Chip(b"", refuse=4))
+
+
+def test_a_slave_that_is_gone_is_named():
+    with pytest.raises(WorkingCounterError, match="slave 1001"):
+        drive(eeprom.read_image(1001), Chip(b"", wkc=0))
+
+
+FIXED = SiiFixed().encode()
+
+
+@pytest.mark.parametrize(
+    ("tail", "text"),
+    [
+        (b"\x0a\0\xff\xff", "category 10 ends at octet 131202, expected at most 4096"),
+        (b"\x0a\0\0\0" * 2000, "no end of the EEPROM within its 4096 octets"),
+    ],
+)
+def test_lengths_that_cannot_be_end_in_an_error(tail, text):
+    with pytest.raises(SiiError, match=text):
+        drive(eeprom.read_image(1001), Chip(FIXED + tail))
