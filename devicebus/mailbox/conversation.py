@@ -12,10 +12,13 @@ mailbox error, and closes it to cancel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple, TypeAlias, TypeVar
 
+from devicebus.errors import MailboxProtocolError
 from eap.codec.mailbox import MailboxType
+from eap.errors import CodecError
 
 T = TypeVar("T")
 
@@ -40,6 +43,7 @@ class Ask(NamedTuple):
     delay_ns: int = 0
     """Wait this long before sending, as after a busy reply."""
     expects_reply: bool = True
+    """If not, the conversation goes on as soon as this is sent, with a message without data."""
 
 
 class Message(NamedTuple):
@@ -65,3 +69,12 @@ class Progress:
     def __init__(self, total: int | None = None) -> None:
         self.done = 0
         self.total = total
+
+
+@contextmanager
+def reading(what: str) -> Iterator[None]:
+    """Turn whatever a decoder says against a slave's octets into MailboxProtocolError."""
+    try:
+        yield
+    except CodecError as exc:
+        raise MailboxProtocolError(f"{what}: {exc}") from None

@@ -69,6 +69,26 @@ class ObjectDictionary:
         _check_value(entry, index, subindex, data)
         _store(entry, index, subindex, data)
 
+    def check_download(
+        self, index: int, subindex: int, size: int, state: OdState, *, complete: bool = False
+    ) -> None:
+        """Refuse what can be refused before the data of a download is there.
+
+        A transfer in segments is so turned away at its first message, not at its last.
+        """
+        if complete:
+            chosen = self._whole(index, subindex, count=0xFF)
+            limit = pdo.layout([entry.kind for _, entry in chosen]).size + 2 * (subindex == 0)
+            if size > limit:
+                raise SdoAbortError(
+                    AbortCode.TOO_LONG, index, subindex, f"{size} octets for entries of {limit}"
+                )
+            _check_any_writable([entry for _, entry in chosen], index, subindex, state)
+        else:
+            entry = self.entry(index, subindex)
+            _check_writable(entry, index, subindex, state)
+            _check_size(entry, index, subindex, size)
+
     def upload_complete(self, index: int, first: int, state: OdState) -> bytes:
         """Return a whole object from subindex *first* (0 or 1) on; subindex 0 takes 16 bits.
 
@@ -85,9 +105,11 @@ class ObjectDictionary:
     def download_complete(self, index: int, first: int, data: bytes, state: OdState) -> None:
         """Write a whole object from subindex *first* on; read-only entries are passed over.
 
-        All values are checked before the first is stored.
+        Where subindex 0 can be written, it says how many entries follow, and is 0 while they are
+        written.  All values are checked before the first is stored.
         """
-        chosen = self._whole(index, first)
+        count = self._new_count(index, first, data, state)
+        chosen = self._whole(index, first, count=count)
         if first == 0:
             data = data[2:]
         plan = pdo.layout([entry.kind for _, entry in chosen])
@@ -104,14 +126,28 @@ class ObjectDictionary:
             octets = _take_bits(data, bit_offset, entry)
             _check_value(entry, index, subindex, octets)
             accepted.append((subindex, entry, octets))
-        if not accepted:
-            writable = any(entry.access & Access.WRITE_ANY for _, entry in chosen)
-            code = AbortCode.DEVICE_STATE if writable else AbortCode.READ_ONLY
-            raise SdoAbortError(code, index, first)
+        if count is not None:
+            counter = self[index].entries[0]
+            accepted = [(0, counter, b"\0"), *accepted, (0, counter, bytes((count,)))]
+        else:
+            _check_any_writable([entry for _, entry in chosen], index, first, state)
         for subindex, entry, octets in accepted:
             _store(entry, index, subindex, octets)
 
-    def _whole(self, index: int, first: int) -> list[tuple[int, Entry]]:
+    def _new_count(self, index: int, first: int, data: bytes, state: OdState) -> int | None:
+        item = self[index]
+        if first or not item.complete_access or not item.entries[0].access & state.write_right:
+            return None
+        if len(data) < 2:
+            raise SdoAbortError(AbortCode.TOO_SHORT, index, 0, "subindex 0 takes two octets")
+        _check_value(item.entries[0], index, 0, data[:1])
+        if data[0] > max(item.entries):
+            raise SdoAbortError(AbortCode.NO_SUBINDEX, index, data[0])
+        return data[0]
+
+    def _whole(
+        self, index: int, first: int, *, count: int | None = None
+    ) -> list[tuple[int, Entry]]:
         item = self[index]
         if not item.complete_access:
             raise SdoAbortError(AbortCode.NO_COMPLETE_ACCESS, index, first)
@@ -119,7 +155,7 @@ class ObjectDictionary:
             raise SdoAbortError(
                 AbortCode.UNSUPPORTED_ACCESS, index, first, "complete access starts at 0 or 1"
             )
-        last = item.max_subindex
+        last = item.max_subindex if count is None else count
         return [(sub, entry) for sub, entry in item.entries.items() if 1 <= sub <= last]
 
 
@@ -141,16 +177,22 @@ def _check_writable(entry: Entry, index: int, subindex: int, state: OdState) -> 
         raise SdoAbortError(code, index, subindex)
 
 
+def _check_any_writable(entries: list[Entry], index: int, first: int, state: OdState) -> None:
+    if not any(entry.access & state.write_right for entry in entries):
+        writable = any(entry.access & Access.WRITE_ANY for entry in entries)
+        code = AbortCode.DEVICE_STATE if writable else AbortCode.READ_ONLY
+        raise SdoAbortError(code, index, first)
+
+
+def _check_size(entry: Entry, index: int, subindex: int, given: int) -> None:
+    if given == entry.kind.size or (given < entry.kind.size and entry.is_text):
+        return
+    code = AbortCode.TOO_LONG if given > entry.kind.size else AbortCode.TOO_SHORT
+    raise SdoAbortError(code, index, subindex, f"{given} octets for {entry.kind.text}")
+
+
 def _check_value(entry: Entry, index: int, subindex: int, data: bytes) -> None:
-    size = entry.kind.size
-    if len(data) > size:
-        raise SdoAbortError(
-            AbortCode.TOO_LONG, index, subindex, f"{len(data)} octets for {entry.kind.text}"
-        )
-    if len(data) < size and not entry.is_text:
-        raise SdoAbortError(
-            AbortCode.TOO_SHORT, index, subindex, f"{len(data)} octets for {entry.kind.text}"
-        )
+    _check_size(entry, index, subindex, len(data))
     if entry.minimum is None and entry.maximum is None:
         return
     value = entry.kind.decode(data, 0)

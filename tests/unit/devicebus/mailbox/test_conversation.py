@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress
-from eap.codec.mailbox import MailboxType
+from devicebus.errors import MailboxProtocolError
+from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress, reading
+from eap.codec.mailbox import MailboxHeader, MailboxType
 
 
 def twice() -> Conversation[bytes]:
@@ -25,3 +26,9 @@ def test_a_conversation_is_resumed_with_each_reply() -> None:
 
 def test_progress_starts_at_nothing() -> None:
     assert (Progress().done, Progress().total, Progress(5).total) == (0, None, 5)
+
+
+def test_what_a_decoder_says_becomes_a_protocol_error() -> None:
+    broken = pytest.raises(MailboxProtocolError, match="answer of S1: MailboxHeader at offset 0")
+    with broken, reading("answer of S1"):
+        MailboxHeader.decode(b"")

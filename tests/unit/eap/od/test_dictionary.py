@@ -193,3 +193,94 @@ def test_what_complete_access_reads_it_writes_back(kinds: list[str], random: obj
         source[0x4000].entries.values(), copy[0x4000].entries.values(), strict=True
     ):
         assert left.octets == right.octets
+
+
+def assignment() -> ObjectDictionary:
+    entries = {0: Entry("Count", "USINT", RW_PREOP, 1, maximum=3)}
+    entries |= {sub: Entry(f"PDO {sub}", "UINT", RW_PREOP, sub) for sub in (1, 2, 3)}
+    return ObjectDictionary([OdObject(0x1C12, "Assignment", ObjectCode.ARRAY, entries)])
+
+
+def test_complete_download_takes_as_many_entries_as_its_count_says() -> None:
+    dictionary = assignment()
+    dictionary.download_complete(0x1C12, 0, bytes.fromhex("0300 0016 0116 0216"), PREOP)
+    assert dictionary[0x1C12].max_subindex == 3
+    dictionary.download_complete(0x1C12, 0, bytes.fromhex("0100 0716"), PREOP)
+    assert dictionary.upload_complete(0x1C12, 0, PREOP) == bytes.fromhex("0100 0716")
+    dictionary.download_complete(0x1C12, 0, bytes(2), PREOP)
+    assert dictionary.upload_complete(0x1C12, 0, PREOP) == bytes(2)
+
+
+def test_count_is_0_while_the_entries_are_written() -> None:
+    dictionary = assignment()
+    item = dictionary[0x1C12]
+    seen = []
+    item.entries[2].write = lambda data: seen.append((item.max_subindex, data))
+    dictionary.download_complete(0x1C12, 0, bytes.fromhex("0200 0016 0116"), PREOP)
+    assert seen == [(0, b"\x01\x16")]
+    assert item.max_subindex == 2
+
+
+@pytest.mark.parametrize(
+    ("octets", "code"),
+    [
+        ("", AbortCode.TOO_SHORT),
+        ("01", AbortCode.TOO_SHORT),
+        ("0200 0016", AbortCode.TOO_SHORT),
+        ("0100 0016 0116", AbortCode.TOO_LONG),
+        ("0400 0016 0116 0216 0316", AbortCode.TOO_HIGH),
+    ],
+)
+def test_complete_download_that_contradicts_its_count_changes_nothing(
+    octets: str, code: AbortCode
+) -> None:
+    dictionary = assignment()
+    data = bytes.fromhex(octets)
+    assert refusal(dictionary.download_complete, 0x1C12, 0, data, PREOP) == code
+    assert dictionary.upload_complete(0x1C12, 0, PREOP) == bytes.fromhex("0100 0100")
+
+
+def test_count_above_the_entries_there_are_is_refused() -> None:
+    dictionary = assignment()
+    dictionary[0x1C12].entries[0].maximum = None
+    code = refusal(dictionary.download_complete, 0x1C12, 0, bytes.fromhex("0400"), PREOP)
+    assert code == AbortCode.NO_SUBINDEX
+
+
+def test_count_is_left_alone_where_it_cannot_be_written() -> None:
+    dictionary = assignment()
+    data = bytes.fromhex("0300 0016 0116 0216")
+    assert refusal(dictionary.download_complete, 0x1C12, 0, data, OP) == AbortCode.TOO_LONG
+    data = bytes.fromhex("0100 0016")
+    assert refusal(dictionary.download_complete, 0x1C12, 0, data, OP) == AbortCode.DEVICE_STATE
+
+
+@pytest.mark.parametrize(
+    ("index", "subindex", "size", "complete", "code"),
+    [
+        (0x8000, 1, 3, False, AbortCode.TOO_LONG),
+        (0x8000, 1, 1, False, AbortCode.TOO_SHORT),
+        (0x8000, 5, 9, False, AbortCode.TOO_LONG),
+        (0x8000, 2, 1, False, AbortCode.READ_ONLY),
+        (0x8000, 3, 1, False, AbortCode.NOT_STORED),
+        (0x9000, 3, 1, False, AbortCode.NO_OBJECT),
+        (0x8000, 0, 14, True, AbortCode.TOO_LONG),
+        (0x8000, 1, 12, True, AbortCode.TOO_LONG),
+        (0x3000, 0, 4, True, AbortCode.NO_COMPLETE_ACCESS),
+    ],
+)
+def test_download_can_be_refused_before_its_data_is_there(
+    index: int, subindex: int, size: int, complete: bool, code: AbortCode
+) -> None:
+    check = make().check_download
+    with pytest.raises(SdoAbortError) as caught:
+        check(index, subindex, size, PREOP, complete=complete)
+    assert caught.value.code == code
+
+
+def test_download_that_may_be_right_passes_the_check() -> None:
+    dictionary = make()
+    dictionary.check_download(0x8000, 1, 2, PREOP)
+    dictionary.check_download(0x8000, 5, 3, PREOP)
+    dictionary.check_download(0x8000, 0, 13, PREOP, complete=True)
+    dictionary.check_download(0x8000, 1, 11, PREOP, complete=True)

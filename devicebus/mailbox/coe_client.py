@@ -1,0 +1,183 @@
+"""SDO uploads and downloads as conversations: the master's side of CoE (ETG.1000.6).
+
+An answer is known by index and subindex, a segment by its toggle bit; what does not fit is late or
+meant for somebody else and never taken.  Refusals are raised as SdoAbortError, broken answers as
+MailboxProtocolError, after an abort that tells the slave.
+"""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+from devicebus.errors import MailboxProtocolError
+from devicebus.mailbox.conversation import Ask, Conversation, Progress, reading
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.codec.coe import CoeHeader, CoeService, encode_message
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import (
+    EXPEDITED_SIZE,
+    INITIATE_OVERHEAD,
+    SEGMENT_OVERHEAD,
+    SdoHeader,
+    SdoRequest,
+    SdoResponse,
+    SdoSegmentHeader,
+    decode_segment,
+    encode_abort,
+    encode_initiate,
+    encode_plain,
+    encode_segment,
+    encode_segment_answer,
+)
+from eap.od.abort import AbortCode, SdoAbortError
+
+MAX_SIZE = 1 << 24
+"""Octets of the largest object that an upload takes unless told otherwise."""
+
+
+def upload(
+    index: int,
+    subindex: int,
+    *,
+    complete: bool = False,
+    progress: Progress | None = None,
+    max_size: int = MAX_SIZE,
+) -> Conversation[bytes]:
+    """Read an entry, or with *complete* a whole object from subindex 0 or 1 on.
+
+    Raises:
+        SdoAbortError: the slave refuses.
+        MailboxProtocolError: its answer is no answer, or longer than *max_size*.
+    """
+    sdo = _Sdo(index, subindex)
+    plain = encode_plain(SdoRequest.UPLOAD, index, subindex, complete=complete)
+    head, rest = yield from sdo.ask(plain, SdoResponse.UPLOAD)
+    if head.expedited:
+        return head.data
+    size = head.value
+    if size > max_size:
+        yield from sdo.give_up(AbortCode.OUT_OF_MEMORY, f"{size} octets, taken are {max_size}")
+    content = bytearray(rest[:size])
+    progress = progress or Progress()
+    progress.done, progress.total = len(content), size
+    toggle = 0
+    while len(content) < size:
+        asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
+        body = yield from sdo.ask_segment(asked, SdoResponse.UPLOAD_SEGMENT, toggle)
+        with reading(f"segment of {sdo}"):
+            segment, data = decode_segment(body)
+        content += data
+        if len(content) > size:
+            yield from sdo.give_up(AbortCode.TOO_LONG, f"more than the {size} octets announced")
+        if segment.last and len(content) < size:
+            raise MailboxProtocolError(f"{sdo}: {len(content)} octets of {size} announced")
+        if not data:
+            yield from sdo.give_up(AbortCode.GENERAL, "a segment without data")
+        progress.done = len(content)
+        toggle ^= 1
+    return bytes(content)
+
+
+def download(
+    index: int,
+    subindex: int,
+    data: bytes,
+    sizes: MailboxSizes,
+    *,
+    complete: bool = False,
+    progress: Progress | None = None,
+) -> Conversation[None]:
+    """Write an entry, or with *complete* a whole object from subindex 0 or 1 on.
+
+    Raises:
+        SdoAbortError: the slave refuses.
+        MailboxProtocolError: its answer is no answer.
+    """
+    sdo = _Sdo(index, subindex)
+    progress = progress or Progress()
+    progress.total = len(data)
+    room = sizes.to_slave - INITIATE_OVERHEAD
+    first = encode_initiate(
+        SdoRequest.DOWNLOAD, index, subindex, data, complete=complete, room=room
+    )
+    yield from sdo.ask(first, SdoResponse.DOWNLOAD)
+    progress.done = len(data) if len(data) <= EXPEDITED_SIZE else min(room, len(data))
+    step = sizes.to_slave - SEGMENT_OVERHEAD
+    toggle = 0
+    while progress.done < len(data):
+        piece = data[progress.done : progress.done + step]
+        last = progress.done + len(piece) == len(data)
+        segment = encode_segment(SdoRequest.DOWNLOAD_SEGMENT, piece, toggle=toggle, last=last)
+        yield from sdo.ask_segment(segment, SdoResponse.DOWNLOAD_SEGMENT, toggle)
+        progress.done += len(piece)
+        toggle ^= 1
+
+
+class _Sdo:
+    """One transfer: what it sends, and which messages answer that."""
+
+    def __init__(self, index: int, subindex: int) -> None:
+        self.index = index
+        self.subindex = subindex
+
+    def __str__(self) -> str:
+        return f"SDO 0x{self.index:04X}:{self.subindex:02X}"
+
+    def ask(self, body: bytes, response: SdoResponse) -> Conversation[tuple[SdoHeader, bytes]]:
+        """Send the first message of a transfer; return the head of the answer and the rest."""
+
+        def accepts(data: bytes) -> bool:
+            return self._aborts(data) or (
+                _service(data) is CoeService.SDO_RESPONSE
+                and (len(data) < _SHORTEST or (data[2] >> 5 == response and self._is_named(data)))
+            )
+
+        request = encode_message(CoeService.SDO_REQUEST, body)
+        data = (yield Ask(MailboxType.COE, request, accepts)).data
+        with reading(f"answer to {self}"):
+            head = SdoHeader.decode(data, CoeHeader.SIZE)
+        if head.specifier == SdoResponse.ABORT:
+            raise SdoAbortError(head.value, self.index, self.subindex)
+        return head, data[_SHORTEST:]
+
+    def ask_segment(self, body: bytes, response: SdoResponse, toggle: int) -> Conversation[bytes]:
+        """Send a segment or ask for one; return the answer behind its CoE header."""
+
+        def accepts(data: bytes) -> bool:
+            if self._aborts(data):
+                return True
+            if _service(data) is not CoeService.SDO_RESPONSE:
+                return False
+            head = data[2:3]
+            return not head or (head[0] >> 5 == response and head[0] >> 4 & 1 == toggle)
+
+        request = encode_message(CoeService.SDO_REQUEST, body)
+        data = (yield Ask(MailboxType.COE, request, accepts)).data
+        with reading(f"segment of {self}"):
+            head = SdoSegmentHeader.decode(data, CoeHeader.SIZE)
+            if head.specifier == SdoResponse.ABORT:
+                code = SdoHeader.decode(data, CoeHeader.SIZE).value
+                raise SdoAbortError(code, self.index, self.subindex)
+        return data[CoeHeader.SIZE :]
+
+    def give_up(self, code: AbortCode, reason: str) -> Conversation[NoReturn]:
+        """Abort the transfer and raise."""
+        abort = encode_abort(self.index, self.subindex, code)
+        yield Ask(MailboxType.COE, abort, expects_reply=False)
+        raise MailboxProtocolError(f"{self}: {reason}")
+
+    def _is_named(self, data: bytes) -> bool:
+        return (data[3] | data[4] << 8, data[5]) == (self.index, self.subindex)
+
+    def _aborts(self, data: bytes) -> bool:
+        known = _service(data) in {CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE}
+        aborts = known and len(data) >= _SHORTEST and data[2] >> 5 == SdoResponse.ABORT
+        return aborts and self._is_named(data)
+
+
+_SHORTEST = CoeHeader.SIZE + SdoHeader.SIZE
+
+
+def _service(data: bytes) -> CoeService | None:
+    number = data[1] >> 4 if len(data) > 1 else 0
+    return CoeService(number) if number in CoeService._value2member_map_ else None

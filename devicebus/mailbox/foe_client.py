@@ -1,0 +1,199 @@
+"""FoE as conversations: the master's side of reading and writing files (ETG.1000.6).
+
+A file is never held: what is read goes to a sink and what is written comes from a source, one
+message at a time.  Each message waits for the answer to the one before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+
+from devicebus.errors import FoeError, MailboxProtocolError, MailboxTimeoutError
+from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress, reading
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.codec.foe import (
+    DATA_OVERHEAD,
+    FoeErrorCode,
+    FoeHeader,
+    FoeOpcode,
+    decode_message,
+    encode_message,
+    name_of,
+    text_of,
+)
+from eap.codec.mailbox import MailboxType
+
+STEP_TIMEOUT_NS = 3_000_000_000
+"""How long the answer to each message may take."""
+BUSY_DELAY_NS = 10_000_000
+BUSY_LIMIT = 6_000
+"""Times in a row that a slave may be busy: a minute, at least."""
+MAX_SIZE = 1 << 28
+"""Octets of the largest file that is read unless told otherwise."""
+
+
+def read(
+    name: str,
+    sink: Callable[[bytes], object],
+    sizes: MailboxSizes,
+    *,
+    password: int = 0,
+    progress: Progress | None = None,
+    max_size: int = MAX_SIZE,
+) -> Conversation[int]:
+    """Read a file into *sink*, in the order of its octets; return how many there were.
+
+    What *sink* raises ends the transfer, also at the slave.
+
+    Raises:
+        FoeError: the slave refuses.
+        MailboxProtocolError: it breaks the protocol, or the file is longer than *max_size*.
+        MailboxTimeoutError: it is busy for too long.
+        ValueError: the name does not fit the mailbox.
+    """
+    foe = _Transfer(f"FoE read of {name!r}")
+    progress = progress or Progress()
+    room = sizes.to_master - DATA_OVERHEAD
+    sent = _request(FoeOpcode.READ, password, name, sizes)
+    expected = 1
+    while True:
+        follows = _is_first if expected == 1 else _is_not(expected - 1)
+        header, data = yield from foe.ask(sent, FoeOpcode.DATA, follows)
+        if header.number != expected:
+            yield from foe.give_up(
+                FoeErrorCode.PACKET_NUMBER, f"packet {header.number}, expected {expected}"
+            )
+        if len(data) > room or progress.done + len(data) > max_size:
+            limit = min(room, max_size - progress.done)
+            yield from foe.give_up(FoeErrorCode.ILLEGAL, f"{len(data)} octets, taken are {limit}")
+        try:
+            sink(data)
+        except OSError:
+            yield from foe.tell(FoeErrorCode.DISK_FULL)
+            raise
+        progress.done += len(data)
+        sent = encode_message(FoeOpcode.ACK, expected)
+        if len(data) < room:
+            yield Ask(MailboxType.FOE, sent, expects_reply=False)
+            return progress.done
+        expected += 1
+
+
+def write(
+    name: str,
+    source: Callable[[int], bytes],
+    sizes: MailboxSizes,
+    *,
+    password: int = 0,
+    progress: Progress | None = None,
+) -> Conversation[int]:
+    """Write a file from *source*; return how many octets there were.
+
+    Args:
+        name: Of the file, at the slave.
+        source: Called with a number of octets; returns as many or fewer, none at the end.
+        sizes: Of the slave's mailboxes.
+        password: Up to 32 bits.
+        progress: What is told how far it is.
+
+    Raises:
+        FoeError: the slave refuses.
+        MailboxProtocolError: it breaks the protocol.
+        MailboxTimeoutError: it is busy for too long.
+        ValueError: the name does not fit the mailbox.
+    """
+    foe = _Transfer(f"FoE write of {name!r}")
+    progress = progress or Progress()
+    room = sizes.to_slave - DATA_OVERHEAD
+    sent = _request(FoeOpcode.WRITE, password, name, sizes)
+    yield from foe.ask(sent, FoeOpcode.ACK, lambda number: number == 0)
+    number = 0
+    size = room
+    while size == room:
+        try:
+            data = _take(source, room)
+        except OSError:
+            yield from foe.tell(FoeErrorCode.NOT_DEFINED)
+            raise
+        number += 1
+        size = len(data)
+        sent = encode_message(FoeOpcode.DATA, number, data)
+        header, _ = yield from foe.ask(sent, FoeOpcode.ACK, _is_not(number - 1))
+        if header.number != number:
+            yield from foe.give_up(
+                FoeErrorCode.PACKET_NUMBER, f"packet {header.number} confirmed, sent was {number}"
+            )
+        progress.done += size
+    return progress.done
+
+
+def _request(opcode: FoeOpcode, password: int, name: str, sizes: MailboxSizes) -> bytes:
+    octets = name.encode()
+    room = sizes.to_slave - DATA_OVERHEAD
+    if len(octets) > room:
+        raise ValueError(f"{name!r} has {len(octets)} octets, the mailbox has room for {room}")
+    return encode_message(opcode, password, octets)
+
+
+def _take(source: Callable[[int], bytes], size: int) -> bytes:
+    data = source(size)
+    while data and len(data) < size:
+        more = source(size - len(data))
+        if not more:
+            break
+        data += more
+    return data
+
+
+def _is_first(number: int) -> bool:
+    # What follows packet 1 belongs to a transfer before this one: late, and not wrong.
+    return number <= 1
+
+
+def _is_not(late: int) -> Callable[[int], bool]:
+    # The number before comes twice when a reply is repeated; any other is wrong, not late.
+    return lambda number: number != late
+
+
+class _Transfer:
+    """What reading and writing have in common."""
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+
+    def ask(
+        self, sent: bytes, opcode: FoeOpcode, accepts_number: Callable[[int], bool]
+    ) -> Generator[Ask, Message, tuple[FoeHeader, bytes]]:
+        """Send a message, again while the slave is busy; return header and body of the answer."""
+
+        def accepts(data: bytes) -> bool:
+            if len(data) < FoeHeader.SIZE or data[0] in {FoeOpcode.ERROR, FoeOpcode.BUSY}:
+                return True
+            return data[0] == opcode and accepts_number(int.from_bytes(data[2:6], "little"))
+
+        ask = Ask(MailboxType.FOE, sent, accepts, STEP_TIMEOUT_NS)
+        for _ in range(BUSY_LIMIT):
+            message = yield ask
+            with reading(self.what):
+                header, body = decode_message(message.data)
+            if header.opcode is FoeOpcode.ERROR:
+                raise self._refusal(header.number, text_of(body))
+            if header.opcode is not FoeOpcode.BUSY:
+                return header, bytes(body)
+            ask = ask._replace(delay_ns=BUSY_DELAY_NS)
+        yield from self.tell(FoeErrorCode.NOT_DEFINED)
+        raise MailboxTimeoutError(f"{self.what}: still busy after {BUSY_LIMIT} answers")
+
+    def tell(self, code: FoeErrorCode) -> Conversation[None]:
+        """Tell the slave that the transfer is over."""
+        yield Ask(MailboxType.FOE, encode_message(FoeOpcode.ERROR, code), expects_reply=False)
+
+    def give_up(self, code: FoeErrorCode, reason: str) -> Conversation[None]:
+        """Tell the slave and raise."""
+        yield from self.tell(code)
+        raise MailboxProtocolError(f"{self.what}: {reason}")
+
+    def _refusal(self, code: int, text: str) -> FoeError:
+        words = f", the slave says {text!r}" if text else ""
+        message = f"{self.what}: {name_of(code)} (0x{code:04X}){words}"
+        return FoeError(message, code=code, text=text)

@@ -1,0 +1,168 @@
+"""FoE on the side of a slave: files read and written one message at a time (ETG.1000.6).
+
+Where the files are is somebody else's concern: a :class:`FileStore`, such as
+:class:`devicebus.mailbox.foe_store.MemoryStore`, opens them and refuses with FoeError.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from devicebus.errors import FoeError
+from devicebus.mailbox.protocol import MailboxSizes, refuse
+from eap.codec.foe import (
+    DATA_OVERHEAD,
+    Busy,
+    FoeErrorCode,
+    FoeHeader,
+    FoeOpcode,
+    encode_message,
+    text_of,
+)
+from eap.codec.mailbox import MailboxError
+from eap.errors import MalformedError, TruncatedError
+
+
+class FileReader(Protocol):
+    """A file that is being read; any binary file object is one."""
+
+    def read(self, size: int, /) -> bytes:
+        """Return the next *size* octets, fewer only at the end."""
+
+    def close(self) -> None:
+        """Nothing more will be read."""
+
+
+class FileWriter(Protocol):
+    """A file that is being written; each method may refuse with FoeError."""
+
+    def write(self, data: bytes, /) -> object:
+        """Take the next octets."""
+
+    def commit(self) -> None:
+        """Make what was written the content of the file: it is complete."""
+
+    def discard(self) -> None:
+        """Forget what was written: the rest will not come."""
+
+
+class FileStore(Protocol):
+    """Where the files are; each method may refuse with FoeError."""
+
+    def open_read(self, name: str, password: int) -> FileReader:
+        """Open a file for reading."""
+
+    def open_write(self, name: str, password: int) -> FileWriter:
+        """Open a file for writing from its start."""
+
+
+class FoeServer:
+    """The FoE protocol of a slave; one transfer at a time, a new request ends the one before.
+
+    Args:
+        store: The files.
+        sizes: Of the slave's mailboxes.
+
+    Attributes:
+        packet_time_ns: How long storing the data of one message takes; until then the slave says
+            that it is busy.
+    """
+
+    def __init__(self, store: FileStore, sizes: MailboxSizes, *, packet_time_ns: int = 0) -> None:
+        self._store = store
+        self._sizes = sizes
+        self.packet_time_ns = packet_time_ns
+        self._reader: FileReader | None = None
+        self._writer: FileWriter | None = None
+        self._number = 0
+        self._sent = b""
+        self._is_last = False
+        self._busy_from_ns = self._busy_until_ns = 0
+
+    def reset(self) -> None:
+        """Forget the transfer under way."""
+        reader, self._reader = self._reader, None
+        writer, self._writer = self._writer, None
+        if reader is not None:
+            reader.close()
+        if writer is not None:
+            writer.discard()
+
+    def messages_to_send(self, now_ns: int) -> list[bytes]:
+        """Return nothing: an FoE server only answers."""
+        del now_ns
+        return []
+
+    def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
+        """Act on a message behind its mailbox header and return the answer."""
+        try:
+            header = FoeHeader.decode(data)
+            return self._answer(header, data[FoeHeader.SIZE :], now_ns)
+        except TruncatedError as exc:
+            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
+        except MalformedError:
+            self.reset()
+            return [encode_message(FoeOpcode.ERROR, FoeErrorCode.ILLEGAL)]
+        except FoeError as exc:
+            self.reset()
+            text = exc.text.encode()[: self._sizes.data_to_master - FoeHeader.SIZE]
+            return [encode_message(FoeOpcode.ERROR, exc.code, text)]
+
+    def _answer(self, header: FoeHeader, body: bytes, now_ns: int) -> list[bytes]:
+        opcode = header.opcode
+        if opcode is FoeOpcode.READ:
+            self.reset()
+            self._reader = self._store.open_read(text_of(body), header.number)
+            return self._send_next(self._reader, 1)
+        if opcode is FoeOpcode.WRITE:
+            self.reset()
+            self._writer = self._store.open_write(text_of(body), header.number)
+            self._number = 0
+            self._busy_until_ns = now_ns
+            return [encode_message(FoeOpcode.ACK, 0)]
+        if opcode is FoeOpcode.ERROR:
+            self.reset()
+            return []
+        if opcode is FoeOpcode.DATA and self._writer is not None:
+            return self._take(self._writer, header.number, body, now_ns)
+        if opcode is FoeOpcode.ACK and self._reader is not None:
+            return self._confirm(self._reader, header.number)
+        if opcode is FoeOpcode.BUSY and self._reader is not None:
+            return [self._sent]
+        raise FoeError(f"{opcode.name} without a transfer", code=FoeErrorCode.ILLEGAL)
+
+    def _confirm(self, reader: FileReader, number: int) -> list[bytes]:
+        if number != self._number:
+            raise _wrong_number(number, self._number)
+        if self._is_last:
+            self.reset()
+            return []
+        return self._send_next(reader, number + 1)
+
+    def _send_next(self, reader: FileReader, number: int) -> list[bytes]:
+        room = self._sizes.to_master - DATA_OVERHEAD
+        data = reader.read(room)
+        self._number = number
+        self._is_last = len(data) < room
+        self._sent = encode_message(FoeOpcode.DATA, number, data)
+        return [self._sent]
+
+    def _take(self, writer: FileWriter, number: int, data: bytes, now_ns: int) -> list[bytes]:
+        if number != self._number + 1:
+            raise _wrong_number(number, self._number + 1)
+        if now_ns < self._busy_until_ns:
+            entire = max(1, self._busy_until_ns - self._busy_from_ns)
+            done = (now_ns - self._busy_from_ns) * 100 // entire
+            return [encode_message(FoeOpcode.BUSY, Busy(done, 100).number)]
+        self._busy_from_ns, self._busy_until_ns = now_ns, now_ns + self.packet_time_ns
+        writer.write(data)
+        self._number = number
+        if len(data) < self._sizes.to_slave - DATA_OVERHEAD:
+            writer.commit()
+            self._writer = None
+        return [encode_message(FoeOpcode.ACK, number)]
+
+
+def _wrong_number(number: int, expected: int) -> FoeError:
+    text = f"packet {number}, expected {expected}"
+    return FoeError(text, code=FoeErrorCode.PACKET_NUMBER, text=text)

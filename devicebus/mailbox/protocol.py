@@ -1,0 +1,58 @@
+"""What the servers of all mailbox protocols have in common."""
+
+from __future__ import annotations
+
+from typing import NoReturn, Protocol
+
+from devicebus.errors import MailboxRefusedError
+from eap.codec.mailbox import MailboxError, MailboxHeader
+
+MINIMUM_SIZE = 16
+"""Octets of the smallest mailbox that holds the header of every protocol but AoE."""
+
+
+class MailboxSizes:
+    """Octets of a slave's two mailboxes, mailbox header included; master and slave know both.
+
+    The servers of one slave share one object, so that a new size holds for all of them.
+    """
+
+    __slots__ = ("to_master", "to_slave")
+
+    def __init__(self, to_slave: int = 128, to_master: int = 128) -> None:
+        self.set(to_slave, to_master)
+
+    def set(self, to_slave: int, to_master: int) -> None:
+        """Change both; raise ValueError if one is too small for a message."""
+        if min(to_slave, to_master) < MINIMUM_SIZE:
+            raise ValueError(
+                f"mailboxes of {to_slave} and {to_master} octets, expected at least {MINIMUM_SIZE}"
+            )
+        self.to_slave = to_slave
+        self.to_master = to_master
+
+    @property
+    def data_to_master(self) -> int:
+        """Octets behind the mailbox header of the longest message to the master."""
+        return self.to_master - MailboxHeader.SIZE
+
+
+class ProtocolServer(Protocol):
+    """One mailbox protocol on the side of the slave; data is what follows the mailbox header."""
+
+    def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
+        """Act on a request and return the answers, in order.
+
+        Raises MailboxRefusedError for what can only be answered with a mailbox error.
+        """
+
+    def messages_to_send(self, now_ns: int) -> list[bytes]:
+        """Take what nobody asked for."""
+
+    def reset(self) -> None:
+        """Forget every transfer: the mailbox starts again."""
+
+
+def refuse(detail: MailboxError, reason: str) -> NoReturn:
+    """Raise the MailboxRefusedError that answers a request with a mailbox error."""
+    raise MailboxRefusedError(f"{detail.name}: {reason}", detail=detail)

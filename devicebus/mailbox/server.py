@@ -1,0 +1,165 @@
+"""A slave's mailbox: protocols behind one pair of sync managers (ETG.1000.4).
+
+It keeps the rules that all protocols share: what repeats a counter is dropped, every reply has the
+address of its request and the slave's own counter, what no protocol takes gets a mailbox error.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from devicebus.errors import MailboxRefusedError
+from devicebus.mailbox.counter import CounterWatch, next_counter
+from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer, refuse
+from eap.codec.mailbox import (
+    MailboxError,
+    MailboxErrorReply,
+    MailboxHeader,
+    MailboxType,
+    encode_message,
+)
+from eap.codec.wire import Buffer
+
+MAX_QUEUED = 8
+"""Messages waiting for the master from which on no further request is taken."""
+
+
+class MailboxStats(NamedTuple):
+    """Counters of one mailbox since it was made."""
+
+    received: int
+    sent: int
+    repeated_requests: int
+    """Dropped, because their counter was that of the request before."""
+    gaps: int
+    refused: int
+    """Answered with a mailbox error."""
+    repeated_replies: int
+    """Sent again because the master asked for it."""
+    dropped: int
+    """Requests that came while the queue was full, or were too short to be answered."""
+
+
+class MailboxServer:
+    """What a slave does with its mailbox; the caller moves whole messages from and to memory.
+
+    Args:
+        protocols: The servers of this slave.
+        sizes: The object that those servers look at.
+    """
+
+    def __init__(
+        self, protocols: Mapping[MailboxType, ProtocolServer], sizes: MailboxSizes
+    ) -> None:
+        self.protocols = dict(protocols)
+        self.sizes = sizes
+        self._watch = CounterWatch()
+        self._queue: deque[bytes] = deque()
+        self._counter = 0
+        self._posted: bytes | None = None
+        self._read: bytes | None = None
+        self._received = self._sent = self._refused = self._repeated = self._dropped = 0
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether a request may be taken; if not, it is to stay in its mailbox."""
+        return len(self._queue) < MAX_QUEUED
+
+    def start(self, to_slave: int, to_master: int) -> None:
+        """Begin anew with mailboxes of these sizes; nothing of before is sent any more."""
+        self.sizes.set(to_slave, to_master)
+        self._watch.restart()
+        self._queue.clear()
+        self._counter = 0
+        self._posted = self._read = None
+        for protocol in self.protocols.values():
+            protocol.reset()
+
+    def receive_message(self, message: Buffer, now_ns: int) -> None:
+        """Act on a message, header first; octets behind its length are ignored."""
+        if len(message) < MailboxHeader.SIZE or not self.is_ready:
+            self._dropped += 1
+            return
+        self._received += 1
+        if not self._watch.is_new(message[5] >> 4 & 7):
+            return
+        address = int.from_bytes(message[2:4], "little")
+        try:
+            kind, replies = self._dispatch(message, now_ns)
+        except MailboxRefusedError as exc:
+            self._refused += 1
+            kind, replies = MailboxType.ERR, [MailboxErrorReply(detail=exc.detail).encode()]
+        for data in replies:
+            self._enqueue(kind, data, address)
+
+    def next_message(self, now_ns: int) -> bytes | None:
+        """Take the message that comes next into the empty mailbox to the master."""
+        if not self._queue:
+            for kind, protocol in self.protocols.items():
+                for data in protocol.messages_to_send(now_ns):
+                    self._enqueue(kind, data, 0)
+        self._posted = self._queue.popleft() if self._queue else None
+        self._sent += self._posted is not None
+        return self._posted
+
+    def handle_read(self) -> None:
+        """Note that the master emptied the mailbox."""
+        if self._posted is not None:
+            self._read, self._posted = self._posted, None
+
+    def repeat_message(self) -> bytes | None:
+        """Return the message that the master read last, to lie in the mailbox again.
+
+        What lies there now, not read yet, follows later.  None: the master has read nothing so far,
+        and the mailbox stays as it is.
+        """
+        if self._read is None:
+            return None
+        if self._posted is not None:
+            self._queue.appendleft(self._posted)
+        self._posted = self._read
+        self._repeated += 1
+        return self._posted
+
+    def stats(self) -> MailboxStats:
+        """Return the counters."""
+        return MailboxStats(
+            self._received,
+            self._sent,
+            self._watch.repeated,
+            self._watch.gaps,
+            self._refused,
+            self._repeated,
+            self._dropped,
+        )
+
+    def _dispatch(self, message: Buffer, now_ns: int) -> tuple[MailboxType, list[bytes]]:
+        length = int.from_bytes(message[:2], "little")
+        room = min(len(message), self.sizes.to_slave) - MailboxHeader.SIZE
+        if not 0 < length <= room:
+            refuse(MailboxError.INVALID_HEADER, f"length {length}, expected 1 to {room}")
+        if message[4] & 0x3F:
+            refuse(MailboxError.INVALID_CHANNEL, f"channel {message[4] & 0x3F}, expected 0")
+        number = message[5] & 0x0F
+        if number == MailboxType.ERR:
+            refuse(MailboxError.INVALID_HEADER, "type 0 is no request")
+        try:
+            kind = MailboxType(number)
+            protocol = self.protocols[kind]
+        except (KeyError, ValueError):
+            refuse(MailboxError.UNSUPPORTED_PROTOCOL, f"type {number}")
+        data = bytes(message[MailboxHeader.SIZE : MailboxHeader.SIZE + length])
+        return kind, protocol.receive_message(data, now_ns)
+
+    def _enqueue(self, kind: MailboxType, data: bytes, address: int) -> None:
+        if len(data) > self.sizes.data_to_master:
+            self._refused += 1
+            kind, data = (
+                MailboxType.ERR,
+                MailboxErrorReply(detail=MailboxError.INVALID_SIZE).encode(),
+            )
+        self._counter = next_counter(self._counter)
+        header = MailboxHeader(0, address, type=kind, counter=self._counter)
+        self._queue.append(encode_message(header, data))

@@ -1,0 +1,311 @@
+"""Conversations octet for octet, with slaves that do not behave, and with ours on a bad line."""
+
+from __future__ import annotations
+
+import itertools
+from contextlib import suppress
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, rule
+
+from devicebus.errors import BusError, MailboxProtocolError, MailboxTimeoutError
+from devicebus.mailbox import coe_client
+from devicebus.mailbox.coe_server import CoeServer
+from devicebus.mailbox.conversation import Progress
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.codec.mailbox import MailboxType
+from eap.od.abort import AbortCode, SdoAbortError
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RW, Entry, ObjectCode, OdObject, OdState, array, variable
+from tests.support.mailbox import Fault, Line, open_line, run_with, talk_to
+
+COE = MailboxType.COE
+SIZES = MailboxSizes(32, 32)
+FOUR = "0030 41 1810 01 04000000 01"
+"""One octet of four."""
+
+
+@pytest.mark.parametrize(
+    ("answer", "data"),
+    [
+        ("0030 43 1810 01 02000000", b"\2\0\0\0"),
+        ("0030 4f 1810 01 02000000", b"\2"),
+        ("0030 42 1810 01 02000000", b"\2\0\0\0"),
+        ("0030 4e 1810 01 02000000", b"\2\0\0\0"),
+        ("0030 53 1810 01 02000000", b"\2\0\0\0"),
+        ("0030 41 1810 01 06000000 454b31393134", b"EK1914"),
+        ("0030 41 1810 01 02000000 454b31393134", b"EK"),
+        ("0030 41 1810 01 00000000", b""),
+    ],
+)
+def test_upload_in_one_message(answer: str, data: bytes) -> None:
+    read, asked = run_with(COE, coe_client.upload(0x1018, 1), [answer])
+    assert read == data
+    assert asked == [bytes.fromhex("0020 40 1810 01 00000000")]
+
+
+def test_upload_in_segments() -> None:
+    progress = Progress()
+    answers = [
+        "0030 51 1810 00 0b000000 0102",
+        "0030 00 03040506070809",
+        "0030 1b 0a0b0000000000",
+    ]
+    talk = coe_client.upload(0x1018, 0, complete=True, progress=progress)
+    read, asked = run_with(COE, talk, answers)
+    assert read == bytes(range(1, 12))
+    assert (progress.done, progress.total) == (11, 11)
+    assert [data.hex() for data in asked] == [
+        "00205018100000000000",
+        "00206000000000000000",
+        "00207000000000000000",
+    ]
+
+
+def test_late_and_unsolicited_messages_are_not_taken() -> None:
+    answers = [
+        "0030 43 1810 02 99999999",
+        "0030 43 1910 01 99999999",
+        "0030 60 1810 01 99999999",
+        "0030 00 99999999999999",
+        "0010 1023 03 0102030405",
+        "0020 80 1810 02 00000206",
+        "0090",
+        "",
+        "0030 41 1810 01 08000000 01",
+        "0030 43 1810 01 99999999",
+        "0030 10 99999999999999",
+        "0030 01 02030405060708",
+    ]
+    assert talk_to(COE, coe_client.upload(0x1018, 1), *answers) == bytes(range(1, 9))
+
+
+@pytest.mark.parametrize("service", ["0020", "0030"])
+def test_abort_is_raised_with_its_code(service: str) -> None:
+    with pytest.raises(SdoAbortError, match=r"0x1018:05: subindex does not exist") as caught:
+        talk_to(COE, coe_client.upload(0x1018, 5), f"{service} 80 1810 05 11000906")
+    assert caught.value.code == AbortCode.NO_SUBINDEX
+
+
+def test_abort_between_segments() -> None:
+    answers = ["0030 41 1810 01 08000000 01", "0020 80 1810 01 00000008"]
+    with pytest.raises(SdoAbortError, match="general error"):
+        talk_to(COE, coe_client.upload(0x1018, 1), *answers)
+
+
+@pytest.mark.parametrize(
+    ("answers", "reason", "abort"),
+    [
+        (["0030"], "needs 8 octets", None),
+        (["0030 43 1810 01 0000"], "needs 8 octets", None),
+        (["0030 41 1810 01 ffffffff"], "4294967295 octets, taken are", AbortCode.OUT_OF_MEMORY),
+        ([FOUR, "0030"], "needs 1 octets", None),
+        ([FOUR, "0030 00"], "without data", AbortCode.GENERAL),
+        ([FOUR, "0030 0e 01020304050607"], "without data", AbortCode.GENERAL),
+        ([FOUR, "0030 00 01020304"], "more than the 4", AbortCode.TOO_LONG),
+        ([FOUR, "0030 0b 01020304050607"], "3 octets of 4", None),
+    ],
+)  # fmt: skip
+def test_answer_that_breaks_the_protocol(
+    answers: list[str], reason: str, abort: AbortCode | None
+) -> None:
+    asked = []
+
+    def watch() -> coe_client.Conversation[bytes]:
+        talk = coe_client.upload(0x1018, 1)
+        ask = next(talk)
+        while True:
+            asked.append(ask)
+            ask = talk.send((yield ask))
+
+    with pytest.raises(MailboxProtocolError, match=reason):
+        talk_to(COE, watch(), *answers)
+    if abort is None:
+        assert all(ask.expects_reply for ask in asked)
+    else:
+        assert asked[-1].data == bytes.fromhex("0020 80 1810 01") + abort.to_bytes(4, "little")
+        assert not asked[-1].expects_reply
+
+
+def test_slave_that_says_nothing_ends_in_a_timeout() -> None:
+    with pytest.raises(MailboxTimeoutError):
+        talk_to(COE, coe_client.upload(0x1018, 1))
+
+
+@pytest.mark.parametrize(
+    ("data", "complete", "sent"),
+    [
+        (b"\1\2", False, ["2b 1810 01 01020000"]),
+        (b"\1\2\3\4", True, ["33 1810 01 01020304"]),
+        (b"", False, ["21 1810 01 00000000"]),
+        (bytes(range(16)), False, ["21 1810 01 10000000 000102030405060708090a0b0c0d0e0f"]),
+        (
+            bytes(range(18)),
+            True,
+            ["31 1810 01 12000000 000102030405060708090a0b0c0d0e0f", "0b 1011 0000000000"],
+        ),
+        (
+            bytes(range(40)),
+            False,
+            [
+                "21 1810 01 28000000 000102030405060708090a0b0c0d0e0f",
+                "00 101112131415161718191a1b1c1d1e1f20212223242526",
+                "1d 27 000000000000",
+            ],
+        ),
+    ],
+)
+def test_download(data: bytes, complete: bool, sent: list[str]) -> None:
+    answers = ["0030 60 1810 01 00000000", "0030 20 00000000000000", "0030 30 00000000000000"]
+    progress = Progress()
+    talk = coe_client.download(0x1018, 1, data, SIZES, complete=complete, progress=progress)
+    _, asked = run_with(COE, talk, answers[: len(sent)])
+    assert asked == [bytes.fromhex("0020" + octets) for octets in sent]
+    assert (progress.done, progress.total) == (len(data), len(data))
+
+
+def test_echo_of_the_data_is_a_confirmation_too() -> None:
+    answer = "0030 60 131c 01 001a0000"
+    talk_to(COE, coe_client.download(0x1C13, 1, b"\x00\x1a", SIZES), answer)
+
+
+def test_refused_segment_of_a_download() -> None:
+    answers = ["0030 60 1810 01 00000000", "0020 80 1810 01 12000706"]
+    with pytest.raises(SdoAbortError, match="longer than the entry"):
+        talk_to(COE, coe_client.download(0x1018, 1, bytes(40), SIZES), *answers)
+
+
+@given(st.lists(st.binary(max_size=24), max_size=30), st.booleans())
+def test_any_answers_end_in_data_or_a_named_error(noise: list[bytes], is_upload: bool) -> None:
+    answers = [b"\0\x30" + octets for octets in noise]
+    talk = (
+        coe_client.upload(0x1018, 1)
+        if is_upload
+        else coe_client.download(0x1018, 1, bytes(60), SIZES)
+    )
+    with suppress(BusError, SdoAbortError):
+        talk_to(COE, talk, *answers)
+
+
+def test_endless_segments_end_with_the_announced_size() -> None:
+    answers = itertools.chain(
+        ["0030 41 1810 01 40000000"],
+        itertools.cycle(["0030 0c 01000000000000", "0030 1c 01000000000000"]),
+    )
+    read, asked = run_with(COE, coe_client.upload(0x1018, 1), answers)
+    assert read == b"\1" * 64
+    assert len(asked) == 65
+
+
+def serve(sizes: MailboxSizes, line_faults: Random | None = None) -> tuple[Line, ObjectDictionary]:
+    entries = {0: Entry("Count", "USINT", RW, 0)}
+    entries |= {sub: Entry(f"PDO {sub}", "UINT", RW) for sub in range(1, 9)}
+    dictionary = ObjectDictionary(
+        [
+            variable(0x2000, "Text", "STRING(3000)", RW, ""),
+            variable(0x2001, "Number", "UDINT", RW),
+            array(0x3000, "Array", "UDINT", [0] * 40, RW),
+            OdObject(0x1C12, "Assignment", ObjectCode.ARRAY, entries),
+        ]
+    )
+    server = CoeServer(dictionary, lambda: OdState.PREOP, sizes)
+    return open_line(COE, server, sizes, faults(line_faults)), dictionary
+
+
+def faults(dice: Random | None) -> object:
+    if dice is None:
+        return lambda: Fault.NONE
+    return lambda: dice.choice([Fault.NONE] * 6 + list(Fault))
+
+
+@settings(max_examples=60)
+@given(
+    st.binary(max_size=1500).map(lambda data: data.replace(b"\0", b"x")),
+    st.integers(16, 256),
+    st.integers(16, 256),
+    st.integers(0, 1 << 30),
+)
+def test_what_was_written_is_read_over_a_bad_line(
+    data: bytes, to_slave: int, to_master: int, seed: int
+) -> None:
+    sizes = MailboxSizes(to_slave, to_master)
+    line, _ = serve(sizes, Random(seed))
+    line.run(coe_client.download(0x2000, 0, data, sizes))
+    assert line.run(coe_client.upload(0x2000, 0)) == data
+
+
+@settings(max_examples=40)
+@given(st.lists(st.integers(0, 0xFFFF), max_size=8), st.integers(16, 64), st.integers(0, 1 << 30))
+def test_whole_objects_over_a_bad_line(numbers: list[int], size: int, seed: int) -> None:
+    sizes = MailboxSizes(size, size)
+    line, dictionary = serve(sizes, Random(seed))
+    octets = b"".join(number.to_bytes(2, "little") for number in numbers)
+    octets = bytes((len(numbers), 0)) + octets
+    line.run(coe_client.download(0x1C12, 0, octets, sizes, complete=True))
+    assert line.run(coe_client.upload(0x1C12, 0, complete=True)) == octets
+    assert dictionary[0x1C12].max_subindex == len(numbers)
+
+
+def test_line_is_as_bad_as_it_should_be() -> None:
+    sizes = MailboxSizes(32, 32)
+    line, _ = serve(sizes, Random(1))
+    line.run(coe_client.download(0x2000, 0, b"x" * 1500, sizes))
+    stats = line.server.stats()
+    assert min(stats.repeated_requests, stats.repeated_replies) > 5
+    assert stats.gaps == 0
+
+
+class CoeMachine(RuleBasedStateMachine):
+    """Transfers that end, are refused or cancelled, in any order, over a bad line."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes = MailboxSizes(40, 36)
+        self.line, _ = serve(self.sizes, Random(5))
+        self.text = b""
+        self.numbers = [0] * 41
+
+    @rule(data=st.binary(max_size=200).map(lambda data: data.replace(b"\0", b"x")))
+    def write_text(self, data: bytes) -> None:
+        self.line.run(coe_client.download(0x2000, 0, data, self.sizes))
+        self.text = data
+
+    @rule()
+    def read_text(self) -> None:
+        assert self.line.run(coe_client.upload(0x2000, 0)) == self.text
+
+    @rule(subindex=st.integers(1, 40), number=st.integers(0, 0xFFFFFFFF))
+    def write_number(self, subindex: int, number: int) -> None:
+        data = number.to_bytes(4, "little")
+        self.line.run(coe_client.download(0x3000, subindex, data, self.sizes))
+        self.numbers[subindex] = number
+
+    @rule(subindex=st.integers(1, 40))
+    def read_number(self, subindex: int) -> None:
+        read = self.line.run(coe_client.upload(0x3000, subindex))
+        assert int.from_bytes(read, "little") == self.numbers[subindex]
+
+    @rule()
+    def read_all(self) -> None:
+        read = self.line.run(coe_client.upload(0x3000, 1, complete=True))
+        assert read == b"".join(number.to_bytes(4, "little") for number in self.numbers[1:])
+
+    @rule(subindex=st.integers(41, 255))
+    def refused(self, subindex: int) -> None:
+        with pytest.raises(SdoAbortError, match="subindex does not exist"):
+            self.line.run(coe_client.upload(0x3000, subindex))
+
+    @rule(steps=st.integers(0, 6), is_upload=st.booleans())
+    def cancelled(self, steps: int, is_upload: bool) -> None:
+        if is_upload:
+            self.line.run_partly(coe_client.upload(0x3000, 1, complete=True), steps)
+        else:
+            too_long = coe_client.download(0x2000, 0, self.text + b"y" * 300, self.sizes)
+            self.line.run_partly(too_long, steps)
+
+
+TestCoeMachine = CoeMachine.TestCase
+TestCoeMachine.settings = settings(max_examples=25, stateful_step_count=25)

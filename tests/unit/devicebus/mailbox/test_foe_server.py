@@ -1,0 +1,184 @@
+"""Requests and answers octet for octet; mailboxes have room for 4 octets of a file."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devicebus.errors import FoeError, MailboxRefusedError
+from devicebus.mailbox.foe_server import FileReader, FoeServer
+from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.codec.foe import FoeErrorCode
+from eap.codec.mailbox import MailboxError
+
+
+class Slave:
+    def __init__(self, content: bytes = b"", *, packet_time_ns: int = 0) -> None:
+        self.file = MemoryFile("f", content, max_size=9)
+        store = MemoryStore([self.file, MemoryFile("secret", password=0x12345678)])
+        self.server = FoeServer(store, MailboxSizes(16, 16), packet_time_ns=packet_time_ns)
+
+    def ask(self, octets: str, now_ns: int = 0) -> str:
+        answers = self.server.receive_message(bytes.fromhex(octets), now_ns)
+        return " | ".join(answer.hex(" ") for answer in answers)
+
+    def error(self, octets: str) -> FoeErrorCode:
+        answer = bytes.fromhex(self.ask(octets))
+        assert answer[:2] == b"\x05\x00"
+        return FoeErrorCode(int.from_bytes(answer[2:6], "little"))
+
+
+READ = "01 00 00000000 66"
+WRITE = "02 00 00000000 66"
+
+
+def test_read_of_several_packets() -> None:
+    slave = Slave(b"abcdefg")
+    assert slave.ask(READ) == "03 00 01 00 00 00 61 62 63 64"
+    assert slave.ask("04 00 01000000") == "03 00 02 00 00 00 65 66 67"
+    assert slave.ask("04 00 02000000") == ""
+    assert slave.error("04 00 02000000") is FoeErrorCode.ILLEGAL
+
+
+@pytest.mark.parametrize("content", [b"", b"abcd"])
+def test_file_of_whole_packets_ends_with_an_empty_one(content: bytes) -> None:
+    slave = Slave(content)
+    answer = slave.ask(READ)
+    if content:
+        assert answer == "03 00 01 00 00 00 61 62 63 64"
+        assert slave.ask("04 00 01000000") == "03 00 02 00 00 00"
+    else:
+        assert answer == "03 00 01 00 00 00"
+
+
+def test_busy_client_gets_the_same_packet_again() -> None:
+    slave = Slave(b"abcdefg")
+    assert slave.ask(READ) == slave.ask("06 00 00000000")
+
+
+def test_write_of_several_packets() -> None:
+    slave = Slave(b"old")
+    assert slave.ask(WRITE) == "04 00 00 00 00 00"
+    assert slave.ask("03 00 01000000 61626364") == "04 00 01 00 00 00"
+    assert slave.file.content == b"old"
+    assert slave.ask("03 00 02000000 6566") == "04 00 02 00 00 00"
+    assert slave.file.content == b"abcdef"
+    assert slave.error("03 00 03000000") is FoeErrorCode.ILLEGAL
+
+
+def test_write_of_whole_packets_ends_with_an_empty_one() -> None:
+    slave = Slave()
+    slave.ask(WRITE)
+    slave.ask("03 00 01000000 61626364")
+    assert slave.ask("03 00 02000000") == "04 00 02 00 00 00"
+    assert slave.file.content == b"abcd"
+
+
+def test_slow_slave_is_busy_until_it_is_done() -> None:
+    slave = Slave(packet_time_ns=1000)
+    slave.ask(WRITE, 0)
+    assert slave.ask("03 00 01000000 61626364", 0) == "04 00 01 00 00 00"
+    assert slave.ask("03 00 02000000 65", 250) == "06 00 19 00 64 00"
+    assert slave.ask("03 00 02000000 65", 999) == "06 00 63 00 64 00"
+    assert slave.file.content == b""
+    assert slave.ask("03 00 02000000 65", 1000) == "04 00 02 00 00 00"
+    assert slave.file.content == b"abcde"
+    assert slave.ask(WRITE, 1001) == "04 00 00 00 00 00"
+    assert slave.ask("03 00 01000000 61", 1001) == "04 00 01 00 00 00"
+
+
+@pytest.mark.parametrize("number", ["00000000", "02000000", "ffffffff"])
+def test_wrong_packet_number_ends_a_write(number: str) -> None:
+    slave = Slave(b"old")
+    slave.ask(WRITE)
+    assert slave.error(f"03 00 {number} 61") is FoeErrorCode.PACKET_NUMBER
+    assert slave.error("03 00 01000000 61") is FoeErrorCode.ILLEGAL
+    assert slave.file.content == b"old"
+
+
+def test_wrong_packet_number_ends_a_read_and_is_explained() -> None:
+    slave = Slave(b"abcdefg")
+    slave.ask(READ)
+    answer = bytes.fromhex(slave.ask("04 00 02000000"))
+    assert answer == bytes.fromhex("05 00 05800000") + b"pack"
+    assert slave.error("04 00 01000000") is FoeErrorCode.ILLEGAL
+
+
+@pytest.mark.parametrize(
+    "octets",
+    ["03 00 01000000", "04 00 00000000", "06 00 00000000", "00 00 00000000", "07 00 00000000"],
+)
+def test_message_without_a_transfer_is_illegal(octets: str) -> None:
+    assert Slave().error(octets) is FoeErrorCode.ILLEGAL
+
+
+def test_password_decides() -> None:
+    assert Slave().error("01 00 00000000 736563726574") is FoeErrorCode.NO_RIGHTS
+    assert Slave().ask("01 00 78563412 736563726574 00") == "03 00 01 00 00 00"
+
+
+def test_refusal_of_the_store_is_sent_with_as_much_text_as_fits() -> None:
+    answer = Slave().ask("02 00 00000000 6e6f746865726521")
+    assert bytes.fromhex(answer) == bytes.fromhex("05 00 01800000") + b"noth"
+
+
+def test_refusal_while_writing_ends_the_transfer() -> None:
+    slave = Slave(b"old")
+    slave.ask(WRITE)
+    slave.ask("03 00 01000000 61626364")
+    slave.ask("03 00 02000000 61626364")
+    assert slave.error("03 00 03000000 61626364") is FoeErrorCode.DISK_FULL
+    assert slave.error("03 00 03000000 61") is FoeErrorCode.ILLEGAL
+    assert slave.file.content == b"old"
+
+
+def test_error_of_the_client_ends_its_transfer_without_an_answer() -> None:
+    slave = Slave(b"abcdefg")
+    slave.ask(READ)
+    assert slave.ask("05 00 03800000") == ""
+    assert slave.error("04 00 01000000") is FoeErrorCode.ILLEGAL
+
+
+def test_new_request_and_reset_end_the_transfer_before() -> None:
+    slave = Slave(b"old")
+    slave.ask(WRITE)
+    slave.ask("03 00 01000000 61626364")
+    assert slave.ask(READ) == "03 00 01 00 00 00 6f 6c 64"
+    slave.server.reset()
+    assert slave.error("04 00 01000000") is FoeErrorCode.ILLEGAL
+    assert slave.server.messages_to_send(0) == []
+
+
+def test_message_without_a_header_is_too_short() -> None:
+    with pytest.raises(MailboxRefusedError) as caught:
+        Slave().ask("01 00 000000")
+    assert caught.value.detail == MailboxError.SIZE_TOO_SHORT
+
+
+def test_any_file_object_can_be_read() -> None:
+    class Folder:
+        opened = io.BytesIO(b"abcdefg")
+
+        def open_read(self, name: str, password: int) -> FileReader:
+            return self.opened
+
+        def open_write(self, name: str, password: int) -> object:
+            raise FoeError(name, code=FoeErrorCode.ACCESS_DENIED)
+
+    server = FoeServer(Folder(), MailboxSizes(16, 16))
+    assert server.receive_message(bytes.fromhex(READ), 0) == [b"\x03\0\1\0\0\0abcd"]
+    assert server.receive_message(bytes.fromhex(WRITE), 0) == [bytes.fromhex("05 00 02800000")]
+    assert Folder.opened.closed
+
+
+@given(st.lists(st.binary(min_size=6, max_size=12), max_size=20))
+def test_any_request_gets_one_answer_at_most(requests: list[bytes]) -> None:
+    slave = Slave(b"abcdefg")
+    for request in requests:
+        answers = slave.server.receive_message(request, 0)
+        assert len(answers) <= 1
+        assert all(len(answer) <= 10 for answer in answers)

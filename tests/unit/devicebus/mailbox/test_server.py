@@ -1,0 +1,232 @@
+"""The rules of all mailbox protocols, with a protocol that answers as told."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.server import MAX_QUEUED, MailboxServer
+from eap.codec.mailbox import (
+    MailboxError,
+    MailboxErrorReply,
+    MailboxHeader,
+    MailboxType,
+    decode_message,
+    encode_message,
+)
+
+
+class Echo:
+    """Answers each octet of a request with a message of its own; keeps what it got."""
+
+    def __init__(self) -> None:
+        self.received: list[tuple[bytes, int]] = []
+        self.unasked: list[bytes] = []
+        self.resets = 0
+
+    def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
+        self.received.append((data, now_ns))
+        return [bytes((octet,)) for octet in data]
+
+    def messages_to_send(self, now_ns: int) -> list[bytes]:
+        messages, self.unasked = self.unasked, []
+        return messages
+
+    def reset(self) -> None:
+        self.resets += 1
+
+
+class Box:
+    """A slave with VoE, and the end of the master."""
+
+    def __init__(self) -> None:
+        self.echo = Echo()
+        self.server = MailboxServer({MailboxType.VOE: self.echo}, MailboxSizes(32, 32))
+
+    def send(
+        self,
+        data: bytes,
+        *,
+        counter: int = 0,
+        kind: MailboxType = MailboxType.VOE,
+        address: int = 0,
+        now_ns: int = 0,
+    ) -> None:
+        header = MailboxHeader(0, address, type=kind, counter=counter)
+        self.server.receive_message(encode_message(header, data).ljust(32, b"\0"), now_ns)
+
+    def fetch(self) -> tuple[MailboxHeader, bytes]:
+        message = self.server.next_message(0)
+        assert message is not None
+        self.server.handle_read()
+        header, data = decode_message(message)
+        return header, bytes(data)
+
+    def refusal(self) -> str:
+        header, data = self.fetch()
+        assert header.type is MailboxType.ERR
+        return MailboxError(MailboxErrorReply.decode(data).detail).name
+
+
+def test_reply_has_the_address_of_its_request_and_an_own_counter() -> None:
+    box = Box()
+    box.send(b"a", counter=5, address=0x1001, now_ns=9)
+    box.send(b"bc", counter=6, address=0)
+    assert box.echo.received == [(b"a", 9), (b"bc", 0)]
+    headers = [box.fetch()[0] for _ in range(3)]
+    assert [(head.address, head.counter) for head in headers] == [(0x1001, 1), (0, 2), (0, 3)]
+    assert box.server.next_message(0) is None
+
+
+def test_reply_counter_never_is_0() -> None:
+    box = Box()
+    for _ in range(9):
+        box.send(b"a")
+        assert box.fetch()[0].counter
+    assert box.server.stats().sent == 9
+
+
+def test_repeated_request_is_dropped_once_its_counter_says_so() -> None:
+    box = Box()
+    for counter in (1, 1, 2, 0, 0, 2):
+        box.send(b"a", counter=counter)
+    assert len(box.echo.received) == 5
+    stats = box.server.stats()
+    assert (stats.received, stats.repeated_requests, stats.gaps) == (6, 1, 0)
+
+
+def test_gap_in_the_requests_is_counted() -> None:
+    box = Box()
+    box.send(b"a", counter=1)
+    box.send(b"a", counter=3)
+    assert box.server.stats().gaps == 1
+
+
+@pytest.mark.parametrize(
+    ("octets", "detail"),
+    [
+        ("0000 0000 00 0f", "INVALID_HEADER"),
+        ("1b00 0000 00 0f", "INVALID_HEADER"),
+        ("ffff 0000 00 0f", "INVALID_HEADER"),
+        ("0400 0000 00 00 01000200", "INVALID_HEADER"),
+        ("0100 0000 01 0f 61", "INVALID_CHANNEL"),
+        ("0100 0000 00 03 61", "UNSUPPORTED_PROTOCOL"),
+        ("0100 0000 00 06 61", "UNSUPPORTED_PROTOCOL"),
+    ],
+)
+def test_what_no_protocol_takes_gets_a_mailbox_error(octets: str, detail: str) -> None:
+    box = Box()
+    box.server.receive_message(bytes.fromhex(octets).ljust(32, b"\0"), 0)
+    assert box.refusal() == detail
+    assert box.echo.received == []
+    assert box.server.stats().refused == 1
+
+
+def test_error_reply_lies_as_on_the_wire() -> None:
+    box = Box()
+    box.send(b"a", kind=MailboxType.FOE, address=0x03E9)
+    assert box.server.next_message(0) == bytes.fromhex("0400 e903 00 10 0100 0200")
+
+
+def test_longest_message_fills_the_mailbox() -> None:
+    box = Box()
+    box.send(bytes(26))
+    assert box.echo.received == [(bytes(26), 0)]
+
+
+def test_answer_longer_than_the_mailbox_becomes_an_error() -> None:
+    box = Box()
+    box.echo.unasked = [bytes(26), bytes(27)]
+    assert box.fetch()[1] == bytes(26)
+    assert box.refusal() == "INVALID_SIZE"
+
+
+def test_no_request_is_taken_while_many_answers_wait() -> None:
+    box = Box()
+    assert box.server.is_ready
+    box.send(bytes(MAX_QUEUED), counter=1)
+    assert not box.server.is_ready
+    box.send(b"a", counter=2)
+    assert (len(box.echo.received), box.server.stats().dropped) == (1, 1)
+    box.fetch()
+    assert box.server.is_ready
+    box.send(b"a", counter=2)
+    assert len(box.echo.received) == 2
+
+
+def test_message_without_a_header_is_dropped() -> None:
+    box = Box()
+    box.server.receive_message(bytes(5), 0)
+    assert box.server.next_message(0) is None
+    assert box.server.stats().dropped == 1
+
+
+def test_answers_come_before_what_nobody_asked_for() -> None:
+    box = Box()
+    box.echo.unasked = [b"news"]
+    box.send(b"a", address=7)
+    assert [box.fetch()[1] for _ in range(2)] == [b"a", b"news"]
+
+
+def test_unasked_message_has_address_0() -> None:
+    box = Box()
+    box.send(b"a", address=7)
+    box.fetch()
+    box.echo.unasked = [b"news"]
+    assert box.fetch()[0].address == 0
+
+
+def test_repeat_sends_what_was_read_last_and_then_goes_on() -> None:
+    box = Box()
+    box.send(b"abc")
+    first = box.server.next_message(0)
+    box.server.handle_read()
+    second = box.server.next_message(0)
+    assert box.server.repeat_message() == first
+    box.server.handle_read()
+    assert box.server.next_message(0) == second
+    box.server.handle_read()
+    assert box.server.repeat_message() == second
+    box.server.handle_read()
+    assert box.fetch()[1] == b"c"
+    assert box.server.stats().repeated_replies == 2
+
+
+def test_repeat_before_anything_was_read_changes_nothing() -> None:
+    box = Box()
+    assert box.server.repeat_message() is None
+    box.send(b"a")
+    assert box.server.next_message(0) is not None
+    assert box.server.repeat_message() is None
+    box.server.handle_read()
+    box.server.handle_read()
+    assert box.server.next_message(0) is None
+
+
+def test_start_forgets_everything_but_the_counts() -> None:
+    box = Box()
+    box.send(b"ab", counter=1)
+    box.fetch()
+    box.server.start(64, 48)
+    assert (box.server.sizes.to_slave, box.server.sizes.to_master) == (64, 48)
+    assert box.echo.resets == 1
+    assert box.server.next_message(0) is None
+    assert box.server.repeat_message() is None
+    box.send(b"c", counter=1)
+    assert box.fetch()[0].counter == 1
+    assert box.server.stats().received == 2
+
+
+@given(st.lists(st.binary(max_size=40), max_size=12))
+def test_any_octets_get_an_answer_or_are_counted(messages: list[bytes]) -> None:
+    box = Box()
+    for octets in messages:
+        box.server.receive_message(octets, 0)
+    stats = box.server.stats()
+    assert stats.received + stats.dropped == len(messages)
+    assert stats.repeated_requests + stats.refused + len(box.echo.received) == stats.received
+    while (message := box.server.next_message(0)) is not None:
+        decode_message(message)
+        assert len(message) <= 32
