@@ -59,12 +59,10 @@ def iter_differences(
         [(each.identity.vendor, each.identity.product) for each in found],
         autojunk=False,
     )
-    for tag, start, end, there, there_end in matcher.get_opcodes():
+    for _, start, end, there, there_end in matcher.get_opcodes():
         pairs = min(end - start, there_end - there)
         for offset in range(pairs):
             yield from _compare(expected[start + offset], found[there + offset])
-        if tag == "equal":
-            continue
         for missing in expected[start + pairs : end]:
             before = f"after {found[there - 1 + pairs].name}" if there + pairs else "at the start"
             yield f"{missing.name} is missing {before}, expected {_describe(missing)}"

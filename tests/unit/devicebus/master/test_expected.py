@@ -84,7 +84,7 @@ def test_all_differences_are_told_at_once():
     assert str(caught.value).startswith(
         "the bus is not as configured (3 slaves expected, 3 found):\n  "
     )
-    assert len(str(caught.value).splitlines()) == 3
+    assert len(str(caught.value).splitlines()) == 4
 
 
 def test_whether_a_slave_fits():

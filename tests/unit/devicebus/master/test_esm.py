@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import AlStatusError, BusError, StateTimeoutError, WorkingCounterError
+from devicebus.master.access import Reply
+from devicebus.master.esm import TIMEOUT_NS, acknowledge, change_state, path, read_status
+from devicebus.master.scan import assign_stations
+from devicebus.sim.smcheck import ALLOWED
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import Command
+from devicebus.wire.register import AlStatus
+from tests.support.busline import MS, Bench, Line, drive, run, segment, slave
+
+INIT, PREOP, BOOT, SAFEOP, OP = (
+    AlState.INIT, AlState.PREOP, AlState.BOOT, AlState.SAFEOP, AlState.OP,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("current", "target", "expected"),
+    [
+        (INIT, INIT, ()),
+        (INIT, OP, (PREOP, SAFEOP, OP)),
+        (SAFEOP, OP, (OP,)),
+        (OP, PREOP, (PREOP,)),
+        (OP, INIT, (INIT,)),
+        (INIT, BOOT, (BOOT,)),
+        (OP, BOOT, (INIT, BOOT)),
+        (BOOT, SAFEOP, (INIT, PREOP, SAFEOP)),
+        (BOOT, INIT, (INIT,)),
+        (BOOT, BOOT, ()),
+    ],
+)
+def test_the_way_from_state_to_state(current, target, expected):
+    assert path(current, target) == expected
+
+
+@pytest.mark.parametrize("current", list(AlState))
+@pytest.mark.parametrize("target", list(AlState))
+def test_every_step_of_every_way_is_allowed(current, target):
+    for step in path(current, target):
+        assert step in ALLOWED[current]
+        current = step
+    assert current is target
+
+
+@pytest.fixture
+def line():
+    """A slave without a mailbox, which needs nothing to reach PREOP."""
+    line = Line(Bench(), segment(slave("a", mailbox=None), slave("b")))
+    run(line, assign_stations([(0, 1001), (1, 1002)]))
+    return line
+
+
+def test_a_state_is_reached(line):
+    run(line, change_state(1001, PREOP))
+    assert run(line, read_status(1001)).state == PREOP
+    before = line.frames
+    run(line, change_state(1001, PREOP))
+    assert line.frames == before + 1
+
+
+def test_a_refusal_gives_code_text_and_where_the_slave_stands(line):
+    with pytest.raises(AlStatusError) as caught:
+        run(line, change_state(1002, PREOP))
+    assert str(caught.value) == (
+        "slave 1002: refuses PREOP and stands in INIT+ERROR: AL status code 0x0016,"
+        " invalid mailbox configuration for PreOp"
+    )
+    assert (caught.value.code, caught.value.state) == (0x16, INIT)
+
+
+def test_an_error_is_acknowledged_first(line):
+    with pytest.raises(AlStatusError):
+        run(line, change_state(1002, OP))
+    assert run(line, read_status(1002)).error
+    assert run(line, acknowledge(1002)) is INIT
+    assert not run(line, read_status(1002)).error
+    line.segment.slaves[0].refuses[PREOP] = 0x8001
+    with pytest.raises(AlStatusError, match="0x8001, code 0x8001 of the vendor"):
+        run(line, change_state(1001, PREOP))
+    line.segment.slaves[0].refuses.clear()
+    run(line, change_state(1001, PREOP))
+
+
+def test_a_slave_that_does_not_answer(line):
+    with pytest.raises(WorkingCounterError, match="slave 1003"):
+        run(line, change_state(1003, PREOP))
+
+
+def stuck(state, *, error=0, code=0):
+    octets = AlStatus(state, error=error, code=code).encode()
+    return lambda access: Reply(octets if access.command is Command.FPRD else access.data, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({}, "slave 7: still in INIT, expected SAFEOP within 10000 ms"),
+        ({"timeout_ns": 3 * MS}, "expected SAFEOP within 3 ms"),
+    ],
+)
+def test_a_slave_that_does_not_move(options, text):
+    with pytest.raises(StateTimeoutError, match=text):
+        drive(change_state(7, SAFEOP, **options), stuck(INIT))
+
+
+def test_every_state_has_its_time():
+    assert set(TIMEOUT_NS) == set(AlState)
+
+
+def test_an_error_that_stays():
+    with pytest.raises(
+        StateTimeoutError,
+        match=r"slave 7: keeps its error 0x001B .sync manager watchdog. in SAFEOP",
+    ):
+        drive(acknowledge(7), stuck(SAFEOP, error=1, code=0x1B))
+
+
+def test_a_state_that_does_not_exist():
+    with pytest.raises(BusError, match="slave 7: stands in state 5, which no slave may"):
+        drive(change_state(7, OP), stuck(5))
