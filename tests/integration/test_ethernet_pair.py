@@ -17,7 +17,7 @@ from tests.support.namespaces import Namespace, cable
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
 
-PLANT = Path("config/ethernet-pair.yaml")
+PLANT = Path(__file__).parents[2] / "config/ethernet-pair.yaml"
 DURATION_S = 60 if os.environ.get("EAP_LONG") else 8
 """The full minute is for ``EAP_LONG=1``; the short run is as strict."""
 TIMEOUT_MS = 10
@@ -33,7 +33,7 @@ def ends() -> Iterator[tuple[Namespace, Namespace]]:
 def pair(farm: Plants, ends: tuple[Namespace, Namespace]) -> tuple[Appliance, Appliance]:
     names = ("left", "right")
     both = [
-        farm.start(PLANT.absolute(), "--station", name, prefix=end.prefix)
+        farm.start(PLANT, "--station", name, prefix=end.prefix)
         for name, end in zip(names, ends, strict=True)
     ]
     for name, appliance in zip(names, both, strict=True):

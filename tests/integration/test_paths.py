@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 
 import pytest
@@ -53,10 +54,14 @@ def plant(*stations: str, cycle_us: int = 10_000) -> str:
     return head + "".join(stations)
 
 
+def wait_for_frames(appliance: Appliance, listener: str, source: str, frames: int) -> None:
+    wait_until(lambda: appliance.rx(listener, source)["received"] >= frames)
+
+
 def assert_hears(appliance: Appliance, listener: str, *froms: str, frames: int = 30) -> None:
     """Frames come, none is lost, and they carry what the sender counts."""
     for source in froms:
-        wait_until(lambda s=source: appliance.rx(listener, s)["received"] >= frames)  # type: ignore[misc]
+        wait_for_frames(appliance, listener, source, frames)
         rx = appliance.rx(listener, source)
         assert (*troubles(rx), rx["state"]) == (0, 0, 0, "running")
         ticks = appliance.values(listener)[f"{source}.ticks"]
@@ -216,7 +221,7 @@ def test_two_ports_of_one_station(farm: Plants) -> None:
         )
     )
     for side in ("left", "right"):
-        wait_until(lambda s=side: appliance.rx(s, "gateway")["received"] > 30)  # type: ignore[misc]
+        wait_for_frames(appliance, side, "gateway", 30)
         assert troubles(appliance.rx(side, "gateway")) == (0, 0, 0)
         assert appliance.values(side)["gateway.ticks"] > 20
     ports = {rx["name"]: rx["port"] for rx in appliance.station("gateway")["pd"]["rx"]}
@@ -296,6 +301,6 @@ def test_a_slow_tcp_peer_loses_whole_frames_and_delays_nobody(farm: Plants) -> N
         assert frame[:10] == data[:10]  # header, publisher and count: no frame was ever cut
         assert frame[22:24] == frame[10:12]  # the counter that the data carries
         cycles.append(int.from_bytes(frame[10:12], "little"))
-    steps = [later - earlier for earlier, later in zip(cycles, cycles[1:], strict=False)]
+    steps = [later - earlier for earlier, later in itertools.pairwise(cycles)]
     assert min(steps) == 1
     assert max(steps) > 100  # the frames that were lost while nobody read
