@@ -169,6 +169,7 @@ class SendBatch:
     ) -> None:
         self.errors: dict[str, int] = {}
         self._sock = sock
+        self._send_octets = sock.send
         self._fd = sock.fileno()
         self._address_of = address_of
         self._addresses: dict[str, tuple[bytearray, tuple[str, int]]] = {}
@@ -178,28 +179,28 @@ class SendBatch:
     def send(self, frames: Sequence[OutFrame]) -> Sequence[OutFrame]:
         """Send *frames* and return those that the kernel refused; :attr:`errors` says why."""
         if len(frames) == 1:
-            return () if self._send_one(frames[0]) else frames
-        if not frames:
+            # For one frame the socket's own method is faster than anything through ctypes.
+            frame = frames[0]
+            try:
+                if self._address_of is None:
+                    self._send_octets(frame.buffer)
+                else:
+                    known = self._addresses.get(frame.destination)
+                    known = known or self._resolve(frame.destination)
+                    self._sock.sendto(frame.buffer, known[1])
+            except OSError as error:
+                count_error(self.errors, error.errno)
+                return frames
             return ()
+        return self._send_many(frames) if frames else ()
+
+    def _send_many(self, frames: Sequence[OutFrame]) -> Sequence[OutFrame]:
         key = tuple(frames)
         batch = self._batches.get(key)
         if batch is None:
             batch = self._prepare(key)
         sent = batch[0]()
         return () if sent == len(key) else self._send_rest(key, batch[1], sent)
-
-    def _send_one(self, frame: OutFrame) -> bool:
-        # For one frame the socket's own method is faster than anything through ctypes.
-        try:
-            if self._address_of is None:
-                self._sock.send(frame.buffer)
-            else:
-                known = self._addresses.get(frame.destination) or self._resolve(frame.destination)
-                self._sock.sendto(frame.buffer, known[1])
-        except OSError as error:
-            count_error(self.errors, error.errno)
-            return False
-        return True
 
     def _send_rest(
         self, frames: tuple[OutFrame, ...], headers: bytearray, sent: int
