@@ -1,0 +1,128 @@
+"""The distributed clock of one slave: local time, system time, and the loop that steers it.
+
+ETG.1000.4, distributed clocks.  All times are nanoseconds; the clock never asks what time it is.
+"""
+
+from __future__ import annotations
+
+from devicebus.wire.register import Register
+
+_PPB = 1_000_000_000
+_U32 = 1 << 32
+_U64 = 1 << 64
+_PHASE_SHIFT = 3
+_RATE_SHIFT = 8
+_LOCKED_NS = 100_000
+"""Larger errors come from offsets, not from the quartz."""
+_MAX_PPB = 1_000_000
+"""The largest frequency error that the loop can take out, as an ESC's own limit is near 0.1 %."""
+_SYNC_OUT, _SYNC0 = 0x01, 0x02
+
+
+class Clock:
+    """Local time that runs *drift_ppm* fast, and the registers that a master sees of it.
+
+    Args:
+        memory: Of the ESC.
+        drift_ppm: Deviation of the slave's quartz.
+        local_start_ns: What the clock shows when it is switched on.
+    """
+
+    __slots__ = ("_base_local", "_base_now", "_drift_ppb", "_last_write_ns", "_memory", "_rate_ppb",
+                 "_sync0_seen")  # fmt: skip
+
+    def __init__(
+        self, memory: bytearray, *, drift_ppm: float = 0.0, local_start_ns: int = 0
+    ) -> None:
+        self._memory = memory
+        self._base_now: int | None = None
+        self._base_local = local_start_ns
+        self._drift_ppb = round(drift_ppm * 1000)
+        self._rate_ppb = 0
+        self._last_write_ns: int | None = None
+        self._sync0_seen = 0
+        self._set(Register.DC_SPEED_START, 0x1000, 2)
+        memory[Register.DC_SYSTEM_TIME_FILTER] = 4
+        memory[Register.DC_SPEED_FILTER] = 12
+
+    def set_drift(self, drift_ppm: float, now_ns: int) -> None:
+        """Change the quartz's deviation from now on."""
+        self._rebase(now_ns, 0)
+        self._drift_ppb = round(drift_ppm * 1000)
+
+    def local_time(self, now_ns: int) -> int:
+        """Return what the slave's own clock shows."""
+        if self._base_now is None:
+            self._base_now = now_ns
+        elapsed = now_ns - self._base_now
+        return (
+            self._base_local + elapsed + elapsed * (self._drift_ppb + self._rate_ppb) // _PPB
+        ) % _U64
+
+    def system_time(self, now_ns: int) -> int:
+        """Return the slave's copy of the system time."""
+        return (self.local_time(now_ns) + self._get(Register.DC_SYSTEM_TIME_OFFSET, 8)) % _U64
+
+    def refresh(self, now_ns: int) -> None:
+        """Put the current time into the registers, before they are read."""
+        self._set(Register.DC_SYSTEM_TIME, self.system_time(now_ns), 8)
+
+    def latch(self, now_ns: int, port_delays: tuple[int | None, ...]) -> None:
+        """Note when a frame passed; a delay of None is a port that it did not pass."""
+        for port, delay in enumerate(port_delays):
+            if delay is not None:
+                at = Register.DC_RECEIVE_TIME + 4 * port
+                self._set(at, self.local_time(now_ns + delay) % _U32, 4)
+        self._set(Register.DC_RECEIVE_TIME_ECAT, self.local_time(now_ns + (port_delays[0] or 0)), 8)
+
+    def steer(self, data: bytes, now_ns: int) -> None:
+        """Compare with the reference clock's time that a master distributes, and follow it."""
+        size = 8 if len(data) >= 8 else 4
+        modulus = 1 << 8 * size
+        received = int.from_bytes(data[:size], "little")
+        received += self._get(Register.DC_SYSTEM_TIME_DELAY, 4)
+        error = (self.system_time(now_ns) - received) % modulus
+        if error >= modulus // 2:
+            error -= modulus
+        behind = 1 << 31 if error < 0 else 0
+        magnitude = min(abs(error), (1 << 31) - 1)
+        self._set(Register.DC_SYSTEM_TIME_DIFFERENCE, magnitude | behind, 4)
+        if self._last_write_ns is not None and now_ns > self._last_write_ns:
+            interval = now_ns - self._last_write_ns
+            self._rebase(now_ns, -error // (1 << _PHASE_SHIFT))
+            if abs(error) < _LOCKED_NS:
+                rate = self._rate_ppb - (error * _PPB // interval >> _RATE_SHIFT)
+                self._rate_ppb = max(-_MAX_PPB, min(_MAX_PPB, rate))
+        self._last_write_ns = now_ns
+
+    def restart_loop(self) -> None:
+        """Forget what the loop has learnt, as a write to its parameters does."""
+        self._last_write_ns = None
+
+    @property
+    def sync0_is_active(self) -> bool:
+        """Whether SYNC0 is switched on with a cycle."""
+        active = self._memory[Register.DC_ACTIVATION]
+        return active & 3 == _SYNC_OUT | _SYNC0 and self._get(Register.DC_SYNC0_CYCLE, 4) > 0
+
+    def take_sync0(self, now_ns: int) -> int:
+        """Return how many SYNC0 pulses came since the last time."""
+        if not self.sync0_is_active:
+            self._sync0_seen = 0
+            return 0
+        since = self.system_time(now_ns) - self._get(Register.DC_START_TIME, 8)
+        pulses = since // self._get(Register.DC_SYNC0_CYCLE, 4) + 1 if since >= 0 else 0
+        fresh = max(0, pulses - self._sync0_seen)
+        self._sync0_seen = pulses
+        return fresh
+
+    def _rebase(self, now_ns: int, step_ns: int) -> None:
+        local = self.local_time(now_ns)
+        self._base_now = now_ns
+        self._base_local = local + step_ns
+
+    def _get(self, at: int, size: int) -> int:
+        return int.from_bytes(self._memory[at : at + size], "little")
+
+    def _set(self, at: int, value: int, size: int) -> None:
+        self._memory[at : at + size] = value.to_bytes(size, "little")

@@ -1,0 +1,135 @@
+"""The object dictionary of a simulated device, from its description.
+
+Identity, mailbox types and PDO objects are made here for all kinds of devices, so that every slave
+describes itself in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from devicebus.sim.devices.pdoobjects import assignment, mapping
+from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
+from eap.codec import datatypes
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RO, RW, RW_PREOP, WO, Access, Entry, OdObject, array, record, variable
+
+RX_PDO, TX_PDO = 0x1600, 0x1A00
+OUTPUTS, INPUTS = 0x7000, 0x6000
+_ACCESS = {
+    AccessKind.READ: RO,
+    AccessKind.WRITE: WO,
+    AccessKind.READ_WRITE: RW,
+    AccessKind.CONFIGURATION: RW_PREOP,
+}
+_SM_TYPES = (1, 2, 3, 4)
+_IDENTITY_TYPE = 0x23
+
+
+class ObjectNumberError(ValueError):
+    """A text names no entry."""
+
+
+def parse_entry(text: str) -> tuple[int, int]:
+    """Read ``INDEX[:SUBINDEX]`` in hex or decimal; raise ObjectNumberError otherwise."""
+    index, _, subindex = text.partition(":")
+    try:
+        numbers = int(index, 0), int(subindex or "0", 0)
+    except ValueError:
+        raise ObjectNumberError(f"{text!r} is not an entry (such as 0x6041:0)") from None
+    if not 0 <= numbers[0] <= 0xFFFF or not 0 <= numbers[1] <= 0xFF:
+        raise ObjectNumberError(f"{text!r} is not an entry (0x0000:0 to 0xFFFF:255)")
+    return numbers
+
+
+def places(channels: Sequence[ChannelSpec], base: int) -> list[tuple[int, int]]:
+    """Return the entry of each of *channels*; those that name none count up from *base*:01."""
+    found = []
+    free = 0
+    for channel in channels:
+        if channel.object:
+            found.append(parse_entry(channel.object))
+        else:
+            free += 1
+            found.append((base + 0x10 * ((free - 1) // 200), (free - 1) % 200 + 1))
+    return found
+
+
+def build_dictionary(spec: SlaveSpec, device_type: int) -> ObjectDictionary:
+    """Make the dictionary of the device that *spec* describes.
+
+    Raises:
+        ValueError: a data type, a value or an entry in it cannot be.
+    """
+    dictionary = ObjectDictionary(_identity(spec, device_type))
+    for each in spec.objects:
+        dictionary.add(_object(each))
+    sides = (
+        (spec.outputs, OUTPUTS, RX_PDO, 0x1C12, RW | Access.RX_MAPPABLE),
+        (spec.inputs, INPUTS, TX_PDO, 0x1C13, RO | Access.TX_MAPPABLE),
+    )
+    for channels, base, pdo, assign, access in sides:
+        mapped = []
+        for channel, (index, subindex) in zip(channels, places(channels, base), strict=True):
+            entry = _add_entry(dictionary, index, subindex, channel, access)
+            mapped.append((index, subindex, entry.kind.bit_length))
+        if mapped:
+            dictionary.add(mapping(pdo, mapped, "RxPDO" if pdo == RX_PDO else "TxPDO"))
+        dictionary.add(assignment(assign, [pdo] if mapped else [], dictionary))
+    dictionary.add(array(0x1C00, "Sync manager type", "USINT", _SM_TYPES))
+    return dictionary
+
+
+def _identity(spec: SlaveSpec, device_type: int) -> Iterable[OdObject]:
+    yield variable(0x1000, "Device type", "UDINT", RO, device_type)
+    yield variable(0x1001, "Error register", "USINT", RO)
+    for index, name, text in (
+        (0x1008, "Device name", spec.name),
+        (0x1009, "Hardware version", "1"),
+        (0x100A, "Software version", "1.0"),
+    ):
+        yield variable(index, name, f"STRING({max(1, len(text.encode()))})", RO, text)
+    numbers = (
+        ("Vendor ID", spec.vendor),
+        ("Product code", spec.product),
+        ("Revision number", spec.revision),
+        ("Serial number", spec.serial),
+    )
+    entries = {sub: Entry(name, "UDINT", RO, value) for sub, (name, value) in enumerate(numbers, 1)}
+    yield record(0x1018, "Identity", entries, data_type=_IDENTITY_TYPE)
+
+
+def _object(spec: ObjectSpec) -> OdObject:
+    if not spec.entries:
+        return variable(
+            spec.index, spec.name, spec.type, _ACCESS[spec.access], spec.value,
+            minimum=spec.minimum, maximum=spec.maximum,
+        )  # fmt: skip
+    return record(spec.index, spec.name, {each.subindex: _entry(each) for each in spec.entries})
+
+
+def _entry(spec: EntrySpec) -> Entry:
+    return Entry(
+        spec.name, spec.type, _ACCESS[spec.access], spec.value,
+        minimum=spec.minimum, maximum=spec.maximum,
+    )  # fmt: skip
+
+
+def _add_entry(
+    dictionary: ObjectDictionary, index: int, subindex: int, channel: ChannelSpec, access: Access
+) -> Entry:
+    if index in dictionary and subindex in dictionary[index].entries:
+        entry = dictionary[index].entries[subindex]
+        entry.access |= access
+        return entry
+    kind = datatypes.parse(channel.type)
+    value = kind.zero if channel.value == 0 else channel.value
+    entry = Entry(channel.name, kind, access, value)
+    if subindex == 0:
+        dictionary.add(variable(index, channel.name, kind, access, value))
+        return dictionary[index].entries[0]
+    old = dict(dictionary[index].entries) if index in dictionary else {}
+    old.pop(0, None)
+    title = "Inputs" if access & Access.TX_MAPPABLE else "Outputs"
+    dictionary.add(record(index, title, {**old, subindex: entry}))
+    return entry

@@ -1,0 +1,315 @@
+"""A slave controller as the wire sees it: registers, memory and what touching them does.
+
+*read* and *write* are what a datagram does; they answer whether the working counter goes up.  The
+slave's application uses the sync managers and :meth:`Esc.set_al_status`, and looks at *al_event*.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import msgspec
+
+from devicebus.sim.access import REGISTERS, access_map
+from devicebus.sim.clock import Clock
+from devicebus.sim.eeprom import Eeprom
+from devicebus.sim.fmmu import Window, active_windows
+from devicebus.sim.syncmanager import SyncChannel
+from devicebus.sim.watchdog import Watchdog
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.register import AlEvent, Register
+
+PORTS = 4
+_YES = b"\1"
+_EVENT_DL, _EVENT_AL = 0x0004, 0x0008
+_DEVICE_EMULATION = 0x01
+
+
+class EscSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """What kind of controller it is; the defaults are those of a common one."""
+
+    type: int = 0x11
+    revision: int = 0
+    build: int = 2
+    fmmus: int = 8
+    sync_managers: int = 8
+    ram: int = 8192
+    """Octets of process data memory."""
+    port_descriptor: int = 0x0F
+    """Two bits a port: 0 none, 1 not configured, 2 E-bus, 3 MII."""
+    has_dc: bool = True
+    drift_ppm: float = 0.0
+    local_start_ns: int = 0
+    """What its clock shows when it is switched on."""
+
+
+class Esc:
+    """One controller with its EEPROM *image*.
+
+    Attributes:
+        al_event: Bits of the AL event register: what the application has not seen yet.
+        ecat_event: Bits of the ECAT event register, for the master.
+        loops_changed: The master has written how ports are to be closed; for the wiring.
+        event_mask: Which of them go into the event field of datagrams.
+        windows: The active FMMUs.
+        port_delays: How long after entering the segment a frame reaches each port; None where none
+            comes; set by the wiring.
+    """
+
+    def __init__(self, image: bytes, settings: EscSettings | None = None) -> None:
+        self.settings = settings or EscSettings()
+        self.image = image
+        self.power_on()
+
+    def power_on(self) -> None:
+        """Begin with the values after a reset; the EEPROM keeps its content."""
+        given = self.settings
+        self.memory = bytearray(REGISTERS + given.ram)
+        self._readable, self._writable = access_map(
+            given.fmmus, given.sync_managers, has_dc=given.has_dc
+        )
+        self.al_event = 0
+        self.ecat_event = 0
+        self.event_mask = 0
+        self.loops_changed = False
+        self.port_delays: tuple[int | None, ...] = (0,) + (None,) * (PORTS - 1)
+        self._describe()
+        self.eeprom = Eeprom(self.memory, self.image)
+        self.clock = Clock(
+            self.memory, drift_ppm=given.drift_ppm, local_start_ns=given.local_start_ns
+        )
+        self.watchdog = Watchdog(self.memory)
+        self.channels = tuple(SyncChannel(self.memory, n) for n in range(given.sync_managers))
+        self._guards: tuple[SyncChannel, ...] = ()
+        self.windows: tuple[Window, ...] = ()
+        self.set_al_status(AlState.INIT, 0)
+        self.ecat_event = 0
+
+    def _describe(self) -> None:
+        given, memory = self.settings, self.memory
+        memory[0:2] = bytes((given.type, given.revision))
+        memory[2:4] = given.build.to_bytes(2, "little")
+        memory[4:8] = bytes(
+            (given.fmmus, given.sync_managers, given.ram // 1024, given.port_descriptor)
+        )
+        memory[Register.FEATURES] = 0x0C if given.has_dc else 0
+        memory[Register.DL_CONTROL] = 1
+
+    @property
+    def station(self) -> int:
+        """Configured station address."""
+        return self._word(Register.STATION_ADDRESS)
+
+    @property
+    def alias(self) -> int | None:
+        """The second address, while DL control enables it."""
+        enabled = self.memory[Register.DL_CONTROL + 3] & 1
+        return self._word(Register.STATION_ALIAS) if enabled else None
+
+    @property
+    def emulates_device(self) -> bool:
+        """Whether AL status follows AL control without an application."""
+        return bool(self.memory[Register.ESC_CONFIGURATION] & _DEVICE_EMULATION)
+
+    @property
+    def irq(self) -> int:
+        """What this controller adds to the event field of every datagram."""
+        return self.event_mask & self._events()
+
+    def loop_control(self, port: int) -> int:
+        """Return how the master wants a port: 0 automatic, 1 closes by itself, 2 open, 3 closed."""
+        return self.memory[Register.DL_CONTROL + 1] >> 2 * port & 3
+
+    def set_dl_status(self, status: int) -> None:
+        """Show the state of the ports; a change is an event for the master."""
+        octets = status.to_bytes(2, "little")
+        at = Register.DL_STATUS
+        if self.memory[at : at + 2] != octets:
+            self.memory[at : at + 2] = octets
+            self.ecat_event |= _EVENT_DL
+
+    def set_al_status(self, status: int, code: int) -> None:
+        """Show where the slave stands: state with error bit, and why."""
+        at = Register.AL_STATUS
+        octets = status.to_bytes(2, "little") + bytes(2) + code.to_bytes(2, "little")
+        if self.memory[at : at + 6] != octets:
+            self.memory[at : at + 6] = octets
+            self.ecat_event |= _EVENT_AL
+
+    def read(self, address: int, length: int, now_ns: int) -> bytes | None:
+        """Return what a master reads, None if nothing of it exists or may be read now."""
+        end = address + length
+        if address >= REGISTERS:
+            return self._read_memory(address, end)
+        if end > REGISTERS:
+            return self._join(
+                (REGISTERS - address, self.read(address, REGISTERS - address, now_ns)),
+                (end - REGISTERS, self._read_memory(REGISTERS, end)),
+            )
+        if _YES not in self._readable[address:end]:
+            return None
+        for page in range(address >> 8, (end - 1 >> 8) + 1):
+            if page in _FRESH:
+                self._refresh(page, now_ns)
+        data = bytes(self.memory[address:end])
+        if address <= Register.AL_STATUS < end:
+            self.ecat_event &= ~_EVENT_AL
+        if address <= Register.DL_STATUS < end:
+            self.ecat_event &= ~_EVENT_DL
+        return data
+
+    def write(self, address: int, data: bytes, now_ns: int) -> bool:
+        """Do what a master's write does; return whether anything was written."""
+        end = address + len(data)
+        if address >= REGISTERS:
+            return self._write_memory(address, data, now_ns)
+        if end > REGISTERS:
+            room = REGISTERS - address
+            done = self.write(address, data[:room], now_ns)
+            return self._write_memory(REGISTERS, data[room:], now_ns) or done
+        marks = self._writable[address:end]
+        if not self.eeprom.is_masters and address <= Register.EEPROM_CONTROL < end:
+            return False
+        if _YES not in marks:
+            return False
+        old = bytes(self.memory[address:end])
+        if b"\0" in marks:
+            data = bytes(
+                new if mark else was for new, was, mark in zip(data, old, marks, strict=True)
+            )
+        self.memory[address:end] = data
+        for page in range(address >> 8, (end - 1 >> 8) + 1):
+            self._written(page, address, end, now_ns)
+        return True
+
+    def peek(self, address: int, length: int) -> bytes:
+        """Return octets as they are, with no effect."""
+        return bytes(self.memory[address : address + length])
+
+    def _refresh(self, page: int, now_ns: int) -> None:
+        memory = self.memory
+        if page == 0x09:
+            self.clock.refresh(now_ns + (self.port_delays[0] or 0))
+            return
+        at = Register.ECAT_EVENT
+        memory[at : at + 2] = self._events().to_bytes(2, "little")
+        at = Register.AL_EVENT
+        memory[at : at + 4] = self.al_event.to_bytes(4, "little")
+
+    def _events(self) -> int:
+        full = sum(1 << 4 + n for n, each in enumerate(self.channels[:8]) if each.is_full)
+        return self.ecat_event | full
+
+    def _written(self, page: int, start: int, end: int, now_ns: int) -> None:
+        match page:
+            case 0x01:
+                self.loops_changed |= start <= Register.DL_CONTROL + 1 < end
+                if start <= Register.AL_CONTROL < end:
+                    self.al_event |= AlEvent.AL_CONTROL
+            case 0x02:
+                self.event_mask = self._word(Register.ECAT_EVENT_MASK)
+            case 0x03 | 0x04:
+                self._clear_counters(start, end)
+            case 0x05:
+                self._eeprom_written(start, end)
+            case 0x06:
+                self.windows = active_windows(self.memory, self.settings.fmmus)
+            case 0x08:
+                self._sync_managers_written(start, end)
+            case 0x09:
+                self._clock_written(start, end, now_ns)
+
+    def _eeprom_written(self, start: int, end: int) -> None:
+        if start <= Register.EEPROM_CONFIGURATION < end:
+            self.eeprom.ownership_written()
+        if start <= Register.EEPROM_CONTROL < end:
+            self.eeprom.control_written()
+            self.image = bytes(self.eeprom.image)
+
+    def _sync_managers_written(self, start: int, end: int) -> None:
+        for number, channel in enumerate(self.channels):
+            at = Register.SYNC_MANAGER + 8 * number
+            if start < at + 8 and end > at and (channel.configure() or start <= at + 6 < end):
+                self.al_event |= AlEvent.SM_ACTIVATION
+        self._guards = tuple(channel for channel in self.channels if channel.is_enabled)
+
+    def _clear_counters(self, start: int, end: int) -> None:
+        groups = (
+            (Register.RX_ERROR, Register.PROCESSING_UNIT_ERROR),
+            (Register.PROCESSING_UNIT_ERROR, Register.PROCESSING_UNIT_ERROR + 1),
+            (Register.PDI_ERROR, Register.PDI_ERROR + 1),
+            (Register.LOST_LINK, Register.LOST_LINK + 4),
+            (Register.WATCHDOG_COUNTER, Register.WATCHDOG_COUNTER + 2),
+        )
+        for first, last in groups:
+            if start < last and end > first:
+                self.memory[first:last] = bytes(last - first)
+
+    def _clock_written(self, start: int, end: int, now_ns: int) -> None:
+        if start <= Register.DC_RECEIVE_TIME < end:
+            self.clock.latch(now_ns, self.port_delays)
+        if start <= Register.DC_SYSTEM_TIME < end:
+            entry = now_ns + (self.port_delays[0] or 0)
+            last = min(end, Register.DC_SYSTEM_TIME + 8)
+            self.clock.steer(bytes(self.memory[Register.DC_SYSTEM_TIME : last]), entry)
+        if start < Register.DC_SYSTEM_TIME_FILTER + 2 and end > Register.DC_SYSTEM_TIME_OFFSET:
+            self.clock.restart_loop()
+
+    def _read_memory(self, start: int, end: int) -> bytes | None:
+        for channel in self._guards:
+            if start < channel.end and end > channel.start:
+                if start < channel.start or end > channel.end:
+                    return self._read_across(start, end)
+                event = channel.read_by_master(start, end)
+                if event < 0:
+                    return None
+                self.al_event |= event
+                return bytes(self.memory[start:end])
+        data = bytes(self.memory[start:end])
+        return data.ljust(end - start, b"\0") if data else None
+
+    def _read_across(self, start: int, end: int) -> bytes | None:
+        return self._join(
+            *((last - at, self._read_memory(at, last)) for at, last in self._split(start, end))
+        )
+
+    @staticmethod
+    def _join(*parts: tuple[int, bytes | None]) -> bytes | None:
+        if all(octets is None for _, octets in parts):
+            return None
+        return b"".join(bytes(size) if octets is None else octets for size, octets in parts)
+
+    def _write_memory(self, start: int, data: bytes, now_ns: int) -> bool:
+        end = start + len(data)
+        for channel in self._guards:
+            if start < channel.end and end > channel.start:
+                if start < channel.start or end > channel.end:
+                    places = self._split(start, end)
+                    done = [
+                        self._write_memory(at, data[at - start : last - start], now_ns)
+                        for at, last in places
+                    ]
+                    return any(done)
+                event = channel.write_by_master(start, data)
+                if event > 0:
+                    self.al_event |= event
+                    if channel.watches:
+                        self.watchdog.feed(now_ns)
+                return event >= 0
+        if start >= len(self.memory):
+            return False
+        room = len(self.memory) - start
+        self.memory[start : start + min(room, len(data))] = data[:room]
+        return True
+
+    def _split(self, start: int, end: int) -> list[tuple[int, int]]:
+        edges = {start, end}
+        for channel in self._guards:
+            edges |= {edge for edge in (channel.start, channel.end) if start < edge < end}
+        return list(pairwise(sorted(edges)))
+
+    def _word(self, at: int) -> int:
+        return self.memory[at] | self.memory[at + 1] << 8
+
+
+_FRESH = frozenset((0x02, 0x09))

@@ -1,0 +1,168 @@
+"""What the controllers on a frame's way do with its datagrams (ETG.1000.4).
+
+The controllers are asked datagram by datagram instead of slave by slave, which no slave can tell
+apart, so that a datagram for one slave costs nothing at the others.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+from devicebus.sim.esc import Esc
+from devicebus.sim.fmmu import insert_parts, read_windows, write_windows
+from devicebus.wire.datagram import OVERHEAD, Command
+from devicebus.wire.register import Register
+from eap.codec.ethercat import EtherCatHeader, FrameType
+
+_HEADER = struct.Struct("<BBHHHH")
+_SIZE = _HEADER.size
+_MORE, _CIRCULATING, _LENGTH = 0x8000, 0x4000, 0x07FF
+_ADDRESS_END = Register.DL_CONTROL + 4
+_READS = frozenset((Command.APRD, Command.FPRD, Command.BRD, Command.APRW, Command.FPRW,
+                    Command.BRW))  # fmt: skip
+_WRITES = frozenset((Command.APWR, Command.FPWR, Command.BWR, Command.APRW, Command.FPRW,
+                     Command.BRW))  # fmt: skip
+_BY_POSITION = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
+_BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
+_MULTIPLE = frozenset((Command.ARMW, Command.FRMW))
+_LOGICAL_WRITES: dict[int, int] = {Command.LWR: 1, Command.LRW: 2}
+_LOGICAL = frozenset((Command.LRD, *_LOGICAL_WRITES))
+
+
+class Chain:
+    """The controllers that work on frames entering at one side, in their order.
+
+    Args:
+        escs: In the order of the frame.
+        closed_at: Index of the first one without a link at port 0, which marks frames as
+            circulating and takes those out that are marked already.
+    """
+
+    def __init__(self, escs: Sequence[Esc], *, closed_at: int | None = None) -> None:
+        self._escs = tuple(escs)
+        self._closed_at = closed_at
+        self._stations: dict[int, list[Esc]] | None = None
+
+    def process(self, frame: bytearray, now_ns: int) -> bool:
+        """Work on *frame* in place; return False if a controller takes it out of the ring."""
+        if len(frame) < EtherCatHeader.SIZE:
+            return True
+        header = EtherCatHeader.decode(frame)
+        if header.type != FrameType.DATAGRAM:
+            return True
+        end = min(EtherCatHeader.SIZE + header.length, len(frame))
+        offset = EtherCatHeader.SIZE
+        while offset + OVERHEAD <= end:
+            command, _, adp, ado, flags, _ = _HEADER.unpack_from(frame, offset)
+            length = flags & _LENGTH
+            if offset + OVERHEAD + length > end:
+                break
+            if self._closed_at is not None:
+                if flags & _CIRCULATING:
+                    return False
+                flags |= _CIRCULATING
+                frame[offset + 6 : offset + 8] = flags.to_bytes(2, "little")
+            self._datagram(frame, offset, command, (adp, ado, length), now_ns)
+            if not flags & _MORE:
+                break
+            offset += OVERHEAD + length
+        return True
+
+    def _datagram(
+        self, frame: bytearray, offset: int, command: int, where: tuple[int, int, int], now_ns: int
+    ) -> None:
+        adp, ado, length = where
+        start = offset + _SIZE
+        data = frame[start : start + length]
+        if command in _LOGICAL:
+            count = self._logical(command, ado << 16 | adp, data, now_ns)
+        elif command in _MULTIPLE:
+            count = self._read_multiple_write(command, adp, ado, data, now_ns)
+        elif command == Command.NOP or command > Command.FRMW:
+            count = 0
+        else:
+            count = self._access(command, self._addressed(command, adp), ado, data, now_ns)
+        if command in _BY_POSITION or command in _BROADCAST:
+            struct.pack_into("<H", frame, offset + 2, (adp + len(self._escs)) & 0xFFFF)
+        self._add_irq(frame, offset + 8)
+        if not count:
+            return
+        end = start + length
+        frame[start:end] = data
+        wkc = frame[end] | frame[end + 1] << 8
+        frame[end : end + 2] = ((wkc + count) & 0xFFFF).to_bytes(2, "little")
+        if command not in _LOGICAL and ado < _ADDRESS_END:
+            self._stations = None
+
+    def _addressed(self, command: int, adp: int) -> Sequence[Esc]:
+        if command in _BROADCAST:
+            return self._escs
+        if command in _BY_POSITION:
+            position = -adp & 0xFFFF
+            return self._escs[position : position + 1]
+        if self._stations is None:
+            self._stations = {}
+            for esc in self._escs:
+                for address in {esc.station, esc.alias}:
+                    if address is not None:
+                        self._stations.setdefault(address, []).append(esc)
+        return self._stations.get(adp, ())
+
+    @staticmethod
+    def _access(command: int, escs: Sequence[Esc], ado: int, data: bytearray, now_ns: int) -> int:
+        count = 0
+        reads, writes = command in _READS, command in _WRITES
+        for esc in escs:
+            sent = bytes(data)
+            octets = esc.read(ado, len(sent), now_ns) if reads else None
+            if writes and esc.write(ado, sent, now_ns):
+                count += 2 if reads else 1
+            if octets is not None:
+                count += 1
+                if command in _BROADCAST:
+                    joined = int.from_bytes(sent, "little") | int.from_bytes(octets, "little")
+                    octets = joined.to_bytes(len(sent), "little")
+                data[:] = octets
+        return count
+
+    def _read_multiple_write(
+        self, command: int, adp: int, ado: int, data: bytearray, now_ns: int
+    ) -> int:
+        """One controller reads, all others write what the frame holds as it passes them."""
+        count = 0
+        readers = self._addressed(Command.FPRD if command == Command.FRMW else command, adp)
+        for esc in self._escs:
+            if esc in readers:
+                octets = esc.read(ado, len(data), now_ns)
+                if octets is not None:
+                    data[:] = octets
+                    count += 1
+            elif esc.write(ado, bytes(data), now_ns):
+                count += 1
+        return count
+
+    def _logical(self, command: int, address: int, data: bytearray, now_ns: int) -> int:
+        count = 0
+        writes = _LOGICAL_WRITES.get(command, 0)
+        reads = command != Command.LWR
+        for esc in self._escs:
+            windows = esc.windows
+            if not windows:
+                continue
+            parts = read_windows(esc, windows, address, len(data), now_ns) if reads else []
+            if writes and write_windows(esc, windows, address, bytes(data), now_ns):
+                count += writes
+            if parts:
+                count += 1
+                insert_parts(data, parts)
+        return count
+
+    def _add_irq(self, frame: bytearray, at: int) -> None:
+        irq = 0
+        for esc in self._escs:
+            if esc.event_mask:
+                irq |= esc.irq
+        if irq:
+            frame[at] |= irq & 0xFF
+            frame[at + 1] |= irq >> 8

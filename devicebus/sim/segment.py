@@ -1,0 +1,147 @@
+"""A segment: slaves, the cables between them, and frames that pass.
+
+A frame begins at its EtherCAT header; Ethernet and UDP are for drivers.  The caller brings the
+time, so that a run can be repeated exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from devicebus.sim.processing import Chain
+from devicebus.sim.slave import Slave
+from devicebus.sim.wiring import CABLE_NS, PortAt, Side, Way, dl_status, find_way
+
+POLL_NS = 1_000_000
+"""How often slaves look at the time on their own."""
+
+
+class Cable(NamedTuple):
+    """Joins port 0 of slave *child* to a port of slave *parent*; both are numbers."""
+
+    child: int
+    parent: int
+    parent_port: int = 1
+
+
+class Segment:
+    """Slaves in a tree; the first one's port 0 is the master's.
+
+    Args:
+        slaves: Numbered from 0.
+        cables: One for each slave but the first; left out, a line through ports 1.
+        ring_end: The port that a second line joins to the master; None without a ring.
+        cable_ns: Delay of each cable.
+    """
+
+    def __init__(
+        self,
+        slaves: Sequence[Slave],
+        cables: Sequence[Cable] | None = None,
+        *,
+        ring_end: PortAt | None = None,
+        cable_ns: int = CABLE_NS,
+    ) -> None:
+        self.slaves = tuple(slaves)
+        if cables is None:
+            cables = [Cable(number, number - 1) for number in range(1, len(slaves))]
+        self._cables = tuple(cables)
+        self._ring_end = ring_end
+        self._cable_ns = cable_ns
+        self._cut: set[int] = set()
+        self._poll_at_ns: int | None = None
+        self._rewire()
+
+    def cut(self, child: int) -> None:
+        """Cut the cable at port 0 of slave *child*; for 0 the one to the master."""
+        self._cut.add(child)
+        self._rewire()
+
+    def mend(self, child: int) -> None:
+        """Join that cable again."""
+        self._cut.discard(child)
+        self._rewire()
+
+    def switch(self, number: int, *, on: bool) -> None:
+        """Switch a slave off or on."""
+        self.slaves[number].switch(on=on)
+        self._rewire()
+
+    def process_frame(
+        self, frame: bytearray, now_ns: int, side: Side = Side.PRIMARY
+    ) -> Side | None:
+        """Let *frame* pass; what the slaves write is in it afterwards.
+
+        Returns:
+            Where it comes out, None if it is lost.
+        """
+        self.handle_timeout(now_ns)
+        chain = self._chains[side]
+        if chain is None:
+            return None
+        survives = chain.process(frame, now_ns)
+        for slave in self._reached[side]:
+            if slave.esc.al_event:
+                slave.run(now_ns)
+        if self._loops_changed():
+            self._rewire()
+        way = self._ways[side]
+        return way.comes_out if survives and way is not None else None
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has something to do."""
+        times = [at for slave in self.slaves if (at := slave.next_timeout()) is not None]
+        return min(times, default=None)
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Let the slaves look at the time; more often than every millisecond costs nothing."""
+        if self._poll_at_ns is not None and now_ns < self._poll_at_ns:
+            return
+        self._poll_at_ns = now_ns + POLL_NS
+        for slave in self.slaves:
+            slave.handle_timeout(now_ns)
+
+    def _loops_changed(self) -> bool:
+        return any(slave.esc.loops_changed for slave in self._reached[Side.PRIMARY])
+
+    def _rewire(self) -> None:
+        links = self._links()
+        self._ways: list[Way | None] = [None, None]
+        self._chains: list[Chain | None] = [None, None]
+        self._reached: list[tuple[Slave, ...]] = [(), ()]
+        for end, side in [(place, side) for place, side in links.items() if side in _SIDES]:
+            assert isinstance(side, Side)  # noqa: S101  chosen so
+            way = find_way(links, end, self._cable_ns)
+            reached = tuple(self.slaves[number] for number in way.order)
+            self._ways[side] = way
+            self._reached[side] = reached
+            self._chains[side] = Chain([each.esc for each in reached], closed_at=way.closed_at)
+            for number in way.order:
+                self.slaves[number].esc.port_delays = tuple(
+                    way.arrivals.get((number, port)) for port in range(4)
+                )
+        for number, slave in enumerate(self.slaves):
+            slave.esc.loops_changed = False
+            joined = frozenset(port for at, port in links if at == number)
+            slave.esc.set_dl_status(dl_status(joined))
+
+    def _links(self) -> dict[PortAt, PortAt | Side]:
+        links: dict[PortAt, PortAt | Side] = {}
+        if self.slaves and 0 not in self._cut and self._is_open(0, 0):
+            links[0, 0] = Side.PRIMARY
+        for child, parent, port in self._cables:
+            whole = child not in self._cut
+            if whole and self._is_open(child, 0) and self._is_open(parent, port):
+                links[child, 0] = (parent, port)
+                links[parent, port] = (child, 0)
+        if self._ring_end is not None and self._is_open(*self._ring_end):
+            links[self._ring_end] = Side.SECONDARY
+        return links
+
+    def _is_open(self, number: int, port: int) -> bool:
+        slave = self.slaves[number]
+        return slave.is_powered and slave.esc.loop_control(port) != 3
+
+
+_SIDES = frozenset(Side)

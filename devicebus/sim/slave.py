@@ -1,0 +1,240 @@
+"""A simulated slave: the state machine of ETG.1000.6 between a controller and a device.
+
+It acts when its controller has an event or when a time has come, and never waits.
+"""
+
+from __future__ import annotations
+
+from devicebus.sim.device import Device
+from devicebus.sim.esc import Esc
+from devicebus.sim.smcheck import ALLOWED, check_clock, check_mailbox, check_process_data
+from devicebus.wire.alstatus import ERROR, AlState, AlStatusCode
+from devicebus.wire.register import AlEvent, Register
+
+OUTPUTS_TIMEOUT_NS = 200_000_000
+"""How long a slave on its way to OP waits for the first outputs (ESI default, back to SafeOp)."""
+
+_IDENTIFY = 0x20
+_WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT))
+_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
+
+
+class Slave:
+    """One slave of a segment.
+
+    Attributes:
+        esc: Its controller.
+        device: What it is.
+        is_powered: False for one that is switched off; set by :meth:`switch`.
+        refuses: Fault: AL status code with which it refuses each state that is in here.
+    """
+
+    def __init__(self, esc: Esc, device: Device) -> None:
+        self.esc = esc
+        self.device = device
+        self.is_powered = True
+        self.refuses: dict[AlState, int] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        self.device.al_state = AlState.INIT
+        self._code = 0
+        self._has_outputs = False
+        self._deadline_ns: int | None = None
+
+    @property
+    def state(self) -> AlState:
+        """Where it stands."""
+        return self.device.al_state
+
+    @property
+    def code(self) -> int:
+        """AL status code; 0 without an error."""
+        return self._code
+
+    def switch(self, *, on: bool) -> None:
+        """Switch the slave off, or on again with everything but its EEPROM forgotten."""
+        if on and not self.is_powered:
+            self.esc.power_on()
+            self._forget()
+        self.is_powered = on
+
+    def run(self, now_ns: int) -> None:
+        """Act on what the controller has seen since the last time."""
+        event, self.esc.al_event = self.esc.al_event, 0
+        if event & AlEvent.AL_CONTROL:
+            self._obey(now_ns)
+        if event & AlEvent.SM_ACTIVATION:
+            self._check_channels(now_ns)
+        if self.device.mailbox is not None and self.state in _WITH_MAILBOX:
+            self._serve_mailbox(event)
+            self._move_messages(now_ns)
+        if self.state in _WITH_PROCESS_DATA and event >= AlEvent.SM0:
+            self._exchange(now_ns)
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Act on the time: watchdog, a late first output, messages that a server has ready."""
+        if not self.is_powered:
+            return
+        if self.esc.watchdog.check(now_ns) and self.state is AlState.OP:
+            self.fail(AlStatusCode.WATCHDOG)
+        if self._deadline_ns is not None and now_ns >= self._deadline_ns:
+            self._deadline_ns = None
+            self._refuse(AlStatusCode.NO_OUTPUTS)
+        if self.device.mailbox is not None and self.state in _WITH_MAILBOX:
+            self._move_messages(now_ns)
+        if self.esc.clock.take_sync0(now_ns) and self.state in _WITH_PROCESS_DATA:
+            self._offer_inputs(now_ns)
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has something to do."""
+        times = [at for at in (self.esc.watchdog.deadline_ns, self._deadline_ns) if at is not None]
+        return min(times, default=None)
+
+    def fail(self, code: int) -> None:
+        """Report an error of its own; in OP it falls back to SAFEOP."""
+        self._refuse(code)
+
+    def _obey(self, now_ns: int) -> None:
+        at = Register.AL_CONTROL
+        control = int.from_bytes(self.esc.memory[at : at + 2], "little")
+        requested = control & 0x0F
+        if self.esc.emulates_device:
+            self._emulate(control)
+            return
+        if self._code and not control & ERROR and requested != AlState.INIT:
+            return
+        self._code = 0
+        self._deadline_ns = None
+        try:
+            target = AlState(requested)
+        except ValueError:
+            self._refuse(AlStatusCode.UNKNOWN_STATE)
+            return
+        if target not in ALLOWED[self.state]:
+            self._refuse(AlStatusCode.INVALID_STATE_CHANGE)
+            return
+        code = self.refuses.get(target, 0) or self._prepare(target, now_ns)
+        if code:
+            self._refuse(code)
+        elif self._deadline_ns is None:
+            self._enter(target)
+        if control & _IDENTIFY and not self._code:
+            self.esc.set_al_status(self.state | _IDENTIFY, self.device.identification)
+
+    def _emulate(self, control: int) -> None:
+        self.device.al_state = AlState(control & 0x0F) if control & 0x0F in _STATES else self.state
+        self.device.process_data.configure()
+        self.esc.set_al_status(control & 0x1F, 0)
+
+    def _prepare(self, target: AlState, now_ns: int) -> int:
+        """Return the code that forbids *target*; begin to wait if it depends on outputs."""
+        before = self.state
+        if before is target:
+            return 0
+        if before is AlState.INIT:
+            return self._start_mailbox(target)
+        if before is AlState.PREOP and target is AlState.SAFEOP:
+            return self._start_inputs(now_ns)
+        if target is AlState.OP:
+            code = check_clock(self.esc, self.device)
+            waits = self.device.process_data.outputs.size and not self._has_outputs
+            if not code and waits:
+                self._deadline_ns = now_ns + OUTPUTS_TIMEOUT_NS
+            return code
+        return 0
+
+    def _start_mailbox(self, target: AlState) -> int:
+        boot = target is AlState.BOOT
+        if boot and not self.device.has_boot:
+            return AlStatusCode.BOOT_NOT_SUPPORTED
+        mailbox = self.device.mailbox
+        if mailbox is None:
+            return 0
+        if not check_mailbox(self.esc):
+            return AlStatusCode.MAILBOX_BOOT if boot else AlStatusCode.MAILBOX_PREOP
+        receive, send = self.esc.channels[:2]
+        receive.discard()
+        send.discard()
+        send.acknowledge_repeat()
+        mailbox.start(receive.length, send.length)
+        return 0
+
+    def _start_inputs(self, now_ns: int) -> int:
+        self.device.process_data.configure()
+        code = check_process_data(self.esc, self.device)
+        if not code:
+            self._has_outputs = False
+            self._offer_inputs(now_ns)
+        return code
+
+    def _enter(self, target: AlState) -> None:
+        if target is not AlState.OP:
+            self.esc.watchdog.stop()
+        self.device.al_state = target
+        self.esc.set_al_status(target, self._code)
+
+    def _refuse(self, code: int) -> None:
+        if self.state is AlState.OP:
+            self.device.al_state = AlState.SAFEOP
+            self.esc.watchdog.stop()
+        self._has_outputs = False
+        self._code = code
+        self.esc.set_al_status(self.state | ERROR, code)
+
+    def _check_channels(self, now_ns: int) -> None:
+        """The master has changed a sync manager: that must not happen under running data."""
+        if self.state not in _WITH_PROCESS_DATA or self.esc.emulates_device:
+            return
+        code = check_process_data(self.esc, self.device)
+        if code:
+            self.esc.watchdog.stop()
+            self.device.al_state = AlState.PREOP
+            self._refuse(code)
+
+    def _serve_mailbox(self, event: int) -> None:
+        mailbox = self.device.mailbox
+        send = self.esc.channels[1]
+        assert mailbox is not None  # noqa: S101  asked by the caller
+        if event & send.event and not send.is_full:
+            mailbox.handle_read()
+        if send.repeat_request != send.repeat_acknowledge:
+            again = mailbox.repeat_message()
+            if again is not None:
+                send.discard()
+                send.put(again)
+            send.acknowledge_repeat()
+
+    def _move_messages(self, now_ns: int) -> None:
+        mailbox = self.device.mailbox
+        receive, send = self.esc.channels[:2]
+        assert mailbox is not None  # noqa: S101  asked by the caller
+        if mailbox.is_ready:
+            request = receive.take()
+            if request is not None:
+                mailbox.receive_message(request, now_ns)
+        if not send.is_full:
+            message = mailbox.next_message(now_ns)
+            if message is not None:
+                send.put(message)
+
+    def _exchange(self, now_ns: int) -> None:
+        process_data = self.device.process_data
+        if process_data.outputs.size:
+            data = self.esc.channels[self.device.output_channel].take()
+            if data is not None:
+                self._has_outputs = True
+                if self._deadline_ns is not None:
+                    self._deadline_ns = None
+                    self._enter(AlState.OP)
+                if self.state is AlState.OP:
+                    process_data.write_outputs(data)
+        self._offer_inputs(now_ns)
+
+    def _offer_inputs(self, now_ns: int) -> None:
+        self.device.step(now_ns)
+        if self.device.process_data.inputs.size:
+            self.esc.channels[self.device.input_channel].put(self.device.process_data.read_inputs())
+
+
+_STATES = frozenset(AlState)

@@ -1,0 +1,184 @@
+"""One sync manager: who may touch its area of the memory, and when (ETG.1000.4).
+
+In both modes an access opens with the first octet and is complete with the last.  A mailbox then
+belongs to the other side; a buffered area has three buffers, so that neither side ever waits and
+nobody sees half of what the other writes.
+"""
+
+from __future__ import annotations
+
+from devicebus.wire.register import Register, SmStatus
+
+_BUFFERED_EMPTY = 0x30
+_ACTIVATE, _STATUS, _PDI_CONTROL = 6, 5, 7
+
+
+class SyncChannel:
+    """Sync manager *number* over the memory of an ESC.
+
+    Attributes:
+        start, end: Its area.
+        is_enabled: Whether it guards the area.
+        is_mailbox: Mailbox mode, else three buffers.
+        master_writes: Direction.
+        watches: Whether writes to it feed the process data watchdog.
+        is_stuck: A fault: what the master wrote is never taken.
+    """
+
+    __slots__ = ("_buffer", "_dirty", "_memory", "_open", "_register", "_setting", "_waiting",
+                 "end", "event", "is_enabled", "is_mailbox", "is_stuck", "master_writes",
+                 "start", "watches")  # fmt: skip
+
+    def __init__(self, memory: bytearray, number: int) -> None:
+        self._memory = memory
+        self._register = Register.SYNC_MANAGER + 8 * number
+        self.event = 0x100 << number
+        self.is_stuck = False
+        self._setting: bytes | None = None
+        self.configure()
+
+    def configure(self) -> bool:
+        """Take over the registers; return whether anything but the repeat bit has changed."""
+        at = self._register
+        octets = self._memory[at : at + 8]
+        setting = bytes((*octets[:5], octets[_ACTIVATE] & 1, octets[_PDI_CONTROL] & 1))
+        if setting == self._setting:
+            return False
+        self._setting = setting
+        self.start = int.from_bytes(octets[0:2], "little")
+        length = int.from_bytes(octets[2:4], "little")
+        self.end = min(self.start + length, len(self._memory))
+        control = octets[4]
+        self.is_mailbox = control & 3 == 2
+        self.master_writes = control >> 2 & 3 == 1
+        self.watches = bool(control & 0x40)
+        self.is_enabled = bool(octets[_ACTIVATE] & 1) and self.start < self.end
+        self._open = False
+        self._dirty = False
+        self._waiting: bytes | None = None
+        self._buffer = bytes(self.end - self.start) if self.is_enabled else b""
+        buffered = self.is_enabled and not self.is_mailbox
+        self._set_status(_BUFFERED_EMPTY if buffered else 0)
+        return True
+
+    @property
+    def length(self) -> int:
+        """Octets of the area, 0 while disabled."""
+        return self.end - self.start if self.is_enabled else 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a mailbox holds a message."""
+        return bool(self._memory[self._register + _STATUS] & SmStatus.MAILBOX_FULL)
+
+    @property
+    def is_locked(self) -> bool:
+        """Whether the slave keeps the master out."""
+        return bool(self._memory[self._register + _PDI_CONTROL] & 1)
+
+    @property
+    def repeat_request(self) -> int:
+        """The bit by which a master asks for the last message again."""
+        return self._memory[self._register + _ACTIVATE] >> 1 & 1
+
+    @property
+    def repeat_acknowledge(self) -> int:
+        """The bit by which the slave says that it sent the last message again."""
+        return self._memory[self._register + _PDI_CONTROL] >> 1 & 1
+
+    def acknowledge_repeat(self) -> None:
+        """Copy the repeat request to the acknowledgement."""
+        at = self._register + _PDI_CONTROL
+        self._memory[at] = self._memory[at] & ~2 | self.repeat_request << 1
+
+    def read_by_master(self, start: int, end: int) -> int:
+        """Prepare a master's read of part of the area.
+
+        Returns:
+            -1 if it is refused, else the AL event that it causes, or 0.
+        """
+        if self.master_writes or self.is_locked or (self.is_mailbox and not self.is_full):
+            return -1
+        if start == self.start:
+            self._open = True
+            if self._waiting is not None:
+                self._memory[self.start : self.end] = self._waiting
+                self._waiting = None
+        elif not self._open:
+            return -1
+        if end < self.end:
+            return 0
+        self._open = False
+        self._set_status(
+            SmStatus.READ_INTERRUPT
+            if self.is_mailbox
+            else self._status & ~SmStatus.WRITE_INTERRUPT | SmStatus.READ_INTERRUPT
+        )
+        return self.event
+
+    def write_by_master(self, start: int, data: bytes) -> int:
+        """Write part of the area for a master.
+
+        Returns:
+            -1 if it is refused, else the AL event that it causes, or 0.
+        """
+        if not self.master_writes or self.is_locked or (self.is_mailbox and self.is_full):
+            return -1
+        if start == self.start:
+            self._open = True
+        elif not self._open:
+            return -1
+        end = start + len(data)
+        self._memory[start:end] = data
+        if end < self.end:
+            return 0
+        self._open = False
+        self._dirty = True
+        if self.is_mailbox:
+            self._set_status(SmStatus.MAILBOX_FULL | SmStatus.WRITE_INTERRUPT)
+        else:
+            self._buffer = bytes(self._memory[self.start : self.end])
+            self._next_buffer()
+        return self.event
+
+    def take(self) -> bytes | None:
+        """Return what the master wrote since the last time, None if nothing or not everything."""
+        if not self._dirty or self.is_stuck:
+            return None
+        self._dirty = False
+        if not self.is_mailbox:
+            return self._buffer
+        self._set_status(SmStatus.READ_INTERRUPT)
+        return bytes(self._memory[self.start : self.end])
+
+    def put(self, data: bytes) -> bool:
+        """Offer *data* to the master; return False while a mailbox is still full."""
+        octets = data.ljust(self.length, b"\0")[: self.length]
+        if self.is_mailbox:
+            if self.is_full:
+                return False
+            self._memory[self.start : self.end] = octets
+            self._set_status(SmStatus.MAILBOX_FULL | SmStatus.WRITE_INTERRUPT)
+            return True
+        if self._open:
+            self._waiting = octets
+        else:
+            self._memory[self.start : self.end] = octets
+        self._next_buffer()
+        return True
+
+    def discard(self) -> None:
+        """Empty a mailbox, whoever filled it."""
+        self._dirty = False
+        self._set_status(0)
+
+    @property
+    def _status(self) -> int:
+        return self._memory[self._register + _STATUS]
+
+    def _set_status(self, status: int) -> None:
+        self._memory[self._register + _STATUS] = status
+
+    def _next_buffer(self) -> None:
+        buffer = ((self._status >> 4 & 3) + 1) % 3 if self._status >> 4 != 3 else 0
+        self._set_status(buffer << 4 | SmStatus.WRITE_INTERRUPT)

@@ -1,0 +1,56 @@
+"""Buses built from descriptions."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.sim.devices.build import build_segment, build_slave
+from devicebus.sim.spec import BusSpec, ClockSpec
+from devicebus.sim.wiring import Side
+from devicebus.wire.datagram import Command, encode_frame
+from tests.support.bus import datagram, generic, send
+
+
+def bus(*specs, **more):
+    return BusSpec(bus="b", slaves=specs, **more)
+
+
+def test_line_by_default():
+    segment = build_segment(bus(generic("a"), generic("b"), generic("c")))
+    assert [slave.device.name for slave in segment.slaves] == ["a", "b", "c"]
+    assert send(segment, Command.BRD, 0, 0, b"\0").wkc == 3
+
+
+def test_branch_by_name():
+    segment = build_segment(
+        bus(generic("a"), generic("b"), generic("c", after="a", port=3), generic("d", after="b"))
+    )
+    segment.cut(2)
+    assert send(segment, Command.BRD, 0, 0, b"\0").wkc == 3
+    segment.cut(1)
+    assert send(segment, Command.BRD, 0, 0, b"\0").wkc == 1
+
+
+def test_slave_before_must_come_before():
+    with pytest.raises(ValueError, match="b is wired to c, which comes later"):
+        build_segment(bus(generic("a"), generic("b", after="c"), generic("c", after="a")))
+
+
+def test_ring_has_a_second_end():
+    segment = build_segment(bus(generic("a"), generic("b"), ring=True))
+    frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
+    assert segment.process_frame(frame, 0) is Side.SECONDARY
+
+
+def test_clock_as_described():
+    slave = build_slave(generic(clock=ClockSpec(drift_ppm=10, start_ns=5, needs_sync0=True)))
+    assert slave.esc.clock.local_time(0) == 5
+    assert slave.esc.clock.local_time(10**9) == 5 + 10**9 + 10_000
+    assert slave.device.needs_sync0
+    assert build_slave(generic(clock=None)).esc.read(0x0910, 8, 0) is None
+
+
+def test_boot_needs_a_mailbox():
+    assert build_slave(generic()).device.has_boot
+    assert not build_slave(generic(mailbox=None)).device.has_boot
+    assert not build_slave(generic(boot=False)).device.has_boot

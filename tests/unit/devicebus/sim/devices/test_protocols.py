@@ -1,0 +1,55 @@
+"""Mailboxes with the protocols that a description asks for."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.sim.device import Device
+from devicebus.sim.devices.protocols import build_mailbox
+from devicebus.sim.spec import FileSpec, MailboxSpec
+from devicebus.wire.alstatus import AlState
+from eap.codec.foe import FoeErrorCode
+from eap.codec.mailbox import MailboxHeader, MailboxType, decode_message, encode_message
+from eap.od.dictionary import ObjectDictionary
+
+
+def make(spec, files=()):
+    device = Device("d", ObjectDictionary())
+    mailbox = build_mailbox(spec, files, device)
+    mailbox.start(spec.size, spec.size)
+    return device, mailbox
+
+
+def ask(mailbox, kind, data):
+    mailbox.receive_message(encode_message(MailboxHeader(0, type=kind), data), 0)
+    header, body = decode_message(mailbox.next_message(0))
+    return header.type, bytes(body)
+
+
+@pytest.mark.parametrize("kind", [MailboxType.COE, MailboxType.FOE])
+def test_protocol_that_is_not_there_is_refused(kind):
+    _, mailbox = make(MailboxSpec(coe=False))
+    assert ask(mailbox, kind, bytes(10)) == (MailboxType.ERR, b"\1\0\2\0")
+
+
+def test_file_for_boot_only_and_with_a_password():
+    files = (FileSpec(name="fw", content="abc", boot_only=True, password=7),)
+    device, mailbox = make(MailboxSpec(foe=True), files)
+    request = b"\1\0" + (7).to_bytes(4, "little") + b"fw"
+    kind, data = ask(mailbox, MailboxType.FOE, request)
+    assert (kind, data[0], int.from_bytes(data[2:6], "little")) == (
+        MailboxType.FOE, 5, FoeErrorCode.BOOTSTRAP_ONLY,
+    )  # fmt: skip
+    device.al_state = AlState.BOOT
+    assert ask(mailbox, MailboxType.FOE, request) == (MailboxType.FOE, b"\3\0\1\0\0\0abc")
+    kind, data = ask(mailbox, MailboxType.FOE, b"\1\0\0\0\0\0fw")
+    assert int.from_bytes(data[2:6], "little") == FoeErrorCode.NO_RIGHTS
+
+
+def test_dictionary_answers_by_coe():
+    _, mailbox = make(MailboxSpec())
+    request = bytes.fromhex("0020 40 0010 00 00000000")
+    assert ask(mailbox, MailboxType.COE, request) == (
+        MailboxType.COE,
+        bytes.fromhex("0020 80 0010 00 00000206"),
+    )

@@ -1,0 +1,75 @@
+"""EEPROM images made from descriptions."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.sim.devices.objects import build_dictionary
+from devicebus.sim.devices.siibuild import IMAGE_SIZE, build_image, plan_channels
+from devicebus.sim.spec import MailboxSpec
+from devicebus.wire import sii
+from devicebus.wire.sii import SiiProtocol
+from tests.support.bus import generic
+
+
+def image_of(spec, *, emulates=False):
+    layout = plan_channels(spec.mailbox, 3, 3)
+    return build_image(spec, build_dictionary(spec, 5001), layout, emulates=emulates)
+
+
+def test_channels_with_a_mailbox():
+    layout = plan_channels(MailboxSpec(size=100), 3, 5)
+    assert [(c.start, c.length, c.control, c.type) for c in layout.channels] == [
+        (0x1000, 100, 0x26, 1), (0x1064, 100, 0x22, 2), (0x10C8, 3, 0x64, 3), (0x10D8, 5, 0x20, 4),
+    ]  # fmt: skip
+    assert layout[1:] == (2, 3)
+
+
+@pytest.mark.parametrize(("outputs", "inputs"), [(0, 4), (4, 0), (1000, 1000)])
+def test_areas_have_room_for_three_buffers(outputs, inputs):
+    layout = plan_channels(None, outputs, inputs)
+    first, second = layout.channels
+    assert first.start + 3 * outputs <= second.start
+    assert [each.enable for each in layout.channels] == [bool(outputs), bool(inputs)]
+    assert layout[1:] == (0, 1)
+
+
+def test_image_tells_what_the_slave_is():
+    spec = generic("valve island", alias=9, vendor=1, product=2, revision=3, serial=4,
+    identity = (fixed.alias, fixed.vendor, fixed.product, fixed.revision, fixed.serial)
+    assert identity == (9, 1, 2, 3, 4)
+    image = image_of(spec)
+    assert (len(image), sii.is_intact(image)) == (IMAGE_SIZE, True)
+    read = sii.decode(image)
+    fixed = read.fixed
+    assert (read.name, read.fmmus[:3]) == ("valve island", (1, 2, 3))
+    assert (fixed.alias, fixed.vendor, fixed.product, fixed.revision, fixed.serial) == (
+        9,
+        1,
+        2,
+        3,
+        4,
+    )
+    assert (fixed.receive_offset, fixed.send_offset, fixed.boot_send_size) == (0x1000, 0x1040, 64)
+    assert fixed.protocols == (
+        SiiProtocol.COE | SiiProtocol.FOE | SiiProtocol.SOE | SiiProtocol.EOE | SiiProtocol.VOE
+    )
+    ((header, entries),) = read.tx_pdos
+    assert (header.index, header.sync_manager, [e.bit_length for e in entries]) == (
+        0x1A00,
+        3,
+        [16, 1, 7],
+    )
+    assert [e.data_type for e in entries] == [6, 1, 0]
+
+
+def test_image_of_a_slave_without_mailbox_boot_and_clock():
+    spec = generic(mailbox=None, boot=False, clock=None, inputs=())
+    read = sii.decode(image_of(spec, emulates=True))
+    assert (read.fixed.protocols, read.fixed.receive_size, read.fixed.boot_receive_size) == (
+        0,
+        0,
+        0,
+    )
+    assert (read.fixed.pdi_control, read.dc, read.tx_pdos) == (0x0104, (), ())
+    assert read.general.coe_sdo == 0

@@ -1,0 +1,91 @@
+"""The EEPROM through its registers."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.sim.eeprom import Eeprom
+from devicebus.wire import sii
+from devicebus.wire.register import EepromCommand, EepromControl, Register
+from devicebus.wire.sii import Sii
+from devicebus.wire.siirecord import SiiFixed
+
+IMAGE = sii.encode(
+    Sii(fixed=SiiFixed(pdi_control=0x0E08, alias=0x1234, vendor=0xABCDEF01, product=7))
+)
+
+
+@pytest.fixture
+def memory():
+    return bytearray(0x1000)
+
+
+@pytest.fixture
+def eeprom(memory):
+    return Eeprom(memory, IMAGE)
+
+
+def command(eeprom, memory, what, word=0, *, write_enable=0, data=b""):
+    memory[Register.EEPROM_DATA : Register.EEPROM_DATA + len(data)] = data
+    memory[Register.EEPROM_ADDRESS : Register.EEPROM_ADDRESS + 4] = word.to_bytes(4, "little")
+    control = EepromControl(write_enable=write_enable, command=what)
+    memory[Register.EEPROM_CONTROL : Register.EEPROM_CONTROL + 2] = control.encode()
+    eeprom.control_written()
+    return EepromControl.decode(memory, Register.EEPROM_CONTROL)
+
+
+def test_power_on_loads_configuration_and_alias(eeprom, memory):
+    assert memory[0x0140:0x0142] == b"\x08\x0e"
+    assert memory[0x0012:0x0014] == b"\x34\x12"
+    assert eeprom.is_masters
+
+
+def test_read_gives_eight_octets(eeprom, memory):
+    status = command(eeprom, memory, EepromCommand.READ, 8)
+    assert memory[0x0508:0x0510] == bytes.fromhex("01efcdab 07000000")
+    assert (status.read_eight, status.busy, status.command_error) == (1, 0, 0)
+
+
+def test_read_behind_the_end_is_erased(eeprom, memory):
+    command(eeprom, memory, EepromCommand.READ, 0xFFFF_FFFF)
+    assert memory[0x0508:0x0510] == b"\xff" * 8
+
+
+def test_write_takes_one_word_and_permission(eeprom, memory):
+    status = command(eeprom, memory, EepromCommand.WRITE, 4, data=b"\x78\x56")
+    assert status.write_enable_error
+    assert eeprom.image == IMAGE
+    status = command(eeprom, memory, EepromCommand.WRITE, 4, write_enable=1, data=b"\x78\x56\xff")
+    assert not status.write_enable_error
+    assert eeprom.image[:12] == IMAGE[:8] + b"\x78\x56" + IMAGE[10:12]
+
+
+def test_write_behind_the_end_and_unknown_command_are_errors(eeprom, memory):
+    last = len(IMAGE) // 2
+    assert command(eeprom, memory, EepromCommand.WRITE, last, write_enable=1).command_error
+    assert command(eeprom, memory, 3).command_error
+    assert not command(eeprom, memory, EepromCommand.NONE).command_error
+
+
+def test_reload_judges_the_check_sum_and_leaves_the_alias(eeprom, memory):
+    command(eeprom, memory, EepromCommand.WRITE, 4, write_enable=1, data=b"\x78\x56")
+    assert command(eeprom, memory, EepromCommand.RELOAD).crc_error
+    eeprom.image[14] = sii.checksum(eeprom.image[:14])
+    assert not command(eeprom, memory, EepromCommand.RELOAD).crc_error
+    assert memory[0x0012:0x0014] == b"\x34\x12"
+
+
+def test_image_with_a_wrong_check_sum_loads_nothing(memory):
+    Eeprom(memory, bytes(256))
+    assert EepromControl.decode(memory, Register.EEPROM_CONTROL).crc_error
+    assert memory[0x0012:0x0014] == bytes(2)
+
+
+def test_interface_is_given_away_and_taken_by_force(eeprom, memory):
+    memory[0x0500] = 1
+    memory[0x0501] = 1
+    eeprom.ownership_written()
+    assert (eeprom.is_masters, memory[0x0501]) == (False, 1)
+    memory[0x0500] = 2
+    eeprom.ownership_written()
+    assert (eeprom.is_masters, memory[0x0501]) == (True, 0)

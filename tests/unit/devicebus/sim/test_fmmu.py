@@ -1,0 +1,113 @@
+"""FMMUs against a model that copies one bit at a time."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devicebus.sim.fmmu import active_windows, insert_parts, read_windows, write_windows
+from devicebus.wire.register import Fmmu
+
+
+class Memory:
+    """256 octets that anybody may touch, but for those from 128 on."""
+
+    def __init__(self, content=bytes(256)):
+        self.octets = bytearray(content)
+
+    def read(self, address, length, now_ns):
+        return None if address >= 128 else self.peek(address, length)
+
+    def write(self, address, data, now_ns):
+        if address < 128:
+            self.octets[address : address + len(data)] = data
+        return address < 128
+
+    def peek(self, address, length):
+        return bytes(self.octets[address : address + length])
+
+
+def windows(*units: Fmmu):
+    memory = bytearray(0x1000)
+    for number, unit in enumerate(units):
+        memory[0x600 + 16 * number : 0x610 + 16 * number] = unit.encode()
+    return active_windows(memory, len(units))
+
+
+def unit(logical, length, physical, kind=3, *, bits=(0, 7, 0)):
+    return Fmmu(logical, length, bits[0], bits[1], physical, bits[2], kind, 1)
+
+
+def test_only_active_units_with_a_length_count():
+    off = Fmmu(0, 4, type=1, activate=0)
+    assert windows(off, unit(0, 0, 0), unit(8, 2, 3)) == windows(unit(8, 2, 3))
+    assert windows(unit(0, 1, 0, bits=(5, 3, 0))) == ()
+
+
+def test_octets_are_read_where_both_overlap():
+    memory = Memory(bytes(range(256)))
+    parts = read_windows(memory, windows(unit(100, 4, 10)), 98, 4, 0)
+    data = bytearray(b"\xee" * 4)
+    insert_parts(data, parts)
+    assert data == b"\xee\xee\x0a\x0b"
+    assert read_windows(memory, windows(unit(100, 4, 10)), 104, 8, 0) == []
+
+
+def test_direction_and_refusal():
+    memory = Memory()
+    assert read_windows(memory, windows(unit(0, 2, 0, kind=2)), 0, 2, 0) == []
+    assert not write_windows(memory, windows(unit(0, 2, 0, kind=1)), 0, b"ab", 0)
+    assert read_windows(memory, windows(unit(0, 2, 200)), 0, 2, 0) == []
+    assert not write_windows(memory, windows(unit(0, 2, 200)), 0, b"ab", 0)
+
+
+def test_bits_leave_their_neighbours_alone():
+    memory = Memory(b"\xff" * 256)
+    one_bit = windows(unit(0, 1, 5, bits=(3, 3, 6)))
+    assert write_windows(memory, one_bit, 0, b"\x00", 0)
+    assert memory.octets[5] == 0b1011_1111
+    data = bytearray(b"\xff")
+    insert_parts(data, read_windows(memory, one_bit, 0, 1, 0))
+    assert data == b"\xf7"
+
+
+@st.composite
+def one_unit(draw):
+    first = draw(st.integers(0, 7))
+    length = draw(st.integers(1, 4))
+    last = draw(st.integers(first if length == 1 else 0, 7))
+    physical_bit = draw(st.integers(0, 7))
+    return unit(draw(st.integers(0, 12)), length, draw(st.integers(0, 20)),
+                bits=(first, last, physical_bit))  # fmt: skip
+
+
+def mapped_bits(each: Fmmu):
+    count = 8 * (each.length - 1) + each.logical_end_bit - each.logical_start_bit + 1
+    for n in range(count):
+        yield (8 * each.logical_start + each.logical_start_bit + n,
+               8 * each.physical_start + each.physical_start_bit + n)  # fmt: skip
+
+
+@given(one_unit(), st.binary(min_size=8, max_size=8), st.binary(min_size=32, max_size=32))
+def test_like_one_bit_at_a_time(each, sent, content):
+    address = 4
+    expected_data = int.from_bytes(sent, "little")
+    expected_memory = int.from_bytes(content, "little")
+    before = expected_memory
+    for logical, physical in mapped_bits(each):
+        place = logical - 8 * address
+        if 0 <= place < 64:
+            expected_memory &= ~(1 << physical)
+            expected_memory |= (expected_data >> place & 1) << physical
+    for logical, physical in mapped_bits(each):
+        place = logical - 8 * address
+        if 0 <= place < 64:
+            expected_data &= ~(1 << place)
+            expected_data |= (before >> physical & 1) << place
+    memory = Memory(content + bytes(224))
+    data = bytearray(sent)
+    parts = read_windows(memory, windows(each), address, 8, 0)
+    write_windows(memory, windows(each), address, sent, 0)
+    insert_parts(data, parts)
+    assert int.from_bytes(data, "little") == expected_data
+    assert int.from_bytes(memory.octets[:32], "little") == expected_memory

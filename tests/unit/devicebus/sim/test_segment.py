@@ -1,0 +1,147 @@
+"""Segments: wiring, cuts, power, rings, and the times at which frames pass."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.sim.devices.build import build_slave
+from devicebus.sim.segment import Cable, Segment
+from devicebus.sim.wiring import CABLE_NS, FORWARD_NS, Side
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
+from devicebus.wire.register import Register
+from tests.support.bus import STATION, Bench, datagram, generic, send
+
+HOP = FORWARD_NS + CABLE_NS
+
+
+def count(bench_or_segment) -> int:
+    segment = getattr(bench_or_segment, "segment", bench_or_segment)
+    return send(segment, Command.BRD, 0, 0, b"\0").wkc
+
+
+def line(number: int) -> Bench:
+    return Bench(*(generic(f"slave {n}") for n in range(number)))
+
+
+def test_every_slave_answers():
+    assert count(line(4)) == 4
+
+
+def test_segment_without_slaves_answers_nothing():
+    frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
+    assert Segment([]).process_frame(frame, 0) is None
+
+
+def test_cut_cable_hides_what_is_behind_it():
+    bench = line(4)
+    bench.segment.cut(2)
+    assert count(bench) == 2
+    status = bench.read(Register.DL_STATUS, 2, STATION + 1).data
+    assert status == (0x5617).to_bytes(2, "little")
+    bench.segment.mend(2)
+    assert count(bench) == 4
+    status = bench.read(Register.DL_STATUS, 2, STATION + 1).data
+    assert status == (0x5A37).to_bytes(2, "little")
+
+
+def test_cut_at_the_master_loses_frames():
+    bench = line(2)
+    bench.segment.cut(0)
+    frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
+    assert bench.segment.process_frame(frame, 0) is None
+
+
+def test_slave_without_power_comes_back_new():
+    bench = line(3)
+    bench.bring(AlState.PREOP, 1)
+    bench.segment.switch(1, on=False)
+    assert count(bench) == 1
+    bench.segment.switch(1, on=True)
+    assert count(bench) == 3
+    assert bench.read(Register.AL_STATUS, 2, STATION + 1).wkc == 0
+    assert bench.send(Command.APRD, 0xFFFF, Register.AL_STATUS, bytes(2)).data == b"\x01\x00"
+    assert bench.read(Register.AL_STATUS, 2, STATION + 2).wkc == 1
+
+
+def test_closed_port_takes_the_rest_away():
+    bench = line(3)
+    assert bench.write(Register.DL_CONTROL + 1, b"\x0c") == 1
+    assert count(bench) == 1
+    bench.write(Register.DL_CONTROL + 1, b"\x00")
+    assert count(bench) == 3
+
+
+def test_branches():
+    specs = [generic(f"slave {n}") for n in range(4)]
+    cables = [Cable(1, 0, 1), Cable(2, 1, 1), Cable(3, 0, 3)]
+    bench = Bench(*specs, cables=cables)
+    stations = [bench.send(Command.APRD, -n & 0xFFFF, 0x10, bytes(2)).wkc for n in range(4)]
+    assert stations == [1, 1, 1, 1]
+    second = bench.segment.slaves[3].esc
+    assert bench.send(Command.APWR, 0xFFFF, 0x1F00, b"x").wkc == 1
+    assert second.peek(0x1F00, 1) == b"x"
+
+
+def test_receive_times_follow_the_wiring():
+    bench = line(3)
+    bench.now_ns = 5_000_000
+    assert bench.send(Command.BWR, 0, Register.DC_RECEIVE_TIME, bytes(4)).wkc == 3
+    times = [
+        [int.from_bytes(bench.read(Register.DC_RECEIVE_TIME + 4 * port, 4, STATION + n).data,
+                        "little") for port in range(2)]
+        for n in range(3)
+    ]  # fmt: skip
+    start = times[0][0]
+    assert times == [
+        [start, start + 4 * HOP],
+        [times[1][0], times[1][0] + 2 * HOP],
+        [times[2][0], 0],
+    ]
+
+
+def test_ring_works_from_both_ends_when_it_is_broken():
+    slaves = [build_slave(generic(f"slave {n}")) for n in range(4)]
+    segment = Segment(slaves, ring_end=(3, 1))
+
+    def send_at(side):
+        frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0")]))
+        out = segment.process_frame(frame, 0, side)
+        return out, next(iter_datagrams(frame)).wkc
+
+    assert send_at(Side.PRIMARY) == (Side.SECONDARY, 4)
+    assert send_at(Side.SECONDARY) == (Side.PRIMARY, 0)
+    segment.cut(1)
+    assert send_at(Side.PRIMARY) == (Side.PRIMARY, 1)
+    assert send_at(Side.SECONDARY) == (Side.SECONDARY, 3)
+    segment.cut(0)
+    assert send_at(Side.PRIMARY) == (None, 0)
+
+
+def test_circulating_frame_is_taken_out_of_a_broken_ring():
+    slaves = [build_slave(generic(f"slave {n}")) for n in range(2)]
+    segment = Segment(slaves, ring_end=(1, 1))
+    segment.cut(1)
+    frame = bytearray(encode_frame([datagram(Command.BRD, 0, 0, b"\0", circulating=1)]))
+    assert segment.process_frame(frame, 0, Side.SECONDARY) is None
+
+
+def test_slaves_look_at_the_time_between_frames():
+    bench = line(1)
+    assert bench.segment.next_timeout() is None
+    bench.bring(AlState.OP)
+    bench.cycle()
+    deadline = bench.segment.next_timeout()
+    assert deadline == 100_000_000
+    bench.segment.handle_timeout(deadline)
+    assert bench.slaves[0].state is AlState.SAFEOP
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_same_run_gives_the_same_frames(frames):
+    def run():
+        bench = line(2)
+        bench.bring(AlState.OP)
+        return [bench.cycle(outputs=bytes((n, 0, 0))) for n in range(frames)]
+
+    assert run() == run()

@@ -1,0 +1,288 @@
+"""The state machine of a slave: what it checks, refuses, waits for and falls back to."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.sim.slave import OUTPUTS_TIMEOUT_NS
+from devicebus.sim.spec import ChannelSpec, ClockSpec
+from devicebus.wire.alstatus import ERROR, AlState, AlStatusCode
+from devicebus.wire.datagram import Command
+from devicebus.wire.register import Register, SyncManager
+from tests.support.bus import Bench, generic
+
+UPLOAD_VENDOR = bytes.fromhex("0a00 0000 00 13 0020 40 1810 01 00000000")
+
+
+def upload(counter: int, index: int = 0x1018, subindex: int = 1) -> bytes:
+    return (
+        bytes.fromhex("0a00 0000 00")
+        + bytes((counter << 4 | 3,))
+        + bytes.fromhex("0020 40")
+        + index.to_bytes(2, "little")
+        + bytes((subindex,))
+        + bytes(4)
+    )
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+@pytest.mark.parametrize("state", [AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT])
+def test_way_up(bench, state):
+    bench.bring(state)
+    assert bench.slaves[0].state is state
+    bench.ask(AlState.INIT)
+    assert bench.status() == (AlState.INIT, 0)
+
+
+@pytest.mark.parametrize(
+    ("start", "asked", "status", "code"),
+    [
+        (AlState.PREOP, AlState.OP, AlState.PREOP, AlStatusCode.INVALID_STATE_CHANGE),
+        (AlState.PREOP, AlState.BOOT, AlState.PREOP, AlStatusCode.INVALID_STATE_CHANGE),
+        (AlState.BOOT, AlState.PREOP, AlState.BOOT, AlStatusCode.INVALID_STATE_CHANGE),
+        (AlState.OP, AlState.BOOT, AlState.SAFEOP, AlStatusCode.INVALID_STATE_CHANGE),
+        (AlState.SAFEOP, 5, AlState.SAFEOP, AlStatusCode.UNKNOWN_STATE),
+        (AlState.OP, 7, AlState.SAFEOP, AlStatusCode.UNKNOWN_STATE),
+    ],
+)
+def test_refused_request(bench, start, asked, status, code):
+    bench.bring(start)
+    bench.ask(asked)
+    assert bench.status() == (status | ERROR, code)
+
+
+def test_error_is_acknowledged_or_ended_by_init(bench):
+    bench.bring(AlState.PREOP)
+    bench.ask(AlState.OP)
+    bench.ask(AlState.SAFEOP)
+    assert bench.status() == (AlState.PREOP | ERROR, AlStatusCode.INVALID_STATE_CHANGE)
+    bench.ask(AlState.PREOP | ERROR)
+    assert bench.status() == (AlState.PREOP, 0)
+    bench.ask(AlState.OP)
+    bench.ask(AlState.INIT)
+    assert bench.status() == (AlState.INIT, 0)
+
+
+@pytest.mark.parametrize("state", [AlState.SAFEOP, AlState.PREOP])
+def test_way_down(bench, state):
+    bench.bring(AlState.OP)
+    bench.ask(state)
+    assert bench.status() == (state, 0)
+    assert bench.slaves[0].next_timeout() is None
+
+
+def test_preop_needs_its_mailboxes(bench):
+    bench.ask(AlState.PREOP)
+    assert bench.status() == (AlState.INIT | ERROR, AlStatusCode.MAILBOX_PREOP)
+    bench.ask(AlState.BOOT | ERROR)
+    assert bench.status() == (AlState.INIT | ERROR, AlStatusCode.MAILBOX_BOOT)
+
+
+def test_boot_only_where_there_is_one():
+    bench = Bench(generic(boot=False))
+    bench.set_channels(0, 0, 2)
+    bench.ask(AlState.BOOT)
+    assert bench.status() == (AlState.INIT | ERROR, AlStatusCode.BOOT_NOT_SUPPORTED)
+
+
+@pytest.mark.parametrize(
+    ("channel", "code"),
+    [(2, AlStatusCode.OUTPUT_CONFIGURATION), (3, AlStatusCode.INPUT_CONFIGURATION)],
+)
+def test_safeop_needs_channels_of_the_mapped_length(bench, channel, code):
+    bench.bring(AlState.PREOP)
+    bench.set_channels(0, 2)
+    at = Register.SYNC_MANAGER + 8 * channel
+    old = SyncManager.decode(bench.read(at, 8).data)
+    bench.write(at, SyncManager(old.start, old.length + 1, enable=1).encode())
+    bench.ask(AlState.SAFEOP)
+    assert bench.status() == (AlState.PREOP | ERROR, code)
+
+
+def test_op_needs_outputs(bench):
+    bench.bring(AlState.SAFEOP)
+    bench.ask(AlState.OP)
+    assert bench.status() == (AlState.SAFEOP, 0)
+    assert bench.segment.next_timeout() == OUTPUTS_TIMEOUT_NS
+    bench.cycle()
+    assert bench.status() == (AlState.OP, 0)
+
+
+def test_op_without_outputs_is_refused_in_time(bench):
+    bench.bring(AlState.SAFEOP)
+    bench.ask(AlState.OP)
+    bench.now_ns = OUTPUTS_TIMEOUT_NS
+    assert bench.status() == (AlState.SAFEOP | ERROR, AlStatusCode.NO_OUTPUTS)
+
+
+def test_slave_without_outputs_goes_to_op_at_once():
+    bench = Bench(generic(outputs=()))
+    bench.bring(AlState.SAFEOP)
+    bench.ask(AlState.OP)
+    assert bench.status() == (AlState.OP, 0)
+
+
+def test_outputs_count_in_op_only(bench):
+    entry = bench.slaves[0].device.dictionary.entry(0x7000, 1)
+    bench.bring(AlState.SAFEOP)
+    bench.cycle(outputs=b"\x34\x12\x01")
+    assert entry.value == 0
+    bench.ask(AlState.OP)
+    assert bench.cycle(outputs=b"\x34\x12\x01").wkc == 3
+    assert entry.value == 0x1234
+    assert bench.slaves[0].device.dictionary.entry(0x7000, 2).value is True
+
+
+def test_inputs_reach_the_master(bench):
+    bench.slaves[0].device.dictionary.entry(0x6000, 1).value = 0xABCD
+    bench.slaves[0].device.dictionary.entry(0x6000, 2).value = True
+    bench.bring(AlState.SAFEOP)
+    assert bench.cycle().data[3:] == b"\xcd\xab\x01"
+
+
+def test_outputs_that_stay_away_end_op(bench):
+    bench.bring(AlState.OP)
+    bench.cycle()
+    bench.now_ns = 99_999_999
+    assert bench.status() == (AlState.OP, 0)
+    bench.now_ns = 101_000_000
+    assert bench.status() == (AlState.SAFEOP | ERROR, AlStatusCode.WATCHDOG)
+    assert bench.read(Register.WATCHDOG_COUNTER, 1).data == b"\x01"
+
+
+def test_channel_switched_off_under_data_is_an_error(bench):
+    bench.bring(AlState.OP)
+    bench.write(Register.SYNC_MANAGER + 16 + 6, b"\x00")
+    assert bench.status() == (AlState.PREOP | ERROR, AlStatusCode.OUTPUT_CONFIGURATION)
+
+
+def test_sync0_where_it_is_needed():
+    bench = Bench(generic(clock=ClockSpec(needs_sync0=True)))
+    bench.bring(AlState.SAFEOP)
+    bench.cycle()
+    bench.ask(AlState.OP)
+    assert bench.status() == (AlState.SAFEOP | ERROR, AlStatusCode.DC_SYNC_CONFIGURATION)
+    bench.write(Register.DC_SYNC0_CYCLE, (1_000_000).to_bytes(4, "little"))
+    bench.write(Register.DC_ACTIVATION, b"\x03")
+    bench.ask(AlState.SAFEOP | ERROR)
+    bench.cycle()
+    bench.ask(AlState.OP)
+    assert bench.status() == (AlState.OP, 0)
+
+
+def test_own_error_falls_out_of_op(bench):
+    bench.bring(AlState.OP)
+    bench.slaves[0].fail(AlStatusCode.SYNCHRONIZATION)
+    assert bench.status() == (AlState.SAFEOP | ERROR, AlStatusCode.SYNCHRONIZATION)
+    assert bench.slaves[0].code == AlStatusCode.SYNCHRONIZATION
+
+
+def test_refused_state_of_a_script(bench):
+    bench.slaves[0].refuses[AlState.PREOP] = 0x8000
+    bench.set_channels(0, 0, 2)
+    bench.ask(AlState.PREOP)
+    assert bench.status() == (AlState.INIT | ERROR, 0x8000)
+
+
+def test_identification_is_given_on_request():
+    bench = Bench(generic(alias=0x0123))
+    bench.ask(AlState.INIT | 0x20)
+    assert bench.status() == (AlState.INIT | 0x20, 0x0123)
+
+
+def test_mailbox_answers(bench):
+    bench.bring(AlState.PREOP)
+    assert bench.fetch().wkc == 0
+    assert bench.post(UPLOAD_VENDOR) == 1
+    reply = bench.fetch()
+    assert (reply.wkc, reply.data[:16]) == (
+        1,
+        bytes.fromhex("0a00 0000 00 13 0030 43 1810 01 5a0e0000"),
+    )
+    assert bench.fetch().wkc == 0
+
+
+def test_mailbox_is_dead_in_init(bench):
+    bench.set_channels(0, 0, 2)
+    assert bench.post(UPLOAD_VENDOR) == 1
+    assert bench.fetch().wkc == 0
+    bench.ask(AlState.PREOP)
+    assert bench.fetch().wkc == 0  # what was there before is forgotten
+
+
+def test_lost_reply_comes_again_by_the_repeat_bit(bench):
+    bench.bring(AlState.PREOP)
+    bench.post(upload(1))
+    first = bench.fetch().data
+    assert bench.fetch().wkc == 0
+    bench.write(0x080E, b"\x03")
+    assert bench.read(0x080F, 1).data == b"\x02"
+    assert bench.fetch().data == first
+    assert bench.fetch().wkc == 0
+
+
+def test_message_not_read_yet_follows_the_repeated_one(bench):
+    bench.bring(AlState.PREOP)
+    bench.post(upload(1, 0x1018, 1))
+    first = bench.fetch().data
+    bench.post(upload(2, 0x1018, 2))
+    bench.write(0x080E, b"\x03")
+    assert bench.fetch().data == first
+    second = bench.fetch()
+    assert (second.wkc, second.data[11]) == (1, 2)
+
+
+def test_second_request_waits_in_the_queue(bench):
+    bench.bring(AlState.PREOP)
+    assert bench.post(upload(1, 0x1018, 1)) == 1
+    assert bench.post(upload(2, 0x1018, 2)) == 1
+    assert [bench.fetch().data[11] for _ in range(2)] == [1, 2]
+
+
+def test_emulated_device_follows_al_control():
+    bench = Bench(generic(mailbox=None, inputs=(), outputs=()))
+    assert bench.slaves[0].esc.emulates_device
+    bench.ask(AlState.OP)
+    assert bench.status() == (AlState.OP, 0)
+    bench.ask(AlState.PREOP | ERROR)
+    assert bench.status() == (AlState.PREOP | ERROR, 0)
+
+
+def test_simple_device_exchanges_without_a_mailbox():
+    bench = Bench(generic(mailbox=None, inputs=(ChannelSpec(name="in"),),
+                          outputs=(ChannelSpec(name="out"),)))  # fmt: skip
+    bench.bring(AlState.OP)
+    assert bench.cycle(outputs=b"\x01").wkc == 3
+    assert bench.slaves[0].device.dictionary.entry(0x7000, 1).value is True
+
+
+def test_power_forgets(bench):
+    bench.bring(AlState.OP)
+    bench.slaves[0].switch(on=False)
+    assert not bench.slaves[0].is_powered
+    bench.slaves[0].handle_timeout(10**12)
+    bench.slaves[0].switch(on=True)
+    assert bench.slaves[0].state is AlState.INIT
+    assert bench.send(Command.APRD, 0, Register.AL_STATUS, bytes(2)).data == b"\x01\x00"
+
+
+def test_sync0_lets_the_device_act():
+    bench = Bench()
+    steps = []
+
+    class Counting:
+        def step(self, state, now_ns):
+            steps.append(now_ns)
+
+    bench.slaves[0].device.behaviour = Counting()
+    bench.bring(AlState.SAFEOP)
+    bench.write(Register.DC_SYNC0_CYCLE, (1_000_000).to_bytes(4, "little"))
+    bench.write(Register.DC_ACTIVATION, b"\x03")
+    steps.clear()
+    bench.now_ns = 5_000_000
+    bench.status()
+    assert steps == [5_000_000]
