@@ -13,9 +13,7 @@ from devicebus.wire.alstatus import AlState
 from eap.codec.mailbox import MailboxType
 
 
-def build_mailbox(
-    spec: MailboxSpec, files: tuple[FileSpec, ...], device: Device
-) -> MailboxServer:
+def build_mailbox(spec: MailboxSpec, files: tuple[FileSpec, ...], device: Device) -> MailboxServer:
     """Make the servers of *device*."""
     sizes = MailboxSizes(spec.size, spec.size)
     servers: dict[MailboxType, ProtocolServer] = {}

@@ -35,31 +35,24 @@ def test_areas_have_room_for_three_buffers(outputs, inputs):
 
 
 def test_image_tells_what_the_slave_is():
-    spec = generic("valve island", alias=9, vendor=1, product=2, revision=3, serial=4,
-    identity = (fixed.alias, fixed.vendor, fixed.product, fixed.revision, fixed.serial)
-    assert identity == (9, 1, 2, 3, 4)
+    mailbox = MailboxSpec(size=64, foe=True, soe=True, eoe=True, voe=True)
+    spec = generic(
+        "valve island", alias=9, vendor=1, product=2, revision=3, serial=4, mailbox=mailbox
+    )
     image = image_of(spec)
     assert (len(image), sii.is_intact(image)) == (IMAGE_SIZE, True)
     read = sii.decode(image)
     fixed = read.fixed
     assert (read.name, read.fmmus[:3]) == ("valve island", (1, 2, 3))
-    assert (fixed.alias, fixed.vendor, fixed.product, fixed.revision, fixed.serial) == (
-        9,
-        1,
-        2,
-        3,
-        4,
-    )
+    identity = (fixed.alias, fixed.vendor, fixed.product, fixed.revision, fixed.serial)
+    assert identity == (9, 1, 2, 3, 4)
     assert (fixed.receive_offset, fixed.send_offset, fixed.boot_send_size) == (0x1000, 0x1040, 64)
     assert fixed.protocols == (
         SiiProtocol.COE | SiiProtocol.FOE | SiiProtocol.SOE | SiiProtocol.EOE | SiiProtocol.VOE
     )
     ((header, entries),) = read.tx_pdos
-    assert (header.index, header.sync_manager, [e.bit_length for e in entries]) == (
-        0x1A00,
-        3,
-        [16, 1, 7],
-    )
+    assert (header.index, header.sync_manager) == (0x1A00, 3)
+    assert [e.bit_length for e in entries] == [16, 1, 7]
     assert [e.data_type for e in entries] == [6, 1, 0]
 
 
