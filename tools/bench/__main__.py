@@ -68,6 +68,8 @@ def _parse(arguments: list[str]) -> Any:
     parser.add_argument("--json", metavar="FILE", help="write all figures to FILE")
     parser.add_argument("--markdown", action="store_true", help=f"put the tables into {PAGE.name}")
     options = parser.parse_args(arguments)
+    if options.markdown and (options.names or options.quick):
+        parser.error("--markdown goes with neither names nor --quick: the page shows a whole run")
     for name in options.names:
         if name not in NAMES:
             parser.error(f"there is no benchmark {name!r}, expected any of {', '.join(NAMES)}")
