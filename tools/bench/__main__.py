@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,8 @@ def _run(name: str, settings: Settings) -> Section:
         figures = module.run(settings)
     except SkippedError as reason:
         figures = [skipped(name, reason)]
+    except (RuntimeError, subprocess.SubprocessError) as error:
+        figures = [Figure(name, f"failed: {error}", verdict=Verdict.MISSED)]
     return Section(name, module.TITLE, figures)
 
 
