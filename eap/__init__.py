@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 __all__ = ["attach"]
 
 
-def attach(station: str) -> AttachedStation:
+def attach(station: str, *, plant: str = "") -> AttachedStation:
     """Attach to the running station of that name; see :mod:`eap.appliance.attach`."""
     from eap.appliance.attach import attach as attach_station  # the engine must not load it
 
-    return attach_station(station)
+    return attach_station(station, plant=plant)

@@ -19,7 +19,7 @@ from time import monotonic_ns, time_ns
 from types import TracebackType
 from typing import Any, Self
 
-from eap.appliance.runtime import ApplianceFolder, find_appliances, runtime_root
+from eap.appliance.runtime import find_running, runtime_root
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.net.image_file import open_image
 from eap.pd.image import Image
@@ -168,22 +168,26 @@ class AttachedStation:
         raise ImageError(f"station {self.name} has no variable {name!r}{hint}")
 
 
-def attach(station: str) -> AttachedStation:
+def attach(station: str, *, plant: str = "") -> AttachedStation:
     """Attach to the running station of that name.
 
+    Args:
+        station: Its name.
+        plant: Name of its plant; needed when several that run have a station of this name.
+
     Raises:
-        ImageError: no appliance of this user runs such a station; the message names those that run.
+        ImageError: no appliance of this user runs such a station, or several do; the message names
+            those that run.
     """
-    running: dict[str, ApplianceFolder] = {}
-    for folder in find_appliances():
-        try:
-            running |= dict.fromkeys(folder.read_info().stations, folder)
-        except OSError:
-            continue  # it is just starting or stopping
-    if station not in running:
-        listed = ", ".join(sorted(running)) or "none"
+    running = [(folder, info) for folder, info in find_running() if plant in {"", info.plant}]
+    found = [(folder, info) for folder, info in running if station in info.stations]
+    if not found:
+        listed = ", ".join(sorted(name for _, info in running for name in info.stations)) or "none"
         raise ImageError(
             f"no station {station!r} runs here (running: {listed}; looked in {runtime_root()} as "
             f"user {os.getuid()}): start its plant with eapctl run"
         )
-    return AttachedStation(running[station].image(station))
+    if len(found) > 1:
+        plants = ", ".join(info.plant for _, info in found)
+        raise ImageError(f"station {station} runs in {plants}: choose one with plant=")
+    return AttachedStation(found[0][0].image(station))

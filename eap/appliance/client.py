@@ -8,8 +8,6 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
-
 from eap.appliance.control import (
     MAX_LINE,
     ErrorCode,
@@ -17,7 +15,7 @@ from eap.appliance.control import (
     decode_reply,
     encode_request,
 )
-from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_appliances, runtime_root
+from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_running, runtime_root
 from eap.errors import ControlError
 
 TIMEOUT_S = 10.0
@@ -112,7 +110,7 @@ def connect(plant: str | None = None, station: str | None = None) -> list[Client
     Raises:
         ControlError: there is none; the message says which others run, and where it looked.
     """
-    running = list(_running())
+    running = find_running()
     chosen = [
         (folder, info)
         for folder, info in running
@@ -151,14 +149,6 @@ def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "stations": [station for answer in answers for station in answer["stations"]],
         "appliances": appliances,
     }
-
-
-def _running() -> Iterator[tuple[ApplianceFolder, ApplianceInfo]]:
-    for folder in find_appliances():
-        try:
-            yield folder, folder.read_info()
-        except (OSError, msgspec.MsgspecError):
-            continue  # it is starting, or of another release: nothing to talk to yet
 
 
 def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> Client:

@@ -82,9 +82,15 @@ class ApplianceFolder:
         """Make the folder *name* ours and empty.
 
         Raises:
-            EnvironmentalError: another process holds it, or the directory cannot be written.
+            EnvironmentalError: another process holds it, it holds somebody else's files, or the
+                directory cannot be written.
         """
         path = runtime_root() / name
+        if _holds_other_files(path):
+            raise EnvironmentalError(
+                f"runtime directory {path} is no folder of an appliance, and would be emptied: set"
+                f" {VARIABLE} to a directory that holds nothing else"
+            )
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             lock_fd = _lock(path)
@@ -174,6 +180,25 @@ def find_appliances() -> list[ApplianceFolder]:
     except OSError:
         return []
     return [folder for folder in map(ApplianceFolder, folders) if folder.is_alive()]
+
+
+def find_running() -> list[tuple[ApplianceFolder, ApplianceInfo]]:
+    """Return all running appliances that can be talked to, each with what it tells of itself."""
+    running = []
+    for folder in find_appliances():
+        try:
+            running.append((folder, folder.read_info()))
+        except (OSError, msgspec.MsgspecError):
+            continue  # it is starting or stopping, or of another release
+    return running
+
+
+def _holds_other_files(path: Path) -> bool:
+    """Whether *path* was not made by an appliance: its first file is always the lock."""
+    try:
+        return any(path.iterdir()) and not (path / "lock").exists()
+    except OSError:
+        return False  # it does not exist, or claiming it will say what is wrong
 
 
 def _lock(path: Path) -> int:

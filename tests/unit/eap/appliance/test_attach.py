@@ -137,6 +137,17 @@ def test_unknown_station_names_the_running_ones(path: Path) -> None:
     assert not path.exists()
 
 
+def test_station_of_two_plants_must_be_chosen(path: Path) -> None:
+    with ApplianceFolder.claim("twin") as twin, running(path, spec()):
+        twin.write_info(
+            ApplianceInfo("twin", "twin.yaml", ["mixer"], "2026-01-01T00:00:00+00:00", 1)
+        )
+        with pytest.raises(ImageError, match="runs in plant, twin: choose one with plant="):
+            eap.attach("mixer")
+        with eap.attach("mixer", plant="plant") as station:
+            assert station.name == "mixer"
+
+
 def test_a_gone_engine_is_an_error_not_a_hang(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 0.1)
     runner = Runner(path, spec())

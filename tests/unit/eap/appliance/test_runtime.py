@@ -10,7 +10,13 @@ from pathlib import Path
 import pytest
 
 from eap.appliance import runtime
-from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_appliances, folder_name
+from eap.appliance.runtime import (
+    ApplianceFolder,
+    ApplianceInfo,
+    find_appliances,
+    find_running,
+    folder_name,
+)
 from eap.errors import EnvironmentalError
 
 
@@ -91,6 +97,22 @@ def test_a_directory_that_cannot_be_made_names_the_variable(tmp_path, monkeypatc
     with pytest.raises(EnvironmentalError, match="EAP_RUNTIME_DIR"):
         ApplianceFolder.claim("demo")
     assert find_appliances() == []
+
+
+def test_a_directory_of_somebody_else_is_not_emptied(root):
+    (root / "demo").mkdir(parents=True)
+    (root / "demo" / "thesis.txt").write_text("")
+    with pytest.raises(EnvironmentalError, match="no folder of an appliance"):
+        ApplianceFolder.claim("demo")
+    assert [entry.name for entry in (root / "demo").iterdir()] == ["thesis.txt"]
+
+
+def test_find_running_leaves_out_what_cannot_be_read(root):
+    with ApplianceFolder.claim("demo") as folder, ApplianceFolder.claim("starting") as starting:
+        folder.write_info(info())
+        assert [found.plant for _, found in find_running()] == ["demo"]
+        (starting.path / "appliance.json").write_text("of another release")
+        assert [found.plant for _, found in find_running()] == ["demo"]
 
 
 def test_a_path_too_long_for_a_socket_is_refused(tmp_path, monkeypatch):
