@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PROC = Path("/proc")
+_SHOWN = 80
+"""Characters of a command in a message."""
 _OWN_COMMANDS = ("eapctl", "eap.appliance", "-m eap ")
 
 
@@ -22,7 +24,10 @@ class Holder:
     command: str = ""
 
     def __str__(self) -> str:
-        return f"process {self.pid} ({self.command})" if self.pid else "an unknown process"
+        if not self.pid:
+            return "an unknown process"
+        short = " ".join(word.rpartition("/")[2] or word for word in self.command.split())
+        return f"process {self.pid} ({short[:_SHOWN]})"
 
 
 def find_holders(protocol: str, address: str, port: int, *, proc: Path = _PROC) -> list[Holder]:
@@ -84,8 +89,8 @@ def _find_process(inode: str, proc: Path) -> tuple[int, str]:
             continue
         try:
             if any(str(link.readlink()) == wanted for link in (process / "fd").iterdir()):
-                command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
-                return int(process.name), command[:80]
+                command = (process / "cmdline").read_bytes().decode(errors="replace")
+                return int(process.name), command.replace("\0", " ").strip()
         except OSError:
             continue
     return 0, ""

@@ -73,6 +73,20 @@ def test_our_own_appliance_is_recognised(proc):
     assert describe(proc).endswith("stop that appliance or give this one another address")
 
 
+def test_long_paths_do_not_hide_whose_process_it_is(proc):
+    add_socket(proc, f"0101007F:{PORT}")
+    add_process(proc, 44, f"/{'long/' * 30}python /{'long/' * 30}eapctl run plant.yaml")
+    text = describe(proc)
+    assert "by process 44 (python eapctl run plant.yaml): stop that appliance" in text
+
+
+def test_a_command_that_is_no_text_is_shown_all_the_same(proc):
+    add_socket(proc, f"0101007F:{PORT}")
+    add_process(proc, 45, "server")
+    (proc / "45" / "cmdline").write_bytes(b"serv\xffer\0-x\0")
+    assert "process 45 (serv\ufffder -x)" in describe(proc)
+
+
 def test_client_on_an_ephemeral_port_is_told_from_a_server(proc):
     add_socket(proc, f"0101007F:{PORT}", remote="08080808:0035")
     text = describe(proc)
