@@ -14,6 +14,7 @@ from eap.ids import InterfaceUri
 from eap.net.interface import interface_of, link_is_up
 from eap.pd.image import Image
 from eap.pd.report import station_status
+from eap.pd.words import StationWord
 
 VERSION = 1
 MIN_SAMPLE_NS = 200_000_000
@@ -61,6 +62,7 @@ def appliance_status(
     stations = []
     for image in images:
         station = station_status(image, monotonic_ns(), time_ns())
+        station["cycle_age_us"] = _cycle_age_us(image)
         for port in station["ports"]:
             port["link"] = link_state(port["interface"])
         counts = station["discarded"]
@@ -80,6 +82,12 @@ def appliance_status(
         },
         "stations": stations,
     }
+
+
+def _cycle_age_us(image: Image) -> int | None:
+    """Return how long ago the last cycle ran, None before the first: a hung engine shows here."""
+    ran_at_ns = image.words[StationWord.CYCLE_AT_NS]
+    return max(monotonic_ns() - ran_at_ns, 0) // 1000 if ran_at_ns else None
 
 
 def link_state(interface: str) -> str:

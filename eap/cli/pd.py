@@ -112,7 +112,9 @@ def set_value(words: tuple[str, ...], plant: str | None, as_json: bool) -> None:
     if as_json:
         write_json({"station": target.station, "variable": target.name, "value": value})
     else:
-        write_text(f"{target} = {value}")
+        from eap.cli.pd_view import value_text
+
+        write_text(f"{target} = {value_text(value)}")
 
 
 def _write_change(change: dict[str, Any]) -> None:

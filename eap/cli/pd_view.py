@@ -69,7 +69,7 @@ def change_line(change: Row) -> str:
     """Return one change as a line: time, variable, value, cycle, quality of received ones."""
     at = change["time"][11:23]
     line = (
-        f"{at}  {change['station']}/{change['variable']} = {_short(change['value'])}"
+        f"{at}  {change['station']}/{change['variable']} = {value_text(change['value'])}"
         f"  cycle {change['cycle']}"
     )
     if "quality" not in change:
@@ -77,12 +77,13 @@ def change_line(change: Row) -> str:
     return f"{line}  quality {words.quality(change['quality']) or 'never received'}"
 
 
-def _short(value: Any) -> str:
+def value_text(value: Any) -> str:
+    """Return a value as a person reads it, long ones cut short."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
         return f"{value:.7g}"  # what a REAL is exact to
     if isinstance(value, list):
-        value = f"[{', '.join(map(_short, value))}]"
+        value = f"[{', '.join(map(value_text, value))}]"
     text = str(value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}… ({len(text)} characters)"

@@ -21,6 +21,8 @@ Row = Mapping[str, Any]
 
 _GOOD, _BAD, _DIM = "green", "bold red", "dim"
 _STATE_STYLE = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
+_HUNG_AFTER_US = 2_000_000
+_HUNG_AFTER_CYCLES = 10
 _NOT_ASKED = "other: not asked for"
 _REASONS = {
     "cycle": "cyclic",
@@ -123,6 +125,9 @@ def _received(row: Row) -> tuple[RenderableType, ...]:
 def _remarks(station: Row) -> Iterator[str]:
     name = station["name"]
     own = []
+    silent_us = station.get("cycle_age_us") or 0
+    if silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * station.get("cycle_us", 0)):
+        own.append(f"has not run a cycle for {words.duration(silent_us)}")
     if overruns := station.get("overruns"):
         own.append(f"left out {words.count(overruns, 'cycle')}")
     if torn := station.get("torn"):

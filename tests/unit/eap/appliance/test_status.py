@@ -10,6 +10,7 @@ import pytest
 from eap.appliance import status
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.appliance.status import ProcessMeter, appliance_status, link_state
+from eap.pd.words import StationWord
 
 
 def now_ns() -> int:
@@ -47,7 +48,7 @@ def test_link_of_the_interface_behind_a_port(interface, link):
     assert link_state(interface) == link
 
 
-def test_the_document_has_the_shape_of_the_contract(files):
+def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     info = ApplianceInfo(
         "demo",
         "demo.yaml",
@@ -58,6 +59,8 @@ def test_the_document_has_the_shape_of_the_contract(files):
         ProcessInfo(0, 1),
     )
     images = [file.image for file in files.values()]
+    monkeypatch.setattr(status, "monotonic_ns", lambda: 9_000_000_000)
+    images[1].words[StationWord.CYCLE_AT_NS] = 4_000_000_000
     discarded = ({"left": {"other_vlan": 1}}, {"left": {"mailbox": 3}})
     document = appliance_status(info, images, discarded, ProcessMeter())
     assert (document["version"], document["plant"]) == (1, "demo")
@@ -69,6 +72,7 @@ def test_the_document_has_the_shape_of_the_contract(files):
     assert processes["services"] == {"pid": None, "cpu": None, "rss": None, "restarts": 1}
     left, right = document["stations"]
     assert (left["name"], left["state"], left["ports"][0]["link"]) == ("left", "INIT", "up")
+    assert (left["cycle_age_us"], right["cycle_age_us"]) == (None, 5_000_000)
     assert left["discarded"] == {"other_vlan": 1, "mailbox": 3}
     assert right["discarded"] == {}
     assert left["pd"]["tx"][0]["name"] == "state"

@@ -165,7 +165,7 @@ def test_set_reads_the_value_by_its_type(appliance: Appliance) -> None:
     assert lines(result) == [{"station": "mixer", "variable": "setpoint", "value": -16}]
     assert appliance.files["mixer"].image.read("setpoint") == -16
     result = invoke("set", "filler/curve", "[1, 2.5]")
-    assert (result.exit_code, result.stdout) == (0, "filler/curve = [1.0, 2.5]\n")
+    assert (result.exit_code, result.stdout) == (0, "filler/curve = [1, 2.5]\n")
     assert appliance.files["filler"].image.read("curve") == (1.0, 2.5)
 
 

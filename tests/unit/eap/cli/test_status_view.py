@@ -136,6 +136,12 @@ def test_sent_pds() -> None:
     assert "mixer → alarm: sent on change once, resend 8 times" in text
 
 
+@pytest.mark.parametrize(("cycle_us", "hangs"), [(10_000, True), (1_000_000, False)])
+def test_station_whose_engine_hangs(cycle_us: int, hangs: bool) -> None:
+    text = show(document(cycle_us=cycle_us, cycle_age_us=3_100_000))
+    assert ("mixer: has not run a cycle for 3.1 s" in text) is hangs
+
+
 def test_remarks_name_all_that_is_rare() -> None:
     left = rx(
         "left", timeouts=1, duplicated=2, reordered=3, late=4, discarded={"version": 5, "length": 6}
