@@ -1,0 +1,176 @@
+"""SoE as conversations: the master's side of reading and writing IDNs (ETG.1000.6).
+
+An answer is known by drive and IDN.  The fragments of one carry no IDN but the last, so fragments
+that end in another IDN were late, and are dropped.
+"""
+
+from __future__ import annotations
+
+from devicebus.errors import MailboxProtocolError, MailboxTimeoutError, SoeError
+from devicebus.mailbox.conversation import Ask, Conversation, Progress, reading
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.soe_procedure import CLEAR, START
+from eap.codec.mailbox import MailboxType
+from eap.codec.soe import (
+    DATA_OVERHEAD,
+    DataState,
+    Element,
+    Idn,
+    SoeHeader,
+    SoeOpcode,
+    decode_message,
+    encode_fragments,
+    encode_message,
+    error_code_of,
+)
+from eap.codec.soeerror import SoeErrorCode, name_of
+
+MAX_SIZE = 0x80020
+"""Octets of the longest answer: eight elements that are lists as long as there can be."""
+_MAX_LATE = 16
+"""Answers to others, in fragments, that are dropped before a read gives up."""
+POLL_DELAY_NS = 10_000_000
+EXECUTION_TIMEOUT_NS = 60_000_000_000
+
+
+def read(
+    idn: Idn,
+    elements: int = Element.VALUE,
+    *,
+    drive: int = 0,
+    progress: Progress | None = None,
+    delay_ns: int = 0,
+) -> Conversation[bytes]:
+    """Read elements of an IDN, one behind the other; lists and texts come with their heads.
+
+    Raises:
+        SoeError: the drive refuses.
+        MailboxProtocolError: its answer is no answer.
+    """
+    what = f"SoE read of {idn} at drive {drive}"
+    progress = progress or Progress()
+    number = idn.number
+    request = encode_message(SoeOpcode.READ_REQUEST, number, drive=drive, elements=elements)
+    content = bytearray()
+    left: int | None = None
+    late = 0
+    while True:
+        accepts = _Accepts(SoeOpcode.READ_RESPONSE, drive, number, is_gathering=left is not None)
+        if left is None and not late:
+            message = yield Ask(MailboxType.SOE, request, accepts, delay_ns=delay_ns)
+        else:
+            message = yield Ask(MailboxType.SOE, None, accepts)
+        with reading(what):
+            header, body = decode_message(message.data)
+        if not header.incomplete and header.idn != number:
+            content.clear()
+            left = None
+            late += 1
+            if late > _MAX_LATE:
+                raise MailboxProtocolError(f"{what}: {late} answers for other IDNs")
+            continue
+        if header.error:
+            raise _refusal(what, body)
+        now_left = header.idn if header.incomplete else 0
+        if left is not None and now_left > left:
+            content.clear()
+        elif left is not None and now_left != left - 1:
+            raise MailboxProtocolError(f"{what}: {left} fragments left, then {now_left}")
+        content += body
+        progress.done = len(content)
+        if len(content) > MAX_SIZE:
+            raise MailboxProtocolError(f"{what}: more than {MAX_SIZE} octets")
+        if not header.incomplete:
+            return bytes(content)
+        left = now_left
+
+
+def write(
+    idn: Idn,
+    data: bytes,
+    sizes: MailboxSizes,
+    *,
+    elements: int = Element.VALUE,
+    drive: int = 0,
+    progress: Progress | None = None,
+) -> Conversation[None]:
+    """Write an element of an IDN; lists are given with their heads.
+
+    Raises:
+        SoeError: the drive refuses.
+        MailboxProtocolError: its answer is no answer.
+    """
+    what = f"SoE write of {idn} at drive {drive}"
+    progress = progress or Progress()
+    progress.total = len(data)
+    room = sizes.to_slave - DATA_OVERHEAD
+    header = SoeHeader(SoeOpcode.WRITE_REQUEST, 0, 0, drive, elements, idn.number)
+    *fragments, last = encode_fragments(header, data, room)
+    for fragment in fragments:
+        yield Ask(MailboxType.SOE, fragment, expects_reply=False)
+        progress.done += room
+    is_gathering = bool(fragments)
+    accepts = _Accepts(SoeOpcode.WRITE_RESPONSE, drive, idn.number, is_gathering=is_gathering)
+    message = yield Ask(MailboxType.SOE, last, accepts)
+    with reading(what):
+        answer, body = decode_message(message.data)
+    if answer.error:
+        raise _refusal(what, body)
+    if answer.idn != idn.number or answer.incomplete:
+        raise MailboxProtocolError(f"{what}: answered for {Idn.of(answer.idn)}")
+    progress.done = len(data)
+
+
+def execute(
+    idn: Idn,
+    sizes: MailboxSizes,
+    *,
+    drive: int = 0,
+    timeout_ns: int = EXECUTION_TIMEOUT_NS,
+) -> Conversation[None]:
+    """Start a procedure command, wait until it is done, and clear it.
+
+    Raises:
+        SoeError: the drive refuses, or the command failed.
+        MailboxTimeoutError: it is not done after *timeout_ns*, not counting the answers' time.
+        MailboxProtocolError: an answer is no answer.
+    """
+    what = f"procedure command {idn} at drive {drive}"
+    yield from write(idn, START.to_bytes(2, "little"), sizes, drive=drive)
+    state = DataState.BUSY
+    for _ in range(max(1, timeout_ns // POLL_DELAY_NS)):
+        octets = yield from read(idn, Element.DATA_STATE, drive=drive, delay_ns=POLL_DELAY_NS)
+        if len(octets) < 2:
+            raise MailboxProtocolError(f"{what}: a data state of {len(octets)} octets")
+        state = DataState(int.from_bytes(octets[:2], "little") & DataState.FAILED)
+        if state & DataState.ERROR or not state & DataState.EXECUTING:
+            break
+    yield from write(idn, CLEAR.to_bytes(2, "little"), sizes, drive=drive)
+    if state & DataState.ERROR:
+        raise SoeError(f"{what}: failed", code=SoeErrorCode.GENERAL)
+    if state & DataState.EXECUTING:
+        raise MailboxTimeoutError(f"{what}: not done after {timeout_ns / 1e9:g} s")
+
+
+class _Accepts:
+    """Which messages answer a request."""
+
+    def __init__(self, opcode: SoeOpcode, drive: int, number: int, *, is_gathering: bool) -> None:
+        self._first = opcode | drive << 5
+        self._number = number
+        self._is_gathering = is_gathering
+
+    def __call__(self, data: bytes) -> bool:
+        if len(data) < SoeHeader.SIZE:
+            return True
+        if data[0] & 0xE7 != self._first:
+            return False
+        is_incomplete = bool(data[0] & 0x08)
+        is_named = int.from_bytes(data[2:4], "little") == self._number
+        return is_incomplete or is_named or self._is_gathering
+
+
+def _refusal(what: str, body: memoryview) -> SoeError:
+    with reading(what):
+        code = error_code_of(body)
+    return SoeError(f"{what}: {name_of(code)} (0x{code:04X})", code=code)
