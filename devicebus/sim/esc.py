@@ -121,12 +121,20 @@ class Esc:
         return self.memory[Register.DL_CONTROL + 1] >> 2 * port & 3
 
     def set_dl_status(self, status: int) -> None:
-        """Show the state of the ports; a change is an event for the master."""
-        octets = status.to_bytes(2, "little")
+        """Show the state of the ports; a change is an event, a link that went is counted."""
         at = Register.DL_STATUS
-        if self.memory[at : at + 2] != octets:
-            self.memory[at : at + 2] = octets
-            self.ecat_event |= _EVENT_DL
+        old = self._word(at)
+        if status == old:
+            return
+        self.memory[at : at + 2] = status.to_bytes(2, "little")
+        self.ecat_event |= _EVENT_DL
+        for port in range(PORTS):
+            if (old & ~status) >> 4 + port & 1:
+                self.count_error(Register.LOST_LINK + port)
+
+    def count_error(self, counter: int) -> None:
+        """Count up one of the error counters, which stop at 255."""
+        self.memory[counter] = min(self.memory[counter] + 1, 0xFF)
 
     def set_al_status(self, status: int, code: int) -> None:
         """Show where the slave stands: state with error bit, and why."""

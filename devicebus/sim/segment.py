@@ -121,10 +121,12 @@ class Segment:
                 self.slaves[number].esc.port_delays = tuple(
                     way.arrivals.get((number, port)) for port in range(4)
                 )
-        for number, slave in enumerate(self.slaves):
+        joined: list[set[int]] = [set() for _ in self.slaves]
+        for number, port in links:
+            joined[number].add(port)
+        for slave, ports in zip(self.slaves, joined, strict=True):
             slave.esc.loops_changed = False
-            joined = frozenset(port for at, port in links if at == number)
-            slave.esc.set_dl_status(dl_status(joined))
+            slave.esc.set_dl_status(dl_status(frozenset(ports)))
 
     def _links(self) -> dict[PortAt, PortAt | Side]:
         links: dict[PortAt, PortAt | Side] = {}

@@ -136,6 +136,40 @@ class SlaveSpec(msgspec.Struct, frozen=True, kw_only=True):
     """Kind ``esi``: the file of the vendor, beside the bus file."""
 
 
+class FaultKind(Enum):
+    """What can go wrong; what each needs beside its kind is in docs/simulator.md."""
+
+    LOSS = "loss"
+    DELAY = "delay"
+    CORRUPT = "corrupt"
+    WKC = "wkc"
+    CUT = "cut"
+    POWER = "power"
+    MAILBOX = "mailbox"
+    FOE = "foe"
+    SDO = "sdo"
+    AL_ERROR = "al-error"
+    REFUSE = "refuse"
+    DRIFT = "drift"
+
+
+class FaultSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """One fault, from *at_ms* after the start for *for_ms*; without an end it stays."""
+
+    kind: FaultKind
+    slave: str = ""
+    at_ms: Annotated[int, Meta(ge=0, le=86_400_000)] = 0
+    for_ms: Annotated[int, Meta(ge=1, le=86_400_000)] | None = None
+    every: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
+    """Frames: every how many-th is hit."""
+    delay_us: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
+    object: str = ""
+    code: U32 = 0
+    """SDO abort code or AL status code."""
+    state: str = ""
+    drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
+
+
 class BusSpec(msgspec.Struct, frozen=True, kw_only=True):
     """A segment."""
 
@@ -144,3 +178,4 @@ class BusSpec(msgspec.Struct, frozen=True, kw_only=True):
     ring: bool = False
     """Whether the last slave's next port leads back to the master."""
     cable_ns: Annotated[int, Meta(ge=0, le=1_000_000)] = 50
+    faults: tuple[FaultSpec, ...] = ()

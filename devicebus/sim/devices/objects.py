@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from devicebus.sim.devices.pdoobjects import assignment, mapping
+from devicebus.sim.faultydictionary import FaultyDictionary
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
 from eap.codec import datatypes
 from eap.od.dictionary import ObjectDictionary
@@ -61,7 +62,7 @@ def build_dictionary(spec: SlaveSpec, device_type: int) -> ObjectDictionary:
     Raises:
         ValueError: a data type, a value or an entry in it cannot be.
     """
-    dictionary = ObjectDictionary(_identity(spec, device_type))
+    dictionary = FaultyDictionary(_identity(spec, device_type))
     for each in spec.objects:
         dictionary.add(_object(each))
     sides = (
