@@ -37,17 +37,21 @@ class Engine:
         return self._due[0][0]
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Run every station that is due; early calls are harmless."""
-        while (head := self._due[0])[0] <= now_ns:
-            due_ns, index = head
-            station = self._stations[index]
-            station.cycle(due_ns, now_ns)
-            following_ns = due_ns + station.cycle_ns
-            if following_ns < now_ns:
-                missed = -(-(now_ns - following_ns) // station.cycle_ns)
-                station.image.words[StationWord.OVERRUNS] += missed
-                following_ns += missed * station.cycle_ns
-            heapreplace(self._due, (following_ns, index))
+        """Run the station that is due first; early calls are harmless.
+
+        One a call, so that whoever calls reads the clock again before the next.
+        """
+        due_ns, index = self._due[0]
+        if due_ns > now_ns:
+            return
+        station = self._stations[index]
+        station.cycle(due_ns, now_ns)
+        following_ns = due_ns + station.cycle_ns
+        if following_ns < now_ns:
+            missed = -(-(now_ns - following_ns) // station.cycle_ns)
+            station.image.words[StationWord.OVERRUNS] += missed
+            following_ns += missed * station.cycle_ns
+        heapreplace(self._due, (following_ns, index))
 
     def receive(self, now_ns: int) -> None:
         """Take pending frames between cycles, of the channels that asked for it."""
