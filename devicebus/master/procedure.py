@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Generic, NamedTuple, TypeAlias, TypeVar
 
 from devicebus.errors import FrameLostError, WorkingCounterError
-from devicebus.master.access import Access, Reply, fprd, fpwr
+from devicebus.master.access import TRIES, Access, Reply, fprd, fpwr
 from eap.errors import EapError
 
 T = TypeVar("T")
@@ -39,22 +39,26 @@ Step: TypeAlias = Sequence[Access] | Sleep
 Procedure: TypeAlias = Generator[Step, Answer, T]
 
 
-def read(station: int, ado: int, size: int, what: str = "") -> Procedure[bytes]:
+def read(
+    station: int, ado: int, size: int, what: str = "", *, tries: int = TRIES
+) -> Procedure[bytes]:
     """Read registers or memory of one slave.
 
     Raises:
         WorkingCounterError: the slave did not answer.
         FrameLostError: nothing came back.
     """
-    (reply,), _ = yield [fprd(station, ado, size)]
+    (reply,), _ = yield [fprd(station, ado, size, tries=tries)]
     if reply.wkc != 1:
         raise WorkingCounterError(f"slave {station}: reading {what or hex(ado)}", 1, reply.wkc)
     return reply.data
 
 
-def write(station: int, ado: int, data: bytes, what: str = "") -> Procedure[None]:
+def write(
+    station: int, ado: int, data: bytes, what: str = "", *, tries: int = TRIES
+) -> Procedure[None]:
     """Write registers or memory of one slave; raises as :func:`read` does."""
-    (reply,), _ = yield [fpwr(station, ado, data)]
+    (reply,), _ = yield [fpwr(station, ado, data, tries=tries)]
     if reply.wkc != 1:
         raise WorkingCounterError(f"slave {station}: writing {what or hex(ado)}", 1, reply.wkc)
 

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+from devicebus.mailbox.server import MailboxServer
 from devicebus.master.access import Access, Reply
+from devicebus.master.esm import change_state
 from devicebus.master.link import Link
+from devicebus.master.mailboxes import Mailbox
+from devicebus.master.mailboxport import MailboxArea, configure
 from devicebus.master.procedure import Answer, Procedure, Sleep
 from devicebus.master.runner import Runner
+from devicebus.master.scan import scan
 from devicebus.master.task import Task
 from devicebus.sim.devices.build import build_segment
 from devicebus.sim.segment import Segment
 from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec
 from devicebus.sim.wiring import Side
+from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Datagram, encode_frame, iter_datagrams
 
 US = 1_000
@@ -158,3 +164,41 @@ def slave(name: str, kind: str = "digital", **options) -> SlaveSpec:
 def segment(*slaves: SlaveSpec) -> Segment:
     """A simulated bus of these slaves."""
     return build_segment(BusSpec(bus="test", slaves=slaves))
+
+
+class SlowServer(MailboxServer):
+    """A slave's mailbox that answers after *delay_ns*, with its addresses echoed or not."""
+
+    def __init__(self, server: MailboxServer) -> None:
+        super().__init__(server.protocols, server.sizes)
+        self.delay_ns = 0
+        self.echoes = True
+        self.held: list[tuple[int, bytes]] = []
+
+    def receive_message(self, message, now_ns):
+        octets = bytearray(message)
+        if not self.echoes:
+            octets[2:4] = b"\0\0"
+        self.held.append((now_ns + self.delay_ns, bytes(octets)))
+
+    def next_message(self, now_ns):
+        while self.held and self.held[0][0] <= now_ns:
+            super().receive_message(self.held.pop(0)[1], now_ns)
+        return super().next_message(now_ns)
+
+
+def open_mailbox(line: Line, station: int = 1001, *, slow: bool = False) -> Mailbox:
+    """Bring a slave of a :class:`Bench` to PREOP and return its mailbox.
+
+    What it sends unasked is in the attribute *heard* of the line.
+    """
+    found = run(line, scan())[station - 1001]
+    if slow:
+        device = line.segment.slaves[station - 1001].device
+        device.mailbox = SlowServer(device.mailbox)
+    fixed = found.sii.fixed
+    area = MailboxArea(fixed.receive_offset, fixed.receive_size, fixed.send_offset, fixed.send_size)
+    run(line, configure(station, area))
+    run(line, change_state(station, AlState.PREOP))
+    line.heard = []
+    return Mailbox(station, area, line.core.runner, line.heard.append)

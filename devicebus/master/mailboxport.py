@@ -1,0 +1,120 @@
+"""The two mailboxes of one slave as the wire has them (ETG.1000.4, sync managers 0 and 1).
+
+A message that was written but whose frame was lost is written again, with the counter by which the
+slave knows it; one that was read but whose frame was lost is asked for again by the repeat bit.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from devicebus.errors import FrameLostError
+from devicebus.master.access import fprd, fpwr
+from devicebus.master.procedure import Procedure, Sleep, read, write
+from devicebus.wire.register import Register, SmStatus, SyncManager
+
+REPEAT_TIMEOUT_NS = 100_000_000
+"""How long a slave may take to repeat; one that never does has forgotten the message."""
+POLL_NS = 200_000
+TRIES = 8
+"""How often a frame is sent at most: a message that is half done is worth some patience."""
+
+_IN = Register.SYNC_MANAGER + SyncManager.SIZE
+_STATUS = _IN + 5
+_ACTIVATE = _IN + 6
+_PDI_CONTROL = _IN + 7
+
+
+class MailboxArea(NamedTuple):
+    """Where the mailboxes lie in a slave's memory; sizes in octets, 0 without a mailbox."""
+
+    to_slave: int
+    to_slave_size: int
+    to_master: int
+    to_master_size: int
+
+    def sync_managers(self) -> tuple[SyncManager, SyncManager]:
+        """Return the registers of sync managers 0 and 1."""
+        return (
+            SyncManager(self.to_slave, self.to_slave_size, 2, 1, pdi_interrupt=1, enable=1),
+            SyncManager(self.to_master, self.to_master_size, 2, 0, pdi_interrupt=1, enable=1),
+        )
+
+
+class Posted(NamedTuple):
+    """What became of a message on its way to the slave."""
+
+    is_taken: bool
+    """False: the mailbox is still full."""
+    is_ambiguous: bool
+    """Whether it may have got there although it was not taken: a frame was lost."""
+
+
+class MailboxPort:
+    """Writes to and reads from the mailboxes of one slave.
+
+    Attributes:
+        repeats: How often the slave was asked to repeat.
+    """
+
+    def __init__(self, station: int, area: MailboxArea) -> None:
+        self.station = station
+        self.area = area
+        self.repeats = 0
+        self._repeat = 0
+
+    def post(self, message: bytes) -> Procedure[Posted]:
+        """Write a message, once its mailbox is empty.
+
+        Raises:
+            FrameLostError: nothing comes back.
+        """
+        padded = message.ljust(self.area.to_slave_size, b"\0")
+        (reply,), _ = yield [fpwr(self.station, self.area.to_slave, padded, tries=TRIES)]
+        return Posted(reply.wkc == 1, reply.tries > 1)
+
+    def is_full(self) -> Procedure[bool]:
+        """Say whether the slave has a message."""
+        (status,) = yield from read(self.station, _STATUS, 1, "mailbox status", tries=TRIES)
+        return bool(status & SmStatus.MAILBOX_FULL)
+
+    def fetch(self) -> Procedure[bytes | None]:
+        """Read the slave's message, None if there is none or it has to be fetched again.
+
+        Raises:
+            FrameLostError: nothing comes back.
+            WorkingCounterError: the slave does not answer.
+        """
+        area = self.area
+        try:
+            (reply,), _ = yield [fprd(self.station, area.to_master, area.to_master_size, tries=1)]
+        except FrameLostError:
+            yield from self._ask_again()
+            return None
+        return reply.data if reply.wkc else None
+
+    def _ask_again(self) -> Procedure[None]:
+        """Toggle the repeat bit and wait until the slave has copied it."""
+        self._repeat ^= 1
+        self.repeats += 1
+        octet = bytes((1 | self._repeat << 1,))
+        yield from write(self.station, _ACTIVATE, octet, "repeat request", tries=TRIES)
+        _, now_ns = yield Sleep(0)
+        deadline_ns = now_ns + REPEAT_TIMEOUT_NS
+        while now_ns < deadline_ns:
+            (copied,) = yield from read(
+                self.station, _PDI_CONTROL, 1, "repeat acknowledge", tries=TRIES
+            )
+            if copied >> 1 & 1 == self._repeat:
+                return
+            _, now_ns = yield Sleep(POLL_NS)
+
+
+def configure(station: int, area: MailboxArea) -> Procedure[None]:
+    """Write sync managers 0 and 1; the slave must be in INIT.
+
+    Raises WorkingCounterError if the slave does not answer.
+    """
+    octets = b"".join(each.encode() for each in area.sync_managers())
+    yield from write(station, Register.SYNC_MANAGER, bytes(len(octets)), "sync managers")
+    yield from write(station, Register.SYNC_MANAGER, octets, "sync managers")

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.mailbox.conversation import Ask
+from devicebus.master.late import ReplyJudge, is_unsolicited
+from eap.codec.coe import CoeService, encode_message
+from eap.codec.mailbox import MailboxHeader, MailboxType
+
+COE, FOE, ERR = MailboxType.COE, MailboxType.FOE, MailboxType.ERR
+ASK = Ask(COE, b"", lambda data: data == b"yes")
+
+
+@pytest.fixture
+def judge():
+    return ReplyJudge()
+
+
+def give(judge, data=b"yes", *, address=0, kind=COE, ask=ASK):
+    return judge.answers(MailboxHeader(0, address, type=kind), data, ask)
+
+
+def test_replies_are_told_by_protocol_and_content(judge):
+    assert judge.next_address() == 0
+    assert give(judge)
+    assert give(judge, address=1001)
+    assert not give(judge, b"no")
+    assert not give(judge, kind=FOE)
+    assert give(judge, kind=ERR)
+
+
+def test_after_a_time_out_requests_are_tagged_and_replies_told_by_the_tag(judge):
+    judge.next_address()
+    judge.expire(ASK)
+    tag = judge.next_address()
+    assert tag & 0x8000
+    assert give(judge, address=tag)
+    assert not give(judge, address=0)
+    again = judge.next_address()
+    assert again != tag
+    assert not give(judge, address=tag)
+    assert not give(judge, kind=ERR, address=tag)
+    assert give(judge, kind=ERR, address=again)
+
+
+def test_tags_go_round_and_are_never_0(judge):
+    judge.expire(ASK)
+    tags = {judge.next_address() for _ in range(0x5000)}
+    assert min(tags) >= 0x8000
+    assert max(tags) <= 0xFFFF
+
+
+def test_without_echo_the_first_fitting_reply_is_the_late_one(judge):
+    judge.expire(ASK)
+    judge.next_address()
+    assert not give(judge, b"no")
+    assert not give(judge)
+    assert give(judge)
+
+
+def test_without_echo_a_lost_reply_costs_one_more_time_out_and_not_two(judge):
+    judge.expire(ASK)
+    judge.next_address()
+    assert not give(judge)
+    judge.expire(ASK)
+    judge.next_address()
+    assert give(judge)
+
+
+def test_a_late_reply_that_nobody_could_confuse_is_settled(judge):
+    judge.expire(ASK)
+    judge.next_address()
+    assert not give(judge, ask=Ask(COE, b"", lambda data: data == b"other"))
+    assert give(judge)
+
+
+def test_without_echo_a_mailbox_error_may_be_late_too(judge):
+    judge.expire(ASK)
+    judge.next_address()
+    assert not give(judge, kind=ERR)
+    assert give(judge, kind=ERR)
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "expected"),
+    [
+        (COE, encode_message(CoeService.EMERGENCY, bytes(8)), True),
+        (COE, encode_message(CoeService.TX_PDO, bytes(8)), True),
+        (COE, encode_message(CoeService.SDO_RESPONSE, bytes(8)), False),
+        (COE, b"\0\xf0", False),
+        (COE, b"", False),
+        (MailboxType.SOE, b"\x05\x40\x20\0", True),
+        (MailboxType.SOE, b"\x06\x40\x20\0", True),
+        (MailboxType.SOE, b"\x02\x40\x20\0", False),
+        (MailboxType.EOE, b"\0\0\0\0", True),
+        (MailboxType.EOE, b"\x03\0\0\0", False),
+        (FOE, bytes(6), False),
+        (MailboxType.VOE, bytes(6), True),
+        (MailboxType.AOE, bytes(32), True),
+        (ERR, b"\1\0\2\0", False),
+    ],
+)
+def test_what_slaves_send_unasked(kind, data, expected):
+    assert is_unsolicited(kind, data) is expected

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import FrameLostError, WorkingCounterError
+from devicebus.master.access import Reply
+from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted, configure
+from devicebus.master.scan import assign_stations
+from devicebus.wire.datagram import Command
+from devicebus.wire.register import Register, SyncManager
+from tests.support.busline import Bench, Line, drive, run, segment, slave
+
+AREA = MailboxArea(0x1000, 32, 0x1080, 48)
+
+
+def test_sync_managers_of_a_mailbox():
+    written, fetched = AREA.sync_managers()
+    assert written.encode().hex() == "0010200026000100"
+    assert fetched.encode().hex() == "8010300022000100"
+
+
+def test_configuring_writes_both():
+    line = Line(Bench(), segment(slave("a")))
+    run(line, assign_stations([(0, 1001)]))
+    run(line, configure(1001, AREA))
+    memory = line.segment.slaves[0].esc.memory
+    there = [SyncManager.decode(memory, Register.SYNC_MANAGER + at) for at in (0, 8)]
+    assert tuple(there) == AREA.sync_managers()
+    with pytest.raises(WorkingCounterError, match="slave 1009: writing sync managers"):
+        run(line, configure(1009, AREA))
+
+
+class Wire:
+    """One slave that has *status* and *reply*; *loses* the next so many mailbox reads."""
+
+    def __init__(self, *, reply=b"", wkc=1, tries=1, acknowledges=True):
+        self.reply = reply
+        self.wkc = wkc
+        self.tries = tries
+        self.acknowledges = acknowledges
+        self.accesses = []
+        self.repeat = 0
+
+    def __call__(self, access):
+        self.accesses.append(access)
+        if access.ado == 0x080E:
+            self.repeat = access.data[0] & 2
+        if access.ado == 0x080F:
+            return Reply(bytes((self.repeat * self.acknowledges,)), 1)
+        if access.ado == 0x080D:
+            return Reply(b"\x08" if self.reply else b"\0", 1)
+        return Reply(self.reply, self.wkc, self.tries)
+
+
+def test_a_message_fills_its_mailbox():
+    wire = Wire()
+    assert drive(MailboxPort(7, AREA).post(b"abc"), wire) == Posted(True, False)
+    assert wire.accesses == [(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 8)]
+
+
+def test_a_full_mailbox_takes_nothing():
+    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0)) == Posted(False, False)
+    assert drive(MailboxPort(7, AREA).post(b"abc"), Wire(wkc=0, tries=2)) == Posted(False, True)
+
+
+def test_messages_are_fetched_whole_and_never_read_twice():
+    wire = Wire(reply=b"x" * 48)
+    port = MailboxPort(7, AREA)
+    assert drive(port.is_full(), wire)
+    assert drive(port.fetch(), wire) == b"x" * 48
+    assert wire.accesses[-1] == (Command.FPRD, 7, 0x1080, bytes(48), 1)
+    assert drive(port.fetch(), Wire(wkc=0)) is None
+    assert not drive(port.is_full(), Wire())
+
+
+def lose_first_read(port, wire):
+    fetching = port.fetch()
+    next(fetching)
+    step = fetching.throw(FrameLostError("gone"))
+
+    def rest():
+        answer = yield step
+        while True:
+            try:
+                answer = yield fetching.send(answer)
+            except StopIteration as end:
+                return end.value
+
+    return drive(rest(), wire)
+
+
+def test_a_lost_reply_is_asked_for_again():
+    port, wire = MailboxPort(7, AREA), Wire(reply=b"x")
+    assert lose_first_read(port, wire) is None
+    assert wire.accesses[0] == (Command.FPWR, 7, 0x080E, b"\x03", 8)
+    assert lose_first_read(port, wire) is None
+    assert wire.accesses[2][3] == b"\x01"
+    assert port.repeats == 2
+
+
+def test_a_slave_that_does_not_repeat_is_not_waited_for_longer_than_a_tenth_of_a_second():
+    wire = Wire(acknowledges=False)
+    assert lose_first_read(MailboxPort(7, AREA), wire) is None
+    assert 100 < len(wire.accesses) < 500 + 2
