@@ -1,4 +1,4 @@
-"""Runs beside island-01 of config/demo.yaml: follows what the station receives, writes a setpoint.
+"""Runs beside island-01 of config/demo.yaml: raises the setpoint while the neighbour runs.
 
 eapctl run config/demo.yaml &
 python docs/examples/thermostat.py --cycles 200
@@ -10,26 +10,30 @@ import argparse
 import sys
 
 import eap
-from eap.errors import ImageError
+from eap.errors import EapError
+
+STATION = "island-01"
 
 
 def main() -> int:
-    """Raise the setpoint while the neighbour's load is low, in step with the station's cycle."""
+    """Follow what the station receives and write its setpoint, in step with its cycle."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--station", default="island-01")
     parser.add_argument("--cycles", type=int, default=200)
     options = parser.parse_args()
     try:
-        with eap.attach(options.station) as station:
+        with eap.attach(STATION) as station:
             for _ in range(options.cycles):
                 values = station.read_all()
-                station["setpoint"] = (values["setpoint"] + 1) % 1000
+                if values["left_running"]:
+                    station["setpoint"] = (values["setpoint"] + 1) % 1000
                 cycle = station.wait_cycle()
                 if cycle % 50 == 0:
                     print(f"cycle {cycle}: setpoint {values['setpoint']}")
-    except ImageError as exc:
+    except EapError as exc:
         print(exc, file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        pass
     return 0
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -87,6 +88,17 @@ def test_watch_of_stations_in_one_stream(demo: Appliance) -> None:
         ticks = [c["value"] for c in changes if f"{c['station']}/{c['variable']}" == name]
         assert len(ticks) > 2
         assert ticks == sorted(set(ticks))
+
+
+def test_the_example_program_raises_the_setpoint(demo: Appliance) -> None:
+    assert run(demo, "pd", "set", "island-01", "setpoint", "10").returncode == 0
+    environment = os.environ | {"EAP_RUNTIME_DIR": str(demo.runtime)}
+    command = [sys.executable, "docs/examples/thermostat.py", "--cycles", "60"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "setpoint" in done.stdout
+    watched = run(demo, "pd", "watch", "island-01/setpoint", "--count", "1", "--json")
+    assert json.loads(watched.stdout)["value"] == 70
 
 
 def test_received_variable_cannot_be_set(demo: Appliance) -> None:
