@@ -1,0 +1,34 @@
+"""AoE as a conversation: an AMS packet to a slave and its answer (ETG.1020)."""
+
+from __future__ import annotations
+
+from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Ask, Conversation, reading
+from eap.codec.ams import AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.codec.mailbox import MailboxType
+from eap.errors import CodecError
+
+
+def exchange(
+    header: AmsHeader, data: bytes, *, timeout_ns: int = RESPONSE_TIMEOUT_NS
+) -> Conversation[tuple[AmsHeader, bytes]]:
+    """Send a request; return header and data of the answer.
+
+    The answer has the invoke id and the command of the request, and comes from where that went.
+    """
+
+    def accepts(packet: bytes) -> bool:
+        try:
+            found = AmsHeader.decode(packet)
+        except CodecError:
+            return True
+        return (
+            bool(found.state_flags & StateFlags.RESPONSE)
+            and (found.invoke_id, found.command) == (header.invoke_id, header.command)
+            and (found.source, found.source_port) == (header.target, header.target_port)
+        )
+
+    packet = encode_packet(header, data)
+    message = yield Ask(MailboxType.AOE, packet, accepts, timeout_ns)
+    with reading(f"AoE answer of {header.target}:{header.target_port}"):
+        answer, body = decode_packet(message.data)
+    return answer, bytes(body)

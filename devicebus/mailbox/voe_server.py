@@ -1,0 +1,42 @@
+"""VoE on the side of a slave: a vendor's own protocol, or an echo (ETG.1000.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from devicebus.mailbox.protocol import refuse
+from eap.codec.mailbox import MailboxError
+from eap.codec.voe import VoeHeader
+from eap.errors import TruncatedError
+
+
+class VoeServer:
+    """The VoE protocol of a slave.
+
+    Args:
+        handler: Called with vendor id, vendor type and data of each request; returns the data of
+            the answer, None if there is none.  Without it the slave echoes.
+    """
+
+    def __init__(self, handler: Callable[[int, int, bytes], bytes | None] | None = None) -> None:
+        self._handler = handler
+
+    def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
+        """Act on a message behind its mailbox header and return the answer, if it has one."""
+        del now_ns
+        try:
+            header = VoeHeader.decode(data)
+        except TruncatedError as exc:
+            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
+        if self._handler is None:
+            return [data]
+        answer = self._handler(header.vendor_id, header.vendor_type, data[VoeHeader.SIZE :])
+        return [] if answer is None else [header.encode() + answer]
+
+    def messages_to_send(self, now_ns: int) -> list[bytes]:
+        """Return nothing: this server only answers."""
+        del now_ns
+        return []
+
+    def reset(self) -> None:
+        """Do nothing: this server remembers nothing."""
