@@ -65,12 +65,12 @@ class TcpDoor:
                     continue
                 peer = f"{address[0]}:{address[1]}"
                 if self._waiting < MAX_WAITING:
+                    self._waiting += 1  # not in the task: a crowd is accepted before it runs
                     group.create_task(self._sort(connection, peer))
                 else:
                     self._close(connection, peer, Refusal.TCP_FULL)
 
     async def _sort(self, connection: socket.socket, peer: str) -> None:
-        self._waiting += 1
         try:
             async with asyncio.timeout(self._first_frame_s):
                 frame_type = await _first_type(connection)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from eap.config.load import Plant
 
 
-@click.command()
+@click.command(short_help="Say at once all that is wrong with a plant file.")
 @click.argument("plant", type=PLANT_FILE)
 @json_option("Print one object: ok, and all findings.")
 @click.pass_context

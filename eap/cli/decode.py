@@ -45,7 +45,7 @@ class _Frame(NamedTuple):
         return {"packet": self.number, "time": self.at_ns / 1e9} | known
 
 
-@click.command()
+@click.command(short_help="Say what is in a frame or in a capture.")
 @click.argument("source", metavar="HEX|FILE", nargs=-1, required=True)
 @json_option("Print one object a frame, on one line.")
 @click.pass_context

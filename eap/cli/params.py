@@ -10,7 +10,7 @@ import click
 
 CommandT = TypeVar("CommandT", bound=Callable[..., Any])
 
-PLANT_FILE = click.Path(dir_okay=False, path_type=Path)
+PLANT_FILE = click.Path(path_type=Path)
 """A plant file; whether it can be read is for the loader to say, in its own words."""
 
 

@@ -23,7 +23,7 @@ def pd() -> None:
     """List, watch and set the process data of running stations."""
 
 
-@pd.command("list")
+@pd.command("list", short_help="List every PD and every variable.")
 @plant_option
 @station_option
 @json_option("One object a line: a PD, or the variables of a station that no PD carries.")

@@ -9,7 +9,7 @@ import click
 from eap.cli.params import PLANT_FILE
 
 
-@click.command()
+@click.command(short_help="Run a plant, or some of its stations.")
 @click.argument("plant", type=PLANT_FILE)
 @click.option(
     "--station",

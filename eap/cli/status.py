@@ -11,7 +11,7 @@ from eap.cli.output import write_json, write_tables
 from eap.cli.params import json_option, plant_option, station_option
 
 
-@click.command()
+@click.command(short_help="Show processes, stations, ports and process data.")
 @plant_option
 @station_option
 @json_option("Print one object; docs/control.md explains its fields.")

@@ -136,3 +136,16 @@ def test_there_is_a_limit_to_those_who_wait(monkeypatch):
         silent.close()
 
     assert play(script) == [Refusal.TCP_FULL]
+
+
+def test_the_limit_holds_when_all_come_at_once(monkeypatch):
+    monkeypatch.setattr(tcp_door, "MAX_WAITING", 2)
+
+    async def script(scene):
+        crowd = [socket.create_connection(scene.address) for _ in range(6)]  # before any is taken
+        while len(scene.refused) < 4:
+            await asyncio.sleep(0.001)
+        for connection in crowd:
+            connection.close()
+
+    assert play(script) == [Refusal.TCP_FULL] * 4

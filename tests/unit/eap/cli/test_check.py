@@ -64,6 +64,12 @@ def test_findings_for_programs(plant: Path) -> None:
     assert all(set(finding) == keys for finding in answer["findings"])
 
 
+def test_a_directory_is_a_finding_too(tmp_path: Path) -> None:
+    result = CliRunner().invoke(main, ["check", str(tmp_path), "--json"])
+    assert result.exit_code == 2
+    assert [f["message"] for f in json.loads(result.stdout)["findings"]] == ["is a directory"]
+
+
 def test_missing_file_is_one_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["check", str(tmp_path / "none.yaml")])
     assert result.exit_code == 2
