@@ -284,3 +284,15 @@ def test_download_that_may_be_right_passes_the_check() -> None:
     dictionary.check_download(0x8000, 5, 3, PREOP)
     dictionary.check_download(0x8000, 0, 13, PREOP, complete=True)
     dictionary.check_download(0x8000, 1, 11, PREOP, complete=True)
+
+
+def test_entry_that_may_not_be_read_is_zero_in_a_whole_object() -> None:
+    entries = {1: Entry("a", "UINT", RO, 7), 2: Entry("b", "UINT", WO, 8)}
+    dictionary = ObjectDictionary([record(0x9000, "Mixed", entries)])
+    assert dictionary.upload_complete(0x9000, 1, OP) == bytes.fromhex("0700 0000")
+
+
+def test_limits_mean_nothing_to_what_is_no_number() -> None:
+    dictionary = ObjectDictionary([variable(0x2000, "Block", "BLOCK(2)", RW, b"ab", maximum=1)])
+    dictionary.download(0x2000, 0, b"zz", OP)
+    assert dictionary.upload(0x2000, 0, OP) == b"zz"

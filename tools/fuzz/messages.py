@@ -1,0 +1,43 @@
+"""Octets cut into mailbox messages, and conversations that get them for answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+from devicebus.errors import MailboxTimeoutError
+from devicebus.mailbox.conversation import Conversation, Message
+from eap.codec.mailbox import MailboxType
+
+T = TypeVar("T")
+
+
+def cut(data: bytes) -> Iterator[bytes]:
+    """Cut *data* into messages: a length of up to 47 octets, and as many octets."""
+    at = 0
+    while at < len(data):
+        size = data[at] % 48
+        yield data[at + 1 : at + 1 + size]
+        at += 1 + size
+
+
+def answer_with(talk: Conversation[T], kind: MailboxType, answers: Iterable[bytes]) -> T:
+    """Run a conversation to its end; when no answer is left it gets a time-out.
+
+    Every other answer is accepted whatever the conversation says, as if it were expected.
+    """
+    rest = iter(answers)
+    try:
+        ask = next(talk)
+        while True:
+            if not ask.expects_reply:
+                ask = talk.send(Message(kind, b""))
+                continue
+            found = next((data for n, data in enumerate(rest) if n % 2 or ask.accepts(data)), None)
+            if found is None:
+                ask = talk.throw(MailboxTimeoutError("no answer is left"))
+            else:
+                ask = talk.send(Message(kind, found))
+    except StopIteration as end:
+        result: T = end.value
+        return result
