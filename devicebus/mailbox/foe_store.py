@@ -149,6 +149,7 @@ class MemoryWriter:
         self._content.clear()
 
 
-def refusal(code: FoeErrorCode, text: str) -> FoeError:
-    """Make the error with which a store refuses; *text* goes to the master."""
-    return FoeError(f"{text}: {name_of(code)}", code=code, text=text)
+def refusal(code: FoeErrorCode, what: str) -> FoeError:
+    """Make the error with which a store refuses; the master gets the code and these words."""
+    text = f"{what}: {name_of(code)}"
+    return FoeError(text, code=code, text=text)

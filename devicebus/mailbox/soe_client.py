@@ -62,18 +62,18 @@ def read(
             message = yield Ask(MailboxType.SOE, None, accepts)
         with reading(what):
             header, body = decode_message(message.data)
-        if not header.incomplete and header.idn != number:
+        is_foreign = not header.incomplete and header.idn != number
+        now_left = header.idn if header.incomplete else 0
+        if is_foreign or (left is not None and now_left > left):
             content.clear()
-            left = None
             late += 1
             if late > _MAX_LATE:
                 raise MailboxProtocolError(f"{what}: {late} answers for other IDNs")
-            continue
-        if header.error:
+            if is_foreign:
+                left = None
+                continue
+        elif header.error:
             raise _refusal(what, body)
-        now_left = header.idn if header.incomplete else 0
-        if left is not None and now_left > left:
-            content.clear()
         elif left is not None and now_left != left - 1:
             raise MailboxProtocolError(f"{what}: {left} fragments left, then {now_left}")
         content += body

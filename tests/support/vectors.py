@@ -66,3 +66,9 @@ def _frame(octets: bytes) -> bytes:
     assert octets[start : start + 2] == b"\x08\x00"
     assert octets[start + 2] == 0x45, "no options in these IP headers"
     return octets[start + 30 :]
+
+
+def load_message(name: str) -> bytes:
+    """The data of one mailbox message of ``type5_mailbox.yaml``, behind its headers."""
+    (vector,) = [item for item in load("type5_mailbox") if item.name.endswith(name)]
+    return bytes.fromhex(vector.fields["mailbox"]["data"])

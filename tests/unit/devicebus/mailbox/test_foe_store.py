@@ -121,4 +121,4 @@ def test_existing_file_may_be_kept() -> None:
 
 def test_refusal_says_what_and_why() -> None:
     error = refusal(FoeErrorCode.DISK_FULL, "log.txt")
-    assert (str(error), error.code, error.text) == ("log.txt: disk full", 0x8003, "log.txt")
+    assert (str(error), error.code, error.text) == (error.text, 0x8003, "log.txt: disk full")

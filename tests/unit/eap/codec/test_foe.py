@@ -15,6 +15,7 @@ from eap.codec.foe import (
     text_of,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
+from tests.support.vectors import load_message
 
 
 @pytest.mark.parametrize(
@@ -76,3 +77,19 @@ def test_every_error_code_has_a_text_of_its_own() -> None:
 )
 def test_trailing_nuls_are_no_part_of_a_text(octets: bytes, text: str) -> None:
     assert text_of(octets) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "opcode", "number", "body"),
+    [
+        ("foe_rrq", FoeOpcode.READ, 0, b"firmware.bin"),
+        ("foe_data1", FoeOpcode.DATA, 1, b"hello"),
+        ("foe_busy", FoeOpcode.BUSY, Busy(3, 10).number, b"wait"),
+        ("foe_err", FoeOpcode.ERROR, FoeErrorCode.NOT_FOUND, b"not found"),
+    ],
+)
+def test_vector(name: str, opcode: FoeOpcode, number: int, body: bytes) -> None:
+    octets = load_message(name)
+    header, read = decode_message(octets)
+    assert (header.opcode, header.number, bytes(read)) == (opcode, number, body)
+    assert encode_message(opcode, number, body) == octets

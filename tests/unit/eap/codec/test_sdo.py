@@ -21,7 +21,7 @@ from eap.codec.sdo import (
 )
 from eap.errors import TruncatedError
 from tests.support.records import records
-from tests.support.vectors import Vector, load
+from tests.support.vectors import Vector, load, load_message
 
 CAPTURED = load("coe_mailbox")
 REQUEST, RESPONSE = SdoRequest, SdoResponse
@@ -133,3 +133,7 @@ def test_round_trip_and_every_prefix_is_truncated(record: type, data: st.DataObj
     assert record.decode(octets) == value
     with pytest.raises(TruncatedError, match=record.__name__):
         record.decode(octets[: data.draw(st.integers(0, len(octets) - 1))])
+
+
+def test_abort_vector() -> None:
+    assert encode_abort(0x1234, 0, 0x06020000) == load_message("coe_abort")

@@ -21,6 +21,7 @@ from eap.codec.soe import (
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
 from tests.support.records import records
+from tests.support.vectors import load_message
 
 
 def test_read_request_lies_as_on_the_wire() -> None:
@@ -117,3 +118,11 @@ def test_garbage_decodes_or_raises_codec_error(noise: bytes) -> None:
     except CodecError:
         return
     assert header.encode() + body == noise
+
+
+def test_vectors() -> None:
+    request, refusal = load_message("soe_read_req"), load_message("soe_read_err")
+    assert encode_message(SoeOpcode.READ_REQUEST, 32) == request
+    assert encode_message(SoeOpcode.READ_RESPONSE, 32, b"\1\x10", error=True) == refusal
+    header, body = decode_message(refusal)
+    assert (header.error, error_code_of(body)) == (1, 0x1001)

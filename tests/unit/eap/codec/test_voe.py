@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from eap.codec.voe import VoeHeader
 from eap.errors import TruncatedError
 from tests.support.records import records
+from tests.support.vectors import load_message
 
 
 def test_header_lies_as_on_the_wire() -> None:
@@ -18,3 +19,10 @@ def test_round_trip_and_every_prefix_is_truncated(header: VoeHeader, cut: int) -
     assert VoeHeader.decode(header.encode() + b"data") == header
     with pytest.raises(TruncatedError, match="VoeHeader"):
         VoeHeader.decode(header.encode()[:cut])
+
+
+def test_vector() -> None:
+    octets = load_message("voe")
+    header = VoeHeader.decode(octets)
+    assert header == VoeHeader(0x1164, 1)
+    assert header.encode() + b"\1\2" == octets
