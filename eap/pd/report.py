@@ -5,7 +5,6 @@ The shapes are a contract: docs/control.md describes them.
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import Any
 
 from eap.codec.pd import PdHeader
@@ -36,7 +35,7 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
     Args:
         image: The station's image.
         now_ns: The time on the monotonic clock.
-        wall_ns: The same moment since 1970, UTC; without it nothing is dated.
+        wall_ns: The same moment since 1970; without it nothing is dated.
     """
     layout, words = image.layout, image.words
     state = words[StationWord.STATE]
@@ -129,11 +128,6 @@ def var_state(image: Image, place: RxPlace) -> int:
     return int(words[place.words + RxWord.MISMATCH])
 
 
-def _timestamp(wall_ns: int) -> str:
-    moment = datetime.fromtimestamp(wall_ns / 1e9, tz=UTC)
-    return moment.isoformat(timespec="milliseconds")
-
-
 def _spread(bins: list[int], largest: int) -> dict[str, int | None]:
     """Return percentiles of a histogram; bins are wider than the largest value is exact."""
     p50, p99 = percentile(bins, 0.5), percentile(bins, 0.99)
@@ -186,7 +180,7 @@ def _rx(image: Image, place: RxPlace, now_ns: int, wall_ns: int | None) -> dict[
         "cycle_index": words[first + RxWord.LAST_CYCLE] & 0xFFFF if received else None,
         "var_state": var_state(image, place),
         "age_us": max(age_ns, 0) // 1000 if received else None,
-        "last_good": _timestamp(wall_ns - age_ns) if received and wall_ns else None,
+        "last_good": round((wall_ns - age_ns) / 1e9, 3) if received and wall_ns else None,
         "jitter_us": _spread(bins, words[first + RxWord.JITTER_MAX_US]),
         "state": RxState(words[first + RxWord.STATE]).name.lower(),
     }
