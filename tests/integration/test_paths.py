@@ -90,16 +90,19 @@ def test_multicast_over_udp_reaches_three_stations_of_one_appliance(farm: Plants
 
 
 @pytest.mark.root
-def test_broadcast_over_udp_reaches_both_ends_of_the_cable(farm: Plants) -> None:
+def test_broadcast_over_udp_reaches_this_host_and_the_other(farm: Plants) -> None:
     text = plant(
         station("source", 1, "udp://10.88.164.1", more=sender("broadcast")),
         station("far", 2, "udp://10.88.164.2", more=receiver("source")),
+        station("near", 3, "udp://10.88.164.3", more=receiver("source")),
     )
     with cable(addresses=True) as (here, there):
+        here.ip("addr", "add", "10.88.164.3/24", "dev", "eth0")
         path = farm.write(text)
         far = farm.run(path, "--station", "far", prefix=there.prefix)
-        farm.run(path, "--station", "source", prefix=here.prefix)
+        near = farm.run(path, "--station", "source", "--station", "near", prefix=here.prefix)
         assert_hears(far, "far", "source")
+        assert_hears(near, "near", "source")
 
 
 @pytest.mark.root
