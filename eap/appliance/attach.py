@@ -108,7 +108,17 @@ class AttachedStation:
                 image.store(name, octets)
 
     def fire(self, pd: str) -> None:
-        """Send the TxPD *pd* in the next cycle; its trigger must say ``event``."""
+        """Send the TxPD *pd* in the next cycle.
+
+        Raises:
+            ImageError: the station sends no such PD, or its trigger does not say ``event``.
+        """
+        by_event = [place.name for place in self._file.image.layout.tx if place.event]
+        if pd not in by_event:
+            listed = ", ".join(by_event) or "none"
+            raise ImageError(
+                f"station {self.name} sends no PD {pd!r} by event; those with event: true: {listed}"
+            )
         name = pd + VAR_CTRL
         control = self[name]
         if control & EVENT_BIT:  # the engine has to see it low before it can rise

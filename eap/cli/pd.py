@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Any
+from math import isfinite
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,6 +17,9 @@ from eap.cli.params import (
     station_option,
 )
 from eap.errors import ControlError
+
+if TYPE_CHECKING:
+    from eap.codec.values import DataType
 
 
 @click.group()
@@ -105,7 +109,7 @@ def set_value(words: tuple[str, ...], plant: str | None, as_json: bool) -> None:
         value: Any = text
         if kind := kinds.get(target.name):
             try:
-                value = kind.to_plain(kind.parse_text(text))
+                value = _to_json(kind, text)
             except ValueError as exc:
                 raise ControlError(f"variable {target}: {exc}", code="value") from None
         client.request("write", station=target.station, values={target.name: value})
@@ -115,6 +119,15 @@ def set_value(words: tuple[str, ...], plant: str | None, as_json: bool) -> None:
         from eap.cli.pd_view import value_text
 
         write_text(f"{target} = {value_text(value)}")
+
+
+def _to_json(kind: DataType, text: str) -> Any:
+    """Read *text* as a value that the control protocol can carry; raise ValueError otherwise."""
+    value = kind.parse_text(text)
+    numbers = value if isinstance(value, tuple) else (value,)
+    if any(isinstance(number, float) and not isfinite(number) for number in numbers):
+        raise ValueError(f"{text!r} cannot be set from here: expected a finite number")
+    return kind.to_plain(value)
 
 
 def _write_change(change: dict[str, Any]) -> None:

@@ -85,6 +85,8 @@ class TxPlace(Record, frozen=True):
     """Whether cycle time or divider is its only trigger."""
     cyclic: bool
     """Whether that schedule is a cycle time (or each cycle), not a divider."""
+    event: bool
+    """Whether the application can send it."""
 
 
 class RxPlace(Record, frozen=True):
@@ -240,6 +242,7 @@ def _tx_places(
                 words=words.take(TxWord.SIZE),
                 frame_words=place.words,
                 by_schedule=trigger.on_change is None and not trigger.event,
+                event=trigger.event,
                 cyclic=bool(trigger.cycle_us) or not (trigger.divider or frame.divider),
             )
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import eap
@@ -17,8 +18,19 @@ from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.net.image_file import ImageFile, create_image
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
-from eap.pd.spec import CounterSource, StationSpec, VariableSpec, Writer
+from eap.pd.spec import (
+    CounterSource,
+    PortKind,
+    PortSpec,
+    StationSpec,
+    TriggerSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
 from eap.pd.station import Station
+from eap.pd.trigger import EVENT_BIT
 
 pytestmark = pytest.mark.net  # threads and real time
 
@@ -129,6 +141,25 @@ def test_unknown_names_suggest_the_near_one(path: Path) -> None:
             station["setpiont"]
         with pytest.raises(ImageError, match=r"no variable 'xyzzy'$"):
             station["xyzzy"]
+
+
+def test_only_what_goes_by_event_can_be_fired(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 1e9)  # nobody runs this image
+    pds = (
+        TxPdSpec("state", 1, ("mode",)),
+        TxPdSpec("alarm", 2, ("mode",), trigger=TriggerSpec(event=True)),
+    )
+    sender = msgspec.structs.replace(
+        spec(),
+        ports=(PortSpec("eap0", PortKind.EAP, "udp://127.9.3.9", "1.1.1.1.2.1"),),
+        frames=(TxFrameSpec("out", "eap0", "127.9.3.8", pds),),
+    )
+    with create_image(path, plan_layout(sender)), eap.attach("mixer") as station:
+        station.fire("alarm")
+        assert station["alarm.VarCtrl"] == EVENT_BIT
+        for name in ("state", "alram"):
+            with pytest.raises(ImageError, match=f"no PD '{name}' by event.*: alarm$"):
+                station.fire(name)
 
 
 def test_unknown_station_names_the_running_ones(path: Path) -> None:

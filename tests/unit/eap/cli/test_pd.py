@@ -174,6 +174,7 @@ def test_set_reads_the_value_by_its_type(appliance: Appliance) -> None:
     [
         (["mixer", "setpoint", "warm"], "'warm' is not a value of INT"),
         (["mixer", "setpoint", "40000"], "from -32768 to 32767"),
+        (["filler", "curve", "1,nan"], "expected a finite number"),
         (["mixer", "level", "1"], "is written by the engine"),
         (["mixer", "setpiont", "1"], "did you mean setpoint?"),
         (["mixr", "setpoint", "1"], "no station mixr runs"),
