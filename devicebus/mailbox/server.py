@@ -119,6 +119,7 @@ class MailboxServer:
             return None
         if self._posted is not None:
             self._queue.appendleft(self._posted)
+            self._sent -= 1
         self._posted = self._read
         self._repeated += 1
         return self._posted

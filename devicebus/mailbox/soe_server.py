@@ -87,8 +87,9 @@ class SoeServer:
         """Notifications and emergencies lost because the master did not fetch those before."""
 
     def reset(self) -> None:
-        """Forget fragments, and what waits to be sent."""
+        """Forget fragments, and what waits to be sent; procedure commands run on."""
         self._partial = None
+        self._running.clear()
         self._pending.clear()
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+import io
+from random import Random
 
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, rule
+
+from devicebus.errors import MailboxRefusedError
+from devicebus.mailbox import coe_client, eoe_client, foe_client, voe_client
+from devicebus.mailbox.coe_server import CoeServer
+from devicebus.mailbox.foe_server import FoeServer
+from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MAX_QUEUED, MailboxServer
+from devicebus.mailbox.voe_server import VoeServer
+from eap.codec.coe import Emergency
 from eap.codec.mailbox import (
     MailboxError,
     MailboxErrorReply,
@@ -16,6 +27,9 @@ from eap.codec.mailbox import (
     decode_message,
     encode_message,
 )
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RW, OdState, variable
+from tests.support.mailbox import Fault, Line
 
 
 class Echo:
@@ -230,3 +244,69 @@ def test_any_octets_get_an_answer_or_are_counted(messages: list[bytes]) -> None:
     while (message := box.server.next_message(0)) is not None:
         decode_message(message)
         assert len(message) <= 32
+
+
+class MailboxMachine(RuleBasedStateMachine):
+    """Protocols side by side: each gets its own answers, and every emergency arrives once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes = MailboxSizes(32, 28)
+        self.coe = CoeServer(
+            ObjectDictionary([variable(0x2000, "Text", "STRING(90)", RW, "x" * 90)]),
+            lambda: OdState.OP,
+            self.sizes,
+        )
+        protocols = {
+            MailboxType.COE: self.coe,
+            MailboxType.FOE: FoeServer(MemoryStore([MemoryFile("f")]), self.sizes),
+            MailboxType.VOE: VoeServer(),
+        }
+        dice = Random(11)
+        bad = [Fault.NONE] * 6 + list(Fault)
+        self.line = Line(MailboxServer(protocols, self.sizes), lambda: dice.choice(bad))
+        self.file = b""
+        self.codes: list[int] = []
+
+    @rule(code=st.integers(1, 0xFFFF))
+    def emergency(self, code: int) -> None:
+        # Fetched at the latest when so many wait, so that none is dropped.
+        if len(self.codes) % 10 == 9:
+            self.line.fetch()
+        self.coe.send_emergency(code)
+        self.codes.append(code)
+
+    @rule()
+    def upload(self) -> None:
+        assert self.line.run(coe_client.upload(0x2000, 0)) == b"x" * 90
+
+    @rule(data=st.binary(max_size=50))
+    def write(self, data: bytes) -> None:
+        source = io.BytesIO(data)
+        self.line.run(foe_client.write("f", source.read, self.sizes))
+        self.file = data
+
+    @rule()
+    def read(self) -> None:
+        sink = io.BytesIO()
+        self.line.run(foe_client.read("f", sink.write, self.sizes))
+        assert sink.getvalue() == self.file
+
+    @rule(data=st.binary(max_size=16))
+    def echo(self, data: bytes) -> None:
+        assert self.line.run(voe_client.exchange(1, 2, data)) == data
+
+    @rule()
+    def refused(self) -> None:
+        with pytest.raises(MailboxRefusedError) as caught:
+            self.line.run(eoe_client.get_ip())
+        assert caught.value.detail == MailboxError.UNSUPPORTED_PROTOCOL
+
+    def teardown(self) -> None:
+        found = [Emergency.decode(message.data, 2).error_code for message in self.line.fetch()]
+        assert found == self.codes
+        assert self.line.server.stats().gaps == 0
+
+
+TestMailboxMachine = MailboxMachine.TestCase
+TestMailboxMachine.settings = settings(max_examples=25, stateful_step_count=30)

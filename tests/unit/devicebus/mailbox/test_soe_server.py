@@ -136,10 +136,12 @@ def test_write_that_starts_again_forgets_what_came_before(between: str) -> None:
 
 def test_reset_forgets_fragments_and_what_waits() -> None:
     drive = Drive()
-    drive.ask("0b 40 0100 040004000100")
+    drive.ask("03 40 6300 0300")
     drive.server.send_emergency(1)
+    drive.ask("0b 40 0100 040004000100")
     drive.server.reset()
-    assert drive.unasked() == []
+    assert drive.unasked(99) == []
+    assert drive.ask("01 01 6300", 99) == ["02 01 63 00 03 00"]
     assert drive.ask("03 40 1000 0200") == ["14 40 10 00 02 70"]
 
 
