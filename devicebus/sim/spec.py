@@ -49,11 +49,15 @@ class ChannelSpec(msgspec.Struct, frozen=True, kw_only=True):
     """Such as ``0x6041:0``; left out, the next of 0x6000 for inputs, of 0x7000 for outputs."""
     value: Value = 0
     noise: float = 0.0
-    """Analogue inputs: largest deviation from *value*, in steps of the type."""
+    """Inputs: largest deviation from *value*, in steps of the type."""
+    values: tuple[float, ...] = ()
+    """Inputs: what they show one after the other, again and again."""
     csv: str = ""
-    """Analogue inputs: file with one value a line, read again from its start at the end."""
+    """Inputs: the same from a file with one value a line."""
+    follows: str = ""
+    """Inputs: the output of this slave that they show."""
     period_ms: Annotated[int, Meta(ge=1, le=3_600_000)] = 10
-    """How long each value of *csv* or of the noise lasts."""
+    """How long each value of *values*, of *csv* or of the noise lasts."""
 
 
 class EntrySpec(msgspec.Struct, frozen=True, kw_only=True):

@@ -19,6 +19,7 @@ from eap.cli.group import LazyGroup
         "decode": "eap.cli.decode:decode",
         "pd": "eap.cli.pd:pd",
         "run": "eap.cli.run:run",
+        "sim": "eap.cli.sim:sim",
         "status": "eap.cli.status:status",
     },
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},

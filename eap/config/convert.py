@@ -8,7 +8,7 @@ A key with a typing error is reported and then read as the one that was meant.
 from __future__ import annotations
 
 from math import isfinite
-from typing import Any
+from typing import Any, TypeVar
 
 from msgspec import inspect
 
@@ -16,7 +16,13 @@ from eap.config.document import Node, ScalarNode
 from eap.config.finding import Report, near, one_of
 from eap.config.structs import PlantFile, Section
 
+T = TypeVar("T")
+
 _UNITS = {"us": " of microseconds", "ms": " of milliseconds"}
+
+
+_NULLS = frozenset(("null", "~"))
+"""Said on purpose; an empty value may be a value forgotten."""
 
 
 class _BrokenError(Exception):
@@ -28,12 +34,20 @@ class _BrokenError(Exception):
 
 def convert(root: Node, report: Report) -> PlantFile | None:
     """Return what *root* describes without the items that were reported; None if it is no plant."""
+    return convert_to(PlantFile, root, report, "plant")
+
+
+def convert_to(kind: type[T], root: Node, report: Report, what: str) -> T | None:
+    """Return what *root* describes as *kind*; None if it is none.  *what* is its name in findings.
+
+    Items that were reported are left out.
+    """
     report.lines[""] = root.line
     try:
-        plant: PlantFile = _Converter(report).value(root, inspect.type_info(PlantFile), "", "plant")
+        found: T = _Converter(report).value(root, inspect.type_info(kind), "", what)
     except _BrokenError:
         return None
-    return plant
+    return found
 
 
 class _Converter:
@@ -69,6 +83,8 @@ class _Converter:
     def _union(self, node: Node, kind: inspect.UnionType, path: str, key: str) -> Any:
         kinds = [each for each in kind.types if not isinstance(each, inspect.NoneType)]
         structs = [each for each in kinds if isinstance(each, inspect.StructType)]
+        if len(kinds) < len(kind.types) and getattr(node, "text", "") in _NULLS:
+            return None
         if len(kinds) == 1:
             return self.value(node, kinds[0], path, key)
         if len(structs) == len(kinds):

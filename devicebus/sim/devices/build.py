@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from devicebus.sim.device import Device
+from devicebus.sim.devices.kinds import behave, complete, device_type
 from devicebus.sim.devices.objects import build_dictionary
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.devices.siibuild import build_image, plan_channels
 from devicebus.sim.esc import Esc, EscSettings
 from devicebus.sim.segment import Cable, Segment
 from devicebus.sim.slave import Slave
-from devicebus.sim.spec import BusSpec, DeviceKind, SlaveSpec
+from devicebus.sim.spec import BusSpec, SlaveSpec
 
-_DEVICE_TYPES = {DeviceKind.DRIVE: 0x0002_0192}
-"""Object 0x1000: the device profile in the low word; 5001 is the modular one of I/O."""
-_MODULAR = 5001
+_NONE: Mapping[str, bytes] = {}
 
 
-def build_slave(spec: SlaveSpec) -> Slave:
-    """Make one slave.
+def build_slave(spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE) -> Slave:
+    """Make one slave; *resources* are the files that *spec* names.
 
     Raises:
         ValueError: a data type, a value or an entry in *spec* cannot be.
     """
-    dictionary = build_dictionary(spec, _DEVICE_TYPES.get(spec.kind, _MODULAR))
+    spec = complete(spec, resources)
+    dictionary = build_dictionary(spec, device_type(spec))
+    behaviour, parameters = behave(spec, dictionary, resources)
     device = Device(
         spec.name,
         dictionary,
+        behaviour=behaviour,
         has_boot=spec.boot and spec.mailbox is not None,
         needs_sync0=spec.clock is not None and spec.clock.needs_sync0,
         identification=spec.alias,
@@ -37,19 +41,19 @@ def build_slave(spec: SlaveSpec) -> Slave:
     device.output_channel = layout.output_channel
     device.input_channel = layout.input_channel
     if spec.mailbox is not None:
-        device.mailbox = build_mailbox(spec.mailbox, spec.files, device)
+        device.mailbox = build_mailbox(spec.mailbox, spec.files, device, parameters)
     emulates = spec.mailbox is None and not layout.channels[0].length + layout.channels[1].length
     image = build_image(spec, dictionary, layout, emulates=emulates)
     return Slave(Esc(image, _settings(spec)), device)
 
 
-def build_segment(bus: BusSpec) -> Segment:
+def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Segment:
     """Make all slaves of *bus* and wire them.
 
     Raises:
         ValueError: a slave cannot be made as described, or is wired to one that comes later.
     """
-    slaves = [build_slave(spec) for spec in bus.slaves]
+    slaves = [build_slave(spec, resources) for spec in bus.slaves]
     numbers = {spec.name: number for number, spec in enumerate(bus.slaves)}
     cables = []
     for number, spec in enumerate(bus.slaves[1:], 1):

@@ -12,8 +12,21 @@ from devicebus.sim.devices.pdoobjects import assignment, mapping
 from devicebus.sim.faultydictionary import FaultyDictionary
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
 from eap.codec import datatypes
+from eap.codec.datatypes import DataType
 from eap.od.dictionary import ObjectDictionary
-from eap.od.model import RO, RW, RW_PREOP, WO, Access, Entry, OdObject, array, record, variable
+from eap.od.model import (
+    RO,
+    RW,
+    RW_PREOP,
+    WO,
+    Access,
+    Entry,
+    ObjectCode,
+    OdObject,
+    array,
+    record,
+    variable,
+)
 
 RX_PDO, TX_PDO = 0x1600, 0x1A00
 OUTPUTS, INPUTS = 0x7000, 0x6000
@@ -102,18 +115,29 @@ def _identity(spec: SlaveSpec, device_type: int) -> Iterable[OdObject]:
 
 def _object(spec: ObjectSpec) -> OdObject:
     if not spec.entries:
-        return variable(
-            spec.index, spec.name, spec.type, _ACCESS[spec.access], spec.value,
-            minimum=spec.minimum, maximum=spec.maximum,
-        )  # fmt: skip
+        return OdObject(spec.index, spec.name, ObjectCode.VAR, {0: _entry(spec)})
     return record(spec.index, spec.name, {each.subindex: _entry(each) for each in spec.entries})
 
 
-def _entry(spec: EntrySpec) -> Entry:
+def _entry(spec: ObjectSpec | EntrySpec) -> Entry:
+    kind = datatypes.parse(spec.type)
     return Entry(
-        spec.name, spec.type, _ACCESS[spec.access], spec.value,
-        minimum=spec.minimum, maximum=spec.maximum,
-    )  # fmt: skip
+        spec.name,
+        kind,
+        _ACCESS[spec.access],
+        spec.value,
+        minimum=_limit(kind, spec.minimum),
+        maximum=_limit(kind, spec.maximum),
+    )
+
+
+def _limit(kind: DataType, limit: float | None) -> float | None:
+    """Return *limit* as a value of its type; raise ValueError if it is none."""
+    if limit is None or kind.scalar_range is None:
+        return None
+    number = limit if isinstance(kind.scalar_range[0], float) else int(limit)
+    kind.encode(number)
+    return number
 
 
 def _add_entry(

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from devicebus.mailbox.coe_server import CoeServer
+from devicebus.mailbox.eoe_server import EoeServer
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.mailbox.foe_store import AllowedIn, MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from devicebus.mailbox.server import MailboxServer
+from devicebus.mailbox.soe_parameter import SoeParameter
+from devicebus.mailbox.soe_server import SoeServer
+from devicebus.mailbox.voe_server import VoeServer
 from devicebus.sim.device import Device
 from devicebus.sim.spec import FileSpec, MailboxSpec
 from devicebus.wire.alstatus import AlState
 from eap.codec.mailbox import MailboxType
 
 
-def build_mailbox(spec: MailboxSpec, files: tuple[FileSpec, ...], device: Device) -> MailboxServer:
-    """Make the servers of *device*."""
+def build_mailbox(
+    spec: MailboxSpec,
+    files: Iterable[FileSpec],
+    device: Device,
+    parameters: Iterable[SoeParameter] = (),
+) -> MailboxServer:
+    """Make the servers of *device*; SoE has *parameters*, VoE echoes."""
     sizes = MailboxSizes(spec.size, spec.size)
     servers: dict[MailboxType, ProtocolServer] = {}
     if spec.coe:
@@ -22,6 +33,12 @@ def build_mailbox(spec: MailboxSpec, files: tuple[FileSpec, ...], device: Device
     if spec.foe:
         store = MemoryStore(map(_file, files), is_boot=lambda: device.al_state is AlState.BOOT)
         servers[MailboxType.FOE] = FoeServer(store, sizes)
+    if spec.soe:
+        servers[MailboxType.SOE] = SoeServer({0: parameters}, device.od_state, sizes)
+    if spec.eoe:
+        servers[MailboxType.EOE] = EoeServer(sizes)
+    if spec.voe:
+        servers[MailboxType.VOE] = VoeServer()
     return MailboxServer(servers, sizes)
 
 

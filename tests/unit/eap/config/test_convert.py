@@ -1,6 +1,11 @@
 from __future__ import annotations
 
+import msgspec
 import pytest
+
+from eap.config.convert import convert_to
+from eap.config.document import read
+from eap.config.finding import Report
 
 
 @pytest.mark.parametrize(
@@ -98,3 +103,27 @@ def test_arrays_and_blocks_have_defaults(load_plant):
     new = f"count: UDINT\n      {pair}\n      raw: {{type: BLOCK(2), default: 'beef'}}"
     plant = load_plant(("count: UDINT", new)).plant
     assert [v.default for v in plant.stations[0].variables] == [2.5, None, [1, 2.5], "beef"]
+
+
+class Lamp(msgspec.Struct):
+    watts: int
+    colour: str | None = "white"
+
+
+@pytest.mark.parametrize(
+    ("text", "lamp", "messages"),
+    [
+        ("watts: 5", Lamp(watts=5), []),
+        ("watts: 5\ncolour: null", Lamp(watts=5, colour=None), []),
+        ("watts: 5\ncolour: ~", Lamp(watts=5, colour=None), []),
+        ("watts: 5\ncolour:", Lamp(watts=5), ["colour has no value"]),
+        ("colour: red", None, ["lamp has no watts"]),
+        ("[5]", None, ["lamp is a list"]),
+    ],
+)
+def test_any_struct_can_be_read(tmp_path, text, lamp, messages):
+    path = tmp_path / "lamp.yaml"
+    path.write_text(text)
+    report = Report(str(path))
+    assert convert_to(Lamp, read(path, report), report, "lamp") == lamp
+    assert [finding.message for finding in report.findings()] == messages

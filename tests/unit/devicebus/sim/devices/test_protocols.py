@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from devicebus.sim.device import Device
+from devicebus.sim.devices.build import build_slave
 from devicebus.sim.devices.protocols import build_mailbox
-from devicebus.sim.spec import FileSpec, MailboxSpec
+from devicebus.sim.spec import DeviceKind, FileSpec, MailboxSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_message, encode_message
@@ -52,4 +53,22 @@ def test_dictionary_answers_by_coe():
     assert ask(mailbox, MailboxType.COE, request) == (
         MailboxType.COE,
         bytes.fromhex("0020 80 0010 00 00000206"),
+    )
+
+
+def test_voe_echoes_and_eoe_answers():
+    _, mailbox = make(MailboxSpec(voe=True, eoe=True))
+    message = bytes.fromhex("34120000 0500 aabb")
+    assert ask(mailbox, MailboxType.VOE, message) == (MailboxType.VOE, message)
+    assert ask(mailbox, MailboxType.EOE, bytes.fromhex("06000000"))[0] is MailboxType.EOE
+
+
+def test_idns_of_a_drive():
+    spec = SlaveSpec(name="d", kind=DeviceKind.DRIVE, mailbox=MailboxSpec(soe=True))
+    mailbox = build_slave(spec).device.mailbox
+    mailbox.start(256, 256)
+    read_mode = bytes.fromhex("01 40 2000")
+    assert ask(mailbox, MailboxType.SOE, read_mode) == (
+        MailboxType.SOE,
+        bytes.fromhex("02 40 2000 02000000"),
     )

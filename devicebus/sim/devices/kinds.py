@@ -1,0 +1,57 @@
+"""The kinds of devices: what each adds to its description, and how it behaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+
+from devicebus.mailbox.soe_parameter import SoeParameter
+from devicebus.sim.device import Behaviour
+from devicebus.sim.devices import drive, driveidns, esi
+from devicebus.sim.devices.signal import Signals
+from devicebus.sim.spec import DeviceKind, SlaveSpec
+from eap.od.dictionary import ObjectDictionary
+
+MODULAR_DEVICE = 5001
+"""Object 0x1000 of everything without a profile of its own (ETG.5001)."""
+_PRODUCTS = {kind: number for number, kind in enumerate(DeviceKind, 1)}
+
+
+def complete(spec: SlaveSpec, resources: Mapping[str, bytes]) -> SlaveSpec:
+    """Return *spec* with everything that its kind adds.
+
+    Raises:
+        ValueError: the description of the vendor is missing or cannot be used.
+    """
+    if spec.kind is DeviceKind.ESI:
+        if spec.esi not in resources:
+            raise ValueError("a device of kind esi needs its file (key esi)")
+        return esi.complete(spec, resources[spec.esi])
+    if spec.kind is DeviceKind.COUPLER and (spec.inputs or spec.outputs):
+        raise ValueError("a coupler has no process data, expected no inputs and no outputs")
+    if spec.kind is DeviceKind.DRIVE:
+        spec = drive.complete(spec)
+    if not spec.product:
+        spec = msgspec.structs.replace(spec, product=_PRODUCTS[spec.kind])
+    return spec
+
+
+def device_type(spec: SlaveSpec) -> int:
+    """Return what object 0x1000 says."""
+    return drive.DEVICE_TYPE if spec.kind is DeviceKind.DRIVE else MODULAR_DEVICE
+
+
+def behave(
+    spec: SlaveSpec, dictionary: ObjectDictionary, resources: Mapping[str, bytes]
+) -> tuple[Behaviour | None, list[SoeParameter]]:
+    """Return the behaviour of a device, if it has one, and its IDNs.
+
+    Raises:
+        ValueError: an input cannot get its values from where it should.
+    """
+    if spec.kind is DeviceKind.DRIVE:
+        axis = drive.Drive(dictionary)
+        return axis, driveidns.parameters(axis, spec.name)
+    signals = Signals(spec, dictionary, resources)
+    return signals or None, []

@@ -1,0 +1,45 @@
+"""``eapctl sim``: simulated slaves that answer a master."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from eap.cli.output import write_json
+from eap.ids import InterfaceUri
+
+
+def _parse_interface(ctx: click.Context, param: click.Parameter, text: str) -> InterfaceUri:
+    try:
+        return InterfaceUri.parse(text)
+    except ValueError as exc:
+        raise click.BadParameter(str(exc), ctx, param) from None
+
+
+@click.group()
+def sim() -> None:
+    """Simulated slaves for masters that speak the EtherCAT device protocol."""
+
+
+@sim.command()
+@click.argument("bus", type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--interface",
+    required=True,
+    callback=_parse_interface,
+    metavar="URI",
+    help="Where to answer: ethernet://IFACE (needs CAP_NET_RAW) or udp://ADDRESS[:PORT].",
+)
+@click.option("--faults", is_flag=True, help="Take faults as JSON, one a line, from stdin.")
+def run(bus: Path, interface: InterfaceUri, faults: bool) -> None:
+    """Run the slaves of the bus file BUS until Ctrl-C or SIGTERM.
+
+    When they answer, one line {"ready": true, "slaves": n} appears on stdout.
+    """
+    from eap.appliance import busfile, segment_process  # yaml and sockets; --help must not wait
+
+    loaded = busfile.load_or_raise(bus)
+    command_fd = sys.stdin.fileno() if faults else None
+    segment_process.run(loaded, interface, write_json, command_fd=command_fd)

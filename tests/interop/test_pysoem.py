@@ -1,0 +1,236 @@
+"""SOEM, by way of pysoem, as the master of our simulated slaves."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.support.simulator import NEAR, simulator, veth_pair
+
+pysoem = pytest.importorskip("pysoem", reason="needs pysoem: pip install pysoem")
+
+pytestmark = [pytest.mark.net, pytest.mark.root]
+
+BUS = """
+bus: interop
+slaves:
+  - name: island
+    kind: generic
+    vendor: 0x1234
+    product: 0x5678
+    revision: 0x90001
+    serial: 42
+    mailbox: {size: 256, foe: true}
+    inputs:
+      - {name: level, type: UINT, follows: speed}
+      - {name: echo, follows: valve}
+    outputs:
+      - {name: speed, type: UINT}
+      - {name: valve}
+    objects:
+      - index: 0x8000
+        name: Settings
+        entries:
+          - {subindex: 1, name: Gain, type: UDINT, value: 7}
+          - {subindex: 2, name: Limit, type: UINT, value: 20, maximum: 100}
+      - {index: 0x8001, name: Curve, type: BLOCK(2048)}
+    files:
+      - {name: firmware.bin, boot_only: true}
+  - {name: drive, kind: drive, product: 9, clock: {drift_ppm: 50}}
+  - {name: plain, kind: digital, product: 8, mailbox: null,
+     inputs: [{name: a}, {name: b}], outputs: [{name: c}]}
+"""
+CYCLES = 1000
+TIMEOUT_US = 500_000
+
+
+@pytest.fixture(scope="module")
+def bus(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bus") / "bus.yaml"
+    path.write_text(BUS)
+    with veth_pair(), simulator(path) as running:
+        assert running.ready == {"ready": True, "slaves": 3}
+        yield running
+
+
+@pytest.fixture
+def master(bus):
+    found = pysoem.Master()
+    found.open(NEAR)
+    try:
+        assert found.config_init() == 3
+        yield found
+        found.state = pysoem.INIT_STATE
+        found.write_state()
+    finally:
+        found.close()
+
+
+def lead(master, state):
+    master.state = state
+    master.write_state()
+    assert master.state_check(state, 4 * TIMEOUT_US) == state
+
+
+def operate(master):
+    """Configure, and go to OP with process data running."""
+    master.config_map()
+    assert master.state_check(pysoem.SAFEOP_STATE, 4 * TIMEOUT_US) == pysoem.SAFEOP_STATE
+    exchange(master)
+    master.state = pysoem.OP_STATE
+    master.write_state()
+    for _ in range(200):
+        exchange(master)
+        if master.state_check(pysoem.OP_STATE, 2000) == pysoem.OP_STATE:
+            return
+    master.read_state()
+    pytest.fail(str([(each.name, each.state, hex(each.al_status)) for each in master.slaves]))
+
+
+def exchange(master) -> int:
+    master.send_processdata()
+    return master.receive_processdata(100_000)
+
+
+def test_scan_finds_names_and_identities(master):
+    island, drive, plain = master.slaves
+    assert (island.name, drive.name, plain.name) == ("island", "drive", "plain")
+    assert (island.man, island.id, island.rev) == (0x1234, 0x5678, 0x90001)
+    assert master.state_check(pysoem.PREOP_STATE, TIMEOUT_US) == pysoem.PREOP_STATE
+
+
+def test_sdo_read_and_write(master):
+    island = master.slaves[0]
+    assert island.sdo_read(0x1018, 4) == (42).to_bytes(4, "little")
+    assert island.sdo_read(0x1008, 0) == b"island"
+    island.sdo_write(0x8000, 1, bytes.fromhex("01020304"))
+    assert island.sdo_read(0x8000, 1) == bytes.fromhex("01020304")
+
+
+@pytest.mark.parametrize(
+    ("index", "subindex", "data", "code"),
+    [
+        (0x9999, 0, None, 0x06020000),
+        (0x8000, 9, None, 0x06090011),
+        (0x8000, 2, b"\xff\x00", 0x06090031),
+        (0x8000, 1, b"\x01", 0x06070013),
+        (0x1018, 1, b"\x01\0\0\0", 0x06010002),
+    ],
+)
+def test_aborts(master, index, subindex, data, code):
+    island = master.slaves[0]
+    access = island.sdo_read if data is None else island.sdo_write
+    arguments = (index, subindex) if data is None else (index, subindex, data)
+    with pytest.raises(pysoem.SdoError) as caught:
+        access(*arguments)
+    assert caught.value.abort_code == code
+
+
+def test_abort_by_a_fault(bus, master):
+    island = master.slaves[0]
+    spec = {"kind": "sdo", "slave": "island", "object": "0x8000", "code": 0x06060000}
+    assert bus.fault(**spec) == {"ok": True}
+    with pytest.raises(pysoem.SdoError) as caught:
+        island.sdo_read(0x8000, 1)
+    assert caught.value.abort_code == 0x06060000
+    assert bus.fault(**spec, end=True) == {"ok": True}
+    island.sdo_read(0x8000, 1)
+
+
+def test_object_list(master):
+    island = master.slaves[0]
+    found = {item.index: item for item in island.od}
+    assert {0x1000, 0x1018, 0x1A00, 0x1C12, 0x6000, 0x7000, 0x8000, 0x8001} <= set(found)
+    assert found[0x8000].name == b"Settings"
+    names = [entry.name for entry in found[0x8000].entries]
+    assert names == [b"SubIndex 000", b"Gain", b"Limit"]
+
+
+def test_segmented_object(master):
+    island = master.slaves[0]
+    curve = bytes(n * 7 % 251 for n in range(2048))
+    island.sdo_write(0x8001, 0, curve)
+    assert island.sdo_read(0x8001, 0, 2048) == curve
+
+
+def test_complete_access(master):
+    island = master.slaves[0]
+    island.sdo_write(0x8000, 1, bytes.fromhex("0a000000 0b00"), ca=True)
+    assert island.sdo_read(0x8000, 0, 64, ca=True) == bytes.fromhex("0200 0a000000 0b00")
+
+
+def test_files_in_boot(master):
+    island = master.slaves[0]
+    lead(master, pysoem.INIT_STATE)
+    island.state = pysoem.BOOT_STATE
+    island.write_state()
+    assert island.state_check(pysoem.BOOT_STATE, TIMEOUT_US) == pysoem.BOOT_STATE
+    for size in (1, 244, 488, 20_000):  # 244 fill one message, 488 two
+        content = bytes(n % 253 for n in range(size))
+        assert island.foe_write("firmware.bin", 0, content) == 1
+        assert island.foe_read("firmware.bin", 0, size + 1) == content
+    island.state = pysoem.INIT_STATE
+    island.write_state()
+
+
+def test_thousand_cycles_in_op(master):
+    operate(master)
+    island = master.slaves[0]
+    assert master.expected_wkc == 9
+    wrong = 0
+    for cycle in range(CYCLES):
+        island.output = cycle.to_bytes(2, "little") + b"\x01"
+        wrong += exchange(master) != 9
+    assert wrong == 0
+    exchange(master)
+    assert island.input == (CYCLES - 1).to_bytes(2, "little") + b"\x01"
+    assert master.state_check(pysoem.OP_STATE, TIMEOUT_US) == pysoem.OP_STATE
+
+
+def test_sdo_beside_process_data(master):
+    operate(master)
+    assert master.slaves[0].sdo_read(0x1018, 1) == (0x1234).to_bytes(4, "little")
+    assert exchange(master) == master.expected_wkc
+
+
+def test_drive_is_switched_on_by_control_words(master):
+    operate(master)
+    drive = master.slaves[1]
+    for word, status in ((6, 0x21), (7, 0x23), (15, 0x27)):
+        for _ in range(3):
+            drive.output = word.to_bytes(2, "little") + (1000).to_bytes(4, "little")
+            exchange(master)
+        assert drive.input[0] & 0x6F == status
+    exchange(master)
+    assert drive.input[2:6] == (1000).to_bytes(4, "little")
+
+
+def test_clocks_and_sync0(master):
+    master.config_map()
+    assert master.config_dc()
+    master.slaves[1].dc_sync(act=True, sync0_cycle_time=1_000_000)
+    operate(master)
+    assert exchange(master) == master.expected_wkc
+
+
+def test_eeprom(master):
+    island = master.slaves[0]
+    assert island.eeprom_read(8) == (0x1234).to_bytes(4, "little")
+    assert island.eeprom_read(0x0A) == (0x5678).to_bytes(4, "little")
+
+
+def test_watchdog_is_reported(master):
+    operate(master)
+    island = master.slaves[0]
+    assert island.state_check(pysoem.SAFEOP_STATE | pysoem.STATE_ERROR, TIMEOUT_US)
+    master.read_state()
+    assert island.state == pysoem.SAFEOP_STATE | pysoem.STATE_ERROR
+    assert island.al_status == 0x001B
+
+
+def test_slave_without_power_is_missed(bus, master):
+    operate(master)
+    try:
+        assert bus.fault(kind="power", slave="plain") == {"ok": True}
+        assert exchange(master) == 6
+    finally:
+        bus.fault(kind="power", slave="plain", end=True)

@@ -1,0 +1,83 @@
+"""A simulated segment in a process of its own, at the far end of a veth pair."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+_CLONE_NEWNET = 0x40000000
+NEAR, FAR = "near", "far"
+
+
+def _ip(command: str) -> None:
+    subprocess.run(["ip", *command.split()], check=True, capture_output=True)
+
+
+@contextlib.contextmanager
+def veth_pair() -> Iterator[None]:
+    """Move this thread, and what it starts, into a network with the interfaces NEAR and FAR."""
+    library = ctypes.CDLL(None, use_errno=True)
+    with Path("/proc/thread-self/ns/net").open("rb") as home:
+        if library.unshare(_CLONE_NEWNET):
+            pytest.skip(f"no network namespace: {os.strerror(ctypes.get_errno())}")
+        try:
+            _ip("link set lo up")
+            _ip(f"link add {NEAR} type veth peer name {FAR}")
+            for name in (NEAR, FAR):
+                # A second network namespace would do no more: the slaves answer on FAR only.
+                _ip(f"link set {name} up")
+            yield
+        finally:
+            library.setns(home.fileno(), _CLONE_NEWNET)
+
+
+class Simulator:
+    """``eapctl sim run`` while it answers."""
+
+    def __init__(self, bus: Path, interface: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "eap", "sim", "run", str(bus), "--interface", interface,
+             "--faults"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+        self.ready = self._read()
+
+    def fault(self, **spec: object) -> dict:
+        """Let a fault begin, or with ``end=True`` end; return what the simulator says."""
+        self._process.stdin.write(json.dumps(spec) + "\n")
+        self._process.stdin.flush()
+        return self._read()
+
+    def close(self) -> int:
+        """End it and return its exit code."""
+        self._process.terminate()
+        with self._process:
+            return self._process.wait(10)
+
+    def _read(self) -> dict:
+        line = self._process.stdout.readline()
+        if not line:
+            self.close()
+            raise AssertionError("the simulator ended")
+        return json.loads(line)
+
+
+@contextlib.contextmanager
+def simulator(bus: Path, interface: str = f"ethernet://{FAR}") -> Iterator[Simulator]:
+    """Run the bus file *bus*; it ends with exit code 0 behind the block."""
+    running = Simulator(bus, interface)
+    try:
+        yield running
+    finally:
+        code = running.close()
+    assert code == 0

@@ -1,0 +1,91 @@
+"""Devices from ESI files."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.sim.devices.build import build_slave
+from devicebus.sim.devices.esi import complete, number
+from devicebus.sim.spec import DeviceKind, SlaveSpec
+from devicebus.wire import sii
+
+XML = b"""<?xml version="1.0"?>
+<EtherCATInfo>
+  <Vendor><Id>#x00000123</Id><Name>Somebody</Name></Vendor>
+  <Descriptions><Devices>
+    <Device Physics="YY">
+      <Type ProductCode="#x1" RevisionNo="#x10000">Other</Type>
+    </Device>
+    <Device Physics="YY">
+      <Type ProductCode="#x2" RevisionNo="#x20000">Mixed</Type>
+      <Sm DefaultSize="192" StartAddress="#x1000" ControlByte="#x26" Enable="1">MBoxOut</Sm>
+      <Sm DefaultSize="160" StartAddress="#x10c0" ControlByte="#x22" Enable="1">MBoxIn</Sm>
+      <Mailbox DataLinkLayer="1"><CoE SdoInfo="1"/><FoE/></Mailbox>
+      <RxPdo Fixed="1" Sm="2"><Index>#x1600</Index><Name>Out</Name>
+        <Entry><Index>#x7000</Index><SubIndex>1</SubIndex><BitLen>4</BitLen>
+          <Name>Nibble</Name><DataType>BITARR4</DataType></Entry>
+        <Entry><Index>0</Index><BitLen>4</BitLen></Entry>
+      </RxPdo>
+      <RxPdo><Index>#x1601</Index><Name>Not assigned</Name>
+        <Entry><Index>#x7010</Index><SubIndex>1</SubIndex><BitLen>8</BitLen></Entry>
+      </RxPdo>
+      <TxPdo Fixed="1" Sm="3"><Index>#x1A00</Index><Name>In</Name>
+        <Entry><Index>#x6000</Index><SubIndex>1</SubIndex><BitLen>16</BitLen>
+          <Name>Level</Name><DataType>INT</DataType></Entry>
+        <Entry><Index>#x6000</Index><SubIndex>2</SubIndex><BitLen>24</BitLen>
+          <Name>Odd</Name><DataType>WHATEVER</DataType></Entry>
+      </TxPdo>
+      <Profile><Dictionary><Objects>
+        <Object><Index>#x1018</Index><Name>Identity</Name><Type>DT1018</Type>
+          <BitSize>144</BitSize></Object>
+        <Object><Index>#x8001</Index><Name>Gain</Name><Type>UINT</Type><BitSize>16</BitSize>
+          <Flags><Access>ro</Access></Flags></Object>
+        <Object><Index>#x8002</Index><Name>Group</Name><Type>DT8002</Type>
+          <BitSize>40</BitSize></Object>
+      </Objects></Dictionary></Profile>
+    </Device>
+  </Devices></Descriptions>
+</EtherCATInfo>
+"""
+SPEC = SlaveSpec(name="mixed", kind=DeviceKind.ESI, esi="mixed.xml", product=2)
+
+
+def test_device_is_what_its_file_says():
+    spec = complete(SPEC, XML)
+    assert (spec.vendor, spec.product, spec.revision) == (0x123, 2, 0x20000)
+    assert (spec.mailbox.size, spec.mailbox.foe, spec.mailbox.soe) == (160, True, False)
+    assert [(c.name, c.type, c.object) for c in spec.outputs] == [("Nibble", "BIT4", "0x7000:1")]
+    assert [(c.name, c.type) for c in spec.inputs] == [("Level", "INT"), ("Odd", "BLOCK(3)")]
+    assert [(o.index, o.name, o.type) for o in spec.objects] == [(0x8001, "Gain", "UINT")]
+
+
+def test_first_device_without_a_product_code():
+    spec = complete(SlaveSpec(name="x", kind=DeviceKind.ESI, esi="mixed.xml"), XML)
+    assert (spec.product, spec.mailbox, spec.inputs) == (1, None, ())
+
+
+def test_slave_is_built_from_it():
+    slave = build_slave(SPEC, {"mixed.xml": XML})
+    image = sii.decode(slave.esc.image)
+    assert (image.fixed.vendor, image.fixed.receive_size) == (0x123, 160)
+    assert slave.device.process_data.inputs.size == 5
+    assert slave.device.dictionary[0x8001].name == "Gain"
+
+
+@pytest.mark.parametrize(
+    ("xml", "message"),
+    [
+        (b"<a", "not XML that can be read"),
+        (b"<a/>", "begins with a, expected EtherCATInfo"),
+        (b"<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", "not XML that can be read"),
+        (b"<EtherCATInfo/>", "describes 0 devices, none with product code 0x2"),
+    ],
+)
+def test_file_that_cannot_be_used(xml, message):
+    with pytest.raises(ValueError, match=message):
+        complete(SPEC, xml)
+
+
+@pytest.mark.parametrize(("text", "value"), [("#x1A00", 0x1A00), (" 12 ", 12), ("#X0f", 15)])
+def test_numbers(text, value):
+    assert number(text) == value

@@ -1,0 +1,54 @@
+"""``eapctl sim run`` as a command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from eap.appliance import segment_process
+from eap.cli.group import exit_code_of
+from eap.cli.sim import sim
+
+COE = Path(__file__).parents[4] / "config" / "buses" / "coe.yaml"
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """What would run, instead of running it."""
+    found = []
+
+    def run(bus, interface, say, *, command_fd=None):
+        found.append((bus.spec.bus, str(interface), command_fd))
+        say({"ready": True, "slaves": len(bus.spec.slaves)})
+
+    monkeypatch.setattr(segment_process, "run", run)
+    return found
+
+
+def invoke(*words):
+    return CliRunner().invoke(sim, ["run", *map(str, words)])
+
+
+def test_ready_line(runs):
+    result = invoke(COE, "--interface", "udp://127.0.9.1")
+    assert result.output == '{"ready":true,"slaves":3}\n'
+    assert runs == [("coe", "udp://127.0.9.1", None)]
+
+
+@pytest.mark.parametrize(
+    "words", [(COE,), (COE, "--interface", "nothing"), ("--interface", "udp://127.0.9.1")]
+)
+def test_usage(runs, words):
+    assert invoke(*words).exit_code == 2
+    assert runs == []
+
+
+def test_bus_file_that_is_none(runs, tmp_path):
+    path = tmp_path / "bus.yaml"
+    path.write_text("bus: x\nslaves: [{name: a}]\n")
+    result = invoke(path, "--interface", "udp://127.0.9.1")
+    assert exit_code_of(result.exception) == 2
+    assert "'a' has no kind" in str(result.exception)
+    assert runs == []
