@@ -80,12 +80,18 @@ class EnginePlant:
 
     def add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
         """Take frames from a connection that services accepted, for all ports behind it."""
+        port = self._tcp_ports[passed.owners[0]]
+        if port.is_full:
+            connection.close()
+            for station in {owner.station for owner in passed.owners}:
+                self._counters.count(station, Refusal.TCP_FULL)
+            return
         try:
             receiver = TcpReceiver(connection, [self._taker(owner) for owner in passed.owners])
         except OSError:
             connection.close()  # the peer has left again
             return
-        self._tcp_ports[passed.owners[0]].accept(receiver)
+        port.accept(receiver)
 
     def publish_discards(self) -> None:
         """Show what the interfaces dropped since the last time."""

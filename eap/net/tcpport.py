@@ -9,6 +9,10 @@ from eap.net.tcp import TcpReceiver, TcpSender
 from eap.pd.link import Channel, OutFrame
 
 
+MOST_CONNECTIONS = 32
+"""Incoming connections of a port: each costs a system call a cycle, whether it says anything."""
+
+
 class TcpPort:
     """One station's port: *datagrams*, connections to destinations, connections from publishers.
 
@@ -33,6 +37,11 @@ class TcpPort:
         if is_tcp and destination not in self._senders:
             self._senders[destination] = TcpSender(destination, self._address, self.errors)
         return b""
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for one more incoming connection."""
+        return len(self._receivers) >= MOST_CONNECTIONS
 
     def accept(self, receiver: TcpReceiver) -> None:
         """Take frames from *receiver* until its connection ends."""

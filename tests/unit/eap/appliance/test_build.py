@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from contextlib import ExitStack
 
 import msgspec
 import pytest
@@ -14,6 +15,7 @@ from eap.appliance.passing import PassedConnection
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.sockets import SharedSockets
 from eap.codec.ethercat import EtherCatHeader
+from eap.net import tcpport
 from eap.net.image_file import open_image
 from eap.pd.report import station_status
 from eap.pd.spec import Wake
@@ -123,3 +125,17 @@ def test_frames_of_a_passed_connection_reach_the_port_behind_it(start, shared):
     assert running.discards() == {"left": {}, "right": {"tcp_type": 1}}
     with open_image(running.folder.image("right")) as file:
         assert station_status(file.image, 1)["discarded"] == {"truncated": 1}
+
+
+@pytest.mark.net
+def test_a_port_has_room_for_so_many_connections(start, shared, monkeypatch):
+    monkeypatch.setattr(tcpport, "MOST_CONNECTIONS", 2)
+    stations = [left(), right(eap_port(2, tcp=True))]
+    running = start(stations, shared(*stations))
+    passed = PassedConnection((PortName("right", "eap0"),), "peer")
+    with socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as peers:
+        for _ in range(3):
+            peer = peers.enter_context(socket.create_connection(listener.getsockname(), 5))
+            running.plant.add_connection(listener.accept()[0], passed)
+        assert peer.recv(1) == b""  # the third was closed
+    assert running.discards() == {"left": {}, "right": {"tcp_full": 1}}
