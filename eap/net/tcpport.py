@@ -8,7 +8,6 @@ from eap.ids import Destination, DestinationKind
 from eap.net.tcp import TcpReceiver, TcpSender
 from eap.pd.link import Channel, OutFrame
 
-
 MOST_CONNECTIONS = 32
 """Incoming connections of a port: each costs a system call a cycle, whether it says anything."""
 
