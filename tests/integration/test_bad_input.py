@@ -48,8 +48,8 @@ UDP_PLANT = (
     .replace("TCP", "tcp: true")
 )
 ETHERNET_PLANT = (
-    PLANT.replace("INTERFACE", "ethernet://eth0")
-    .replace("SECOND", "ethernet://eth0")
+    PLANT.replace("INTERFACE", "ethernet://line0")
+    .replace("SECOND", "ethernet://line0")
     .replace("DESTINATION", "multicast")
     .replace(", TCP", "")
 )
@@ -197,7 +197,7 @@ def test_bad_frames_over_ethernet(farm: Plants) -> None:
         foreign = header[:12] + b"\x08\x00"
         expected: Counter[str] = Counter()
         with there.socket(socket.AF_PACKET, socket.SOCK_RAW) as wire:
-            wire.bind(("eth0", 0))
+            wire.bind(("line0", 0))
             for reason, frames in hostile_frames().items():
                 for frame in frames:
                     if len(frame) < 2:

@@ -122,7 +122,9 @@ def test_killed_services_leave_no_gap(both: tuple[Appliance, Appliance], witness
 def test_an_engine_that_does_not_get_up_ends_the_start_in_one_line(farm: Plants) -> None:
     appliance = farm.start(farm.write(PLANT))
     engine = 0
+    deadline = time.monotonic() + 10
     while not engine:
+        assert time.monotonic() < deadline, "no engine was started"
         for info in appliance.runtime.glob("*/appliance.json"):
             engine = json.loads(info.read_text())["engine"]["pid"]
     os.kill(engine, signal.SIGSTOP)

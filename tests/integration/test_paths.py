@@ -97,7 +97,7 @@ def test_broadcast_over_udp_reaches_this_host_and_the_other(farm: Plants) -> Non
         station("near", 3, "udp://10.88.164.3", more=receiver("source")),
     )
     with cable(addresses=True) as (here, there):
-        here.ip("addr", "add", "10.88.164.3/24", "dev", "eth0")
+        here.ip("addr", "add", "10.88.164.3/24", "dev", "line0")
         path = farm.write(text)
         far = farm.run(path, "--station", "far", prefix=there.prefix)
         near = farm.run(path, "--station", "source", "--station", "near", prefix=here.prefix)
@@ -110,7 +110,7 @@ def test_broadcast_over_udp_reaches_this_host_and_the_other(farm: Plants) -> Non
 def test_stations_of_one_appliance_on_one_interface_hear_each_other(
     farm: Plants, destination: str
 ) -> None:
-    link = "ethernet://eth0"
+    link = "ethernet://line0"
     text = plant(
         station("one", 1, link, more=sender(destination) + receiver("two", "far")),
         station("two", 2, link, more=sender(destination) + receiver("one", "far")),
@@ -128,7 +128,7 @@ def test_stations_of_one_appliance_on_one_interface_hear_each_other(
 @pytest.mark.root
 def test_unicast_over_ethernet_goes_to_its_address_only(farm: Plants) -> None:
     with cable() as (here, there):
-        link = "ethernet://eth0"
+        link = "ethernet://line0"
         path = farm.write(
             plant(
                 station("source", 1, link, more=sender(there.mac())),
@@ -144,7 +144,7 @@ def test_unicast_over_ethernet_goes_to_its_address_only(farm: Plants) -> None:
 
 @pytest.mark.root
 def test_a_named_vlan_is_sent_tagged_and_all_others_are_counted(farm: Plants) -> None:
-    link, vlan = "ethernet://eth0", ", vlan: {id: 7, priority: 5}"
+    link, vlan = "ethernet://line0", ", vlan: {id: 7, priority: 5}"
     text = plant(
         station("source", 1, link, port=vlan, more=sender("multicast")),
         station("tagged", 2, link, port=vlan, more=receiver("source")),
@@ -157,14 +157,14 @@ def test_a_named_vlan_is_sent_tagged_and_all_others_are_counted(farm: Plants) ->
         far = farm.run(path, "--station", "tagged", prefix=there.prefix)
         with there.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as wire:
             wire.setsockopt(263, 8, 1)  # SOL_PACKET, PACKET_AUXDATA
-            wire.bind(("eth0", 3))
+            wire.bind(("line0", 3))
             farm.run(path, "--station", "source", prefix=here.prefix)
             assert_hears(far, "tagged", "source")
             _, ((_, _, auxiliary),), _, _ = wire.recvmsg(2048, 64)
             assert int.from_bytes(auxiliary[16:18], "little") == 5 << 13 | 7
         before = far.station("tagged")["discarded"]
         with here.socket(socket.AF_PACKET, socket.SOCK_RAW) as wire:
-            wire.bind(("eth0", 0))
+            wire.bind(("line0", 0))
             kind = ETHERTYPE.to_bytes(2, "big")
             for tag in (b"", b"\x81\x00\x00\x08", b"\x81\x00\x00\x00", b"\x81\x00\xa0\x07"):
                 wire.send((MULTICAST + STRANGER + tag + kind + frame).ljust(60, b"\0"))
@@ -180,10 +180,10 @@ def test_an_untagged_port_takes_priority_tags_and_counts_vlans(farm: Plants) -> 
         PdFrameHeader(NetId.parse("9.9.9.9.9.9"), 1, 1), [(PdHeader(99, 0, 2), b"\1\2")]
     )
     with cable() as (here, there):
-        path = farm.write(plant(station("plain", 1, "ethernet://eth0")))
+        path = farm.write(plant(station("plain", 1, "ethernet://line0")))
         plain = farm.run(path, prefix=there.prefix)
         with here.socket(socket.AF_PACKET, socket.SOCK_RAW) as wire:
-            wire.bind(("eth0", 0))
+            wire.bind(("line0", 0))
             for tag in (b"", b"\x81\x00\xe0\x00", b"\x81\x00\xe0\x07"):
                 content = tag + ETHERTYPE.to_bytes(2, "big") + frame
                 wire.send((MULTICAST + STRANGER + content).ljust(60, b"\0"))

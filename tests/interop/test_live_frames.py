@@ -74,7 +74,7 @@ class Way:
         self.transport = "tcp" if tcp else source.partition(":")[0]
 
 
-ETHERNET, HERE, THERE = "ethernet://eth0", "udp://127.9.8.1", "udp://127.9.8.2"
+ETHERNET, HERE, THERE = "ethernet://line0", "udp://127.9.8.1", "udp://127.9.8.2"
 WAYS = {
     "ethernet": Way(ETHERNET, ETHERNET, "multicast"),
     "ethernet-broadcast": Way(ETHERNET, ETHERNET, "broadcast"),
@@ -109,7 +109,7 @@ def run_both(
 ) -> tuple[list[dict[str, Any]], dict[str, Any], list[dict[str, Any]]]:
     """Run sink and source for some 100 cycles; return PDs sent, PDs received, what was watched."""
     plant = farm.write(way.plant)
-    interface = "eth0" if way.needs_cable else "lo"
+    interface = "line0" if way.needs_cable else "lo"
     with capture(path, interface, prefixes[1]):
         sink = farm.run(plant, "--station", "sink", prefix=prefixes[1])
         source = farm.run(plant, "--station", "source", prefix=prefixes[0])

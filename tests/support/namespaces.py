@@ -19,7 +19,7 @@ _library = ctypes.CDLL(None, use_errno=True)
 
 
 class Namespace:
-    """One namespace; its loopback is up, and its end of a cable is called ``eth0``.
+    """One namespace; its loopback is up, and its end of a cable is called ``line0``.
 
     Attributes:
         prefix: Words that run a command inside, as the process that is started.
@@ -34,12 +34,12 @@ class Namespace:
         _run("ip", "-netns", self.name, *words)
 
     def plug(self) -> None:
-        """Switch ``eth0`` on."""
-        self.ip("link", "set", "eth0", "up")
+        """Switch ``line0`` on."""
+        self.ip("link", "set", "line0", "up")
 
     def unplug(self) -> None:
-        """Switch ``eth0`` off, which takes the carrier from the other end, too."""
-        self.ip("link", "set", "eth0", "down")
+        """Switch ``line0`` off, which takes the carrier from the other end, too."""
+        self.ip("link", "set", "line0", "down")
 
     def socket(self, *kind: int) -> socket.socket:
         """Return a socket of this test that belongs to the namespace."""
@@ -51,9 +51,9 @@ class Namespace:
                 _enter(home.fileno())
 
     def mac(self) -> str:
-        """Return the address of ``eth0``."""
+        """Return the address of ``line0``."""
         with self.socket(socket.AF_PACKET, socket.SOCK_RAW) as sock:
-            sock.bind(("eth0", 0))
+            sock.bind(("line0", 0))
             return str(MacAddr(sock.getsockname()[4]))
 
 
@@ -77,7 +77,7 @@ def namespace() -> Iterator[Namespace]:
 
 @contextmanager
 def cable(*, addresses: bool = False) -> Iterator[tuple[Namespace, Namespace]]:
-    """Make two namespaces whose ``eth0`` are the ends of one cable.
+    """Make two namespaces whose ``line0`` are the ends of one cable.
 
     With *addresses* they are 10.88.164.1/24 and 10.88.164.2/24.
     """
@@ -85,12 +85,12 @@ def cable(*, addresses: bool = False) -> Iterator[tuple[Namespace, Namespace]]:
         ends = stack.enter_context(namespace()), stack.enter_context(namespace())
         left, right = (end.name for end in ends)
         _run(
-            *("ip", "link", "add", "eth0", "netns", left, "type", "veth"),
-            *("peer", "name", "eth0", "netns", right),
+            *("ip", "link", "add", "line0", "netns", left, "type", "veth"),
+            *("peer", "name", "line0", "netns", right),
         )
         for number, end in enumerate(ends, 1):
             if addresses:
-                end.ip("addr", "add", f"10.88.164.{number}/24", "broadcast", "+", "dev", "eth0")
+                end.ip("addr", "add", f"10.88.164.{number}/24", "broadcast", "+", "dev", "line0")
             end.plug()
         yield ends
 
