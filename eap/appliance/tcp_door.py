@@ -99,7 +99,7 @@ class TcpDoor:
             self._close(connection, peer, Refusal.ENGINE_BUSY)
 
     def _close(self, connection: socket.socket, peer: str, reason: Refusal) -> None:
-        logger.info("TCP connection from %s closed: %s", peer, reason)
+        logger.debug("TCP connection from %s closed: %s", peer, reason)
         self._refuse(reason)
         connection.close()
 
