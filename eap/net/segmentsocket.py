@@ -53,14 +53,14 @@ class SegmentSocket:
         self._sock.close()
 
     def receive(self) -> Arrival | None:
-        """Return the next frame, None if there is none now or it is not for a segment."""
+        """Return the next frame, None if there is none now."""
         try:
             data, address = self._sock.recvfrom(_LARGEST)
         except (BlockingIOError, ConnectionRefusedError):
             return None
         if not self._is_ethernet:
             return Arrival(bytearray(data), address)
-        if len(data) < _HEADER or data[6] & _PROCESSED:
+        if len(data) < _HEADER:
             return None
         return Arrival(bytearray(data[_HEADER:]), data[:_HEADER])
 

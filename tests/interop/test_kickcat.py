@@ -1,0 +1,69 @@
+"""KickCAT as the master of our simulated slaves."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.support.simulator import NEAR, simulator, veth_pair
+
+kickcat = pytest.importorskip("kickcat", reason="needs kickcat: pip install kickcat")
+
+pytestmark = [pytest.mark.net, pytest.mark.root]
+
+BUS = """
+bus: interop
+slaves:
+  - name: island
+    kind: generic
+    vendor: 0x1234
+    inputs: [{name: level, type: UINT, follows: speed}]
+    outputs: [{name: speed, type: UINT}]
+    objects: [{index: 0x8001, name: Curve, type: BLOCK(100)}]
+  - {name: drive, kind: drive}
+"""
+FRAME_S, ANSWER_S, STATE_S = 0.02, 0.5, 2.0
+
+
+@pytest.fixture
+def bus(tmp_path):
+    path = tmp_path / "bus.yaml"
+    path.write_text(BUS)
+    with veth_pair(), simulator(path):
+        link = kickcat.create_link(NEAR, "")
+        link.set_timeout(FRAME_S)
+        found = kickcat.Bus(link)
+        found.init(0.1)
+        yield found
+
+
+def operate(bus):
+    bus.create_mapping()
+    bus.request_state(kickcat.State.SAFE_OP)
+    bus.wait_for_state(kickcat.State.SAFE_OP, STATE_S)
+    for slave in bus.slaves():
+        slave.set_output_bytes(bytes(slave.output_size))
+    bus.process_data_no_check()
+    bus.request_state(kickcat.State.OPERATIONAL)
+    bus.wait_for_state(kickcat.State.OPERATIONAL, STATE_S, bus.process_data_no_check)
+
+
+def test_scan_and_sdo(bus):
+    slaves = bus.slaves()
+    assert len(slaves) == 2
+    octets = bus.read_sdo(slaves[0], 0x1018, 1, kickcat.Access.PARTIAL, 4, ANSWER_S)
+    assert octets == (0x1234).to_bytes(4, "little")
+    curve = bus.read_sdo(slaves[0], 0x8001, 0, kickcat.Access.PARTIAL, 100, ANSWER_S)
+    assert curve == bytes(100)
+    assert bus.read_object_description(slaves[0], 0x8001)[0] == "Curve"
+
+
+def test_process_data_in_op(bus):
+    operate(bus)
+    island = bus.slaves()[0]
+    assert bus.get_state(island) == kickcat.State.OPERATIONAL
+    for number in range(100):
+        island.set_output_bytes(number.to_bytes(2, "little"))
+        bus.process_data()
+    bus.process_data()
+    assert island.input_data == (99).to_bytes(2, "little")
+    assert [bus.get_state(each) for each in bus.slaves()] == [kickcat.State.OPERATIONAL] * 2
