@@ -51,7 +51,8 @@ def acknowledge(station: int) -> Procedure[AlState]:
     """
     status = yield from read_status(station)
     if status.error:
-        control = AlControl(status.state, acknowledge=1).encode()
+        # An error without a code is our own bit, mirrored by a controller that emulates a device.
+        control = AlControl(status.state, acknowledge=int(status.code != 0)).encode()
         yield from write(station, Register.AL_CONTROL, control, "AL control")
         status = yield from _poll_until(
             station, lambda status: not status.error, ACKNOWLEDGE_TIMEOUT_NS

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from devicebus.errors import FrameLostError
+from devicebus.mailbox.protocol import MINIMUM_SIZE
 from devicebus.master.access import fprd, fpwr
 from devicebus.master.procedure import Procedure, Sleep, read, write
 from devicebus.wire.register import Register, SmStatus, SyncManager
@@ -32,6 +33,11 @@ class MailboxArea(NamedTuple):
     to_slave_size: int
     to_master: int
     to_master_size: int
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the slave has a mailbox at all."""
+        return min(self.to_slave_size, self.to_master_size) >= MINIMUM_SIZE
 
     def sync_managers(self) -> tuple[SyncManager, SyncManager]:
         """Return the registers of sync managers 0 and 1."""

@@ -16,7 +16,7 @@ from devicebus.master.runner import Runner
 from devicebus.master.scan import scan
 from devicebus.master.task import Task
 from devicebus.sim.devices.build import build_segment
-from devicebus.sim.segment import Segment
+from devicebus.sim.segment import POLL_NS, Segment
 from devicebus.sim.spec import BusSpec, ChannelSpec, DeviceKind, SlaveSpec
 from devicebus.sim.wiring import Side
 from devicebus.wire.alstatus import AlState
@@ -79,7 +79,7 @@ class Line:
         """Let frames go round and come back, or else the time pass to what happens next."""
         frames = self.core.frames_to_send(self.now_ns)
         if not frames:
-            times = (self.core.next_timeout(), self.segment.next_timeout(), until_ns)
+            times = (self.core.next_timeout(), self.now_ns + POLL_NS, until_ns)
             due = [at for at in times if at is not None]
             self.now_ns = max(self.now_ns, min(due))
             self.segment.handle_timeout(self.now_ns)
@@ -202,3 +202,19 @@ def open_mailbox(line: Line, station: int = 1001, *, slow: bool = False) -> Mail
     run(line, change_state(station, AlState.PREOP))
     line.heard = []
     return Mailbox(station, area, line.core.runner, line.heard.append)
+
+
+class Paced(Line):
+    """A line whose core, a master, starts a cycle every millisecond."""
+
+    next_cycle_ns = 0
+
+    def step(self, until_ns):
+        if self.now_ns >= self.next_cycle_ns:
+            self.core.start_cycle(self.now_ns)
+            self.next_cycle_ns = self.now_ns + MS
+        super().step(min(until_ns, self.next_cycle_ns))
+
+    def events(self):
+        """Take all events."""
+        return list(iter(self.core.next_event, None))

@@ -121,3 +121,15 @@ def test_an_error_that_stays():
 def test_a_state_that_does_not_exist():
     with pytest.raises(BusError, match="slave 7: stands in state 5, which no slave may"):
         drive(change_state(7, OP), stuck(5))
+
+
+def test_a_controller_that_emulates_a_device_mirrors_the_acknowledge_bit():
+    written = [b"\x11\0"]
+
+    def emulate(access):
+        if access.command is Command.FPWR:
+            written.append(access.data)
+        return Reply(written[-1].ljust(6, b"\0") if access.command is Command.FPRD else b"", 1)
+
+    assert drive(acknowledge(7), emulate) is INIT
+    assert written[-1] == b"\1\0"

@@ -1,0 +1,134 @@
+"""What the master knows about its bus, shared by the procedures that work on it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from devicebus.master.cycle import Cycle, Presence
+from devicebus.master.event import Event
+from devicebus.master.expected import ExpectedSlave
+from devicebus.master.image import BusImage
+from devicebus.master.link import TIMEOUT_NS, Link
+from devicebus.master.mailboxes import Mailbox
+from devicebus.master.mailboxport import MailboxArea
+from devicebus.master.pdo import Channel, PdoChoice
+from devicebus.master.runner import Runner
+from devicebus.master.scan import FIRST_STATION, FoundSlave
+from devicebus.master.task import Task
+from devicebus.wire.alstatus import AlState
+
+MAX_EVENTS = 1000
+"""Events that wait for the user; the oldest are dropped."""
+
+
+class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """How a master works."""
+
+    expected: Sequence[ExpectedSlave] = ()
+    """Slaves in the order of the line; nothing is compared without any."""
+    choices: Mapping[int, PdoChoice] = {}
+    """PDOs by station address; other slaves keep what they come with."""
+    first_station: int = FIRST_STATION
+    frame_timeout_ns: int = TIMEOUT_NS
+    acyclic_octets: int = 1536
+    """Budget of acyclic datagrams in a cycle."""
+    watchdog_ms: int | None = None
+    """After so long without outputs slaves leave OP; None keeps what they come with."""
+    allow_lrw: bool = True
+    """False exchanges process data by LWR and LRD even where slaves know LRW."""
+
+
+class Unit:
+    """One slave that the master drives.
+
+    Attributes:
+        state: Where it was brought.
+        target: Where it belongs.
+        channels: Its process data.
+        mailbox: Open in the states that have one.
+        missed_ns: Since when it is not where it belongs; None while it is.
+        is_lost: Whether it does not answer.
+        work: What is going on to bring it somewhere.
+        retry_ns: Not tried again before then.
+    """
+
+    def __init__(self, found: FoundSlave, name: str) -> None:
+        self.found = found
+        self.name = name
+        self.station = found.station
+        self.state = AlState.INIT
+        self.target = AlState.INIT
+        self.channels: tuple[Channel, ...] = ()
+        self.mailbox: Mailbox | None = None
+        self.missed_ns: int | None = None
+        self.is_lost = False
+        self.work: Task[Any] | None = None
+        self.retry_ns = 0
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it is being brought somewhere."""
+        return self.work is not None and not self.work.is_done
+
+
+class Bus:
+    """All slaves, their process data, and the wire to them.
+
+    Attributes:
+        units: By station address, in the order of the line.
+        image, cycle: None until process data is laid out.
+        is_lost: No frame comes back.
+        is_troubled: The last cycle was not as expected: look at the slaves soon.
+    """
+
+    def __init__(self, settings: MasterSettings) -> None:
+        self.settings = settings
+        self.link = Link(
+            timeout_ns=settings.frame_timeout_ns, acyclic_octets=settings.acyclic_octets
+        )
+        self.runner = Runner(self.link)
+        self.units: dict[int, Unit] = {}
+        self.image: BusImage | None = None
+        self.cycle: Cycle | None = None
+        self.is_lost = False
+        self.is_troubled = False
+        self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
+
+    def emit(self, event: Event) -> None:
+        """Tell the user."""
+        self._events.append(event)
+
+    def next_event(self) -> Event | None:
+        """Take the oldest event."""
+        return self._events.popleft() if self._events else None
+
+    def open_mailbox(self, unit: Unit, area: MailboxArea) -> None:
+        """The slave's mailbox works from now on."""
+        self.close_mailbox(unit)
+        unit.mailbox = Mailbox(unit.station, area, self.runner, self.emit)
+
+    def close_mailbox(self, unit: Unit) -> None:
+        """The slave's mailbox works no longer: whoever waits for it is told."""
+        mailbox, unit.mailbox = unit.mailbox, None
+        if mailbox is not None:
+            mailbox.close()
+
+    def set_presence(self, unit: Unit, presence: Presence) -> None:
+        """The slave takes part in the cycle, or no longer."""
+        if self.cycle is not None:
+            self.cycle.set_presence(unit.station, presence)
+
+    def forget(self) -> None:
+        """Begin anew: no slave is known."""
+        for unit in self.units.values():
+            if unit.work is not None:
+                unit.work.cancel()
+            self.close_mailbox(unit)
+        self.units = {}
+        self.image = self.cycle = None
+        self.link.stop_cycles()
+        self.is_lost = self.is_troubled = False

@@ -1,0 +1,215 @@
+"""The exchange of process data: one or a few logical datagrams a cycle, and their counters.
+
+A slave counts once its FMMUs and sync managers are set up, and no longer when it is away, so that
+the others' inputs stay valid while one is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import Enum, auto
+from typing import NamedTuple
+
+import msgspec
+
+from devicebus.errors import FrameLostError
+from devicebus.master.access import Access, Reply, logical
+from devicebus.master.image import BusImage
+from devicebus.master.layout import Group, Place
+from devicebus.master.link import Link
+from devicebus.wire.datagram import Command
+
+
+class Presence(Enum):
+    """Whether a slave takes part."""
+
+    AWAY = auto()
+    """It is not set up and does not count."""
+    UNSURE = auto()
+    """It may count or not: it is being set up, or lost and might come back as it was."""
+    PRESENT = auto()
+
+
+class CycleStats(msgspec.Struct, frozen=True):
+    """Counters since process data runs; times in nanoseconds."""
+
+    cycles: int
+    good: int
+    """Cycles that came back with the expected working counters."""
+    wkc_errors: int
+    lost: int
+    expected_wkc: int
+    received_wkc: int
+    """Both of the last cycle, over all datagrams."""
+    trip_ns: int
+    """From queueing the last cycle to its reply."""
+    max_trip_ns: int
+
+
+class _Part(NamedTuple):
+    """One datagram of a cycle."""
+
+    command: Command
+    address: int
+    group: int
+
+
+class Cycle:
+    """Exchanges the process data of *image* once whenever it is told to.
+
+    Args:
+        link: Takes the datagrams.
+        image: Outputs and inputs.
+        knows_lrw: Whether all slaves let one datagram read and write.
+        trouble: Called with the time when a cycle does not come back as expected.
+    """
+
+    def __init__(
+        self, link: Link, image: BusImage, trouble: Callable[[int], None], *, knows_lrw: bool
+    ) -> None:
+        self._link = link
+        self._image = image
+        self._trouble = trouble
+        self.extra: Sequence[Access] = ()
+        """More datagrams of each cycle; their replies go to *take_extra*."""
+        self.take_extra: Callable[[Sequence[Reply]], None] = lambda replies: None
+        self._presence = dict.fromkeys(image.layout.places, Presence.AWAY)
+        self._parts = tuple(
+            part
+            for number, group in enumerate(image.layout.groups)
+            for part in _parts(number, group, knows_lrw=knows_lrw)
+        )
+        self._allowed: tuple[frozenset[int], ...] = ()
+        self._judge()
+        self._cycles = self._good = self._wkc_errors = self._lost = 0
+        self._received = self._trip_ns = self._max_trip_ns = 0
+
+    def set_presence(self, station: int, presence: Presence) -> None:
+        """A slave comes or goes."""
+        if station in self._presence and self._presence[station] is not presence:
+            self._presence[station] = presence
+            self._judge()
+
+    def presence(self, station: int) -> Presence:
+        """Whether a slave takes part."""
+        return self._presence.get(station, Presence.AWAY)
+
+    def start(self, now_ns: int) -> None:
+        """Queue this cycle's datagrams."""
+        self._link.start_cycle()
+        accesses = [self._access(part) for part in self._parts]
+        accesses += self.extra
+        if not accesses:
+            return
+        self._cycles += 1
+        allowed = self._allowed
+
+        def done(outcome: list[Reply] | FrameLostError, done_ns: int) -> None:
+            if isinstance(outcome, FrameLostError):
+                self._lost += 1
+                self._trouble(done_ns)
+                return
+            self._trip_ns = done_ns - now_ns
+            self._max_trip_ns = max(self._max_trip_ns, self._trip_ns)
+            self._take(outcome, allowed, done_ns)
+
+        self._link.submit(accesses, done, cyclic=True)
+
+    def stats(self) -> CycleStats:
+        """Return a snapshot of the counters."""
+        return CycleStats(
+            self._cycles,
+            self._good,
+            self._wkc_errors,
+            self._lost,
+            sum(max(each) for each in self._allowed),
+            self._received,
+            self._trip_ns,
+            self._max_trip_ns,
+        )
+
+    def _access(self, part: _Part) -> Access:
+        group = self._image.layout.groups[part.group]
+        data = b""
+        if part.command is not Command.LRD:
+            data = bytes(self._image.outputs[group.outputs : group.outputs + group.outputs_size])
+        if part.command is not Command.LWR:
+            data += bytes(group.inputs_size)
+        return logical(part.command, part.address, data)
+
+    def _take(self, replies: list[Reply], allowed: tuple[frozenset[int], ...], now_ns: int) -> None:
+        is_good = True
+        for part, reply, counts in zip(self._parts, replies, allowed, strict=False):
+            if reply.wkc in counts:
+                self._take_inputs(part, reply.data)
+            else:
+                is_good = False
+        count = len(self._parts)
+        self._received = sum(reply.wkc for reply in replies[:count])
+        self.take_extra(replies[count:])
+        if is_good:
+            self._good += 1
+        else:
+            self._wkc_errors += 1
+            self._trouble(now_ns)
+
+    def _take_inputs(self, part: _Part, data: bytes) -> None:
+        if part.command is Command.LWR:
+            return
+        group = self._image.layout.groups[part.group]
+        begin = group.outputs_size if part.command is Command.LRW else 0
+        inputs = self._image.inputs
+        if self._is_whole[part.group]:
+            inputs[group.inputs : group.inputs + group.inputs_size] = data[begin:]
+            return
+        for place in self._members(part.group):
+            if self._presence[place.station] is Presence.PRESENT:
+                start = begin + place.inputs - group.inputs
+                end = start + place.inputs_size
+                inputs[place.inputs : place.inputs + place.inputs_size] = data[start:end]
+
+    def _members(self, group: int) -> list[Place]:
+        return [place for place in self._image.layout.places.values() if place.group == group]
+
+    def _judge(self) -> None:
+        """Work out anew what the working counters have to be."""
+        allowed = []
+        for part in self._parts:
+            counts = {0}
+            for place in self._members(part.group):
+                presence = self._presence[place.station]
+                more = {each + _count(part.command, place) for each in counts}
+                if presence is Presence.PRESENT:
+                    counts = more
+                elif presence is Presence.UNSURE:
+                    counts |= more
+            allowed.append(frozenset(counts))
+        self._allowed = tuple(allowed)
+        self._is_whole = [
+            all(self._presence[each.station] is Presence.PRESENT for each in self._members(number))
+            for number in range(len(self._image.layout.groups))
+        ]
+
+
+def _parts(number: int, group: Group, *, knows_lrw: bool) -> list[_Part]:
+    if knows_lrw and group.outputs_size and group.inputs_size:
+        return [_Part(Command.LRW, group.address, number)]
+    parts = []
+    if group.outputs_size:
+        parts.append(_Part(Command.LWR, group.address, number))
+    if group.inputs_size:
+        parts.append(_Part(Command.LRD, group.address + group.outputs_size, number))
+    return parts
+
+
+def _count(command: Command, place: Place) -> int:
+    """What a slave adds to the working counter (ETG.1000.4)."""
+    reads = int(place.inputs_size > 0)
+    writes = int(place.outputs_size > 0)
+    match command:
+        case Command.LRD:
+            return reads
+        case Command.LWR:
+            return writes
+        case _:
+            return reads + 2 * writes

@@ -1,0 +1,182 @@
+"""The master: everything together behind the calls of a core."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import TypeVar
+
+import msgspec
+
+from devicebus.errors import BusError
+from devicebus.mailbox.conversation import Conversation
+from devicebus.master.bring import bring
+from devicebus.master.bus import Bus, MasterSettings, Unit
+from devicebus.master.cycle import CycleStats
+from devicebus.master.event import Event
+from devicebus.master.image import BusImage
+from devicebus.master.link import LinkStats
+from devicebus.master.mailstats import MailboxStats
+from devicebus.master.procedure import Procedure
+from devicebus.master.scan import FoundSlave, scan
+from devicebus.master.startup import start_up
+from devicebus.master.task import Task
+from devicebus.master.watch import watch
+from devicebus.wire.alstatus import AlState
+from eap.codec.wire import Buffer
+
+T = TypeVar("T")
+
+LOOK_NS = 10_000_000
+"""How often idle mailboxes are looked into for unsolicited messages."""
+
+
+class MasterStats(msgspec.Struct, frozen=True):
+    """Counters of all parts; *cycle* once process data is laid out."""
+
+    link: LinkStats
+    cycle: CycleStats | None
+    mailboxes: dict[int, MailboxStats]
+
+
+class Master:
+    """A type-1 master for one bus.
+
+    The user starts tasks, the driver feeds frames and time, and whoever has the clock of the plant
+    calls :meth:`start_cycle`.
+    """
+
+    def __init__(self, settings: MasterSettings | None = None) -> None:
+        self._bus = Bus(settings or MasterSettings())
+        self._running: Task[None] | None = None
+        self._look_ns = 0
+
+    @property
+    def units(self) -> dict[int, Unit]:
+        """The slaves by station address, in the order of the line; for reading."""
+        return self._bus.units
+
+    @property
+    def image(self) -> BusImage | None:
+        """Process data, None before it is laid out."""
+        return self._bus.image
+
+    def bring_up(self, now_ns: int, target: AlState = AlState.OP) -> Task[None]:
+        """Find the slaves and bring them to *target*; from then on they are kept there.
+
+        What ran before ends.  OP needs cycles: call :meth:`start_cycle` all the while.
+        """
+        if self._running is not None:
+            self._running.cancel()
+        task = self._bus.runner.start(start_up(self._bus, target), now_ns, "bringing up the bus")
+
+        def keep(done: Task[None]) -> None:
+            if done.error is None:
+                self._running = self.run(watch(self._bus), now_ns, "watching the bus")
+
+        self._running = task
+        task.watch(keep)
+        return task
+
+    def scan(self, now_ns: int) -> Task[tuple[FoundSlave, ...]]:
+        """Look who is there, without changing anybody's state."""
+        return self.run(scan(self._bus.settings.first_station), now_ns, "scanning the bus")
+
+    def request_state(self, station: int, target: AlState, now_ns: int) -> Task[None]:
+        """Bring one slave to a state, where it is kept then.
+
+        Raises BusError if there is no such slave, or it is being brought somewhere.
+        """
+        unit = self._unit(station)
+        if unit.is_busy:
+            raise BusError(f"slave {station} is on its way to {unit.target.name} already")
+        unit.target = target
+        unit.work = self.run(bring(self._bus, unit, target), now_ns, f"slave {station}: state")
+        return unit.work
+
+    def converse(
+        self,
+        station: int,
+        conversation: Conversation[T],
+        now_ns: int,
+        *,
+        name: str = "a request",
+        requester: Hashable = None,
+    ) -> Task[T]:
+        """Talk to a slave's mailbox.
+
+        Raises BusError if there is no such slave, or its mailbox is closed.
+        """
+        unit = self._unit(station)
+        if unit.mailbox is None:
+            conversation.close()
+            raise BusError(
+                f"slave {station} ({unit.name}) has no mailbox in {unit.state.name}"
+                if not unit.is_lost
+                else f"slave {station} ({unit.name}) does not answer"
+            )
+        return unit.mailbox.converse(conversation, now_ns, name=name, requester=requester)
+
+    def run(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
+        """Run any procedure beside everything else."""
+        return self._bus.runner.start(procedure, now_ns, name)
+
+    def start_cycle(self, now_ns: int) -> None:
+        """Exchange process data once, and refill the budget of everything else."""
+        if self._bus.cycle is not None:
+            self._bus.cycle.start(now_ns)
+
+    def stop_cycles(self) -> None:
+        """No cycle will be started for now: acyclic frames need not hold back."""
+        self._bus.link.stop_cycles()
+
+    def frames_to_send(self, now_ns: int) -> list[bytes]:
+        """Take the frames that are ready to go out."""
+        return self._bus.link.frames_to_send(now_ns)
+
+    def receive_frame(self, data: Buffer, now_ns: int) -> None:
+        """Take a frame that came back."""
+        self._bus.link.receive_frame(data, now_ns)
+
+    def next_timeout(self) -> int | None:
+        """When :meth:`handle_timeout` must be called."""
+        times = [self._bus.link.next_timeout(), self._bus.runner.next_timeout()]
+        if self._has_mailbox():
+            times.append(self._look_ns)
+        return min((at for at in times if at is not None), default=None)
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Time passed; early calls are harmless."""
+        self._bus.link.handle_timeout(now_ns)
+        self._bus.runner.handle_timeout(now_ns)
+        if now_ns >= self._look_ns and self._has_mailbox():
+            self._look_ns = now_ns + LOOK_NS
+            for unit in self._bus.units.values():
+                if unit.mailbox is not None:
+                    unit.mailbox.look(now_ns)
+
+    def next_event(self) -> Event | None:
+        """Take the oldest event."""
+        return self._bus.next_event()
+
+    def stats(self) -> MasterStats:
+        """Return a snapshot of all counters."""
+        bus = self._bus
+        return MasterStats(
+            bus.link.stats(),
+            bus.cycle.stats() if bus.cycle is not None else None,
+            {
+                station: unit.mailbox.stats()
+                for station, unit in bus.units.items()
+                if unit.mailbox is not None
+            },
+        )
+
+    def _has_mailbox(self) -> bool:
+        return any(unit.mailbox is not None for unit in self._bus.units.values())
+
+    def _unit(self, station: int) -> Unit:
+        try:
+            return self._bus.units[station]
+        except KeyError:
+            known = ", ".join(map(str, self._bus.units)) or "none"
+            raise BusError(f"there is no slave {station}; known are {known}") from None

@@ -1,0 +1,214 @@
+"""Process data of a slave: which PDOs its sync managers carry, and what these map.
+
+The EEPROM says it for simple slaves; those with CoE are asked, and may be told (ETG.1000.6, objects
+0x1C10 and following for the assignment, 0x1600 and 0x1A00 and following for the mapping).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from devicebus.errors import MailboxProtocolError
+from devicebus.mailbox import coe_client, coeinfo_client
+from devicebus.mailbox.conversation import Conversation
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.wire.sii import Sii, SiiPdo
+from devicebus.wire.siirecord import SiiSyncManager
+from eap.od.abort import SdoAbortError
+
+ASSIGNMENT = 0x1C10
+"""Object that assigns PDOs to sync manager 0; the others follow."""
+MAX_ENTRIES = 254
+OUTPUTS, INPUTS = 3, 4
+"""Types of sync managers."""
+_WRITES = 0x04
+
+
+class PdoEntry(msgspec.Struct, frozen=True):
+    """One mapped entry; index 0 is padding."""
+
+    index: int
+    subindex: int
+    bit_length: int
+    name: str = ""
+    data_type: int = 0
+
+
+class Pdo(msgspec.Struct, frozen=True):
+    """A PDO and what it maps, in order."""
+
+    index: int
+    entries: tuple[PdoEntry, ...]
+
+
+class Channel(NamedTuple):
+    """A sync manager that carries process data."""
+
+    number: int
+    start: int
+    control: int
+    is_output: bool
+    pdos: tuple[Pdo, ...]
+    fixed_size: int = 0
+    """Octets that it has without any PDO."""
+
+    @property
+    def size(self) -> int:
+        """Octets."""
+        bits = sum(entry.bit_length for pdo in self.pdos for entry in pdo.entries)
+        return (bits + 7) // 8 if self.pdos else self.fixed_size
+
+
+class PdoChoice(msgspec.Struct, frozen=True, kw_only=True):
+    """What a slave is told to exchange."""
+
+    assignment: Mapping[int, Sequence[int]] = {}
+    """PDOs by sync manager."""
+    mapping: Mapping[int, Sequence[tuple[int, int, int]]] = {}
+    """Index, subindex and bits of each entry, by PDO."""
+
+
+def channels_from_sii(sii: Sii) -> tuple[Channel, ...]:
+    """Return the sync managers for process data with the PDOs that the EEPROM assigns."""
+    return tuple(
+        Channel(
+            number,
+            manager.start,
+            manager.control,
+            is_output,
+            tuple(
+                _pdo(sii, pdo)
+                for pdo in (sii.rx_pdos if is_output else sii.tx_pdos)
+                if pdo.header.sync_manager == number
+            ),
+            manager.length if manager.enable & 1 else 0,
+        )
+        for number, manager in enumerate(sii.sync_managers)
+        if (is_output := _is_output(manager)) is not None
+    )
+
+
+def read_channels(sii: Sii) -> Conversation[tuple[Channel, ...]]:
+    """Ask a slave with CoE what its sync managers carry.
+
+    What the slave does not know by SDO is as its EEPROM says.
+
+    Raises:
+        MailboxProtocolError: an answer is no list.
+        MailboxTimeoutError: the slave does not answer.
+    """
+    known = channels_from_sii(sii)
+    texts = {
+        (entry.index, entry.subindex): entry
+        for channel in known
+        for pdo in channel.pdos
+        for entry in pdo.entries
+    }
+    asks_names = bool(sii.general and sii.general.coe_info)
+    channels = []
+    for channel in known:
+        try:
+            indexes = yield from _read_list(ASSIGNMENT + channel.number, 2)
+            pdos = []
+            for index in indexes:
+                mapped = yield from _read_list(index, 4)
+                pdos.append(Pdo(index, tuple(_entry(number, texts) for number in mapped)))
+        except SdoAbortError:
+            channels.append(channel)
+            continue
+        if asks_names:
+            pdos = yield from _with_names(pdos)
+        channels.append(channel._replace(pdos=tuple(pdos), fixed_size=0))
+    return tuple(channels)
+
+
+def write_choice(choice: PdoChoice, sizes: MailboxSizes) -> Conversation[None]:
+    """Tell a slave in PREOP what to map and to assign.
+
+    Raises:
+        SdoAbortError: the slave refuses.
+    """
+    for pdo, entries in choice.mapping.items():
+        numbers = [index << 16 | subindex << 8 | bits for index, subindex, bits in entries]
+        yield from _write_list(pdo, numbers, 4, sizes)
+    for manager, pdos in choice.assignment.items():
+        yield from _write_list(ASSIGNMENT + manager, pdos, 2, sizes)
+
+
+def _is_output(manager: SiiSyncManager) -> bool | None:
+    if manager.type in {OUTPUTS, INPUTS}:
+        return manager.type == OUTPUTS
+    is_buffered = manager.control & 3 == 0
+    if manager.type == 0 and is_buffered and manager.length:
+        return bool(manager.control & _WRITES)
+    return None
+
+
+def _pdo(sii: Sii, pdo: SiiPdo) -> Pdo:
+    return Pdo(
+        pdo.header.index,
+        tuple(
+            PdoEntry(
+                each.index, each.subindex, each.bit_length, sii.string(each.name), each.data_type
+            )
+            for each in pdo.entries
+        ),
+    )
+
+
+def _entry(number: int, texts: Mapping[tuple[int, int], PdoEntry]) -> PdoEntry:
+    index, subindex, bits = number >> 16, number >> 8 & 0xFF, number & 0xFF
+    known = texts.get((index, subindex))
+    if known is None or not index:
+        return PdoEntry(index, subindex, bits)
+    return PdoEntry(index, subindex, bits, known.name, known.data_type)
+
+
+def _with_names(pdos: Sequence[Pdo]) -> Conversation[list[Pdo]]:
+    named = []
+    for pdo in pdos:
+        entries: tuple[PdoEntry, ...] = ()
+        for entry in pdo.entries:
+            entries += ((yield from _with_name(entry)),)
+        named.append(Pdo(pdo.index, entries))
+    return named
+
+
+def _with_name(entry: PdoEntry) -> Conversation[PdoEntry]:
+    if entry.name or not entry.index:
+        return entry
+    try:
+        text = yield from coeinfo_client.entry_description(entry.index, entry.subindex, 0)
+    except (SdoAbortError, MailboxProtocolError):
+        return entry
+    return PdoEntry(entry.index, entry.subindex, entry.bit_length, text.name, text.data_type)
+
+
+def _read_list(index: int, size: int) -> Conversation[list[int]]:
+    octets = yield from coe_client.upload(index, 0)
+    count = int.from_bytes(octets, "little")
+    if len(octets) not in {1, 2} or count > MAX_ENTRIES:
+        raise MailboxProtocolError(
+            f"0x{index:04X}:00 is {octets.hex()}, expected a count up to {MAX_ENTRIES}"
+        )
+    numbers = []
+    for subindex in range(1, count + 1):
+        octets = yield from coe_client.upload(index, subindex)
+        if len(octets) != size:
+            raise MailboxProtocolError(
+                f"0x{index:04X}:{subindex:02X} has {len(octets)} octets, expected {size}"
+            )
+        numbers.append(int.from_bytes(octets, "little"))
+    return numbers
+
+
+def _write_list(
+    index: int, numbers: Sequence[int], size: int, sizes: MailboxSizes
+) -> Conversation[None]:
+    yield from coe_client.download(index, 0, b"\0", sizes)
+    for subindex, number in enumerate(numbers, 1):
+        yield from coe_client.download(index, subindex, number.to_bytes(size, "little"), sizes)
+    yield from coe_client.download(index, 0, bytes((len(numbers),)), sizes)

@@ -1,0 +1,90 @@
+"""From an unknown bus to one that runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from devicebus.errors import BusError
+from devicebus.master.access import bwr
+from devicebus.master.bring import bring, read_process_data
+from devicebus.master.bus import Bus, Unit
+from devicebus.master.cycle import Cycle
+from devicebus.master.expected import check_bus
+from devicebus.master.image import BusImage
+from devicebus.master.layout import SlaveShape, lay_out
+from devicebus.master.procedure import Procedure, together
+from devicebus.master.scan import FoundSlave, scan
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.register import AlControl, Register
+from eap.errors import EapError
+
+
+def start_up(bus: Bus, target: AlState) -> Procedure[None]:
+    """Find all slaves and bring them to *target*, INIT to OP, together.
+
+    For OP cycles have to run as soon as the bus has one.
+
+    Raises:
+        IdentityError: the bus is not the expected one.
+        BusError: slaves did not get there; the message names each and why.
+    """
+    bus.forget()
+    yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
+    found = yield from scan(bus.settings.first_station)
+    if bus.settings.expected:
+        check_bus(bus.settings.expected, found)
+    bus.units = {unit.station: unit for unit in _units(bus, found)}
+    units = list(bus.units.values())
+    for unit in units:
+        unit.target = target
+    yield from _bring_all(bus, units, AlState.INIT)
+    if target is AlState.INIT:
+        return
+    yield from _bring_all(bus, units, AlState.PREOP)
+    if target is AlState.PREOP:
+        return
+    _check(units, (yield from together([read_process_data(bus, unit) for unit in units])))
+    set_up_cycle(bus)
+    yield from _bring_all(bus, units, AlState.SAFEOP)
+    if target is AlState.OP:
+        yield from _bring_all(bus, units, AlState.OP)
+
+
+def set_up_cycle(bus: Bus) -> None:
+    """Lay out the process data of all slaves, so that cycles can run."""
+    units = bus.units.values()
+    layout = lay_out(
+        [SlaveShape(unit.station, unit.channels, unit.found.esc.fmmus) for unit in units]
+    )
+    knows_lrw = bus.settings.allow_lrw and all(unit.found.esc.knows_lrw for unit in units)
+
+    def trouble(now_ns: int) -> None:
+        del now_ns
+        bus.is_troubled = True
+
+    bus.image = BusImage(layout)
+    bus.cycle = Cycle(bus.link, bus.image, trouble, knows_lrw=knows_lrw)
+
+
+def _units(bus: Bus, found: Sequence[FoundSlave]) -> list[Unit]:
+    expected = bus.settings.expected
+    names = [each.name for each in expected] or [each.name for each in found]
+    return [Unit(each, name) for each, name in zip(found, names, strict=True)]
+
+
+def _bring_all(bus: Bus, units: Sequence[Unit], target: AlState) -> Procedure[None]:
+    _check(units, (yield from together([bring(bus, unit, target) for unit in units])))
+
+
+def _check(units: Sequence[Unit], results: Sequence[EapError | None]) -> None:
+    """Raise what went wrong: one error as it is, several as one that lists them."""
+    errors = [
+        (unit, result)
+        for unit, result in zip(units, results, strict=True)
+        if isinstance(result, EapError)
+    ]
+    if len(errors) == 1:
+        raise errors[0][1]
+    if errors:
+        lines = "\n  ".join(f"{unit.name}: {error}" for unit, error in errors)
+        raise BusError(f"{len(errors)} slaves have failed:\n  {lines}")

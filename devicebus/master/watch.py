@@ -1,0 +1,180 @@
+"""Watching the slaves: one that goes is left out, one that comes back is brought back.
+
+The others notice nothing: every step is an acyclic access within the budget of the cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from devicebus.errors import FrameLostError, IdentityError
+from devicebus.master.access import Reply, fprd, fpwr
+from devicebus.master.bring import bring
+from devicebus.master.bus import Bus, Unit
+from devicebus.master.cycle import Presence
+from devicebus.master.event import BusBack, BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
+from devicebus.master.procedure import Procedure, Sleep
+from devicebus.master.scan import assign_stations, count_slaves, read_identity, read_stations
+from devicebus.master.task import Task
+from devicebus.wire.alstatus import ERROR, AlState
+from devicebus.wire.register import AlStatus, Register
+from eap.errors import EapError
+
+PERIOD_NS = 100_000_000
+"""Between two looks at all slaves while nothing is wrong."""
+SLICE_NS = 5_000_000
+"""After trouble in the cycle the next look comes this soon."""
+RETRY_NS = 1_000_000_000
+"""Before a slave that could not be brought back is tried again."""
+_PER_STEP = 15
+_WITH_MAILBOX = frozenset((AlState.SAFEOP, AlState.OP))
+
+
+def watch(bus: Bus) -> Procedure[None]:
+    """Look at the slaves for ever."""
+    while True:
+        now_ns = yield from _pause(bus)
+        try:
+            count = yield from count_slaves()
+            replies = yield from _read_states(list(bus.units))
+        except FrameLostError:
+            _lose_all(bus, now_ns)
+            continue
+        if bus.is_lost:
+            bus.is_lost = False
+            bus.emit(BusBack(now_ns))
+        for unit, reply in zip(list(bus.units.values()), replies, strict=True):
+            if reply.wkc:
+                _judge(bus, unit, AlStatus.decode(reply.data), now_ns)
+            else:
+                _lose(bus, unit, now_ns)
+        lost = [unit for unit in bus.units.values() if unit.is_lost]
+        if lost and count > len(bus.units) - len(lost):
+            yield from _seek(bus, count, now_ns)
+
+
+def _pause(bus: Bus) -> Procedure[int]:
+    """Wait for the next look; return the time."""
+    _, now_ns = yield Sleep(SLICE_NS)
+    end_ns = now_ns + PERIOD_NS - SLICE_NS
+    while now_ns < end_ns and not bus.is_troubled:
+        _, now_ns = yield Sleep(SLICE_NS)
+    bus.is_troubled = False
+    return now_ns
+
+
+def _read_states(stations: Sequence[int]) -> Procedure[list[Reply]]:
+    replies: list[Reply] = []
+    for start in range(0, len(stations), _PER_STEP):
+        part = stations[start : start + _PER_STEP]
+        answers, _ = yield [fprd(at, Register.AL_STATUS, AlStatus.SIZE) for at in part]
+        replies += answers
+    return replies
+
+
+def _lose_all(bus: Bus, now_ns: int) -> None:
+    if not bus.is_lost:
+        bus.is_lost = True
+        bus.emit(BusLost(now_ns))
+    for unit in bus.units.values():
+        _lose(bus, unit, now_ns)
+
+
+def _lose(bus: Bus, unit: Unit, now_ns: int) -> None:
+    """A slave does not answer: leave it out."""
+    if unit.is_lost:
+        return
+    unit.is_lost = True
+    unit.retry_ns = 0
+    unit.missed_ns = unit.missed_ns or now_ns
+    if unit.work is not None:
+        unit.work.cancel()
+    bus.close_mailbox(unit)
+    bus.set_presence(unit, Presence.UNSURE)
+    bus.emit(SlaveLost(unit.station, now_ns))
+
+
+def _judge(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
+    """A slave answers: bring it back if it is not where it belongs."""
+    if unit.is_busy or now_ns < unit.retry_ns:
+        return
+    is_right = status.state == unit.target and not status.error
+    if is_right and not unit.is_lost:
+        return
+    if unit.missed_ns is None:
+        unit.missed_ns = now_ns
+        shown = status.state | (ERROR if status.error else 0)
+        bus.emit(SlaveLeft(unit.station, shown, status.code, now_ns))
+    _begin(bus, unit, status, now_ns)
+
+
+def _begin(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
+    stays = (
+        not unit.is_lost
+        and status.state in _WITH_MAILBOX
+        and unit.target in _WITH_MAILBOX
+        and unit.state in _WITH_MAILBOX
+    )
+    unit.is_lost = False
+    bus.is_troubled = True
+
+    def done(task: Task[int]) -> None:
+        if task.error is None:
+            missed_ns, unit.missed_ns = unit.missed_ns, None
+            end_ns = task.result()
+            bus.emit(SlaveBack(unit.station, end_ns - (missed_ns or end_ns), end_ns))
+        elif not unit.is_lost:
+            unit.retry_ns = now_ns + RETRY_NS
+            unit.is_lost = isinstance(task.error, IdentityError)
+            bus.emit(SlaveFailed(unit.station, str(task.error), now_ns))
+
+    work = _revive(bus, unit, stays=stays)
+    unit.work = bus.runner.start(work, now_ns, f"bringing back slave {unit.station}")
+    unit.work.watch(done)
+
+
+def _revive(bus: Bus, unit: Unit, *, stays: bool) -> Procedure[int]:
+    """Bring a slave back; return the time.  Unless it *stays* set up it begins in INIT."""
+    if not stays:
+        found = unit.found.identity
+        identity = yield from read_identity(unit.station)
+        if identity != found:
+            yield [fpwr(unit.station, Register.STATION_ADDRESS, bytes(2))]
+            raise IdentityError(
+                f"in place of {unit.name} (station {unit.station}) there is {identity}, serial"
+                f" {identity.serial}, expected {found}, serial {found.serial}"
+            )
+        yield from bring(bus, unit, AlState.INIT)
+    yield from bring(bus, unit, unit.target)
+    _, now_ns = yield Sleep(0)
+    return now_ns
+
+
+def _seek(bus: Bus, count: int, now_ns: int) -> Procedure[None]:
+    """Give slaves that came without an address that of the lost one whose place they have."""
+    try:
+        stations = yield from read_stations(count)
+        places = _places(bus, stations, now_ns)
+        if places:
+            yield from assign_stations(places)
+            bus.is_troubled = True
+    except EapError:
+        bus.is_troubled = True  # the line has changed meanwhile: look again
+
+
+def _places(bus: Bus, stations: Sequence[int], now_ns: int) -> list[tuple[int, int]]:
+    """Return positions and station addresses; a lost slave comes behind those before it."""
+    order = {station: number for number, station in enumerate(bus.units)}
+    lost = [at for at, unit in bus.units.items() if unit.is_lost and unit.retry_ns <= now_ns]
+    places = []
+    last = -1
+    for position, station in enumerate(stations):
+        if station in order:
+            last = max(last, order[station])
+            continue
+        fitting = [each for each in lost if order[each] > last]
+        if fitting:
+            lost.remove(fitting[0])
+            last = order[fitting[0]]
+            places.append((position, fitting[0]))
+    return places

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from devicebus.mailbox.conversation import Ask
+from devicebus.master.bus import MAX_EVENTS, Bus, MasterSettings, Unit
+from devicebus.master.cycle import Presence
+from devicebus.master.event import BusLost
+from devicebus.master.mailboxport import MailboxArea
+from devicebus.master.scan import scan
+from devicebus.master.startup import set_up_cycle
+from eap.codec.mailbox import MailboxType
+from tests.support.busline import Bench, Line, run, segment, slave
+
+AREA = MailboxArea(0x1000, 128, 0x1080, 128)
+
+
+def made():
+    (found,) = run(Line(Bench(), segment(slave("a"))), scan())
+    bus = Bus(MasterSettings(acyclic_octets=100))
+    unit = bus.units[1001] = Unit(found, "first")
+    return bus, unit
+
+
+def test_events_come_in_their_order_and_the_oldest_are_dropped():
+    bus, _ = made()
+    for at in range(MAX_EVENTS + 2):
+        bus.emit(BusLost(at))
+    assert bus.next_event() == BusLost(2)
+    assert len(list(iter(bus.next_event, None))) == MAX_EVENTS - 1
+
+
+def test_a_mailbox_that_closes_tells_who_waits():
+    bus, unit = made()
+    bus.open_mailbox(unit, AREA)
+    first = unit.mailbox
+
+    closed = first.converse(talk(), 0)
+    bus.open_mailbox(unit, AREA)
+    assert closed.is_done
+    assert unit.mailbox is not first
+    bus.close_mailbox(unit)
+    bus.close_mailbox(unit)
+    assert unit.mailbox is None
+
+
+def talk():
+    yield Ask(MailboxType.COE, b"")
+
+
+def test_forgetting_ends_what_runs():
+    bus, unit = made()
+    bus.set_presence(unit, Presence.PRESENT)
+    set_up_cycle(bus)
+    bus.open_mailbox(unit, AREA)
+    unit.work = bus.runner.start(scan(), 0)
+    assert unit.is_busy
+    bus.is_lost = bus.is_troubled = True
+    bus.forget()
+    assert not unit.is_busy
+    assert (bus.units, bus.image, bus.cycle, unit.mailbox) == ({}, None, None, None)
+    assert not bus.is_lost
+    assert not bus.is_troubled

@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.master.access import frmw
+from devicebus.master.cycle import Cycle, Presence
+from devicebus.master.image import BusImage
+from devicebus.master.layout import BASE, lay_out
+from devicebus.master.link import Link
+from devicebus.wire.datagram import Command
+from tests.support.busline import MS, accesses_of, answer
+from tests.unit.devicebus.master.test_layout import shape
+
+SHAPES = (shape(1, (8, 8), (16,)), shape(2, (8,), (8,)), shape(3, (), (8,)))
+
+
+class Fixture:
+    def __init__(self, *, knows_lrw=True, present=(1, 2, 3)):
+        self.link = Link()
+        self.image = BusImage(lay_out(SHAPES))
+        self.troubles = []
+        self.cycle = Cycle(self.link, self.image, self.troubles.append, knows_lrw=knows_lrw)
+        for station in present:
+            self.cycle.set_presence(station, Presence.PRESENT)
+
+    def round(self, wkc, data=b"", now_ns=0):
+        self.cycle.start(now_ns)
+        frames = self.link.frames_to_send(now_ns)
+        for frame in frames:
+            self.link.receive_frame(answer(frame, wkc=wkc, data=data), now_ns + 50)
+        return [access for frame in frames for access in accesses_of(frame)]
+
+
+def test_one_datagram_takes_outputs_and_brings_inputs():
+    f = Fixture()
+    f.image.outputs[:] = b"abc"
+    (access,) = f.round(7, b"...WXYZ")
+    assert access == (Command.LRW, BASE & 0xFFFF, BASE >> 16, b"abc\0\0\0\0", 3)
+    assert f.image.inputs == b"WXYZ"
+    stats = f.cycle.stats()
+    assert (stats.cycles, stats.good, stats.expected_wkc, stats.received_wkc) == (1, 1, 7, 7)
+    assert (stats.trip_ns, stats.max_trip_ns, f.troubles) == (50, 50, [])
+
+
+def test_slaves_that_do_not_know_lrw_are_written_and_read():
+    f = Fixture(knows_lrw=False)
+    f.image.outputs[:] = b"abc"
+    write, read = f.round(3, b"WXYZ")
+    assert (write.command, write.adp, write.data) == (Command.LWR, 0, b"abc")
+    assert (read.command, read.adp, read.data) == (Command.LRD, 3, bytes(4))
+    assert f.cycle.stats().expected_wkc == 2 + 3
+    assert f.cycle.stats().wkc_errors == 1
+    assert f.image.inputs == b"WXYZ"
+
+
+def test_a_wrong_working_counter_leaves_the_inputs_alone():
+    f = Fixture()
+    f.round(7, b"...WXYZ")
+    f.round(4, b"...abcd", now_ns=MS)
+    assert f.image.inputs == b"WXYZ"
+    assert f.cycle.stats().wkc_errors == 1
+    assert f.troubles == [MS + 50]
+
+
+def test_inputs_of_those_who_are_there_go_on_while_one_is_away():
+    f = Fixture()
+    f.round(7, b"...WXYZ")
+    f.cycle.set_presence(1, Presence.AWAY)
+    f.round(4, b"...\0\0yz")
+    assert f.image.inputs == b"WXyz"
+    assert f.cycle.stats().wkc_errors == 0
+    assert f.cycle.presence(1) is Presence.AWAY
+    assert f.cycle.presence(99) is Presence.AWAY
+
+
+@pytest.mark.parametrize(("wkc", "errors"), [(4, 0), (6, 1), (7, 0), (3, 1), (8, 1)])
+def test_a_slave_nobody_is_sure_of_counts_wholly_or_not_at_all(wkc, errors):
+    f = Fixture()
+    f.cycle.set_presence(1, Presence.UNSURE)
+    f.round(wkc, b"...WXYZ")
+    assert f.cycle.stats().wkc_errors == errors
+    assert f.image.inputs == (b"\0\0\0\0" if errors else b"\0\0YZ")
+
+
+def test_what_is_expected_holds_from_the_next_cycle_on():
+    f = Fixture()
+    f.cycle.start(0)
+    (frame,) = f.link.frames_to_send(0)
+    f.cycle.set_presence(1, Presence.AWAY)
+    f.link.receive_frame(answer(frame, wkc=7), 1)
+    assert f.cycle.stats().good == 1
+
+
+def test_a_lost_cycle_is_counted_and_not_sent_again():
+    f = Fixture()
+    f.cycle.start(0)
+    f.link.frames_to_send(0)
+    f.link.handle_timeout(2 * MS)
+    assert f.link.frames_to_send(2 * MS) == []
+    assert (f.cycle.stats().lost, f.troubles) == (1, [2 * MS])
+
+
+def test_more_datagrams_go_with_a_cycle():
+    f = Fixture()
+    taken = []
+    f.cycle.extra = [frmw(1, 0x910, 8)]
+    f.cycle.take_extra = taken.extend
+    accesses = f.round(7, b"...WXYZ")
+    assert [each.command for each in accesses] == [Command.LRW, Command.FRMW]
+    assert taken[0].data == b"...WXYZ\0"
+
+
+def test_a_bus_without_process_data_sends_nothing():
+    cycle = Cycle(link := Link(), BusImage(lay_out([])), lambda now: None, knows_lrw=True)
+    cycle.start(0)
+    assert (link.frames_to_send(0), cycle.stats().cycles) == ([], 0)

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import MailboxProtocolError
+from devicebus.mailbox.conversation import Message
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.pdo import (
+    Channel,
+    Pdo,
+    PdoChoice,
+    PdoEntry,
+    channels_from_sii,
+    read_channels,
+    write_choice,
+)
+from devicebus.wire.sii import Sii, SiiPdo
+from devicebus.wire.siirecord import (
+    SiiFixed,
+    SiiGeneral,
+    SiiPdoEntry,
+    SiiPdoHeader,
+    SiiSyncManager,
+)
+from eap.codec.coe import CoeService, encode_message
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoResponse, encode_initiate
+from eap.od.abort import SdoAbortError
+from tests.support.busline import Bench, Line, open_mailbox, segment, slave
+
+MANAGERS = (
+    SiiSyncManager(0x1000, 128, 0x26, type=1),
+    SiiSyncManager(0x1080, 128, 0x22, type=2),
+    SiiSyncManager(0x1100, 0, 0x64, type=3),
+    SiiSyncManager(0x1180, 4, 0x20, type=4),
+)
+SII = Sii(
+    fixed=SiiFixed(),
+    strings=("lamp",),
+    sync_managers=MANAGERS,
+    rx_pdos=(
+        SiiPdo(
+            SiiPdoHeader(0x1600, 2, 2),
+            (SiiPdoEntry(0x7000, 1, 1, 1, 1), SiiPdoEntry(0, 0, 0, 0, 7)),
+        ),
+        SiiPdo(SiiPdoHeader(0x1601, 1, 0xFF), (SiiPdoEntry(0x7000, 2, 0, 6, 16),)),
+    ),
+)
+
+
+def test_the_eeprom_tells_what_sync_managers_carry():
+    outputs, inputs = channels_from_sii(SII)
+    entries = (PdoEntry(0x7000, 1, 1, "lamp", 1), PdoEntry(0, 0, 7))
+    assert outputs == Channel(2, 0x1100, 0x64, True, (Pdo(0x1600, entries),))
+    assert (outputs.size, inputs.size, inputs.pdos, inputs.is_output) == (1, 4, (), False)
+
+
+def test_sync_managers_without_a_type_are_told_by_their_control():
+    managers = (
+        SiiSyncManager(0x0F00, 1, 0x44),
+        SiiSyncManager(0x1000, 2, 0x00),
+        SiiSyncManager(0x1080, 0, 0x00),
+        SiiSyncManager(0x1100, 64, 0x26),
+    )
+    found = channels_from_sii(Sii(fixed=SiiFixed(), sync_managers=managers))
+    assert [(each.number, each.is_output, each.size) for each in found] == [
+        (0, True, 1),
+        (1, False, 2),
+    ]
+
+
+def test_a_slave_with_coe_is_asked_and_names_its_entries():
+    line = Line(Bench(), segment(slave("a")))
+    box = open_mailbox(line)
+    sii = Sii(fixed=SiiFixed(), sync_managers=MANAGERS, general=SiiGeneral(coe_sdo=1, coe_info=1))
+    outputs, inputs = line.wait(box.converse(read_channels(sii), line.now_ns))
+    assert outputs.pdos[0].entries[0] == PdoEntry(0x7000, 1, 1, "out", 1)
+    assert inputs.pdos[0].entries == (PdoEntry(0x6000, 1, 1, "in", 1), PdoEntry(0, 0, 7))
+    assert (outputs.size, inputs.size) == (1, 1)
+
+
+def test_what_it_does_not_know_is_as_the_eeprom_says():
+    line = Line(Bench(), segment(slave("a", inputs=())))
+    dictionary = line.segment.slaves[0].device.dictionary
+    for index in (0x1C12, 0x1C13):
+        if index in dictionary:
+            dictionary.remove(index)
+    box = open_mailbox(line)
+    assert line.wait(box.converse(read_channels(SII), line.now_ns)) == channels_from_sii(SII)
+
+
+def test_a_choice_is_written_in_the_order_that_slaves_want():
+    line = Line(Bench(), segment(slave("a")))
+    box = open_mailbox(line)
+    empty = PdoChoice(assignment={2: (), 3: (0x1A00,)})
+    line.wait(box.converse(write_choice(empty, box.sizes), line.now_ns))
+    dictionary = line.segment.slaves[0].device.dictionary
+    assert dictionary.entry(0x1C12, 0).value == 0
+    assert dictionary.entry(0x1C13, 1).value == 0x1A00
+    wrong = PdoChoice(mapping={0x1600: ((0x7000, 1, 8),)})
+    with pytest.raises(SdoAbortError, match="0x1600:0"):
+        line.wait(box.converse(write_choice(wrong, box.sizes), line.now_ns))
+
+
+def test_a_mapping_is_written_as_index_subindex_and_bits():
+    writing = write_choice(PdoChoice(mapping={0x1600: ((0x7010, 2, 16),)}), MailboxSizes())
+    first = next(writing)
+    assert first.data[3:6] == b"\x00\x16\x00"
+    answer = encode_message(CoeService.SDO_RESPONSE, b"\x60\x00\x16\x00" + bytes(4))
+    second = writing.send(Message(MailboxType.COE, answer))
+    assert second.data[5:] == b"\x01\x10\x02\x10\x70"
+
+
+def response(index, subindex, octets):
+    body = encode_initiate(SdoResponse.UPLOAD, index, subindex, octets, complete=False, room=100)
+    return Message(MailboxType.COE, encode_message(CoeService.SDO_RESPONSE, body))
+
+
+@pytest.mark.parametrize(
+    ("replies", "text"),
+    [
+        ([(0x1C12, 0, b"\xff")], "0x1C12:00 is ff, expected a count up to 254"),
+        ([(0x1C12, 0, b"\1\0\0\0")], "0x1C12:00 is 01000000, expected a count"),
+        ([(0x1C12, 0, b"\1"), (0x1C12, 1, b"\0")], "0x1C12:01 has 1 octets, expected 2"),
+    ],
+)
+def test_lists_that_are_none_are_refused(replies, text):
+    asking = read_channels(SII)
+    next(asking)
+    for reply in replies[:-1]:
+        asking.send(response(*reply))
+    with pytest.raises(MailboxProtocolError, match=text):
+        asking.send(response(*replies[-1]))

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import AlStatusError, BusError, FrameLostError, IdentityError
+from devicebus.master.bus import MasterSettings
+from devicebus.master.expected import ExpectedSlave
+from devicebus.master.master import Master
+from devicebus.sim.spec import MailboxSpec
+from devicebus.wire.alstatus import AlState
+from tests.support.busline import MS, Paced, segment, slave
+
+
+def line_of(*slaves, **settings):
+    return Paced(Master(MasterSettings(**settings)), segment(*slaves))
+
+
+def states(line):
+    return [each.state for each in line.segment.slaves]
+
+
+SLAVES = (
+    slave("coupler", "coupler", mailbox=None),
+    slave("a"),
+    slave("b", mailbox=None),
+    slave("c", after="coupler", port=3, mailbox=MailboxSpec(size=128)),
+)
+
+
+@pytest.mark.parametrize("target", [AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP])
+def test_all_slaves_get_to_the_state_together(target):
+    line = line_of(*SLAVES)
+    line.wait(line.core.bring_up(line.now_ns, target))
+    assert set(states(line)) == {target}
+    assert {unit.state for unit in line.core.units.values()} == {target}
+
+
+def test_sixteen_slaves_are_in_op_in_less_than_a_tenth_of_a_second():
+    line = line_of(*[slave(f"s{n}") for n in range(16)])
+    begun = line.now_ns
+    line.wait(line.core.bring_up(begun))
+    assert set(states(line)) == {AlState.OP}
+    assert line.now_ns - begun < 100 * MS
+
+
+def test_a_bus_that_runs_is_taken_over():
+    line = line_of(*SLAVES)
+    line.wait(line.core.bring_up(line.now_ns))
+    line.wait(line.core.bring_up(line.now_ns))
+    assert set(states(line)) == {AlState.OP}
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_lost_frames_delay_it_only(seed):
+    line = line_of(*SLAVES)
+    line.lose_out = lambda number: number % 11 == seed
+    line.lose_back = lambda number: number % 13 == seed
+    line.wait(line.core.bring_up(line.now_ns))
+    assert set(states(line)) == {AlState.OP}
+
+
+def test_names_are_those_that_were_expected():
+    expected = [ExpectedSlave(name=f"n{n}", vendor=0xE5A, product=7) for n in range(2)]
+    line = line_of(slave("a"), slave("b"), expected=expected)
+    line.wait(line.core.bring_up(line.now_ns, AlState.PREOP))
+    assert [unit.name for unit in line.core.units.values()] == ["n0", "n1"]
+
+
+def test_another_bus_is_left_in_init():
+    expected = [ExpectedSlave(name="n", vendor=0xE5A, product=8)]
+    line = line_of(slave("a"), expected=expected)
+    with pytest.raises(IdentityError, match="expected n with vendor"):
+        line.wait(line.core.bring_up(line.now_ns))
+    assert states(line) == [AlState.INIT]
+
+
+def test_whoever_refuses_is_named():
+    line = line_of(slave("a"), slave("b"), slave("c"))
+    line.segment.slaves[1].refuses[AlState.OP] = 0x1A
+    with pytest.raises(AlStatusError, match="slave 1002: refuses OP"):
+        line.wait(line.core.bring_up(line.now_ns))
+    line.segment.slaves[2].refuses[AlState.OP] = 0x19
+    with pytest.raises(BusError) as caught:
+        line.wait(line.core.bring_up(line.now_ns))
+    lines = str(caught.value).splitlines()
+    assert lines[0] == "2 slaves have failed:"
+    assert lines[1].startswith("  b: slave 1002: refuses OP")
+    assert lines[2].startswith("  c: slave 1003: refuses OP")
+
+
+def test_a_bus_that_is_not_there():
+    line = line_of(slave("a"))
+    line.segment.cut(0)
+    with pytest.raises(FrameLostError, match="check the cable"):
+        line.wait(line.core.bring_up(line.now_ns))

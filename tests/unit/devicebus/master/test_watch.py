@@ -1,0 +1,144 @@
+"""Slaves that go and come back, and the others that notice nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.master.event import (
+    BusBack,
+    BusLost,
+    SlaveBack,
+    SlaveFailed,
+    SlaveLeft,
+    SlaveLost,
+)
+from devicebus.master.master import Master
+from devicebus.wire.alstatus import AlState
+from tests.support.busline import MS, Paced, segment, slave
+
+
+@pytest.fixture
+def line():
+    line = Paced(
+        Master(),
+        segment(
+            slave("a", serial=1),
+            slave("branch", serial=2, after="a", port=3),
+            slave("b", serial=3, after="a"),
+            slave("c", serial=4),
+        ),
+    )
+    line.wait(line.core.bring_up(line.now_ns))
+    line.elapse(20 * MS)
+    assert line.events() == []
+    return line
+
+
+def kinds(events):
+    return [(type(each).__name__, each.station) for each in events]
+
+
+def by_name(line):
+    return {each.device.name: each for each in line.segment.slaves}
+
+
+def test_a_slave_that_leaves_op_is_brought_back_at_once(line):
+    by_name(line)["b"].fail(0x1A)
+    begun = line.now_ns
+    line.elapse(130 * MS)
+    left, back = line.events()
+    assert (left.station, left.status, left.code) == (1003, 0x14, 0x1A)
+    assert kinds([left, back]) == [("SlaveLeft", 1003), ("SlaveBack", 1003)]
+    assert back.at_ns - begun < 120 * MS
+    assert by_name(line)["b"].state is AlState.OP
+    assert line.core.stats().cycle.wkc_errors == 0
+
+
+def test_a_slave_that_was_switched_off_comes_back_with_its_address(line):
+    line.segment.switch(1, on=False)
+    line.elapse(30 * MS)
+    assert kinds(line.events()) == [("SlaveLost", 1002)]
+    assert line.core.units[1002].mailbox is None
+    errors = line.core.stats().cycle.wkc_errors
+    assert 1 <= errors <= 10
+    cycles = line.core.stats().cycle.good
+    line.elapse(200 * MS)
+    assert line.core.stats().cycle.good - cycles == 200
+    line.segment.switch(1, on=True)
+    begun = line.now_ns
+    line.elapse(150 * MS)
+    (back,) = line.events()
+    assert kinds([back]) == [("SlaveBack", 1002)]
+    assert back.at_ns - begun < 130 * MS
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
+    assert line.core.stats().cycle.wkc_errors == errors
+    assert line.core.units[1002].mailbox is not None
+
+
+def test_all_behind_a_cut_come_back_when_it_is_mended(line):
+    line.segment.cut(2)
+    line.elapse(500 * MS)
+    assert set(kinds(line.events())) == {("SlaveLost", 1003), ("SlaveLost", 1004)}
+    errors = line.core.stats().cycle.wkc_errors
+    line.segment.mend(2)
+    line.elapse(200 * MS)
+    assert line.core.stats().cycle.wkc_errors == errors
+    assert set(kinds(line.events())) == {("SlaveBack", 1003), ("SlaveBack", 1004)}
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
+
+
+def test_two_that_lost_their_addresses_get_their_own_again(line):
+    for number in (1, 3):
+        line.segment.switch(number, on=False)
+    line.elapse(50 * MS)
+    for number in (3, 1):
+        line.segment.switch(number, on=True)
+    line.elapse(300 * MS)
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
+    stations = {name: each.esc.station for name, each in by_name(line).items()}
+    assert stations == {"a": 1001, "branch": 1002, "b": 1003, "c": 1004}
+
+
+def test_a_slave_that_cannot_come_back_is_tried_each_second(line):
+    slave_b = by_name(line)["b"]
+    slave_b.refuses[AlState.OP] = 0x1A
+    slave_b.fail(0x1A)
+    line.elapse(2500 * MS)
+    events = line.events()
+    assert isinstance(events[0], SlaveLeft)
+    failures = [each for each in events if isinstance(each, SlaveFailed)]
+    assert len(events) == 1 + len(failures)
+    assert 2 <= len(failures) <= 3
+    assert "refuses OP" in failures[0].reason
+    slave_b.refuses.clear()
+    line.elapse(1500 * MS)
+    assert kinds(line.events()) == [("SlaveBack", 1003)]
+
+
+def test_another_slave_in_its_place_is_refused(line):
+    line.segment.switch(3, on=False)
+    line.elapse(50 * MS)
+    line.events()
+    image = line.segment.slaves[3].esc.image
+    line.segment.slaves[3].esc.image = image[:28] + b"\x63" + image[29:]
+    line.segment.switch(3, on=True)
+    line.elapse(300 * MS)
+    (failed,) = line.events()
+    assert isinstance(failed, SlaveFailed)
+    assert "in place of c (station 1004) there is vendor" in failed.reason
+    assert "serial 99" in failed.reason
+    assert by_name(line)["b"].state is AlState.OP
+
+
+def test_the_whole_bus_goes_and_comes_back(line):
+    line.segment.cut(0)
+    line.elapse(300 * MS)
+    events = line.events()
+    assert [each for each in events if isinstance(each, BusLost)]
+    assert len([each for each in events if isinstance(each, SlaveLost)]) == 4
+    line.segment.mend(0)
+    line.elapse(300 * MS)
+    events = line.events()
+    assert isinstance(events[0], BusBack)
+    assert len([each for each in events if isinstance(each, SlaveBack)]) == 4
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
