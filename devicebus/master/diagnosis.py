@@ -1,0 +1,144 @@
+"""Where the bus is ill: states, and the error counters of every port.
+
+A damaged frame is counted as invalid by the first slave that sees it and as forwarded by those
+behind it; the first port that counts is next to the cable or the slave at fault (ESC data sheet).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from devicebus.master.access import Reply, fprd, fpwr
+from devicebus.master.procedure import Procedure
+from devicebus.master.topology import find_joints
+from devicebus.wire.alstatus import ERROR, name_of, state_name
+from devicebus.wire.register import AlStatus, DlStatus, Register
+
+_PORTS = 4
+_COUNTERS = 0x14
+_PER_STEP = 15
+
+
+class PortErrors(msgspec.Struct, frozen=True):
+    """Counters of one port; each stops at 255."""
+
+    port: int
+    is_open: bool
+    invalid_frames: int
+    physical: int
+    forwarded: int
+    lost_links: int
+
+    @property
+    def total(self) -> int:
+        """What arose here: errors that only passed are not counted."""
+        return self.invalid_frames + self.physical + self.lost_links
+
+
+class SlaveDiagnosis(msgspec.Struct, frozen=True):
+    """What one slave says of itself; nothing if it does not answer."""
+
+    station: int
+    answers: bool
+    state: str = ""
+    code: int = 0
+    text: str = ""
+    """What *code* means."""
+    ports: tuple[PortErrors, ...] = ()
+
+
+class Fault(msgspec.Struct, frozen=True):
+    """Where errors start: at this port, or on the cable to what is wired to it."""
+
+    station: int
+    port: int
+    neighbour: int | None
+    """Station address of the slave at the other end; None for the master or nobody."""
+
+
+class BusDiagnosis(msgspec.Struct, frozen=True):
+    """All slaves in the order of the line."""
+
+    slaves: tuple[SlaveDiagnosis, ...]
+    first_fault: Fault | None
+    """The first port in the order of the frame that has counted errors."""
+
+
+def diagnose(stations: Sequence[int]) -> Procedure[BusDiagnosis]:
+    """Read states and counters of slaves, which come in the order of the line.
+
+    Raises FrameLostError if nothing comes back.
+    """
+    found = []
+    statuses = []
+    for station, replies in (yield from _read(stations)):
+        slave, status = _slave(station, replies)
+        found.append(slave)
+        statuses.append(status)
+    return BusDiagnosis(tuple(found), _first_fault(found, statuses))
+
+
+def clear_counters(stations: Sequence[int]) -> Procedure[None]:
+    """Set all error counters back to 0; slaves that do not answer are left out."""
+    for start in range(0, len(stations), _PER_STEP):
+        part = stations[start : start + _PER_STEP]
+        yield [fpwr(at, Register.RX_ERROR, bytes(_COUNTERS)) for at in part]
+
+
+def _read(stations: Sequence[int]) -> Procedure[list[tuple[int, list[Reply]]]]:
+    found = []
+    for station in stations:
+        replies, _ = yield [
+            fprd(station, Register.AL_STATUS, AlStatus.SIZE),
+            fprd(station, Register.DL_STATUS, DlStatus.SIZE),
+            fprd(station, Register.RX_ERROR, _COUNTERS),
+        ]
+        found.append((station, list(replies)))
+    return found
+
+
+def _slave(station: int, replies: Sequence[Reply]) -> tuple[SlaveDiagnosis, DlStatus]:
+    al, dl, counters = replies
+    if not (al.wkc and dl.wkc and counters.wkc):
+        return SlaveDiagnosis(station, answers=False), DlStatus()
+    status = AlStatus.decode(al.data)
+    dl_status = DlStatus.decode(dl.data)
+    open_ports = find_joints([dl_status])[0].ports
+    octets = counters.data
+    ports = tuple(
+        PortErrors(
+            port,
+            port in open_ports,
+            octets[2 * port],
+            octets[2 * port + 1],
+            octets[8 + port],
+            octets[16 + port],
+        )
+        for port in range(_PORTS)
+    )
+    shown = state_name(status.state | (ERROR if status.error else 0))
+    text = name_of(status.code) if status.code else ""
+    return SlaveDiagnosis(station, True, shown, status.code, text, ports), dl_status
+
+
+def _first_fault(slaves: Sequence[SlaveDiagnosis], statuses: Sequence[DlStatus]) -> Fault | None:
+    joints = find_joints(statuses)
+    for position, slave in enumerate(slaves):
+        for port in slave.ports:
+            if not port.total:
+                continue
+            joint = joints[position]
+            if port.port == joint.entry_port:
+                parent = joint.parent
+                return Fault(
+                    slave.station, port.port, None if parent is None else slaves[parent].station
+                )
+            children = (
+                slaves[number].station
+                for number, each in enumerate(joints)
+                if (each.parent, each.parent_port) == (position, port.port)
+            )
+            return Fault(slave.station, port.port, next(children, None))
+    return None
