@@ -30,11 +30,11 @@ from eap.pd.spec import (
     Writer,
 )
 
-STAGGER_GROUPS = 3
+STAGGER_GROUPS = 8
 """Into how many moments of the cycle the stations are spread.
 
-More of them send more evenly, but each is a wake-up of the engine: fifteen for the fifteen stations
-of the solar line took half as much processor time again.
+More of them send more evenly, but each is a wake-up of the engine: the fifteen stations of the solar
+line took 15 % of a core in fifteen groups and 12 % in eight, where half of them still start on time.
 """
 MIN_STAGGER_US = 250
 """Time that a group may take before the next one begins."""

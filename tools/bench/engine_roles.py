@@ -90,6 +90,7 @@ def _station(number: int, cycle_us: int) -> StationSpec:
         name=f"station-{number}",
         net_id=f"127.0.1.{number}.1.1",
         cycle_us=cycle_us,
+        phase_us=(number - 1) * cycle_us // 2,  # as the plant file staggers two stations
         ports=(PortSpec("eap0", PortKind.EAP, f"udp://127.0.1.{number}", f"127.0.1.{number}.2.1"),),
         variables=(
             VariableSpec("count", "UDINT", Writer.ENGINE),
