@@ -21,7 +21,9 @@ slaves:
     objects: [{index: 0x8001, name: Curve, type: BLOCK(100)}]
   - {name: drive, kind: drive}
 """
-FRAME_S, ANSWER_S, STATE_S = 0.02, 0.5, 2.0
+FRAME_S, ANSWER_S, STATE_S = 0.02, 1.0, 5.0
+ATTEMPTS = 5  # KickCAT waits out FRAME_S for every frame, so it is short, and a busy machine late
+CYCLES = 20
 
 
 @pytest.fixture
@@ -32,8 +34,17 @@ def bus(tmp_path):
         link = kickcat.create_link(NEAR, "")
         link.set_timeout(FRAME_S)
         found = kickcat.Bus(link)
-        found.init(0.1)
+        patient(lambda: found.init(0.1))
         yield found
+
+
+def patient(call):
+    for _ in range(ATTEMPTS - 1):
+        try:
+            return call()
+        except RuntimeError:
+            continue
+    return call()
 
 
 def operate(bus):
@@ -61,9 +72,9 @@ def test_process_data_in_op(bus):
     operate(bus)
     island = bus.slaves()[0]
     assert bus.get_state(island) == kickcat.State.OPERATIONAL
-    for number in range(100):
+    for number in range(CYCLES):
         island.set_output_bytes(number.to_bytes(2, "little"))
-        bus.process_data()
-    bus.process_data()
-    assert island.input_data == (99).to_bytes(2, "little")
+        patient(bus.process_data)
+    patient(bus.process_data)
+    assert island.input_data == (CYCLES - 1).to_bytes(2, "little")
     assert [bus.get_state(each) for each in bus.slaves()] == [kickcat.State.OPERATIONAL] * 2
