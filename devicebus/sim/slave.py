@@ -15,6 +15,7 @@ OUTPUTS_TIMEOUT_NS = 200_000_000
 """How long a slave on its way to OP waits for the first outputs (ESI default, back to SafeOp)."""
 
 _IDENTIFY = 0x20
+_MAILBOX_EVENTS = AlEvent.SM_ACTIVATION | AlEvent.SM0 | AlEvent.SM0 << 1
 _WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT))
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
@@ -66,7 +67,7 @@ class Slave:
             self._obey(now_ns)
         if event & AlEvent.SM_ACTIVATION:
             self._check_channels(now_ns)
-        if self.device.mailbox is not None and self.state in _WITH_MAILBOX:
+        if event & _MAILBOX_EVENTS and self._has_mailbox():
             self._serve_mailbox(event)
             self._move_messages(now_ns)
         if self.state in _WITH_PROCESS_DATA and event >= AlEvent.SM0:
@@ -81,7 +82,7 @@ class Slave:
         if self._deadline_ns is not None and now_ns >= self._deadline_ns:
             self._deadline_ns = None
             self._refuse(AlStatusCode.NO_OUTPUTS)
-        if self.device.mailbox is not None and self.state in _WITH_MAILBOX:
+        if self._has_mailbox():
             self._move_messages(now_ns)
         if self.esc.clock.take_sync0(now_ns) and self.state in _WITH_PROCESS_DATA:
             self._offer_inputs(now_ns)
@@ -191,6 +192,9 @@ class Slave:
             self.esc.watchdog.stop()
             self.device.al_state = AlState.PREOP
             self._refuse(code)
+
+    def _has_mailbox(self) -> bool:
+        return self.device.mailbox is not None and self.state in _WITH_MAILBOX
 
     def _serve_mailbox(self, event: int) -> None:
         mailbox = self.device.mailbox
