@@ -33,8 +33,9 @@ from eap.pd.spec import (
 STAGGER_GROUPS = 8
 """Into how many moments of the cycle the stations are spread.
 
-More of them send more evenly, but each is a wake-up of the engine: the fifteen stations of the solar
-line took 15 % of a core in fifteen groups and 12 % in eight, where half of them still start on time.
+More of them send more evenly, but each is a wake-up of the engine: the fifteen stations of the
+solar line took 15 % of a core in fifteen groups and 12 % in eight, where half of them still start
+on time.
 """
 MIN_STAGGER_US = 250
 """Time that a group may take before the next one begins."""
