@@ -1,0 +1,196 @@
+"""Distributed clocks: delays, offsets, drift, SYNC0 (ETG.1000.4; ESC data sheet, section I 9).
+
+All slaves latch when one frame passes each of their ports.  From this follows how long a frame
+takes to each slave, and how far its clock is off; the first slave with a clock is the reference,
+whose time a datagram of every cycle then hands to the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from devicebus.errors import WorkingCounterError
+from devicebus.master.access import Access, bwr, fprd, frmw
+from devicebus.master.procedure import Procedure, read, write
+from devicebus.master.scan import FoundSlave
+from devicebus.master.topology import Joint
+from devicebus.wire.register import Register
+
+_U32 = 0xFFFF_FFFF
+_U64 = (1 << 64) - 1
+_ORDER = (0, 3, 1, 2)
+_SPEED_START = 0x1000
+_DRIFT_FRAMES = 20
+_DRIFT_PER_FRAME = 15
+SYNC_LEAD_NS = 100_000_000
+"""How far ahead SYNC0 begins; its registers must be written by then."""
+_CYCLIC_OUT = 0x03
+"""Cyclic operation and SYNC0, in the activation register."""
+
+
+class Sync0(msgspec.Struct, frozen=True):
+    """SYNC0 of a slave; times in nanoseconds."""
+
+    cycle_ns: int
+    shift_ns: int = 0
+    """After the start of the cycle that all slaves share."""
+
+
+class Latched(NamedTuple):
+    """When one frame passed a slave, by that slave's own clock."""
+
+    ports: tuple[int, int, int, int]
+    """32 bits each."""
+    processing: int
+    """64 bits, at the processing unit."""
+
+
+class ClockState(NamedTuple):
+    """What was set in one slave."""
+
+    station: int
+    delay_ns: int
+    """From the reference to this slave."""
+    offset_ns: int
+
+
+def synchronize(
+    slaves: Sequence[FoundSlave], time_ns: int, *, only: frozenset[int] | None = None
+) -> Procedure[tuple[ClockState, ...]]:
+    """Set delays and offsets; return them, the reference first, nothing without any clock.
+
+    Args:
+        slaves: All in the order of the line.
+        time_ns: System time, since 2000-01-01, that the reference gets; with *only* it keeps its.
+        only: Station addresses of slaves that came back; the others are left alone.
+
+    Raises:
+        WorkingCounterError: a slave does not answer.
+        FrameLostError: nothing comes back.
+    """
+    clocks = [slave for slave in slaves if slave.esc.has_clock]
+    if not clocks:
+        return ()
+    yield [bwr(Register.DC_RECEIVE_TIME, bytes(4))]
+    latched: dict[int, Latched] = {}
+    for slave in clocks:
+        latched[slave.position] = yield from _read_latched(slave.station)
+    delays = find_delays({each.position: each.joint for each in slaves}, latched)
+    reference = clocks[0]
+    start_ns = time_ns
+    if only is not None:
+        octets = yield from read(reference.station, Register.DC_SYSTEM_TIME_OFFSET, 8, "offset")
+        start_ns = latched[reference.position].processing + int.from_bytes(octets, "little")
+    states = []
+    for slave in clocks:
+        offset = (start_ns + delays[slave.position] - latched[slave.position].processing) & _U64
+        state = ClockState(slave.station, delays[slave.position], offset)
+        states.append(state)
+        if only is None or slave.station in only:
+            yield from _write_state(state)
+    for _ in range(_DRIFT_FRAMES):
+        yield [drift_access(reference.station)] * _DRIFT_PER_FRAME
+    return tuple(states)
+
+
+def find_delays(joints: Mapping[int, Joint], latched: Mapping[int, Latched]) -> dict[int, int]:
+    """Return the delay to each slave with a clock, by position; the first one's is 0.
+
+    Slaves without a clock count as a part of the cable.
+    """
+    delays: dict[int, int] = {}
+    for position in sorted(latched):
+        parent, port = _clocked_parent(position, joints, latched)
+        if parent is None:
+            delays[position] = 0
+            continue
+        above, times = joints[parent], latched[parent].ports
+        before = _port_before(above, port)
+        round_trip = times[port] - times[before] & _U32
+        inside = _inside(joints[position], latched[position].ports)
+        earlier = times[before] - times[above.entry_port] & _U32
+        delays[position] = delays[parent] + earlier + max(0, round_trip - inside) // 2
+    return delays
+
+
+def drift_access(reference: int) -> Access:
+    """Return the datagram that hands the reference's time to all; one belongs in every cycle."""
+    return frmw(reference, Register.DC_SYSTEM_TIME, 8)
+
+
+def start_sync0(station: int, sync0: Sync0) -> Procedure[int]:
+    """Start SYNC0 in a slave whose clock is set; return when the first pulse comes.
+
+    Raises WorkingCounterError if the slave does not answer.
+    """
+    yield from write(station, Register.DC_ACTIVATION, b"\0", "DC activation")
+    yield from write(station, Register.DC_CYCLIC_UNIT, b"\0", "DC cyclic unit")
+    octets = yield from read(station, Register.DC_SYSTEM_TIME, 8, "DC system time")
+    earliest = int.from_bytes(octets, "little") + SYNC_LEAD_NS
+    start = -(-earliest // sync0.cycle_ns) * sync0.cycle_ns + sync0.shift_ns
+    yield from write(station, Register.DC_START_TIME, start.to_bytes(8, "little"), "SYNC0 start")
+    cycle = sync0.cycle_ns.to_bytes(4, "little")
+    yield from write(station, Register.DC_SYNC0_CYCLE, cycle, "SYNC0 cycle")
+    yield from write(station, Register.DC_ACTIVATION, bytes((_CYCLIC_OUT,)), "DC activation")
+    return start
+
+
+def read_difference(station: int) -> Procedure[int]:
+    """Return by how many nanoseconds a slave's clock is ahead of the reference."""
+    octets = yield from read(station, Register.DC_SYSTEM_TIME_DIFFERENCE, 4, "DC difference")
+    value = int.from_bytes(octets, "little")
+    magnitude = value & 0x7FFF_FFFF
+    return -magnitude if value >> 31 else magnitude
+
+
+def _read_latched(station: int) -> Procedure[Latched]:
+    replies, _ = yield [
+        fprd(station, Register.DC_RECEIVE_TIME, 16),
+        fprd(station, Register.DC_RECEIVE_TIME_ECAT, 8),
+    ]
+    for reply in replies:
+        if reply.wkc != 1:
+            raise WorkingCounterError(f"slave {station}: reading receive times", 1, reply.wkc)
+    ports, processing = (reply.data for reply in replies)
+    first, second, third, fourth = (
+        int.from_bytes(ports[at : at + 4], "little") for at in range(0, 16, 4)
+    )
+    return Latched((first, second, third, fourth), int.from_bytes(processing, "little"))
+
+
+def _write_state(state: ClockState) -> Procedure[None]:
+    offset = state.offset_ns.to_bytes(8, "little")
+    yield from write(state.station, Register.DC_SYSTEM_TIME_OFFSET, offset, "DC offset")
+    delay = state.delay_ns.to_bytes(4, "little")
+    yield from write(state.station, Register.DC_SYSTEM_TIME_DELAY, delay, "DC delay")
+    speed = _SPEED_START.to_bytes(2, "little")
+    yield from write(state.station, Register.DC_SPEED_START, speed, "DC speed")
+
+
+def _clocked_parent(
+    position: int, joints: Mapping[int, Joint], latched: Mapping[int, Latched]
+) -> tuple[int | None, int]:
+    """Return the nearest slave with a clock towards the master, and its port that leads here."""
+    joint = joints[position]
+    while joint.parent is not None and joint.parent not in latched:
+        joint = joints[joint.parent]
+    return joint.parent, joint.parent_port
+
+
+def _way(joint: Joint) -> list[int]:
+    """Return the open ports in the order in which a frame comes in at them."""
+    turn = _ORDER.index(joint.entry_port)
+    return [port for port in _ORDER[turn:] + _ORDER[:turn] if port in joint.ports]
+
+
+def _port_before(joint: Joint, port: int) -> int:
+    way = _way(joint)
+    return way[way.index(port) - 1]
+
+
+def _inside(joint: Joint, times: Sequence[int]) -> int:
+    """Return how long a frame is behind a slave, from coming in to its last return."""
+    return times[_way(joint)[-1]] - times[joint.entry_port] & _U32

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import WorkingCounterError
+from devicebus.master.clocks import (
+    Latched,
+    Sync0,
+    drift_access,
+    find_delays,
+    read_difference,
+    start_sync0,
+    synchronize,
+)
+from devicebus.master.scan import scan
+from devicebus.master.topology import Joint
+from devicebus.sim.spec import ClockSpec
+from devicebus.sim.wiring import CABLE_NS, FORWARD_NS
+from devicebus.wire.register import Register
+from tests.support.busline import MS, Bench, Line, run, segment, slave
+
+HOP = CABLE_NS + FORWARD_NS
+TIME = 800_000_000 * 1_000_000_000
+
+
+def line_of(*slaves):
+    line = Line(Bench(), segment(*slaves))
+    return line, run(line, scan())
+
+
+def clocked(name, start_ns=0, drift_ppm=0.0, **options):
+    return slave(name, clock=ClockSpec(start_ns=start_ns, drift_ppm=drift_ppm), **options)
+
+
+def times(line):
+    return {
+        each.device.name: each.esc.clock.system_time(line.now_ns) for each in line.segment.slaves
+    }
+
+
+def test_clocks_that_started_anyhow_show_the_same_time():
+    line, found = line_of(
+        clocked("a", 5_000_000_000), clocked("b", 77), clocked("c", 123_456_789_012)
+    )
+    states = run(line, synchronize(found, TIME))
+    assert [state.station for state in states] == [1001, 1002, 1003]
+    shown = times(line)
+    assert abs(shown["a"] - TIME) < 100 * MS
+    assert max(shown.values()) - min(shown.values()) < 3 * HOP
+
+
+def test_delays_along_a_line_with_branches():
+    line, found = line_of(
+        clocked("a"),
+        clocked("branch", after="a", port=3),
+        clocked("b", after="a"),
+        slave("none", clock=None),
+        clocked("c"),
+    )
+    by_name = {
+        slave.name: state.delay_ns
+        for state in run(line, synchronize(found, TIME))
+        for slave in found
+        if slave.station == state.station
+    }
+    assert by_name["a"] == 0
+    assert by_name["branch"] == pytest.approx(HOP, abs=FORWARD_NS)
+    assert by_name["b"] == pytest.approx(3 * HOP, abs=2 * FORWARD_NS)
+    assert by_name["b"] < by_name["c"]
+    assert "none" not in by_name
+
+
+def test_times_of_32_bits_that_wrap():
+    joints = {
+        0: Joint((0, 1), None, 0, 0),
+        1: Joint((0,), 0, 1, 0),
+    }
+    start = 0xFFFF_FF00
+    latched = {
+        0: Latched((start, start + 700 & 0xFFFF_FFFF, 0, 0), start),
+        1: Latched((50, 0, 0, 0), 50),
+    }
+    assert find_delays(joints, latched) == {0: 0, 1: 350}
+
+
+def test_a_bus_without_clocks_has_nothing_to_do():
+    line, found = line_of(slave("a", clock=None))
+    assert run(line, synchronize(found, TIME)) == ()
+
+
+def test_one_that_came_back_is_set_and_the_others_left_alone():
+    line, found = line_of(clocked("a", 5), clocked("b", 77))
+    run(line, synchronize(found, TIME))
+    memory = line.segment.slaves[1].esc.memory
+    at = Register.DC_SYSTEM_TIME_OFFSET
+    memory[at : at + 8] = bytes(8)
+    before = bytes(line.segment.slaves[0].esc.memory[at : at + 8])
+    run(line, synchronize(found, 0, only=frozenset((1002,))))
+    assert line.segment.slaves[0].esc.memory[at : at + 8] == before
+    shown = times(line)
+    assert abs(shown["a"] - shown["b"]) < 2 * HOP
+
+
+def test_drift_is_taken_out_by_the_datagram_of_every_cycle():
+    line, found = line_of(clocked("a"), clocked("b", drift_ppm=50))
+    run(line, synchronize(found, TIME))
+
+    def steer():
+        yield [drift_access(1001)]
+
+    for _ in range(3000):
+        run(line, steer())
+        line.elapse(MS)
+    assert abs(run(line, read_difference(1002))) < 100
+    shown = times(line)
+    assert abs(shown["a"] - shown["b"]) < 2 * HOP
+
+
+def test_differences_have_a_sign():
+    line, _ = line_of(clocked("a"))
+    at = Register.DC_SYSTEM_TIME_DIFFERENCE
+    memory = line.segment.slaves[0].esc.memory
+    memory[at : at + 4] = b"\x05\0\0\x80"
+    assert run(line, read_difference(1001)) == -5
+    memory[at : at + 4] = b"\x05\0\0\0"
+    assert run(line, read_difference(1001)) == 5
+
+
+def test_sync0_starts_at_a_whole_cycle_and_its_shift():
+    line, found = line_of(clocked("a"))
+    run(line, synchronize(found, TIME))
+    start = run(line, start_sync0(1001, Sync0(MS, 250_000)))
+    assert start % MS == 250_000
+    shown = times(line)["a"]
+    assert shown + 90 * MS < start < shown + 102 * MS
+    clock = line.segment.slaves[0].esc.clock
+    assert clock.sync0_is_active
+    assert clock.take_sync0(line.now_ns + 110 * MS) >= 8
+
+
+def test_a_slave_that_is_gone_is_named():
+    line, found = line_of(clocked("a"), clocked("b"))
+    line.segment.cut(1)
+    with pytest.raises(WorkingCounterError, match="slave 1002: reading receive times"):
+        run(line, synchronize(found, TIME))
