@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.segment import Cable, Segment
@@ -145,3 +147,48 @@ def test_same_run_gives_the_same_frames(frames):
         return [bench.cycle(outputs=bytes((n, 0, 0))) for n in range(frames)]
 
     assert run() == run()
+
+
+PLACES = st.one_of(
+    st.sampled_from((0x10, 0x100, 0x120, 0x200, 0x300, 0x500, 0x502, 0x600, 0x800, 0x808, 0x80E,
+                     0x900, 0x910, 0x920, 0x980, 0x9A0, 0xFFE, 0x1000, 0x1100, 0x1200)),
+    st.integers(0, 0xFFFF),
+)  # fmt: skip
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(Command),
+            st.sampled_from((0, 0xFFFF, STATION, STATION + 1)),
+            PLACES,
+            st.binary(max_size=64),
+            st.sampled_from((0, 1000, 10**9)),
+        ),
+        max_size=30,
+    )
+)
+def test_whatever_a_master_sends_the_slaves_stay_alive(steps):
+    bench = line(2)
+    bench.bring(AlState.OP)
+    for command, adp, ado, data, pause_ns in steps:
+        bench.now_ns += pause_ns
+        frame = bytearray(encode_frame([datagram(command, adp, ado, data)]))
+        bench.segment.process_frame(frame, bench.now_ns)
+    for number in range(2):
+        bench.segment.switch(number, on=False)
+        bench.segment.switch(number, on=True)
+    assert count(bench) == 2
+
+
+def test_whole_assignment_in_one_transfer():
+    bench = line(1)
+    bench.bring(AlState.PREOP)
+    dictionary = bench.slaves[0].device.dictionary
+    dictionary.download_complete(0x1C13, 0, b"\0\0", bench.slaves[0].device.od_state())
+    bench.set_channels(0, 2)
+    bench.ask(AlState.SAFEOP)
+    assert bench.status() == (AlState.PREOP | 0x10, 0x1E)
+    dictionary.download_complete(0x1C13, 0, b"\1\0\0\x1a", bench.slaves[0].device.od_state())
+    bench.ask(AlState.SAFEOP | 0x10)
+    assert bench.status() == (AlState.SAFEOP, 0)
