@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.sim.devices.objects import parse_entry
 from devicebus.sim.faultydictionary import FaultyDictionary
@@ -37,6 +38,15 @@ def _sdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
             dictionary.aborts[index] = spec.code or AbortCode.GENERAL
 
 
+def _emergency(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Report an error code, and with the end of the fault that there is none any more."""
+    del now_ns
+    mailbox = slave.device.mailbox
+    server = mailbox.protocols.get(MailboxType.COE) if mailbox else None
+    if isinstance(server, CoeServer):
+        server.send_emergency(spec.code & 0xFFFF if on else 0, int(on))
+
+
 def _al_error(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del now_ns
     if on:
@@ -60,6 +70,7 @@ SLAVE_FAULTS: dict[FaultKind, Callable[[Slave, FaultSpec, int, bool], None]] = {
     FaultKind.MAILBOX: _mailbox,
     FaultKind.FOE: _foe,
     FaultKind.SDO: _sdo,
+    FaultKind.EMERGENCY: _emergency,
     FaultKind.AL_ERROR: _al_error,
     FaultKind.REFUSE: _refuse,
     FaultKind.DRIFT: _drift,

@@ -152,6 +152,7 @@ class FaultKind(Enum):
     MAILBOX = "mailbox"
     FOE = "foe"
     SDO = "sdo"
+    EMERGENCY = "emergency"
     AL_ERROR = "al-error"
     REFUSE = "refuse"
     DRIFT = "drift"
@@ -169,7 +170,7 @@ class FaultSpec(msgspec.Struct, frozen=True, kw_only=True):
     delay_us: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
     object: str = ""
     code: U32 = 0
-    """SDO abort code or AL status code."""
+    """SDO abort code, AL status code, or error code of an emergency."""
     state: str = ""
     drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
 

@@ -66,6 +66,21 @@ def test_error_of_its_own(bench):
     assert bench.status() == (AlState.PREOP | ERROR, 0x8001)
 
 
+def test_emergency_and_its_end(bench):
+    for on, body in ((True, "1050 01"), (False, "0000 00")):
+        switch(bench, "emergency", on=on, code=0x5010)
+        bench.now_ns += 2_000_000
+        bench.status()
+        assert bench.fetch().data[6:16] == bytes.fromhex("0010") + bytes.fromhex(body) + bytes(5)
+
+
+def test_emergency_needs_coe():
+    bench = Bench()
+    bench.slaves[0].device.mailbox = None
+    switch(bench, "emergency", code=0x5010)
+    assert bench.status() == (AlState.INIT, 0)
+
+
 def test_refused_state(bench):
     switch(bench, "refuse", state="INIT")
     bench.ask(AlState.INIT)
