@@ -7,6 +7,7 @@ from typing import TypeVar
 from devicebus.errors import BusError, SiiError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.master.bus import Bus, Unit
+from devicebus.master.clocks import start_sync0, synchronize
 from devicebus.master.configure import (
     boot_mailbox,
     clear,
@@ -64,6 +65,14 @@ def read_process_data(bus: Bus, unit: Unit) -> Procedure[None]:
         unit.channels = yield from _ask(bus, unit.mailbox, reading, "reading PDOs")
     else:
         unit.channels = channels_from_sii(sii)
+
+
+def set_clocks(bus: Bus, *, only: frozenset[int] | None = None) -> Procedure[None]:
+    """Set the clocks of all slaves, or *only* of those that came back."""
+    _, now_ns = yield Sleep(0)
+    present = [unit.found for unit in bus.units.values() if not unit.is_lost]
+    states = yield from synchronize(present, now_ns + bus.settings.epoch_offset_ns, only=only)
+    bus.follow(states[0].station if states else None)
 
 
 def wait_for(task: Task[T]) -> Procedure[T]:
@@ -126,5 +135,8 @@ def _prepare_process_data(bus: Bus, unit: Unit) -> Procedure[None]:
         return
     if bus.settings.watchdog_ms is not None:
         yield from set_watchdog(unit.station, bus.settings.watchdog_ms)
+    sync0 = bus.settings.sync0.get(unit.station)
+    if sync0 is not None and bus.reference is not None:
+        yield from start_sync0(unit.station, sync0)
     bus.set_presence(unit, Presence.UNSURE)
     yield from set_process_data(place)

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from devicebus.master.clocks import Sync0, drift_access
 from devicebus.master.cycle import Cycle, Presence
 from devicebus.master.event import Event
 from devicebus.master.expected import ExpectedSlave
@@ -38,6 +39,12 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Budget of acyclic datagrams in a cycle."""
     watchdog_ms: int | None = None
     """After so long without outputs slaves leave OP; None keeps what they come with."""
+    clocks: bool = False
+    """Whether distributed clocks are set and kept together; SYNC0 needs it."""
+    sync0: Mapping[int, Sync0] = {}
+    """By station address."""
+    epoch_offset_ns: int = 0
+    """From the master's time to nanoseconds since 2000-01-01, which the clocks show."""
     allow_lrw: bool = True
     """False exchanges process data by LWR and LRD even where slaves know LRW."""
 
@@ -81,6 +88,7 @@ class Bus:
     Attributes:
         units: By station address, in the order of the line.
         image, cycle: None until process data is laid out.
+        reference: Station address of the slave whose clock the others follow.
         is_lost: No frame comes back.
         is_troubled: The last cycle was not as expected: look at the slaves soon.
     """
@@ -94,6 +102,7 @@ class Bus:
         self.units: dict[int, Unit] = {}
         self.image: BusImage | None = None
         self.cycle: Cycle | None = None
+        self.reference: int | None = None
         self.is_lost = False
         self.is_troubled = False
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
@@ -122,6 +131,12 @@ class Bus:
         if self.cycle is not None:
             self.cycle.set_presence(unit.station, presence)
 
+    def follow(self, reference: int | None) -> None:
+        """Hand this slave's time to the others in every cycle, or nobody's."""
+        self.reference = reference
+        if self.cycle is not None:
+            self.cycle.extra = [] if reference is None else [drift_access(reference)]
+
     def forget(self) -> None:
         """Begin anew: no slave is known."""
         for unit in self.units.values():
@@ -129,6 +144,6 @@ class Bus:
                 unit.work.cancel()
             self.close_mailbox(unit)
         self.units = {}
-        self.image = self.cycle = None
+        self.image = self.cycle = self.reference = None
         self.link.stop_cycles()
         self.is_lost = self.is_troubled = False

@@ -64,7 +64,7 @@ def synchronize(
 
     Args:
         slaves: All in the order of the line.
-        time_ns: System time, since 2000-01-01, that the reference gets; with *only* it keeps its.
+        time_ns: System time, since 2000-01-01, that all get if no other clock runs already.
         only: Station addresses of slaves that came back; the others are left alone.
 
     Raises:
@@ -79,11 +79,13 @@ def synchronize(
     for slave in clocks:
         latched[slave.position] = yield from _read_latched(slave.station)
     delays = find_delays({each.position: each.joint for each in slaves}, latched)
-    reference = clocks[0]
     start_ns = time_ns
-    if only is not None:
-        octets = yield from read(reference.station, Register.DC_SYSTEM_TIME_OFFSET, 8, "offset")
-        start_ns = latched[reference.position].processing + int.from_bytes(octets, "little")
+    running = [slave for slave in clocks if only is not None and slave.station not in only]
+    if running:
+        base = running[0]
+        octets = yield from read(base.station, Register.DC_SYSTEM_TIME_OFFSET, 8, "DC offset")
+        shown = latched[base.position].processing + int.from_bytes(octets, "little")
+        start_ns = shown - delays[base.position]
     states = []
     for slave in clocks:
         offset = (start_ns + delays[slave.position] - latched[slave.position].processing) & _U64
@@ -92,7 +94,7 @@ def synchronize(
         if only is None or slave.station in only:
             yield from _write_state(state)
     for _ in range(_DRIFT_FRAMES):
-        yield [drift_access(reference.station)] * _DRIFT_PER_FRAME
+        yield [drift_access(clocks[0].station)] * _DRIFT_PER_FRAME
     return tuple(states)
 
 
@@ -176,6 +178,8 @@ def _clocked_parent(
     """Return the nearest slave with a clock towards the master, and its port that leads here."""
     joint = joints[position]
     while joint.parent is not None and joint.parent not in latched:
+        if joint.parent not in joints:
+            return None, 0
         joint = joints[joint.parent]
     return joint.parent, joint.parent_port
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from devicebus.errors import BusError
 from devicebus.master.access import bwr
-from devicebus.master.bring import bring, read_process_data
+from devicebus.master.bring import bring, read_process_data, set_clocks
 from devicebus.master.bus import Bus, Unit
 from devicebus.master.cycle import Cycle
 from devicebus.master.expected import check_bus
@@ -44,6 +44,8 @@ def start_up(bus: Bus, target: AlState) -> Procedure[None]:
     if target is AlState.PREOP:
         return
     _check(units, (yield from together([read_process_data(bus, unit) for unit in units])))
+    if bus.settings.clocks:
+        yield from set_clocks(bus)
     set_up_cycle(bus)
     yield from _bring_all(bus, units, AlState.SAFEOP)
     if target is AlState.OP:
@@ -64,6 +66,7 @@ def set_up_cycle(bus: Bus) -> None:
 
     bus.image = BusImage(layout)
     bus.cycle = Cycle(bus.link, bus.image, trouble, knows_lrw=knows_lrw)
+    bus.follow(bus.reference)
 
 
 def _units(bus: Bus, found: Sequence[FoundSlave]) -> list[Unit]:

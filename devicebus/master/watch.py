@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from devicebus.errors import FrameLostError, IdentityError
 from devicebus.master.access import Reply, fprd, fpwr
-from devicebus.master.bring import bring
+from devicebus.master.bring import bring, set_clocks
 from devicebus.master.bus import Bus, Unit
 from devicebus.master.cycle import Presence
 from devicebus.master.event import BusBack, BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
@@ -91,6 +91,8 @@ def _lose(bus: Bus, unit: Unit, now_ns: int) -> None:
         unit.work.cancel()
     bus.close_mailbox(unit)
     bus.set_presence(unit, Presence.UNSURE)
+    if unit.station == bus.reference:
+        bus.follow(None)  # without it the others would be handed the empty datagram's time
     bus.emit(SlaveLost(unit.station, now_ns))
 
 
@@ -145,6 +147,8 @@ def _revive(bus: Bus, unit: Unit, *, stays: bool) -> Procedure[int]:
                 f" {identity.serial}, expected {found}, serial {found.serial}"
             )
         yield from bring(bus, unit, AlState.INIT)
+        if bus.settings.clocks:
+            yield from set_clocks(bus, only=frozenset((unit.station,)))
     yield from bring(bus, unit, unit.target)
     _, now_ns = yield Sleep(0)
     return now_ns

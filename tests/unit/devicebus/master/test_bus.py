@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from devicebus.mailbox.conversation import Ask
+from devicebus.master.access import frmw
 from devicebus.master.bus import MAX_EVENTS, Bus, MasterSettings, Unit
 from devicebus.master.cycle import Presence
 from devicebus.master.event import BusLost
@@ -59,3 +60,13 @@ def test_forgetting_ends_what_runs():
     assert (bus.units, bus.image, bus.cycle, unit.mailbox) == ({}, None, None, None)
     assert not bus.is_lost
     assert not bus.is_troubled
+
+
+def test_the_reference_is_followed_in_every_cycle():
+    bus, _ = made()
+    bus.follow(1001)
+    assert bus.reference == 1001
+    set_up_cycle(bus)
+    assert bus.cycle.extra == [frmw(1001, 0x0910, 8)]
+    bus.follow(None)
+    assert (bus.reference, bus.cycle.extra) == (None, [])

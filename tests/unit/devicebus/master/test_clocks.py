@@ -88,17 +88,23 @@ def test_a_bus_without_clocks_has_nothing_to_do():
     assert run(line, synchronize(found, TIME)) == ()
 
 
-def test_one_that_came_back_is_set_and_the_others_left_alone():
+@pytest.mark.parametrize("back", [0, 1])
+def test_one_that_came_back_is_set_and_the_others_left_alone(back):
     line, found = line_of(clocked("a", 5), clocked("b", 77))
     run(line, synchronize(found, TIME))
-    memory = line.segment.slaves[1].esc.memory
     at = Register.DC_SYSTEM_TIME_OFFSET
-    memory[at : at + 8] = bytes(8)
-    before = bytes(line.segment.slaves[0].esc.memory[at : at + 8])
-    run(line, synchronize(found, 0, only=frozenset((1002,))))
-    assert line.segment.slaves[0].esc.memory[at : at + 8] == before
+    memory = [each.esc.memory for each in line.segment.slaves]
+    memory[back][at : at + 8] = bytes(8)
+    before = bytes(memory[1 - back][at : at + 8])
+    run(line, synchronize(found, 0, only=frozenset((1001 + back,))))
+    assert memory[1 - back][at : at + 8] == before
     shown = times(line)
     assert abs(shown["a"] - shown["b"]) < 2 * HOP
+
+
+def test_a_slave_behind_one_that_is_not_known_begins_anew():
+    joints = {2: Joint((0,), 1, 1, 0)}
+    assert find_delays(joints, {2: Latched((5, 0, 0, 0), 5)}) == {2: 0}
 
 
 def test_drift_is_taken_out_by_the_datagram_of_every_cycle():

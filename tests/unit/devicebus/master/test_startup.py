@@ -4,9 +4,10 @@ import pytest
 
 from devicebus.errors import AlStatusError, BusError, FrameLostError, IdentityError
 from devicebus.master.bus import MasterSettings
+from devicebus.master.clocks import Sync0
 from devicebus.master.expected import ExpectedSlave
 from devicebus.master.master import Master
-from devicebus.sim.spec import MailboxSpec
+from devicebus.sim.spec import ClockSpec, MailboxSpec
 from devicebus.wire.alstatus import AlState
 from tests.support.busline import MS, Paced, segment, slave
 
@@ -93,3 +94,43 @@ def test_a_bus_that_is_not_there():
     line.segment.cut(0)
     with pytest.raises(FrameLostError, match="check the cable"):
         line.wait(line.core.bring_up(line.now_ns))
+
+
+def clocked(name):
+    return slave(name, clock=ClockSpec(needs_sync0=True, drift_ppm=len(name) * 20))
+
+
+def test_slaves_that_need_sync0_reach_op_with_their_clocks_together():
+    line = line_of(
+        clocked("a"),
+        clocked("bb"),
+        clocks=True,
+        sync0={1001: Sync0(MS), 1002: Sync0(MS, 1000)},
+        epoch_offset_ns=10**17,
+    )
+    line.wait(line.core.bring_up(line.now_ns))
+    line.elapse(3000 * MS)
+    assert set(states(line)) == {AlState.OP}
+    one, two = (each.esc.clock.system_time(line.now_ns) for each in line.segment.slaves)
+    assert abs(one - two) < 1000
+    assert abs(one - line.now_ns - 10**17) < 10 * MS
+    line.segment.switch(1, on=False)
+    line.elapse(100 * MS)
+    line.segment.switch(1, on=True)
+    line.elapse(1000 * MS)
+    assert set(states(line)) == {AlState.OP}
+    one, two = (each.esc.clock.system_time(line.now_ns) for each in line.segment.slaves)
+    assert abs(one - two) < 1000
+    assert all(each.esc.clock.sync0_is_active for each in line.segment.slaves)
+
+
+def test_without_clocks_such_slaves_refuse():
+    line = line_of(clocked("a"))
+    with pytest.raises(AlStatusError, match="0x0030, invalid DC SYNC configuration"):
+        line.wait(line.core.bring_up(line.now_ns))
+
+
+def test_a_bus_without_any_clock_runs_all_the_same():
+    line = line_of(slave("a", clock=None), clocks=True)
+    line.wait(line.core.bring_up(line.now_ns))
+    assert states(line) == [AlState.OP]

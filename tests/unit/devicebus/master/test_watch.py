@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from devicebus.master.bus import MasterSettings
 from devicebus.master.event import (
     BusBack,
     BusLost,
@@ -14,7 +15,8 @@ from devicebus.master.event import (
 )
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import AlState
-from tests.support.busline import MS, Paced, segment, slave
+from devicebus.wire.datagram import Command
+from tests.support.busline import MS, Paced, accesses_of, segment, slave
 
 
 @pytest.fixture
@@ -141,4 +143,28 @@ def test_the_whole_bus_goes_and_comes_back(line):
     events = line.events()
     assert isinstance(events[0], BusBack)
     assert len([each for each in events if isinstance(each, SlaveBack)]) == 4
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
+
+
+def test_a_reference_clock_that_is_gone_is_followed_no_longer():
+    line = Paced(
+        Master(MasterSettings(clocks=True)),
+        segment(
+            slave("none", clock=None), slave("a", after="none", port=3), slave("b", after="none")
+        ),
+    )
+    line.wait(line.core.bring_up(line.now_ns))
+    line.segment.switch(1, on=False)
+    line.elapse(50 * MS)
+    sent = []
+    keep = line.core.frames_to_send
+    line.core.frames_to_send = lambda now: [sent.append(each) or each for each in keep(now)]
+    line.elapse(50 * MS)
+    commands = {access.command for frame in sent for access in accesses_of(frame)}
+    assert Command.LRW in commands
+    assert Command.FRMW not in commands
+    line.segment.switch(1, on=True)
+    line.elapse(300 * MS)
+    commands = {access.command for frame in sent for access in accesses_of(frame)}
+    assert Command.FRMW in commands
     assert {each.state for each in line.segment.slaves} == {AlState.OP}
