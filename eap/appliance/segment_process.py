@@ -9,12 +9,14 @@ import os
 import select
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 import msgspec
 
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.spec import FaultSpec
+from devicebus.sim.wiring import Side
 from eap.appliance.busfile import Bus
 from eap.appliance.signals import catch_end_signals
 from eap.ids import InterfaceUri
@@ -36,6 +38,7 @@ def run(
     interface: InterfaceUri,
     say: Callable[[dict[str, Any]], None],
     *,
+    second: InterfaceUri | None = None,
     command_fd: int | None = None,
 ) -> None:
     """Answer on *interface* until SIGINT or SIGTERM.
@@ -45,38 +48,40 @@ def run(
         interface: Where.
         say: Called with ``{"ready": true, "slaves": n}`` when the segment answers, and with the
             outcome of each command.
+        second: The other line of a ring.
         command_fd: Where commands come from.
 
     Raises:
         EnvironmentalError: *interface* cannot be opened.
     """
     segment = bus.build()
-    with catch_end_signals() as end_fd:
-        sock = open_segment(interface)
-        try:
-            say({"ready": True, "slaves": len(bus.spec.slaves)})
-            _Loop(segment, sock, say, command_fd).run(end_fd)
-        finally:
-            sock.close()
+    with catch_end_signals() as end_fd, ExitStack() as stack:
+        sockets = {}
+        for side, uri in zip(Side, (interface, second), strict=True):
+            if uri is not None:
+                sockets[side] = open_segment(uri)
+                stack.callback(sockets[side].close)
+        say({"ready": True, "slaves": len(bus.spec.slaves)})
+        _Loop(segment, sockets, say, command_fd).run(end_fd)
 
 
 class _Loop:
     def __init__(
         self,
         segment: FaultySegment,
-        sock: SegmentSocket,
+        sockets: dict[Side, SegmentSocket],
         say: Callable[[dict[str, Any]], None],
         command_fd: int | None,
     ) -> None:
         self._segment = segment
-        self._sock = sock
+        self._sockets = sockets
         self._say = say
         self._command_fd = command_fd
         self._partial = b""
 
     def run(self, end_fd: int) -> None:
         poll = select.poll()
-        for fd in (end_fd, self._sock.fileno(), self._command_fd):
+        for fd in (end_fd, self._command_fd, *(each.fileno() for each in self._sockets.values())):
             if fd is not None:
                 poll.register(fd, select.POLLIN)
         while True:
@@ -85,23 +90,25 @@ class _Loop:
                     return
                 if fd == self._command_fd and not self._take_commands():
                     poll.unregister(fd)
-            self._pass_frames()
+            for side, sock in self._sockets.items():
+                self._pass_frames(side, sock)
 
     def _patience_ms(self) -> float | None:
         due = self._segment.next_timeout()
         return None if due is None else max(0.0, (due - time.monotonic_ns()) / _MS)
 
-    def _pass_frames(self) -> None:
+    def _pass_frames(self, side: Side, sock: SegmentSocket) -> None:
         segment = self._segment
         for _ in range(_BATCH):
-            arrival = self._sock.receive()
+            arrival = sock.receive()
             now_ns = time.monotonic_ns()
             if arrival is None:
                 segment.handle_timeout(now_ns)
             else:
-                segment.receive_frame(arrival.frame, now_ns, origin=arrival.origin)
+                segment.receive_frame(arrival.frame, now_ns, side=side, origin=arrival.origin)
             for out in segment.frames_to_send(now_ns):
-                self._sock.send(out.frame, out.origin)
+                if out.side in self._sockets:
+                    self._sockets[out.side].send(out.frame, out.origin)
             if arrival is None:
                 return
 

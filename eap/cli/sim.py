@@ -11,9 +11,11 @@ from eap.cli.output import write_json
 from eap.ids import InterfaceUri
 
 
-def _parse_interface(ctx: click.Context, param: click.Parameter, text: str) -> InterfaceUri:
+def _parse_interface(
+    ctx: click.Context, param: click.Parameter, text: str | None
+) -> InterfaceUri | None:
     try:
-        return InterfaceUri.parse(text)
+        return None if text is None else InterfaceUri.parse(text)
     except ValueError as exc:
         raise click.BadParameter(str(exc), ctx, param) from None
 
@@ -32,8 +34,14 @@ def sim() -> None:
     metavar="URI",
     help="Where to answer: ethernet://IFACE (needs CAP_NET_RAW) or udp://ADDRESS[:PORT].",
 )
+@click.option(
+    "--second",
+    callback=_parse_interface,
+    metavar="URI",
+    help="The other line of a ring: ethernet://IFACE.",
+)
 @click.option("--faults", is_flag=True, help="Take faults as JSON, one a line, from stdin.")
-def run(bus: Path, interface: InterfaceUri, faults: bool) -> None:
+def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults: bool) -> None:
     """Run the slaves of the bus file BUS until Ctrl-C or SIGTERM.
 
     When they answer, one line {"ready": true, "slaves": n} appears on stdout.
@@ -41,5 +49,9 @@ def run(bus: Path, interface: InterfaceUri, faults: bool) -> None:
     from eap.appliance import busfile, segment_process  # yaml and sockets; --help must not wait
 
     loaded = busfile.load_or_raise(bus)
+    if second is not None and not (loaded.spec.ring and second.scheme == "ethernet"):
+        raise click.UsageError(
+            "--second is an ethernet:// interface, for a bus file with ring: true"
+        )
     command_fd = sys.stdin.fileno() if faults else None
-    segment_process.run(loaded, interface, write_json, command_fd=command_fd)
+    segment_process.run(loaded, interface, write_json, second=second, command_fd=command_fd)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.support.simulator import NEAR, simulator, veth_pair
+from tests.support.simulator import FAR, FAR_2, NEAR, NEAR_2, simulator, veth_pair
 
 pysoem = pytest.importorskip("pysoem", reason="needs pysoem: pip install pysoem")
 
@@ -234,3 +234,34 @@ def test_slave_without_power_is_missed(bus, master):
         assert exchange(master) == 6
     finally:
         bus.fault(kind="power", slave="plain", end=True)
+
+
+RING = """
+bus: ring
+ring: true
+slaves:
+  - {name: a, kind: generic, inputs: [{name: in, type: UINT}]}
+  - {name: b, kind: generic, inputs: [{name: in, type: UINT}]}
+  - {name: c, kind: generic, inputs: [{name: in, type: UINT}]}
+"""
+
+
+def test_ring_goes_on_with_a_cut_cable(tmp_path):
+    path = tmp_path / "ring.yaml"
+    path.write_text(RING)
+    with (
+        veth_pair(),
+        simulator(path, f"ethernet://{FAR}", "--second", f"ethernet://{FAR_2}") as running,
+    ):
+        found = pysoem.Master()
+        found.open(NEAR, NEAR_2)
+        try:
+            assert found.config_init() == 3
+            operate(found)
+            assert exchange(found) == 3
+            assert running.fault(kind="cut", slave="b") == {"ok": True}
+            assert exchange(found) == 3
+            found.state = pysoem.INIT_STATE
+            found.write_state()
+        finally:
+            found.close()

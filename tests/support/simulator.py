@@ -15,6 +15,7 @@ import pytest
 
 _CLONE_NEWNET = 0x40000000
 NEAR, FAR = "near", "far"
+NEAR_2, FAR_2 = "near2", "far2"
 
 
 def _ip(command: str) -> None:
@@ -23,17 +24,18 @@ def _ip(command: str) -> None:
 
 @contextlib.contextmanager
 def veth_pair() -> Iterator[None]:
-    """Move this thread, and what it starts, into a network with the interfaces NEAR and FAR."""
+    """Move this thread, and what it starts, into a network with two cables, NEAR to FAR each."""
     library = ctypes.CDLL(None, use_errno=True)
     with Path("/proc/thread-self/ns/net").open("rb") as home:
         if library.unshare(_CLONE_NEWNET):
             pytest.skip(f"no network namespace: {os.strerror(ctypes.get_errno())}")
         try:
             _ip("link set lo up")
-            _ip(f"link add {NEAR} type veth peer name {FAR}")
-            for name in (NEAR, FAR):
-                # A second network namespace would do no more: the slaves answer on FAR only.
-                _ip(f"link set {name} up")
+            # A second network namespace would do no more: the slaves answer at the far ends only.
+            for near, far in ((NEAR, FAR), (NEAR_2, FAR_2)):
+                _ip(f"link add {near} type veth peer name {far}")
+                _ip(f"link set {near} up")
+                _ip(f"link set {far} up")
             yield
         finally:
             library.setns(home.fileno(), _CLONE_NEWNET)
@@ -42,10 +44,10 @@ def veth_pair() -> Iterator[None]:
 class Simulator:
     """``eapctl sim run`` while it answers."""
 
-    def __init__(self, bus: Path, interface: str) -> None:
+    def __init__(self, bus: Path, interface: str, *more: str) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "eap", "sim", "run", str(bus), "--interface", interface,
-             "--faults"],
+             "--faults", *more],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -73,9 +75,9 @@ class Simulator:
 
 
 @contextlib.contextmanager
-def simulator(bus: Path, interface: str = f"ethernet://{FAR}") -> Iterator[Simulator]:
+def simulator(bus: Path, interface: str = f"ethernet://{FAR}", *more: str) -> Iterator[Simulator]:
     """Run the bus file *bus*; it ends with exit code 0 behind the block."""
-    running = Simulator(bus, interface)
+    running = Simulator(bus, interface, *more)
     try:
         yield running
     finally:

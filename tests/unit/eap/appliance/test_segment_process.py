@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import signal
 import socket
 import threading
@@ -43,14 +44,22 @@ def run_with(script):
     read_end, write_end = os.pipe()
     failures = []
 
+    answers = queue.Queue()
+
     def say(line):
         said.append(line)
         if line.get("ready"):
             threading.Thread(target=play).start()
+        else:
+            answers.put(line)
+
+    def command(text):
+        os.write(write_end, text.encode() + b"\n")
+        return answers.get(timeout=5)
 
     def play():
         try:
-            script(lambda text: os.write(write_end, text.encode() + b"\n"))
+            script(command)
         except BaseException as exc:  # noqa: BLE001  shown by the test's own thread
             failures.append(exc)
         finally:
@@ -72,29 +81,50 @@ def test_answers_until_it_is_asked_to_end(master):
 
 
 def test_faults_by_command(master):
-    counts = []
-
     def script(command):
-        counts.append(scan(master))
-        command(json.dumps({"kind": "power", "slave": "b"}))
-        counts.extend(scan(master) for _ in range(50))
-        command(json.dumps({"kind": "power", "slave": "b", "end": True}))
-        counts.extend(scan(master) for _ in range(50))
-        command("nonsense")
-        command(json.dumps({"kind": "cut", "slave": "x"}))
-        scan(master)
+        assert scan(master) == 2
+        assert command(json.dumps({"kind": "power", "slave": "b"})) == {"ok": True}
+        assert scan(master) == 1
+        assert command(json.dumps({"kind": "power", "slave": "b", "end": True})) == {"ok": True}
+        assert scan(master) == 2
 
-    said = run_with(script)
-    assert counts[0] == counts[-1] == 2
-    assert counts[50] == 1
-    assert said[1:3] == [{"ok": True}, {"ok": True}]
-    assert [each["ok"] for each in said[3:]] == [False] * (len(said) - 3)
-    assert "no slave 'x'" in said[-1]["error"]
+    assert len(run_with(script)) == 3
+
+
+def test_command_that_cannot_be(master):
+    def script(command):
+        for text in ("nonsense", '{"kind": "rain"}', json.dumps({"kind": "cut", "slave": "x"})):
+            assert command(text)["ok"] is False
+        assert scan(master) == 2
+
+    assert "no slave 'x'" in run_with(script)[-1]["error"]
+
+
+def test_commands_may_come_in_pieces_and_end(master):
+    bus = Bus(BusSpec(bus="b", slaves=(generic("a"),)), {})
+    read_end, write_end = os.pipe()
+    said = []
+
+    def say(line):
+        said.append(line)
+        if line.get("ready"):
+            os.write(write_end, b'{"kind": "cut", ')
+            os.write(write_end, b'"slave": "a"}\n\n{"kind"')
+            os.close(write_end)
+            return
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    try:
+        interface = InterfaceUri.parse("udp://127.0.9.7")
+        segment_process.run(bus, interface, say, command_fd=read_end)
+    finally:
+        os.close(read_end)
+    assert said[1:] == [{"ok": True}]
 
 
 def test_late_frame_comes_when_its_time_has_come(master):
     def script(command):
-        command(json.dumps({"kind": "delay", "delay_us": 20_000}))
+        assert command(json.dumps({"kind": "delay", "delay_us": 20_000}))["ok"]
         for _ in range(5):
             assert scan(master) == 2
 

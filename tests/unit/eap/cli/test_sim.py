@@ -19,8 +19,8 @@ def runs(monkeypatch):
     """What would run, instead of running it."""
     found = []
 
-    def run(bus, interface, say, *, command_fd=None):
-        found.append((bus.spec.bus, str(interface), command_fd))
+    def run(bus, interface, say, *, second, command_fd):
+        found.append((bus.spec.bus, str(interface), second and str(second), command_fd))
         say({"ready": True, "slaves": len(bus.spec.slaves)})
 
     monkeypatch.setattr(segment_process, "run", run)
@@ -34,7 +34,7 @@ def invoke(*words):
 def test_ready_line(runs):
     result = invoke(COE, "--interface", "udp://127.0.9.1")
     assert result.output == '{"ready":true,"slaves":3}\n'
-    assert runs == [("coe", "udp://127.0.9.1", None)]
+    assert runs == [("coe", "udp://127.0.9.1", None, None)]
 
 
 @pytest.mark.parametrize(
@@ -52,3 +52,22 @@ def test_bus_file_that_is_none(runs, tmp_path):
     assert exit_code_of(result.exception) == 2
     assert "'a' has no kind" in str(result.exception)
     assert runs == []
+
+
+RING = "bus: r\nring: true\nslaves: [{name: a, kind: coupler}]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "second", "code"),
+    [
+        (RING, "ethernet://b", 0),
+        (RING, "udp://127.0.9.2", 2),
+        (RING.replace("true", "false"), "ethernet://b", 2),
+    ],
+)
+def test_second_line_of_a_ring(runs, tmp_path, text, second, code):
+    path = tmp_path / "bus.yaml"
+    path.write_text(text)
+    result = invoke(path, "--interface", "ethernet://a", "--second", second)
+    assert result.exit_code == code
+    assert runs == ([("r", "ethernet://a", "ethernet://b", None)] if code == 0 else [])
