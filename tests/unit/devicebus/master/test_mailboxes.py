@@ -306,6 +306,34 @@ def test_errors_of_files_end_the_conversation_only(line, box):
     assert line.wait(start(line, box, echo())) == b"abc"
 
 
+def test_a_reply_to_a_request_that_seemed_not_to_be_taken_is_its_reply(line, box):
+    device = line.segment.slaves[0]
+    device.esc.channels[0].is_stuck = True
+    first = line.frames
+
+    def unstick(number):
+        if number == first + 2:
+            device.esc.channels[0].is_stuck = False
+            device.handle_timeout(line.now_ns)
+        return False
+
+    line.lose_back = lambda number: number == first
+    line.lose_out = unstick
+    assert line.wait(start(line, box, vendor())) == VENDOR
+    assert server(line).stats().received == 1
+    assert line.wait(start(line, box, number(2))) == b"\2\0\0\0"
+
+
+def test_an_endless_talker_is_taken_in_portions(line, box):
+    talker = server(line).protocols[MailboxType.VOE] = Talker()
+    talker.messages_to_send = lambda now: [b"again"]
+    line.elapse(2 * MS)
+    box.look(line.now_ns)
+    line.elapse(5 * MS)
+    assert len(line.heard) <= 16
+    assert line.wait(start(line, box, vendor())) == VENDOR
+
+
 def raw(line, octets):
     """Let the slave answer the next request with these octets."""
     mailbox = server(line)
