@@ -15,6 +15,7 @@ from eap.cli.group import LazyGroup
 @click.group(
     cls=LazyGroup,
     commands_at={
+        "bus": "eap.cli.bus:bus",
         "check": "eap.cli.check:check",
         "decode": "eap.cli.decode:decode",
         "pd": "eap.cli.pd:pd",

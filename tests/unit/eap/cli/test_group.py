@@ -112,7 +112,20 @@ def test_documentation_shows_every_command_with_all_its_options() -> None:
                 assert all(option in sections[name] for option in options), (name, options)
 
 
-HELP = [[], ["check"], ["decode"], ["pd"], ["pd", "watch"], ["pd", "set"], ["run"], ["status"]]
+HELP = [
+    [],
+    ["bus"],
+    ["bus", "foe", "put"],
+    ["bus", "idn", "read"],
+    ["bus", "sdo", "read"],
+    ["check"],
+    ["decode"],
+    ["pd"],
+    ["pd", "watch"],
+    ["pd", "set"],
+    ["run"],
+    ["status"],
+]
 
 
 @pytest.mark.net

@@ -1,0 +1,85 @@
+"""Taking over the mailbox of a slave from whoever used it before.
+
+A slave drops a message with the counter of the one before (ETG.1000.4), and nobody can ask it which
+that was.  So the first message is one that needs no answer: dropped or not, the next one is new.
+"""
+
+from __future__ import annotations
+
+from devicebus.errors import BusError
+from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.master.bring import bring, wait_for
+from devicebus.master.bus import Bus, Unit
+from devicebus.master.mailboxes import Mailbox
+from devicebus.master.mailboxport import MailboxArea
+from devicebus.master.procedure import Procedure, Sleep, read
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.register import Register, SyncManager
+from devicebus.wire.sii import SiiProtocol
+from eap.codec import foe, soe
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import encode_abort
+from eap.codec.voe import VoeHeader
+from eap.od.abort import AbortCode
+
+SETTLE_NS = 2_000_000
+"""How long an answer to the first message is waited for, to be thrown away."""
+_MAILBOX_MODE = 2
+
+
+def attach(bus: Bus, unit: Unit) -> Procedure[Mailbox]:
+    """Return the open mailbox of a slave, which is brought to PREOP if it is in INIT.
+
+    Raises:
+        BusError: it has none.
+        AlStatusError: it refuses PREOP.
+        WorkingCounterError: it does not answer.
+    """
+    if unit.state is AlState.INIT:
+        yield from bring(bus, unit, AlState.PREOP)
+        return _opened(unit)
+    octets = yield from read(
+        unit.station, Register.SYNC_MANAGER, 2 * SyncManager.SIZE, "sync managers"
+    )
+    out, back = SyncManager.decode(octets), SyncManager.decode(octets, SyncManager.SIZE)
+    if out.mode == back.mode == _MAILBOX_MODE and out.enable and back.enable:
+        area = MailboxArea(out.start, out.length, back.start, back.length)
+        if area.is_there:
+            bus.open_mailbox(unit, area)
+            yield from _settle(bus, unit)
+    return _opened(unit)
+
+
+def _opened(unit: Unit) -> Mailbox:
+    if unit.mailbox is None:
+        raise BusError(
+            f"slave {unit.station} ({unit.name}) has no mailbox in {unit.state.name}: nothing but"
+            " its state, its EEPROM and its registers can be reached"
+        )
+    return unit.mailbox
+
+
+def _settle(bus: Bus, unit: Unit) -> Procedure[None]:
+    """Throw away what waits in the mailbox, and use up one counter."""
+    mailbox = _opened(unit)
+    _, now_ns = yield Sleep(0)
+    mailbox.look(now_ns)
+    greeting = _greet(SiiProtocol(unit.found.sii.fixed.protocols), unit.state)
+    yield from wait_for(mailbox.converse(greeting, now_ns, name="greeting", requester=bus))
+    for _ in range(2):
+        _, now_ns = yield Sleep(SETTLE_NS // 2)
+        mailbox.look(now_ns)
+
+
+def _greet(protocols: SiiProtocol, state: AlState) -> Conversation[None]:
+    """Send what a slave may ignore, in a protocol that it knows."""
+    if protocols & SiiProtocol.COE and state is not AlState.BOOT:
+        yield Ask(MailboxType.COE, encode_abort(0, 0, AbortCode.GENERAL), expects_reply=False)
+    elif protocols & SiiProtocol.FOE:
+        over = foe.encode_message(foe.FoeOpcode.ERROR, foe.FoeErrorCode.NOT_DEFINED)
+        yield Ask(MailboxType.FOE, over, expects_reply=False)
+    elif protocols & SiiProtocol.SOE:
+        note = soe.encode_message(soe.SoeOpcode.NOTIFICATION, 0)
+        yield Ask(MailboxType.SOE, note, expects_reply=False)
+    else:
+        yield Ask(MailboxType.VOE, VoeHeader(0, 0).encode(), expects_reply=False)

@@ -1,0 +1,158 @@
+"""What a bus tells about its slaves, as plain data: who they are, how they are, their EEPROMs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from devicebus.errors import SiiError
+from devicebus.master import eeprom
+from devicebus.master.bus import Unit
+from devicebus.master.esm import read_status
+from devicebus.master.procedure import read
+from devicebus.wire import sii
+from devicebus.wire.alstatus import AlState, name_of, state_name
+from devicebus.wire.register import DlStatus, Register
+from devicebus.wire.sii import SiiProtocol
+from eap.appliance.bus_session import BusSession
+
+STATES = tuple(state.name for state in AlState)
+_PORTS = 4
+_COUNTERS = 20
+_FORWARDED = Register.FORWARDED_RX_ERROR - Register.RX_ERROR
+_PROCESSING = Register.PROCESSING_UNIT_ERROR - Register.RX_ERROR
+_PDI = Register.PDI_ERROR - Register.RX_ERROR
+_LOST_LINK = Register.LOST_LINK - Register.RX_ERROR
+
+
+def scan_rows(bus: BusSession) -> list[dict[str, Any]]:
+    """Return who is there, in the order of the line; raises as a scan does."""
+    return [_slave(unit) for unit in bus.scan()]
+
+
+def state_rows(bus: BusSession, slave: str | None, target: str | None) -> list[dict[str, Any]]:
+    """Return the states of one slave or of all, after bringing them to *target* if it is given.
+
+    Raises:
+        BusError: there is no such slave, or one refuses the state.
+    """
+    units = [bus.find(slave)] if slave is not None else bus.scan()
+    if target is not None:
+        bus.bring(units, AlState[target])
+    return [_state(bus, unit) for unit in units]
+
+
+def diagnosis(bus: BusSession, slave: str | None) -> dict[str, Any]:
+    """Return states and error counters; *starts_at* is where the line first damages frames."""
+    units = [bus.find(slave)] if slave is not None else bus.scan()
+    rows = [_state(bus, unit) | _counters(bus, unit) for unit in units]
+    damaged = [
+        {"slave": row["address"], "name": row["name"], "port": port["port"]}
+        for row in rows
+        for port in row["ports"]
+        if port["crc_errors"] or port["rx_errors"]
+    ]
+    frames = bus.link_stats()
+    return {
+        "frames": {"sent": frames.sent, "received": frames.received, "lost": frames.lost},
+        "starts_at": damaged[0] if damaged else None,
+        "slaves": rows,
+    }
+
+
+def read_eeprom(bus: BusSession, slave: str) -> tuple[dict[str, Any], bytes]:
+    """Return what an EEPROM says in short, and all its octets.
+
+    Raises:
+        SiiError: it cannot be read.
+    """
+    unit = bus.find(slave)
+    image = bus.run(eeprom.read_image(unit.station), f"slave {unit.station}: its EEPROM")
+    content = sii.decode(image)
+    fixed = content.fixed
+    return {
+        "address": unit.station,
+        "name": content.name,
+        "vendor": fixed.vendor,
+        "product": fixed.product,
+        "revision": fixed.revision,
+        "serial": fixed.serial,
+        "alias": fixed.alias,
+        "intact": sii.is_intact(image),
+        "octets": len(image),
+        "categories": [
+            {"type": kind, "octets": len(data)} for kind, data in sii.iter_categories(image)
+        ],
+    }, image
+
+
+def write_eeprom(bus: BusSession, slave: str, image: bytes) -> dict[str, Any]:
+    """Write a whole EEPROM, read it back, and let the slave load it.
+
+    Raises:
+        SiiError: no slave would start with this image, or the EEPROM does not take it.
+    """
+    if not sii.is_intact(image):
+        raise SiiError("the check sum of this image is wrong: a slave would not load it")
+    sii.decode(image)
+    unit = bus.find(slave)
+    what = f"slave {unit.station}: its EEPROM"
+    bus.run(eeprom.write_image(unit.station, image), what)
+    there = bus.run(eeprom.read_image(unit.station), what)
+    if not image.startswith(there):
+        raise SiiError(f"{what} holds something else than was written")
+    bus.run(eeprom.reload(unit.station), what)
+    return {"address": unit.station, "name": unit.name, "octets": len(image)}
+
+
+def _slave(unit: Unit) -> dict[str, Any]:
+    found = unit.found
+    status = found.al_status
+    protocols = SiiProtocol(found.sii.fixed.protocols & sum(SiiProtocol))
+    return {
+        "address": unit.station,
+        "name": unit.name,
+        "vendor": found.identity.vendor,
+        "product": found.identity.product,
+        "revision": found.identity.revision,
+        "serial": found.identity.serial,
+        "alias": found.alias,
+        "state": state_name(status.state | status.error << 4),
+        "code": status.code,
+        "mailbox": [f"{str(each.name)[0]}oE" for each in protocols],
+        "parent": None if found.joint.parent is None else found.joint.parent,
+        "ports": list(found.joint.ports),
+        "fault": found.fault,
+    }
+
+
+def _state(bus: BusSession, unit: Unit) -> dict[str, Any]:
+    status = bus.run(read_status(unit.station), f"slave {unit.station}: its state")
+    return {
+        "address": unit.station,
+        "name": unit.name,
+        "state": state_name(status.state | status.error << 4),
+        "code": status.code,
+        "reason": name_of(status.code) if status.code else "",
+    }
+
+
+def _counters(bus: BusSession, unit: Unit) -> dict[str, Any]:
+    octets = bus.run(read(unit.station, Register.RX_ERROR, _COUNTERS, "error counters"))
+    links = bus.run(read(unit.station, Register.DL_STATUS, DlStatus.SIZE, "DL status"))
+    link = DlStatus.decode(links).link
+    ports = [
+        {
+            "port": port,
+            "link": bool(link >> port & 1),
+            "crc_errors": octets[2 * port],
+            "rx_errors": octets[2 * port + 1],
+            "forwarded_errors": octets[_FORWARDED + port],
+            "lost_links": octets[_LOST_LINK + port],
+        }
+        for port in range(_PORTS)
+    ]
+    return {
+        "ports": ports,
+        "processing_errors": octets[_PROCESSING],
+        "pdi_errors": octets[_PDI],
+    }

@@ -1,0 +1,176 @@
+"""``eapctl bus``: look at a bus of slaves and talk to them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from eap.cli.bus_params import (
+    BusCommand,
+    interface_option,
+    number_up_to,
+    open_session,
+    parse_octets,
+    slave_argument,
+)
+from eap.cli.group import LazyGroup
+from eap.cli.output import write_json, write_tables, write_text
+from eap.cli.params import json_option
+from eap.ids import InterfaceUri
+
+STATES = ("INIT", "PREOP", "BOOT", "SAFEOP", "OP")
+_U32 = 0xFFFFFFFF
+_U16 = 0xFFFF
+
+
+@click.group(
+    cls=LazyGroup,
+    commands_at={
+        "diag": "eap.cli.bus:diag",
+        "foe": "eap.cli.bus_foe:foe",
+        "idn": "eap.cli.bus_idn:idn",
+        "scan": "eap.cli.bus:scan",
+        "sdo": "eap.cli.bus_sdo:sdo",
+        "sii": "eap.cli.bus:sii",
+        "state": "eap.cli.bus:state",
+        "voe": "eap.cli.bus:voe",
+    },
+)
+def bus() -> None:
+    """Look at a bus of slaves and talk to them.
+
+    SLAVE is a station address (1001 is the first slave) or the slave's name.  Slaves stay in their
+    states, except that one in INIT is brought to PREOP when its mailbox is needed.
+    """
+
+
+@click.command(cls=BusCommand)
+@interface_option
+@json_option("Print one object.")
+def scan(interface: InterfaceUri, as_json: bool) -> None:
+    """Find all slaves: identity, state, alias, mailbox protocols."""
+    from eap.appliance.bus_info import scan_rows
+
+    with open_session(interface) as session:
+        rows = scan_rows(session)
+    if as_json:
+        write_json({"slaves": rows})
+        return
+    from eap.cli.bus_view import scan_table
+
+    write_tables([scan_table(rows)])
+
+
+@click.command(cls=BusCommand)
+@click.argument("words", nargs=-1, metavar="[SLAVE] [INIT|PREOP|SAFEOP|OP|BOOT]")
+@interface_option
+@json_option("Print one object.")
+def state(words: tuple[str, ...], interface: InterfaceUri, as_json: bool) -> None:
+    """Show states, or bring one slave or all of them to a state.
+
+    A slave with outputs does not stay in OP when nobody sends it process data: this command does so
+    only until all slaves are there.
+    """
+    from eap.appliance.bus_info import state_rows
+
+    target = words[-1].upper() if words and words[-1].upper() in STATES else None
+    rest = words[:-1] if target else words
+    if len(rest) > 1:
+        raise click.UsageError(f"{rest[-1]!r} is not a state, expected one of {', '.join(STATES)}")
+    with open_session(interface) as session:
+        rows = state_rows(session, rest[0] if rest else None, target)
+    if as_json:
+        write_json({"slaves": rows})
+        return
+    from eap.cli.bus_view import state_table
+
+    write_tables([state_table(rows)])
+
+
+@click.command(cls=BusCommand)
+@click.argument("slave", required=False, metavar="[SLAVE]")
+@interface_option
+@json_option("Print one object.")
+def diag(slave: str | None, interface: InterfaceUri, as_json: bool) -> None:
+    """Show states, error counters of every port, and where frames get damaged."""
+    from eap.appliance.bus_info import diagnosis
+
+    with open_session(interface) as session:
+        found = diagnosis(session, slave)
+    if as_json:
+        write_json(found)
+        return
+    from eap.cli.bus_view import diagnosis_tables
+
+    write_tables(diagnosis_tables(found))
+
+
+@click.group()
+def sii() -> None:
+    """Read and write the EEPROM of a slave."""
+
+
+@sii.command("dump", cls=BusCommand)
+@slave_argument
+@click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
+@interface_option
+@json_option("Print one object, with all octets in hexadecimal digits.")
+def sii_dump(slave: str, file: Path | None, interface: InterfaceUri, as_json: bool) -> None:
+    """Read the EEPROM; with FILE, store its octets there."""
+    from eap.appliance.bus_info import read_eeprom
+
+    with open_session(interface) as session:
+        content, image = read_eeprom(session, slave)
+    if file is not None:
+        file.write_bytes(image)
+    if as_json:
+        write_json(content | {"data": image.hex()})
+        return
+    from eap.cli.bus_view import eeprom_lines
+
+    write_text("\n".join(eeprom_lines(content, b"" if file else image)))
+
+
+@sii.command("write", cls=BusCommand)
+@slave_argument
+@click.argument("file", type=click.Path(exists=True, path_type=Path, dir_okay=False))
+@interface_option
+@json_option("Print one object.")
+def sii_write(slave: str, file: Path, interface: InterfaceUri, as_json: bool) -> None:
+    """Write FILE into the EEPROM and compare what is there then."""
+    from eap.appliance.bus_info import write_eeprom
+
+    with open_session(interface) as session:
+        done = write_eeprom(session, slave, file.read_bytes())
+    if as_json:
+        write_json(done)
+    else:
+        write_text(f"slave {done['address']}: {done['octets']} octets written and compared")
+
+
+@click.command(cls=BusCommand)
+@slave_argument
+@click.argument("data", type=parse_octets, metavar="HEX")
+@click.option("--vendor", type=number_up_to(_U32), required=True, metavar="ID", help="Vendor ID.")
+@click.option(
+    "--vendor-type",
+    type=number_up_to(_U16),
+    default=0,
+    metavar="TYPE",
+    help="What the vendor makes of it.",
+)
+@interface_option
+@json_option("Print one object.")
+def voe(
+    slave: str, data: bytes, vendor: int, vendor_type: int, interface: InterfaceUri, as_json: bool
+) -> None:
+    """Send a message of a vendor's own protocol and print the answer."""
+    from eap.appliance.bus_foe import exchange
+
+    with open_session(interface) as session:
+        answer = exchange(session, slave, vendor, vendor_type, data)
+    if as_json:
+        write_json(answer)
+    else:
+        write_text(answer["data"])

@@ -1,0 +1,125 @@
+"""``eapctl bus foe``: files of a slave, through its FoE mailbox."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from eap.cli.bus_params import (
+    BusCommand,
+    CommandT,
+    interface_option,
+    number_up_to,
+    open_session,
+    slave_argument,
+)
+from eap.cli.output import write_json, write_text
+from eap.cli.params import json_option
+from eap.ids import InterfaceUri
+
+
+def _password_option(command: CommandT) -> CommandT:
+    return click.option(
+        "--password",
+        type=number_up_to(0xFFFFFFFF),
+        default=0,
+        metavar="N",
+        help="If the slave wants one.",
+    )(command)
+
+
+@click.group()
+def foe() -> None:
+    """Read and write files of a slave (FoE)."""
+
+
+@foe.command(cls=BusCommand)
+@slave_argument
+@click.argument("name")
+@click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
+@_password_option
+@interface_option
+@json_option("Print one object; without it a progress bar is on stderr.")
+def get(
+    slave: str,
+    name: str,
+    file: Path | None,
+    password: int,
+    interface: InterfaceUri,
+    as_json: bool,
+) -> None:
+    """Read the file NAME of a slave into FILE, by default NAME in this folder."""
+    from eap.appliance.bus_foe import get_file
+
+    target = file or Path(Path(name).name)
+    with open_session(interface) as session, _progress(name, hidden=as_json) as report:
+        row = get_file(session, slave, name, target, password=password, report=report)
+    _show(row, f"{row['name']} → {row['file']}", as_json=as_json)
+
+
+@foe.command(cls=BusCommand)
+@slave_argument
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("name", required=False)
+@_password_option
+@interface_option
+@json_option("Print one object; without it a progress bar is on stderr.")
+def put(
+    slave: str,
+    file: Path,
+    name: str | None,
+    password: int,
+    interface: InterfaceUri,
+    as_json: bool,
+) -> None:
+    """Write FILE to a slave, as NAME if that is given."""
+    from eap.appliance.bus_foe import put_file
+
+    target = name or file.name
+    with open_session(interface) as session, _progress(target, hidden=as_json) as report:
+        row = put_file(session, slave, file, target, password=password, report=report)
+    _show(row, f"{row['file']} → {row['name']}", as_json=as_json)
+
+
+def _show(row: dict[str, Any], what: str, *, as_json: bool) -> None:
+    if as_json:
+        write_json(row)
+        return
+    speed = f"{row['rate'] / 1000:.0f} kB/s"
+    write_text(f"{what}: {row['octets']} octets in {row['seconds']:.1f} s, {speed}")
+    write_text(f"sha256 {row['sha256']}")
+
+
+@contextmanager
+def _progress(name: str, *, hidden: bool) -> Iterator[Callable[[int, int | None], None]]:
+    """Show a bar on stderr while a file is on its way; only a terminal gets one."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    disable = hidden or not console.is_terminal
+    with Progress(*columns, console=console, disable=disable) as bar:
+        task = bar.add_task(name, total=None)
+
+        def report(done: int, total: int | None) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield report

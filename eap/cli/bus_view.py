@@ -1,0 +1,169 @@
+"""Slaves, objects and IDNs as tables and lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeAlias
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from eap.cli.words import count
+
+Row: TypeAlias = dict[str, Any]
+
+_SHOWN_OCTETS = 32
+
+
+def scan_table(rows: Iterable[Row]) -> Table:
+    """Return the table of a scan."""
+    table = _table("Slave", "Name", "Vendor", "Product", "Revision", "Serial", "Alias", "State",
+                   "Mailbox")  # fmt: skip
+    for row in rows:
+        numbers = (f"0x{row[key]:X}" for key in ("vendor", "product", "revision"))
+        table.add_row(
+            str(row["address"]),
+            row["fault"] or row["name"],
+            *numbers,
+            str(row["serial"]),
+            str(row["alias"] or ""),
+            _state(row["state"]),
+            " ".join(row["mailbox"]),
+        )
+    return table
+
+
+def state_table(rows: Iterable[Row]) -> Table:
+    """Return the table of the slaves' states."""
+    table = _table("Slave", "Name", "State", "Reason")
+    for row in rows:
+        table.add_row(str(row["address"]), row["name"], _state(row["state"]), _reason(row))
+    return table
+
+
+def diagnosis_tables(found: Row) -> Iterator[Table | Text]:
+    """Yield one table a bus, and in words where its trouble starts."""
+    table = _table("Slave", "Name", "State", "Port", "Link", "CRC", "RX", "Forwarded", "Lost link")
+    for row in found["slaves"]:
+        first = (str(row["address"]), row["name"], _state(row["state"]))
+        for port in row["ports"]:
+            numbers = ("crc_errors", "rx_errors", "forwarded_errors", "lost_links")
+            errors = [port[key] for key in numbers]
+            if not port["link"] and not any(errors):
+                continue
+            link = "up" if port["link"] else "down"
+            table.add_row(*first, str(port["port"]), link, *(str(each or "") for each in errors))
+            first = ("", "", Text())
+    yield table
+    for row in found["slaves"]:
+        if row["reason"]:
+            yield Text(f"{row['name']} ({row['address']}): {_reason(row)}")
+    frames = found["frames"]
+    yield Text(f"{count(frames['sent'], 'frame')} sent, {frames['lost']} lost")
+    start = found["starts_at"]
+    if start is not None:
+        yield Text(
+            f"frames are damaged on their way to port {start['port']} of {start['name']}"
+            f" ({start['slave']}): check that cable first",
+            style="red",
+        )
+
+
+def eeprom_lines(content: Row, image: bytes) -> Iterator[str]:
+    """Yield what an EEPROM says, then its octets."""
+    yield f"slave {content['address']}: {content['name'] or 'without a name'}"
+    for key in ("vendor", "product", "revision", "serial"):
+        yield f"  {key:9} 0x{content[key]:08X}"
+    intact = "right" if content["intact"] else "WRONG"
+    kinds = ", ".join(f"{each['type']} ({each['octets']})" for each in content["categories"])
+    yield f"  check sum {intact}; {content['octets']} octets; categories {kinds or 'none'}"
+    for offset in range(0, len(image), 16):
+        yield f"{offset:04x}  {image[offset : offset + 16].hex(' ')}"
+
+
+def value_line(row: Row) -> str:
+    """Return an entry and its value."""
+    octets = bytes.fromhex(row["data"])
+    if row["value"] is None:
+        return f"{entry_name(row)} = [{octets.hex(' ')}] ({count(len(octets), 'octet')})"
+    kind = f" {row['type']}" if row["type"] else ""
+    return f"{entry_name(row)} ={kind} {_value(row)}"
+
+
+def entry_name(row: Row) -> str:
+    """Return index and subindex as people write them."""
+    return f"0x{row['index']:04X}:{row['subindex']:02X}"
+
+
+def object_table(rows: Iterable[Row]) -> Table:
+    """Return the table of objects."""
+    table = _table("Index", "Name", "Kind", "Subindexes")
+    for row in rows:
+        top = str(row["max_subindex"] or "")
+        table.add_row(f"0x{row['index']:04X}", row["name"], row["code"], top)
+    return table
+
+
+def dump_table(rows: Iterable[Row]) -> Table:
+    """Return the table of all entries with their values."""
+    table = _table("Entry", "Name", "Type", "Access", "Value")
+    for row in rows:
+        if "error" in row:
+            value = Text(row["error"], style="red")
+        else:
+            value = Text(_value(row) if row["data"] is not None else "")
+        own, whole = row["name"], row["object"]
+        name = own if own == whole or not own else f"{whole}: {own}"
+        access = row.get("access", "")
+        table.add_row(entry_name(row), name or whole, row.get("type") or "", access, value)
+    return table
+
+
+def idn_lines(row: Row) -> Iterator[str]:
+    """Yield an IDN and what else is known of it."""
+    unit = f" {row['unit']}" if row["unit"] else ""
+    yield f"{row['idn']} = {_plain(row['value'])}{unit}"
+    for key in ("name", "minimum", "maximum", "default"):
+        if row[key] is not None:
+            yield f"  {key:8} {_plain(row[key])}"
+
+
+def idn_table(rows: Iterable[Row]) -> Table:
+    """Return the table of IDNs."""
+    table = _table("IDN", "Name")
+    for row in rows:
+        table.add_row(row["idn"], row["name"])
+    return table
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for heading in columns:
+        table.add_column(heading, overflow="fold", vertical="top")
+    return table
+
+
+def _state(name: str) -> Text:
+    return Text(name, style="red" if name.endswith("ERROR") else "")
+
+
+def _reason(row: Row) -> str:
+    return f"{row['reason']} (0x{row['code']:04X})" if row["reason"] else ""
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return str(value)
+
+
+def _value(row: Row) -> str:
+    value = row["value"]
+    octets = bytes.fromhex(row["data"])
+    if value is None or value == row["data"]:
+        more = f" … ({len(octets)} octets)" if len(octets) > _SHOWN_OCTETS else ""
+        return f"[{octets[:_SHOWN_OCTETS].hex(' ')}{more}]"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value} (0x{int.from_bytes(octets, 'little'):0{2 * len(octets)}X})"
+    return str(value)

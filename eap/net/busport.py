@@ -1,0 +1,131 @@
+"""The socket of a master: frames of type 1 go out to a bus and come back through it.
+
+On Ethernet the first slave controller marks a frame as processed in its source address; what is not
+marked was never at a slave.  By UDP a bus answers whoever asked it.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+
+from eap.codec.ethercat import EAP_PORT, ETHERTYPE
+from eap.errors import EnvironmentalError
+from eap.ids import InterfaceUri, MacAddr
+from eap.net.interface import check_interface
+from eap.net.packetsocket import (
+    PACKET_ADD_MEMBERSHIP,
+    PACKET_IGNORE_OUTGOING,
+    PACKET_MR_MULTICAST,
+    SOL_PACKET,
+    missing_capability,
+)
+
+BUS_MULTICAST_MAC = MacAddr.parse("01:01:05:01:00:00")
+"""Where masters send frames of type 1; slaves take them whatever their destination is."""
+
+_HEADER = 14
+_PROCESSED = 0x02
+_LARGEST = 2048
+_MINIMUM = 60
+_LOST = (BlockingIOError, ConnectionRefusedError)
+
+
+class BusPort:
+    """The master's end of one bus; ``fileno`` makes it fit for poll and select.
+
+    Args:
+        sock: Connected by UDP, or bound to an Ethernet interface.
+        header: In front of each frame on Ethernet, nothing by UDP.
+    """
+
+    def __init__(self, sock: socket.socket, header: bytes = b"") -> None:
+        self._sock = sock
+        self._header = header
+        sock.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._sock.close()
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame; one that the network does not take is lost, as frames are.
+
+        Raises:
+            EnvironmentalError: the interface is gone or switched off.
+        """
+        octets = (self._header + frame).ljust(_MINIMUM, b"\0") if self._header else frame
+        try:
+            self._sock.send(octets)
+        except _LOST:
+            return
+        except OSError as error:
+            raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
+
+    def receive(self) -> bytes | None:
+        """Return the next frame from its EtherCAT header on, None if there is none now.
+
+        Raises:
+            EnvironmentalError: the interface is gone or switched off.
+        """
+        while True:
+            try:
+                data = self._sock.recv(_LARGEST)
+            except _LOST:
+                return None
+            except OSError as error:
+                raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
+            if not self._header:
+                return data
+            if len(data) > _HEADER and data[6] & _PROCESSED:
+                return data[_HEADER:]
+
+
+def open_bus_port(interface: InterfaceUri) -> BusPort:
+    """Open ``ethernet://IFACE``, or ``udp://ADDRESS[:PORT]`` of whoever passes frames to a bus.
+
+    Raises:
+        EnvironmentalError: it cannot be opened, and why; or it is neither of the two.
+    """
+    if interface.scheme == "udp":
+        return _open_udp(interface.host, interface.port or EAP_PORT)
+    if interface.scheme == "ethernet":
+        return _open_ethernet(interface.host)
+    raise EnvironmentalError(
+        f"{interface}: a bus is reached by ethernet://INTERFACE or udp://ADDRESS"
+    )
+
+
+def _open_udp(address: str, port: int) -> BusPort:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.connect((address, port))
+    except OSError as error:
+        sock.close()
+        raise EnvironmentalError(f"udp://{address}:{port}: {error.strerror}") from None
+    return BusPort(sock)
+
+
+def _open_ethernet(name: str) -> BusPort:
+    check_interface(name)
+    try:
+        sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
+    except PermissionError:
+        raise EnvironmentalError(missing_capability(name)) from None
+    try:
+        sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
+        sock.bind((name, ETHERTYPE))
+        group = bytes(BUS_MULTICAST_MAC)
+        index = socket.if_nametoindex(name)
+        membership = struct.pack("iHH8s", index, PACKET_MR_MULTICAST, len(group), group)
+        sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
+        own = bytearray(sock.getsockname()[4])
+    except OSError as error:
+        sock.close()
+        raise EnvironmentalError(f"interface {name}: {error.strerror}") from None
+    own[0] &= ~_PROCESSED  # the bit by which the first slave marks what it has processed
+    return BusPort(sock, group + own + struct.pack("!H", ETHERTYPE))

@@ -1,0 +1,47 @@
+"""``eapctl bus foe``."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+
+import pytest
+from click.testing import CliRunner
+from rich.console import Console
+
+from eap.cli.bus_foe import foe
+from eap.cli.group import exit_code_of
+from tests.support.loopbus import LoopBus
+
+WHERE = ["--interface", "udp://127.0.4.1"]
+CONTENT = bytes(range(256)) * 100
+
+
+@pytest.fixture
+def command(monkeypatch, tmp_path):
+    LoopBus("drive").replace(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "new.bin").write_bytes(CONTENT)
+    return lambda *words: CliRunner().invoke(foe, [*words, *WHERE])
+
+
+def test_there_and_back(command, tmp_path):
+    result = command("put", "drive", "new.bin", "firmware.bin")
+    assert result.output.startswith("new.bin → firmware.bin: 25600 octets in ")
+    assert result.output.endswith(f"sha256 {sha256(CONTENT).hexdigest()}\n")
+    row = json.loads(command("get", "drive", "firmware.bin", "--json").output)
+    assert (row["file"], row["octets"]) == ("firmware.bin", 25600)
+    assert (tmp_path / "firmware.bin").read_bytes() == CONTENT
+
+
+def test_bar_on_a_terminal(command, monkeypatch):
+    monkeypatch.setattr(Console, "is_terminal", property(lambda self: True))
+    result = command("put", "drive", "new.bin", "firmware.bin")
+    assert "25.6/25.6 kB" in result.stderr
+    assert "new.bin → firmware.bin" in result.stdout
+    assert command("put", "drive", "new.bin", "firmware.bin", "--json").stderr == ""
+
+
+def test_file_that_is_not_there(command):
+    assert exit_code_of(command("get", "drive", "nothing", "x").exception) == 1
+    assert exit_code_of(command("put", "drive", "nothing").exception) == 2

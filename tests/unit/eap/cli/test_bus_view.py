@@ -1,0 +1,114 @@
+"""Slaves, objects and IDNs as people see them."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from eap.cli.bus_view import (
+    diagnosis_tables,
+    dump_table,
+    eeprom_lines,
+    entry_name,
+    idn_lines,
+    idn_table,
+    object_table,
+    scan_table,
+    state_table,
+    value_line,
+)
+
+
+def shown(*parts):
+    console = Console(file=io.StringIO(), width=120, highlight=False)
+    for part in parts:
+        console.print(part)
+    return console.file.getvalue()
+
+
+def port(number, **counters):
+    none = dict.fromkeys(("crc_errors", "rx_errors", "forwarded_errors", "lost_links"), 0)
+    return {"port": number, "link": number == 0, **none, **counters}
+
+
+def test_slave_whose_eeprom_is_unreadable():
+    row = {"address": 1001, "name": "", "vendor": 0, "product": 0, "revision": 0, "serial": 0,
+           "alias": 7, "state": "INIT+ERROR", "mailbox": [], "fault": "no end"}  # fmt: skip
+    text = shown(scan_table([row]))
+    assert "no end" in text
+    assert "INIT+ERROR" in text
+
+
+def test_state_with_its_reason():
+    row = {"address": 1001, "name": "a", "state": "INIT+ERROR", "code": 0x51, "reason": "bad"}
+    assert "bad (0x0051)" in shown(state_table([row]))
+
+
+def test_diagnosis():
+    row = {"address": 1002, "name": "b", "state": "OP", "code": 0x1B, "reason": "watchdog",
+           "ports": [port(0, crc_errors=3), port(1), port(2, lost_links=9)]}  # fmt: skip
+    found = {
+        "slaves": [row],
+        "frames": {"sent": 1, "lost": 0},
+        "starts_at": {"slave": 1002, "name": "b", "port": 0},
+    }
+    text = shown(*diagnosis_tables(found))
+    assert "damaged on their way to port 0 of b (1002)" in text
+    assert "b (1002): watchdog (0x001B)" in text
+    assert "1 frame sent, 0 lost" in text
+    assert "down" in text
+
+
+def test_eeprom():
+    content = {"address": 1001, "name": "", "vendor": 1, "product": 2, "revision": 3, "serial": 4,
+               "intact": False, "octets": 17, "categories": []}  # fmt: skip
+    lines = list(eeprom_lines(content, bytes(17)))
+    assert lines[0] == "slave 1001: without a name"
+    assert lines[-3] == "  check sum WRONG; 17 octets; categories none"
+    assert lines[-1] == "0010  00"
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        ({"type": "UINT", "value": 5, "data": "0500"}, "UINT 5 (0x0005)"),
+        ({"type": "BOOL", "value": True, "data": "01"}, "BOOL True"),
+        ({"type": "REAL", "value": 0.5, "data": "0000003f"}, "REAL 0.5"),
+        ({"type": "STRING(2)", "value": "ab", "data": "6162"}, "STRING(2) ab"),
+        ({"type": None, "value": 1, "data": "01"}, "1 (0x01)"),
+        ({"type": None, "value": None, "data": "010203"}, "[01 02 03] (3 octets)"),
+        ({"type": "BLOCK(1)", "value": "07", "data": "07"}, "BLOCK(1) [07]"),
+    ],
+)
+def test_value(row, text):
+    place = {"index": 0x1018, "subindex": 1}
+    assert entry_name(place) == "0x1018:01"
+    assert value_line(place | row) == f"0x1018:01 = {text}"
+
+
+def test_objects_and_entries():
+    assert "RECORD" in shown(
+        object_table([{"index": 1, "name": "x", "code": "RECORD", "max_subindex": 3}])
+    )
+    own = {"index": 1, "subindex": 2, "object": "Whole", "name": "Part"}
+    text = shown(
+        dump_table(
+            [
+                own | {"type": "BLOCK(40)", "access": "rw", "value": "00" * 40, "data": "00" * 40},
+                own | {"type": "UINT", "access": "w", "value": None, "data": None},
+                own | {"name": "", "error": "broken"},
+            ]
+        )
+    )
+    assert "Whole: Part" in text
+    assert "(40 octets)" in text
+    assert "broken" in text
+
+
+def test_idns():
+    row = {"idn": "S-0-0024", "value": [1, 2], "unit": "mm", "name": "Targets", "minimum": None,
+           "maximum": 5, "default": None}  # fmt: skip
+    assert list(idn_lines(row)) == ["S-0-0024 = 1, 2 mm", "  name     Targets", "  maximum  5"]
+    assert "Targets" in shown(idn_table([row]))

@@ -1,0 +1,109 @@
+"""The master's end of a bus on UDP and on Ethernet."""
+
+from __future__ import annotations
+
+import select
+import socket
+
+import pytest
+
+from eap.errors import EnvironmentalError
+from eap.ids import InterfaceUri
+from eap.net.busport import open_bus_port
+from eap.net.segmentsocket import open_segment
+from tests.unit.eap.net.conftest import ip
+
+pytestmark = pytest.mark.net
+
+FRAME = bytes.fromhex("0d10 07 00 0000 0000 0100 0000 00 0000")
+
+
+def exchange(master, far):
+    """Pass a frame to the far end, which answers with one octet changed; return what comes back."""
+    assert master.receive() is None
+    master.send(FRAME)
+    assert select.select([far], [], [], 5)[0]
+    arrival = far.receive()
+    assert arrival.frame[: len(FRAME)] == FRAME
+    arrival.frame[2] = 8
+    far.send(arrival.frame, arrival.origin)
+    assert select.select([master], [], [], 5)[0]
+    return master.receive()
+
+
+def test_udp():
+    far = open_segment(InterfaceUri.parse("udp://127.0.4.9"))
+    master = open_bus_port(InterfaceUri.parse("udp://127.0.4.9"))
+    try:
+        assert exchange(master, far) == FRAME[:2] + b"\x08" + FRAME[3:]
+    finally:
+        master.close()
+        far.close()
+
+
+def test_nobody_there_is_a_lost_frame():
+    master = open_bus_port(InterfaceUri.parse("udp://127.0.4.9:40002"))
+    try:
+        for _ in range(3):
+            master.send(FRAME)
+            assert master.receive() is None
+    finally:
+        master.close()
+
+
+@pytest.mark.root
+def test_ethernet(cable):
+    near, distant = cable
+    far = open_segment(InterfaceUri.parse(f"ethernet://{distant}"))
+    master = open_bus_port(InterfaceUri.parse(f"ethernet://{near}"))
+    try:
+        back = exchange(master, far)
+        assert back[: len(FRAME)] == FRAME[:2] + b"\x08" + FRAME[3:]
+    finally:
+        master.close()
+        far.close()
+
+
+@pytest.mark.root
+def test_what_was_at_no_slave_is_not_taken(cable):
+    near, distant = cable
+    master = open_bus_port(InterfaceUri.parse(f"ethernet://{near}"))
+    other = open_bus_port(InterfaceUri.parse(f"ethernet://{distant}"))
+    try:
+        other.send(FRAME)
+        assert select.select([master], [], [], 5)[0]
+        assert master.receive() is None
+    finally:
+        master.close()
+        other.close()
+
+
+@pytest.mark.root
+@pytest.mark.parametrize(
+    "call", [lambda master: master.send(FRAME), lambda master: master.receive()]
+)
+def test_interface_that_goes_down(cable, call):
+    near, _ = cable
+    master = open_bus_port(InterfaceUri.parse(f"ethernet://{near}"))
+    try:
+        ip(f"link set {near} down")
+        with pytest.raises(EnvironmentalError, match="cannot be reached"):
+            call(master)
+    finally:
+        master.close()
+
+
+@pytest.mark.parametrize("text", ["tcp://127.0.0.1", "loop://x", "ethernet://nothere"])
+def test_interface_that_is_no_bus(text):
+    with pytest.raises(EnvironmentalError, match=r"a bus is reached by|no interface"):
+        open_bus_port(InterfaceUri.parse(text))
+
+
+def test_ethernet_without_the_capability(monkeypatch):
+    def refuse(*arguments):
+        raise PermissionError
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    monkeypatch.setattr("eap.net.busport.check_interface", lambda name: None)
+    with pytest.raises(EnvironmentalError, match="CAP_NET_RAW"):
+        open_bus_port(InterfaceUri.parse("ethernet://lo"))
