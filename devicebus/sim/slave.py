@@ -10,6 +10,7 @@ from devicebus.sim.esc import Esc
 from devicebus.sim.smcheck import ALLOWED, check_clock, check_mailbox, check_process_data
 from devicebus.wire.alstatus import ERROR, AlState, AlStatusCode
 from devicebus.wire.register import AlEvent, Register
+from eap.codec.mailbox import MailboxType
 
 OUTPUTS_TIMEOUT_NS = 200_000_000
 """How long a slave on its way to OP waits for the first outputs (ESI default, back to SafeOp)."""
@@ -35,6 +36,7 @@ class Slave:
         self.device = device
         self.is_powered = True
         self.refuses: dict[AlState, int] = {}
+        self._protocols = dict(device.mailbox.protocols) if device.mailbox else {}
         self._forget()
 
     def _forget(self) -> None:
@@ -158,6 +160,11 @@ class Slave:
         receive.discard()
         send.discard()
         send.acknowledge_repeat()
+        mailbox.protocols = {
+            kind: server
+            for kind, server in self._protocols.items()
+            if kind is MailboxType.FOE or not boot
+        }
         mailbox.start(receive.length, send.length)
         return 0
 

@@ -214,6 +214,18 @@ def test_mailbox_is_dead_in_init(bench):
     assert bench.fetch().wkc == 0  # what was there before is forgotten
 
 
+def test_boot_knows_files_only(bench):
+    bench.bring(AlState.BOOT)
+    bench.post(UPLOAD_VENDOR)
+    assert bench.fetch().data[:10] == bytes.fromhex("0400 0000 00 10 0100 0200")
+    bench.post(bytes.fromhex("0700 0000 00 24 0100 00000000 78"))
+    assert bench.fetch().data[5:8] == bytes.fromhex("24 05 00")
+    bench.ask(AlState.INIT)
+    bench.bring(AlState.PREOP)
+    bench.post(UPLOAD_VENDOR)
+    assert bench.fetch().data[8] == 0x43
+
+
 def test_lost_reply_comes_again_by_the_repeat_bit(bench):
     bench.bring(AlState.PREOP)
     bench.post(upload(1))
