@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
+
 from devicebus.errors import SiiError
 from devicebus.master import eeprom
 from devicebus.master.bus import Unit
+from devicebus.master.diagnosis import diagnose
 from devicebus.master.esm import read_status
-from devicebus.master.procedure import read
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
-from devicebus.wire.register import DlStatus, Register
 from devicebus.wire.sii import SiiProtocol
 from eap.appliance.bus_session import BusSession
 
 STATES = tuple(state.name for state in AlState)
-_PORTS = 4
-_COUNTERS = 20
-_FORWARDED = Register.FORWARDED_RX_ERROR - Register.RX_ERROR
-_PROCESSING = Register.PROCESSING_UNIT_ERROR - Register.RX_ERROR
-_PDI = Register.PDI_ERROR - Register.RX_ERROR
-_LOST_LINK = Register.LOST_LINK - Register.RX_ERROR
 
 
 def scan_rows(bus: BusSession) -> list[dict[str, Any]]:
@@ -42,20 +37,39 @@ def state_rows(bus: BusSession, slave: str | None, target: str | None) -> list[d
 
 
 def diagnosis(bus: BusSession, slave: str | None) -> dict[str, Any]:
-    """Return states and error counters; *starts_at* is where the line first damages frames."""
-    units = [bus.find(slave)] if slave is not None else bus.scan()
-    rows = [_state(bus, unit) | _counters(bus, unit) for unit in units]
-    damaged = [
-        {"slave": row["address"], "name": row["name"], "port": port["port"]}
-        for row in rows
-        for port in row["ports"]
-        if port["crc_errors"] or port["rx_errors"]
-    ]
+    """Return states and error counters of one slave or of all, and where on the line errors start.
+
+    Raises:
+        BusError: there is no such slave.
+    """
+    names = {unit.station: unit.name for unit in bus.scan()}
+    wanted = {bus.find(slave).station} if slave is not None else {*names}
+    found = bus.run(diagnose(list(names)), "diagnosis")
+    fault = found.first_fault
     frames = bus.link_stats()
     return {
         "frames": {"sent": frames.sent, "received": frames.received, "lost": frames.lost},
-        "starts_at": damaged[0] if damaged else None,
-        "slaves": rows,
+        "starts_at": None
+        if fault is None
+        else {
+            "slave": fault.station,
+            "name": names[fault.station],
+            "port": fault.port,
+            "neighbour": fault.neighbour,
+        },
+        "slaves": [
+            {
+                "address": each.station,
+                "name": names[each.station],
+                "state": each.state,
+                "code": each.code,
+                "reason": each.text if each.code else "",
+                "answers": each.answers,
+                "ports": [msgspec.structs.asdict(port) for port in each.ports],
+            }
+            for each in found.slaves
+            if each.station in wanted
+        ],
     }
 
 
@@ -133,26 +147,4 @@ def _state(bus: BusSession, unit: Unit) -> dict[str, Any]:
         "state": state_name(status.state | status.error << 4),
         "code": status.code,
         "reason": name_of(status.code) if status.code else "",
-    }
-
-
-def _counters(bus: BusSession, unit: Unit) -> dict[str, Any]:
-    octets = bus.run(read(unit.station, Register.RX_ERROR, _COUNTERS, "error counters"))
-    links = bus.run(read(unit.station, Register.DL_STATUS, DlStatus.SIZE, "DL status"))
-    link = DlStatus.decode(links).link
-    ports = [
-        {
-            "port": port,
-            "link": bool(link >> port & 1),
-            "crc_errors": octets[2 * port],
-            "rx_errors": octets[2 * port + 1],
-            "forwarded_errors": octets[_FORWARDED + port],
-            "lost_links": octets[_LOST_LINK + port],
-        }
-        for port in range(_PORTS)
-    ]
-    return {
-        "ports": ports,
-        "processing_errors": octets[_PROCESSING],
-        "pdi_errors": octets[_PDI],
     }

@@ -14,6 +14,7 @@ from eap.cli.words import count
 Row: TypeAlias = dict[str, Any]
 
 _SHOWN_OCTETS = 32
+_COUNTERS = ("invalid_frames", "physical", "forwarded", "lost_links")
 
 
 def scan_table(rows: Iterable[Row]) -> Table:
@@ -43,17 +44,18 @@ def state_table(rows: Iterable[Row]) -> Table:
 
 
 def diagnosis_tables(found: Row) -> Iterator[Table | Text]:
-    """Yield one table a bus, and in words where its trouble starts."""
-    table = _table("Slave", "Name", "State", "Port", "Link", "CRC", "RX", "Forwarded", "Lost link")
+    """Yield the table of all ports, and in words where trouble starts."""
+    table = _table("Slave", "Name", "State", "Port", "Open", "CRC", "RX", "Forwarded", "Lost link")
     for row in found["slaves"]:
-        first = (str(row["address"]), row["name"], _state(row["state"]))
-        for port in row["ports"]:
-            numbers = ("crc_errors", "rx_errors", "forwarded_errors", "lost_links")
-            errors = [port[key] for key in numbers]
-            if not port["link"] and not any(errors):
+        state = row["state"] if row["answers"] else "no answer"
+        first = (str(row["address"]), row["name"], _state(state))
+        for port in row["ports"] or [{}]:
+            errors = [port.get(key, 0) for key in _COUNTERS]
+            if port and not port["is_open"] and not any(errors):
                 continue
-            link = "up" if port["link"] else "down"
-            table.add_row(*first, str(port["port"]), link, *(str(each or "") for each in errors))
+            is_open = ("yes" if port["is_open"] else "no") if port else ""
+            numbers = (str(each or "") for each in errors)
+            table.add_row(*first, str(port.get("port", "")), is_open, *numbers)
             first = ("", "", Text())
     yield table
     for row in found["slaves"]:
@@ -63,9 +65,10 @@ def diagnosis_tables(found: Row) -> Iterator[Table | Text]:
     yield Text(f"{count(frames['sent'], 'frame')} sent, {frames['lost']} lost")
     start = found["starts_at"]
     if start is not None:
+        far = f" to slave {start['neighbour']}" if start["neighbour"] is not None else ""
         yield Text(
-            f"frames are damaged on their way to port {start['port']} of {start['name']}"
-            f" ({start['slave']}): check that cable first",
+            f"errors start at port {start['port']} of {start['name']} ({start['slave']}):"
+            f" check its cable{far} first",
             style="red",
         )
 

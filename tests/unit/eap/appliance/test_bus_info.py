@@ -58,8 +58,9 @@ def test_diagnosis_of_a_sound_bus(line):
         found = diagnosis(bus, None)
     assert found["starts_at"] is None
     assert found["frames"]["lost"] == 0
-    assert [port["link"] for port in found["slaves"][1]["ports"]] == [True, True, False, False]
-    assert found["slaves"][1]["pdi_errors"] == 0
+    slave = found["slaves"][1]
+    assert (slave["address"], slave["name"], slave["state"]) == (1002, "buttons", "INIT")
+    assert [port["is_open"] for port in slave["ports"]] == [True, True, False, False]
 
 
 def test_diagnosis_names_where_damage_starts(line):
@@ -69,8 +70,8 @@ def test_diagnosis_names_where_damage_starts(line):
     with line.session() as bus:
         found = diagnosis(bus, None)
         (only,) = diagnosis(bus, "buttons")["slaves"]
-    assert found["starts_at"] == {"slave": 1002, "name": "buttons", "port": 0}
-    assert only["ports"][0]["crc_errors"] == 3
+    assert found["starts_at"] == {"slave": 1002, "name": "buttons", "port": 0, "neighbour": 1001}
+    assert only["ports"][0]["invalid_frames"] == 3
     assert only["ports"][1]["lost_links"] == 2
 
 

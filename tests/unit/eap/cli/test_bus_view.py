@@ -29,8 +29,8 @@ def shown(*parts):
 
 
 def port(number, **counters):
-    none = dict.fromkeys(("crc_errors", "rx_errors", "forwarded_errors", "lost_links"), 0)
-    return {"port": number, "link": number == 0, **none, **counters}
+    none = dict.fromkeys(("invalid_frames", "physical", "forwarded", "lost_links"), 0)
+    return {"port": number, "is_open": number == 0, **none, **counters}
 
 
 def test_slave_whose_eeprom_is_unreadable():
@@ -48,17 +48,20 @@ def test_state_with_its_reason():
 
 def test_diagnosis():
     row = {"address": 1002, "name": "b", "state": "OP", "code": 0x1B, "reason": "watchdog",
-           "ports": [port(0, crc_errors=3), port(1), port(2, lost_links=9)]}  # fmt: skip
+           "answers": True,
+           "ports": [port(0, invalid_frames=3), port(1), port(2, lost_links=9)]}  # fmt: skip
+    gone = {"address": 1003, "name": "c", "state": "", "code": 0, "reason": "",
+            "answers": False, "ports": []}  # fmt: skip
     found = {
-        "slaves": [row],
+        "slaves": [row, gone],
         "frames": {"sent": 1, "lost": 0},
-        "starts_at": {"slave": 1002, "name": "b", "port": 0},
+        "starts_at": {"slave": 1002, "name": "b", "port": 0, "neighbour": 1001},
     }
     text = shown(*diagnosis_tables(found))
-    assert "damaged on their way to port 0 of b (1002)" in text
+    assert "errors start at port 0 of b (1002): check its cable to slave 1001 first" in text
     assert "b (1002): watchdog (0x001B)" in text
     assert "1 frame sent, 0 lost" in text
-    assert "down" in text
+    assert "no answer" in text
 
 
 def test_eeprom():
