@@ -53,6 +53,23 @@ class SharedSocket(Record, frozen=True):
     services_fd: int = NO_DESCRIPTOR
 
 
+class BusSocket(Record, frozen=True):
+    """What belongs to one bus port, opened once like the shared sockets.
+
+    The number of a bus in requests is its place in the handover.
+    """
+
+    owner: PortName
+    engine_fd: int = NO_DESCRIPTOR
+    """Where the engine's frames go: a packet or UDP socket, or a pair with the segment process."""
+    segment_fd: int = NO_DESCRIPTOR
+    """The other side of that pair, for the process of a simulated segment."""
+    segment_command_fd: int = NO_DESCRIPTOR
+    """Where that process gets commands, one JSON object a message, and answers them."""
+    command_fd: int = NO_DESCRIPTOR
+    """The other side of that pair, for services."""
+
+
 class EngineOptions(Record, frozen=True):
     """How hard the engine tries to be on time."""
 
@@ -79,6 +96,9 @@ class Handover(Record, frozen=True):
     link_fd: int = NO_DESCRIPTOR
     """This side of the SOCK_SEQPACKET pair between engine and services."""
     control_fd: int = NO_DESCRIPTOR
+    buses: tuple[BusSocket, ...] = ()
+    bus_fd: int = NO_DESCRIPTOR
+    """This side of the pair on which services asks the engine for something on a bus."""
     options: EngineOptions = EngineOptions()
 
     def port(self, name: PortName) -> PortSpec:

@@ -213,6 +213,73 @@ class Wake(StrEnum):
     """As they arrive: the shortest latency, at the price of a wake-up a frame."""
 
 
+class BusEntrySpec(Record, frozen=True):
+    """One entry of a slave's process data, in the order of its PDOs.
+
+    *variable* is its name in the process image, empty for padding and for what has no type of ours.
+    """
+
+    variable: str
+    index: int
+    subindex: int
+    bit_length: int
+
+
+class BusSlaveSpec(Record, frozen=True):
+    """One slave that a bus is expected to have; what is None may be anything."""
+
+    name: str
+    station: int
+    """Station address: 1001 for the first in the line."""
+    vendor: int
+    product: int
+    revision: int | None = None
+    serial: int | None = None
+    alias: int | None = None
+    outputs: tuple[BusEntrySpec, ...] = ()
+    inputs: tuple[BusEntrySpec, ...] = ()
+
+
+class BusTarget(StrEnum):
+    """The state to which the slaves of a bus are brought, and where they are kept."""
+
+    INIT = "INIT"
+    PREOP = "PREOP"
+    SAFEOP = "SAFEOP"
+    OP = "OP"
+
+
+class BusPortSpec(Record, frozen=True):
+    """What a bus port has beside an interface."""
+
+    file: str = ""
+    """Absolute path of the bus file that describes it; empty if nothing is expected."""
+    slaves: tuple[BusSlaveSpec, ...] = ()
+    """In the order of the line; empty takes whatever is there, without variables."""
+    target: BusTarget = BusTarget.OP
+    clocks: bool = False
+    """Whether distributed clocks are set and kept together."""
+
+
+class LinkSpec(Record, frozen=True):
+    """In each cycle *target* gets the value of *source*, both variables of one station.
+
+    Without scale, offset and swap bits are copied: *bits* of them (0: all of the source) from bit
+    *source_bit* of the source to bit *target_bit* of the target.
+    """
+
+    source: str
+    target: str
+    source_bit: int = 0
+    target_bit: int = 0
+    bits: int = 0
+    scale: float = 1.0
+    """Numbers: the target is source times *scale* plus *offset*, within the limits of its type."""
+    offset: float = 0.0
+    swap: bool = False
+    """Whether the octets are reversed on the way."""
+
+
 class PortSpec(Record, frozen=True):
     """One port; *interface* is a URI such as ``udp://127.0.1.1`` or ``ethernet://eth0``."""
 
@@ -230,6 +297,8 @@ class PortSpec(Record, frozen=True):
     tcp: bool = False
     """Whether type 4 is taken from TCP connections too."""
     wake: Wake = Wake.CYCLE
+    bus: BusPortSpec | None = None
+    """Bus ports only."""
 
 
 class StationSpec(Record, frozen=True):
@@ -245,3 +314,4 @@ class StationSpec(Record, frozen=True):
     sources: tuple[Source, ...] = ()
     frames: tuple[TxFrameSpec, ...] = ()
     subscriptions: tuple[RxPdSpec, ...] = ()
+    links: tuple[LinkSpec, ...] = ()

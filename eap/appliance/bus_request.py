@@ -1,0 +1,143 @@
+"""What services ask the engine to do on a bus, and what it answers: one message each.
+
+They travel as MessagePack over a SOCK_SEQPACKET pair.  Requests are small steps, such as one
+mailbox message: whole transfers, files and retries are the business of who asks.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import msgspec
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True):
+    """Base of all requests; *bus* counts the bus ports of the appliance in the handover's order."""
+
+    id: int
+    """Chosen by who asks; the answer repeats it."""
+    bus: int
+
+
+class Describe(Message, frozen=True, tag="describe"):
+    """Say how the bus is: answered by *report*."""
+
+
+class AskMailbox(Message, frozen=True, kw_only=True, tag="mailbox"):
+    """One step of a conversation with a slave's mailbox: answered by *data*.
+
+    Fields as those of ``devicebus.mailbox.conversation.Ask``.
+    """
+
+    station: int
+    type: int
+    request: bytes
+    listen: bool = False
+    timeout_ns: int
+    delay_ns: int = 0
+    expects_reply: bool = True
+
+
+class Datagram(msgspec.Struct, frozen=True, array_like=True):
+    """One datagram, as ``devicebus.master.access.Access``."""
+
+    command: int
+    adp: int
+    ado: int
+    data: bytes
+    tries: int
+
+
+class Outcome(msgspec.Struct, frozen=True, array_like=True):
+    """What came back for one datagram, as ``devicebus.master.access.Reply``."""
+
+    wkc: int
+    data: bytes
+    tries: int
+
+
+class Transfer(Message, frozen=True, kw_only=True, tag="transfer"):
+    """One step of a procedure, datagrams without logical ones: answered by *outcomes*."""
+
+    datagrams: tuple[Datagram, ...]
+
+
+class Bring(Message, frozen=True, kw_only=True, tag="bring"):
+    """Bring a slave to an AL state where it is kept then; 0 is all slaves.  Answered when there."""
+
+    station: int
+    target: int
+
+
+class Cancel(Message, frozen=True, tag="cancel"):
+    """Whoever asked *id* does not wait any more: not answered."""
+
+
+Request: TypeAlias = Describe | AskMailbox | Transfer | Bring | Cancel
+
+
+class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
+    """How a slave is."""
+
+    station: int
+    name: str
+    vendor: int
+    product: int
+    revision: int
+    serial: int
+    alias: int
+    state: int
+    """AL state where it was brought, 0 if it does not answer."""
+    target: int
+    to_slave: int = 0
+    to_master: int = 0
+    """Octets of the mailboxes, 0 while it has none."""
+    protocols: int = 0
+    """As in its EEPROM."""
+    fault: str = ""
+    """Why it is not where it belongs."""
+
+
+class BusReport(msgspec.Struct, frozen=True, kw_only=True):
+    """How a bus is; counters since the engine started, times in nanoseconds."""
+
+    is_up: bool
+    """Whether it has been brought up, wherever its slaves are now."""
+    fault: str = ""
+    """Why not."""
+    slaves: tuple[SlaveReport, ...] = ()
+    frames_sent: int = 0
+    frames_lost: int = 0
+    cycles: int = 0
+    cycles_good: int = 0
+    wkc_errors: int = 0
+    cycles_lost: int = 0
+    expected_wkc: int = 0
+    received_wkc: int = 0
+    trip_ns: int = 0
+    max_trip_ns: int = 0
+
+
+class Failure(msgspec.Struct, frozen=True):
+    """Why a request was not done: the name of one of ``devicebus.errors``, and its text."""
+
+    kind: str
+    message: str
+    detail: int = 0
+    """Mailbox error code."""
+
+
+class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The answer to one request: *failure*, or what the request says."""
+
+    id: int
+    failure: Failure | None = None
+    data: bytes = b""
+    outcomes: tuple[Outcome, ...] = ()
+    report: BusReport | None = None
+
+
+class Hello(msgspec.Struct, frozen=True):
+    """The first message of an engine: what was asked of the one before is not answered."""
+
+    pid: int
