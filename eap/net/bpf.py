@@ -1,7 +1,7 @@
 """Classic BPF programs by which the kernel sorts frames between engine and services.
 
 Frame types 2, 3 and 5 are acyclic and go to services; 1, 4 and everything unknown go to the
-engine, which counts what it does not know.
+engine, which counts what it does not know.  Sockets of buses take type 1 alone.
 """
 
 from __future__ import annotations
@@ -92,6 +92,20 @@ def packet_filter(role: Role) -> list[Instruction]:
         (_GREATER, 0, 1, socket.PACKET_MULTICAST),
         (_RETURN, 0, 0, 0),
         *_by_type(_ETHERNET_HEADER, *_verdicts(role)),
+    ]
+
+
+def type1_filter() -> list[Instruction]:
+    """Keep EtherCAT frames of type 1, whoever they are addressed to."""
+    return [
+        (_LOAD_HALF, 0, 0, 12),
+        (_EQUAL, 1, 0, ETHERTYPE),
+        (_RETURN, 0, 0, 0),
+        (_LOAD_BYTE, 0, 0, _ETHERNET_HEADER + 1),
+        (_SHIFT_RIGHT, 0, 0, 4),
+        (_EQUAL, 0, 1, FrameType.DATAGRAM),
+        (_RETURN, 0, 0, _ALL),
+        (_RETURN, 0, 0, 0),
     ]
 
 

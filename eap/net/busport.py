@@ -1,7 +1,8 @@
 """The socket of a master: frames of type 1 go out to a bus and come back through it.
 
 On Ethernet the first slave controller marks a frame as processed in its source address; what is not
-marked was never at a slave.  By UDP a bus answers whoever asked it.
+marked was never at a slave.  By UDP a bus answers whoever asked it; a simulated segment in another
+process is at the other end of a pair.
 """
 
 from __future__ import annotations
@@ -12,14 +13,7 @@ import struct
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, MacAddr
-from eap.net.interface import check_interface
-from eap.net.packetsocket import (
-    PACKET_ADD_MEMBERSHIP,
-    PACKET_IGNORE_OUTGOING,
-    PACKET_MR_MULTICAST,
-    SOL_PACKET,
-    missing_capability,
-)
+from eap.net.packetsocket import open_type1
 
 BUS_MULTICAST_MAC = MacAddr.parse("01:01:05:01:00:00")
 """Where masters send frames of type 1; slaves take them whatever their destination is."""
@@ -35,13 +29,13 @@ class BusPort:
     """The master's end of one bus; ``fileno`` makes it fit for poll and select.
 
     Args:
-        sock: Connected by UDP, or bound to an Ethernet interface.
-        header: In front of each frame on Ethernet, nothing by UDP.
+        sock: As :func:`open_bus_socket` returns it, or one of a pair whose other end is a
+            :class:`SegmentSocket`.
     """
 
-    def __init__(self, sock: socket.socket, header: bytes = b"") -> None:
+    def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
-        self._header = header
+        self._header = _ethernet_header(sock) if sock.family == socket.AF_PACKET else b""
         sock.setblocking(False)
 
     def fileno(self) -> int:
@@ -80,12 +74,17 @@ class BusPort:
             except OSError as error:
                 raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
             if not self._header:
-                return data
+                return data or None
             if len(data) > _HEADER and data[6] & _PROCESSED:
                 return data[_HEADER:]
 
 
 def open_bus_port(interface: InterfaceUri) -> BusPort:
+    """Open a bus; raises as :func:`open_bus_socket` does."""
+    return BusPort(open_bus_socket(interface))
+
+
+def open_bus_socket(interface: InterfaceUri) -> socket.socket:
     """Open ``ethernet://IFACE``, or ``udp://ADDRESS[:PORT]`` of whoever passes frames to a bus.
 
     Raises:
@@ -94,38 +93,23 @@ def open_bus_port(interface: InterfaceUri) -> BusPort:
     if interface.scheme == "udp":
         return _open_udp(interface.host, interface.port or EAP_PORT)
     if interface.scheme == "ethernet":
-        return _open_ethernet(interface.host)
+        return open_type1(interface.host, group=bytes(BUS_MULTICAST_MAC))
     raise EnvironmentalError(
         f"{interface}: a bus is reached by ethernet://INTERFACE or udp://ADDRESS"
     )
 
 
-def _open_udp(address: str, port: int) -> BusPort:
+def _open_udp(address: str, port: int) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         sock.connect((address, port))
     except OSError as error:
         sock.close()
         raise EnvironmentalError(f"udp://{address}:{port}: {error.strerror}") from None
-    return BusPort(sock)
+    return sock
 
 
-def _open_ethernet(name: str) -> BusPort:
-    check_interface(name)
-    try:
-        sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
-    except PermissionError:
-        raise EnvironmentalError(missing_capability(name)) from None
-    try:
-        sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
-        sock.bind((name, ETHERTYPE))
-        group = bytes(BUS_MULTICAST_MAC)
-        index = socket.if_nametoindex(name)
-        membership = struct.pack("iHH8s", index, PACKET_MR_MULTICAST, len(group), group)
-        sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
-        own = bytearray(sock.getsockname()[4])
-    except OSError as error:
-        sock.close()
-        raise EnvironmentalError(f"interface {name}: {error.strerror}") from None
+def _ethernet_header(sock: socket.socket) -> bytes:
+    own = bytearray(sock.getsockname()[4])
     own[0] &= ~_PROCESSED  # the bit by which the first slave marks what it has processed
-    return BusPort(sock, group + own + struct.pack("!H", ETHERTYPE))
+    return bytes(BUS_MULTICAST_MAC) + own + struct.pack("!H", ETHERTYPE)

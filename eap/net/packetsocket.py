@@ -1,12 +1,14 @@
-"""Opening AF_PACKET sockets, always a pair: one for the engine, one for services."""
+"""Opening AF_PACKET sockets: for EAP a pair, the engine's and that of services; for a bus one."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import socket
+import struct
 import sys
 
+from eap.codec.ethercat import ETHERTYPE
 from eap.errors import EnvironmentalError
 from eap.net import bpf
 from eap.net.interface import check_interface
@@ -17,6 +19,7 @@ PACKET_ADD_MEMBERSHIP = 1
 PACKET_AUXDATA = 8
 PACKET_IGNORE_OUTGOING = 23
 PACKET_MR_MULTICAST = 0
+PACKET_MR_PROMISC = 1
 _ETH_P_ALL = 3
 _ARPHRD_ETHER = 1
 _ARPHRD_LOOPBACK = 772
@@ -43,31 +46,63 @@ def open_packet_pair(interface: str) -> tuple[socket.socket, socket.socket]:
         raise
 
 
-def _open(interface: str, role: bpf.Role) -> socket.socket:
+def open_type1(interface: str, *, group: bytes = b"") -> socket.socket:
+    """Open *interface* for frames of type 1, which the kernel picks out.
+
+    Args:
+        interface: Its name.
+        group: The multicast address to hear; without one whatever passes is heard.
+
+    Raises:
+        EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
+    """
+    check_interface(interface)
+    sock = _deaf_socket(interface)
+    kind = PACKET_MR_MULTICAST if group else PACKET_MR_PROMISC
     try:
-        # Of protocol 0, hence deaf: no foreign frame gets in before the filter is in place.
-        sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
-    except PermissionError:
-        raise EnvironmentalError(missing_capability(interface)) from None
-    try:
-        _set_up(sock, interface, role)
-    except BaseException:
+        bpf.attach(sock, bpf.type1_filter())
+        _join(sock, interface, ETHERTYPE)
+        index = socket.if_nametoindex(interface)
+        membership = struct.pack("iHH8s", index, kind, len(group), group)
+        sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
+    except (OSError, EnvironmentalError) as error:
         sock.close()
-        raise
+        raise _explain(interface, error) from None
     return sock
 
 
-def _set_up(sock: socket.socket, interface: str, role: bpf.Role) -> None:
+def _open(interface: str, role: bpf.Role) -> socket.socket:
+    sock = _deaf_socket(interface)
     try:
         bpf.attach(sock, bpf.packet_filter(role))
         sock.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
-        sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
         prepare_receiver(sock)
-        sock.bind((interface, _ETH_P_ALL))
-    except OSError as error:
-        raise EnvironmentalError(f"interface {interface}: {error.strerror}") from None
+        _join(sock, interface, _ETH_P_ALL)
+    except (OSError, EnvironmentalError) as error:
+        sock.close()
+        raise _explain(interface, error) from None
+    return sock
+
+
+def _deaf_socket(interface: str) -> socket.socket:
+    """Return a socket of protocol 0: no foreign frame gets in before its filter is in place."""
+    try:
+        return socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
+    except PermissionError:
+        raise EnvironmentalError(missing_capability(interface)) from None
+
+
+def _join(sock: socket.socket, interface: str, protocol: int) -> None:
+    sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
+    sock.bind((interface, protocol))
     if sock.getsockname()[3] not in (_ARPHRD_ETHER, _ARPHRD_LOOPBACK):
         raise EnvironmentalError(f"interface {interface} is not an Ethernet interface")
+
+
+def _explain(interface: str, error: OSError | EnvironmentalError) -> EnvironmentalError:
+    if isinstance(error, EnvironmentalError):
+        return error
+    return EnvironmentalError(f"interface {interface}: {error.strerror}")
 
 
 def missing_capability(interface: str) -> str:

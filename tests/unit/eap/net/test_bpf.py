@@ -62,3 +62,10 @@ def test_packet_filter_keeps_its_types_of_our_ethertype(role, types):
     assert exchange(bpf.packet_filter(role), datagrams) == types
     foreign = [ethernet_like(n, b"\x08\x00") for n in range(16)]
     assert exchange(bpf.packet_filter(role), [*foreign, b"short"]) == set()
+
+
+def test_bus_gets_type_1_alone():
+    datagrams = [ethernet_like(n) for n in range(16)]
+    assert exchange(bpf.type1_filter(), datagrams) == {1}
+    foreign = [ethernet_like(n, b"\x08\x00") for n in range(16)]
+    assert exchange(bpf.type1_filter(), [*foreign, b"short"]) == set()

@@ -1,4 +1,4 @@
-"""The master's end of a bus on UDP and on Ethernet."""
+"""The master's end of a bus on UDP, on Ethernet and on a pair."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.busport import open_bus_port
-from eap.net.segmentsocket import open_segment
+from eap.net.busport import BusPort, open_bus_port
+from eap.net.segmentsocket import SegmentSocket, open_segment
 from tests.unit.eap.net.conftest import ip
 
 pytestmark = pytest.mark.net
@@ -39,6 +39,36 @@ def test_udp():
     finally:
         master.close()
         far.close()
+
+
+@pytest.fixture
+def pair():
+    near, distant = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ends = BusPort(near), SegmentSocket(distant)
+    yield ends
+    for end in ends:
+        end.close()
+
+
+def test_pair(pair):
+    assert exchange(*pair) == FRAME[:2] + b"\x08" + FRAME[3:]
+
+
+def test_other_end_that_reads_nothing_loses_frames_and_takes_them_again(pair):
+    master, far = pair
+    for _ in range(2000):
+        master.send(FRAME)
+    read = sum(1 for _ in iter(far.receive, None))
+    assert 0 < read < 2000
+    assert exchange(master, far)
+
+
+def test_empty_message_is_no_frame(pair):
+    master, far = pair
+    far.send(bytearray(), b"")
+    assert master.receive() is None
+    master.send(b"")
+    assert far.receive() is None
 
 
 def test_nobody_there_is_a_lost_frame():
@@ -104,6 +134,6 @@ def test_ethernet_without_the_capability(monkeypatch):
         raise PermissionError
 
     monkeypatch.setattr(socket, "socket", refuse)
-    monkeypatch.setattr("eap.net.busport.check_interface", lambda name: None)
+    monkeypatch.setattr("eap.net.packetsocket.check_interface", lambda name: None)
     with pytest.raises(EnvironmentalError, match="CAP_NET_RAW"):
         open_bus_port(InterfaceUri.parse("ethernet://lo"))

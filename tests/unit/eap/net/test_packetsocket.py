@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from eap.errors import EnvironmentalError
-from eap.net.packetsocket import missing_capability, open_packet_pair
+from eap.net.packetsocket import missing_capability, open_packet_pair, open_type1
 from tests.unit.eap.net.conftest import ip
 
 pytestmark = pytest.mark.net
@@ -51,11 +51,24 @@ def test_interface_without_a_cable_can_be_opened(cable):
 
 
 @pytest.mark.root
-def test_interface_of_another_kind_is_refused(cable):
+def test_bus_gets_frames_of_type_1_and_no_others(cable):
+    with open_type1("left") as deaf, open_type1("right") as sender:
+        for kind in (4, 1, 5):
+            sender.send(bytes(12) + b"\x88\xa4" + bytes((0, kind << 4)) + bytes(46))
+        deaf.settimeout(5)
+        assert deaf.recv(100)[15] == 0x10
+        deaf.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            deaf.recv(100)
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("opener", [open_packet_pair, open_type1])
+def test_interface_of_another_kind_is_refused(cable, opener):
     ip("tuntap add dev tunnel mode tun")
     ip("link set tunnel up")
     with pytest.raises(EnvironmentalError, match="tunnel is not an Ethernet interface"):
-        open_packet_pair("tunnel")
+        opener("tunnel")
 
 
 @pytest.mark.root

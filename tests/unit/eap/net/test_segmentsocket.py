@@ -9,7 +9,7 @@ import pytest
 
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.segmentsocket import open_segment
+from eap.net.segmentsocket import SegmentSocket, open_segment
 
 pytestmark = pytest.mark.net
 
@@ -60,6 +60,19 @@ def test_port_that_is_taken():
     try:
         with pytest.raises(EnvironmentalError, match=r"127\.0\.9\.8"):
             open_udp()
+    finally:
+        end.close()
+
+
+def test_pair_whose_other_end_has_gone_does_no_harm():
+    near, distant = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    end = SegmentSocket(near)
+    try:
+        distant.send(FRAME)
+        assert end.receive() == (FRAME, b"")
+        distant.close()
+        end.send(bytearray(FRAME), b"")
+        assert end.receive() is None
     finally:
         end.close()
 
