@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.handover import Handover, decode_report
+from eap.appliance.handover import Handover, SegmentHandover, decode_report
 
 FIRST_BACKOFF_NS = 100_000_000
 LONGEST_BACKOFF_NS = 5_000_000_000
@@ -63,7 +63,9 @@ class Child:
         """Process id, 0 when there is no process."""
         return self._process.pid if self._process else 0
 
-    def start(self, handover: Handover, descriptors: Iterable[int], now_ns: int) -> None:
+    def start(
+        self, handover: Handover | SegmentHandover, descriptors: Iterable[int], now_ns: int
+    ) -> None:
         """Start the process; *descriptors* are those that *handover* speaks of."""
         self.ready_fd, ready_end = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self.error_fd, error_end = os.pipe2(os.O_CLOEXEC)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 
@@ -70,6 +70,38 @@ class BusSocket(Record, frozen=True):
     """The other side of that pair, for services."""
 
 
+class Handed(Record, frozen=True):
+    """What crosses to a child in a descriptor."""
+
+    def to_descriptor(self) -> int:
+        """Return the descriptor of a file that holds this; the caller closes it."""
+        fd = os.memfd_create("eap-handover", os.MFD_CLOEXEC)
+        with os.fdopen(os.dup(fd), "wb") as file:
+            file.write(msgspec.json.encode(self))
+        return fd
+
+    @classmethod
+    def from_descriptor(cls, fd: int) -> Self:
+        """Read what ``to_descriptor`` wrote, and close *fd*."""
+        with os.fdopen(fd, "rb") as file:
+            file.seek(0)
+            return msgspec.json.decode(file.read(), type=cls)
+
+
+class SegmentHandover(Handed, frozen=True):
+    """All that the process of a simulated segment gets."""
+
+    supervisor: int
+    """Process id, as in Handover."""
+    file: str
+    """The bus file."""
+    frames_fd: int
+    """This side of the pair with the engine."""
+    command_fd: int
+    """This side of the pair with services."""
+    ready_fd: int = NO_DESCRIPTOR
+
+
 class EngineOptions(Record, frozen=True):
     """How hard the engine tries to be on time."""
 
@@ -81,8 +113,8 @@ class EngineOptions(Record, frozen=True):
     """Of SCHED_FIFO, 1 to 99."""
 
 
-class Handover(Record, frozen=True):
-    """All that a child gets; a descriptor that it does not need is NO_DESCRIPTOR."""
+class Handover(Handed, frozen=True):
+    """All that engine and services get; a descriptor that it does not need is NO_DESCRIPTOR."""
 
     supervisor: int
     """Process id: a child whose parent is another one has been orphaned."""
@@ -110,20 +142,6 @@ class Handover(Record, frozen=True):
             for port in station.ports
             if port.name == name.port
         )
-
-    def to_descriptor(self) -> int:
-        """Return the descriptor of a file that holds this; the caller closes it."""
-        fd = os.memfd_create("eap-handover", os.MFD_CLOEXEC)
-        with os.fdopen(os.dup(fd), "wb") as file:
-            file.write(msgspec.json.encode(self))
-        return fd
-
-    @classmethod
-    def from_descriptor(cls, fd: int) -> Handover:
-        """Read what ``to_descriptor`` wrote, and close *fd*."""
-        with os.fdopen(fd, "rb") as file:
-            file.seek(0)
-            return msgspec.json.decode(file.read(), type=cls)
 
 
 def tell_ready(fd: int, report: dict[str, Any]) -> None:

@@ -49,6 +49,8 @@ class ApplianceInfo(msgspec.Struct):
     """Process id."""
     engine: ProcessInfo = msgspec.field(default_factory=ProcessInfo)
     services: ProcessInfo = msgspec.field(default_factory=ProcessInfo)
+    segments: dict[str, ProcessInfo] = {}
+    """Simulated buses by ``STATION/PORT``."""
 
 
 def runtime_root() -> Path:

@@ -1,26 +1,38 @@
 """A simulated segment as a process: it answers a master until it is asked to end.
 
-Commands come as JSON, one fault a line, on a descriptor; each is answered with a line by *say*.
+``eapctl sim run`` runs one in its own process; the supervisor starts one for each simulated bus
+with one argument, the descriptor of its handover.  Commands come as JSON, one fault each, as lines
+or as messages; each is answered.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import select
+import socket
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import msgspec
 
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.spec import FaultSpec
 from devicebus.sim.wiring import Side
-from eap.appliance.busfile import Bus
+from eap.appliance.busfile import Bus, load_or_raise
+from eap.appliance.handover import SegmentHandover, tell_ready
 from eap.appliance.signals import catch_end_signals
+from eap.errors import ConfigError
 from eap.ids import InterfaceUri
+from eap.net import realtime
 from eap.net.segmentsocket import SegmentSocket, open_segment
+
+NICE = 5
+"""A busy simulated segment waits for the engine, not the other way round."""
 
 _BATCH = 64
 _MS = 1_000_000
@@ -31,6 +43,68 @@ class FaultCommand(FaultSpec, frozen=True):
     """A fault as a command; with *end* the fault that it describes is over."""
 
     end: bool = False
+    id: int | None = None
+    """The answer repeats it."""
+
+
+class Commands(Protocol):
+    """Where commands come from and answers go."""
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when there is a command."""
+
+    def take(self) -> Iterable[bytes] | None:
+        """Return the commands that wait, None when no more will come."""
+
+    def answer(self, outcome: dict[str, Any]) -> None:
+        """Answer one command; neither waits nor fails."""
+
+
+class CommandLines:
+    """Commands as lines from *fd*, answered by *say*."""
+
+    def __init__(self, fd: int, say: Callable[[dict[str, Any]], None]) -> None:
+        self.answer = say
+        self._fd = fd
+        self._partial = b""
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._fd
+
+    def take(self) -> Iterable[bytes] | None:
+        """Return all whole lines that are there."""
+        data = os.read(self._fd, _MAX_COMMAND)
+        *lines, rest = (self._partial + data).split(b"\n")
+        self._partial = rest[-_MAX_COMMAND:]
+        return [line for line in map(bytes.strip, lines) if line] if data else None
+
+
+class CommandMessages:
+    """Commands as messages of *sock*; one that asks without reading gets no answers."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        sock.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._sock.fileno()
+
+    def take(self) -> Iterable[bytes] | None:
+        """Return the next message."""
+        try:
+            data = self._sock.recv(_MAX_COMMAND)
+        except BlockingIOError:
+            return ()
+        return [data] if data else None
+
+    def answer(self, outcome: dict[str, Any]) -> None:
+        """Send one message."""
+        try:
+            self._sock.send(msgspec.json.encode(outcome))
+        except OSError:
+            return
 
 
 def run(
@@ -56,39 +130,58 @@ def run(
     """
     segment = bus.build()
     with catch_end_signals() as end_fd, ExitStack() as stack:
-        sockets = {}
+        sockets: dict[Side, SegmentSocket] = {}
         for side, uri in zip(Side, (interface, second), strict=True):
             if uri is not None:
                 sockets[side] = open_segment(uri)
                 stack.callback(sockets[side].close)
         say({"ready": True, "slaves": len(bus.spec.slaves)})
-        _Loop(segment, sockets, say, command_fd).run(end_fd)
+        commands = None if command_fd is None else CommandLines(command_fd, say)
+        _Loop(segment, sockets, commands).run(end_fd)
+
+
+def run_for_appliance(handover: SegmentHandover) -> None:
+    """Answer the engine at the other end of a pair until SIGTERM.
+
+    Raises:
+        ConfigError: the bus file is none; one line a finding.
+    """
+    bus = load_or_raise(Path(handover.file))
+    segment = bus.build()
+    with catch_end_signals() as end_fd, ExitStack() as stack:
+        frames = SegmentSocket(socket.socket(fileno=handover.frames_fd))
+        stack.callback(frames.close)
+        commands = stack.enter_context(socket.socket(fileno=handover.command_fd))
+        while frames.receive() is not None:
+            continue  # sent while nobody was here, and awaited no longer
+        gc.collect()
+        gc.freeze()
+        tell_ready(handover.ready_fd, {"slaves": len(bus.spec.slaves)})
+        _Loop(segment, {Side.PRIMARY: frames}, CommandMessages(commands)).run(end_fd)
 
 
 class _Loop:
     def __init__(
         self,
         segment: FaultySegment,
-        sockets: dict[Side, SegmentSocket],
-        say: Callable[[dict[str, Any]], None],
-        command_fd: int | None,
+        sockets: Mapping[Side, SegmentSocket],
+        commands: Commands | None,
     ) -> None:
         self._segment = segment
         self._sockets = sockets
-        self._say = say
-        self._command_fd = command_fd
-        self._partial = b""
+        self._commands = commands
 
     def run(self, end_fd: int) -> None:
         poll = select.poll()
-        for fd in (end_fd, self._command_fd, *(each.fileno() for each in self._sockets.values())):
+        command_fd = self._commands.fileno() if self._commands is not None else None
+        for fd in (end_fd, command_fd, *(each.fileno() for each in self._sockets.values())):
             if fd is not None:
                 poll.register(fd, select.POLLIN)
         while True:
             for fd, _ in poll.poll(self._patience_ms()):
                 if fd == end_fd:
                     return
-                if fd == self._command_fd and not self._take_commands():
+                if fd == command_fd and not self._take_commands():
                     poll.unregister(fd)
             for side, sock in self._sockets.items():
                 self._pass_frames(side, sock)
@@ -113,21 +206,37 @@ class _Loop:
                 return
 
     def _take_commands(self) -> bool:
-        assert self._command_fd is not None  # noqa: S101  only called when it is readable
-        data = os.read(self._command_fd, _MAX_COMMAND)
-        *lines, self._partial = (self._partial + data).split(b"\n")
-        for line in filter(None, map(bytes.strip, lines)):
-            self._obey(line)
-        self._partial = self._partial[-_MAX_COMMAND:]
-        return bool(data)
+        assert self._commands is not None  # noqa: S101  only called when it is readable
+        taken = self._commands.take()
+        for text in taken or ():
+            self._commands.answer(self._obey(text))
+        return taken is not None
 
-    def _obey(self, line: bytes) -> None:
+    def _obey(self, text: bytes) -> dict[str, Any]:
         now_ns = time.monotonic_ns()
+        outcome: dict[str, Any] = {"ok": True}
         try:
-            command = msgspec.json.decode(line, type=FaultCommand)
+            command = msgspec.json.decode(text, type=FaultCommand)
+            outcome |= {} if command.id is None else {"id": command.id}
             fault = msgspec.convert(msgspec.structs.asdict(command), FaultSpec)
             (self._segment.end if command.end else self._segment.begin)(fault, now_ns)
         except (msgspec.MsgspecError, ValueError) as exc:
-            self._say({"ok": False, "error": str(exc)})
-        else:
-            self._say({"ok": True})
+            outcome |= {"ok": False, "error": str(exc)}
+        return outcome
+
+
+def main() -> int:
+    """Return the exit code: 2 for a bus file that is none."""
+    handover = SegmentHandover.from_descriptor(int(sys.argv[1]))
+    realtime.die_with_parent(handover.supervisor)
+    os.nice(NICE)
+    try:
+        run_for_appliance(handover)
+    except ConfigError as exc:
+        sys.stderr.write(f"segment: {exc}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

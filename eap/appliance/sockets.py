@@ -16,6 +16,7 @@ from typing import Self
 
 import msgspec
 
+from eap.appliance.bus_sockets import open_buses, open_message_pair
 from eap.appliance.handover import NO_DESCRIPTOR, PortName, SharedSocket, SocketKind
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
@@ -64,8 +65,11 @@ class SharedSockets:
 
     Attributes:
         descriptions: The plan, with the descriptors filled in.
+        buses: What belongs to each bus port.
         engine_link: The engine's side of its pair with services.
         services_link: The other side.
+        engine_bus: The engine's side of the pair for requests to buses, if there are any.
+        services_bus: The other side.
         control: The listening control socket.
     """
 
@@ -73,22 +77,25 @@ class SharedSockets:
         """Open everything, or nothing: EnvironmentalError says what could not be opened."""
         with ExitStack() as opened:
             self.descriptions = tuple(_open(planned, opened) for planned in plan_sockets(stations))
-            link = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            self.engine_link, self.services_link = (
-                opened.enter_context(end).fileno() for end in link
-            )
+            self.buses = open_buses(stations, opened)
+            self.engine_link, self.services_link = open_message_pair(opened)
+            self.engine_bus = self.services_bus = NO_DESCRIPTOR
+            if self.buses:
+                self.engine_bus, self.services_bus = open_message_pair(opened)
             self.control = _open_control(control_path, opened).fileno()
             self._opened = opened.pop_all()
 
     def engine_descriptors(self) -> list[int]:
         """Return what the engine inherits."""
         wanted = [shared.engine_fd for shared in self.descriptions]
-        return [fd for fd in wanted if fd != NO_DESCRIPTOR] + [self.engine_link]
+        wanted += [bus.engine_fd for bus in self.buses]
+        return _existing(*wanted, self.engine_link, self.engine_bus)
 
     def services_descriptors(self) -> list[int]:
         """Return what services inherits."""
         wanted = [shared.services_fd for shared in self.descriptions]
-        return [*wanted, self.services_link, self.control]
+        wanted += [bus.command_fd for bus in self.buses]
+        return _existing(*wanted, self.services_link, self.services_bus, self.control)
 
     def close(self) -> None:
         """Close all."""
@@ -104,6 +111,10 @@ class SharedSockets:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _existing(*descriptors: int) -> list[int]:
+    return [fd for fd in descriptors if fd != NO_DESCRIPTOR]
 
 
 def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:

@@ -11,16 +11,18 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from pathlib import Path
 from time import monotonic_ns
 
 import msgspec
+from msgspec.structs import replace
 
+from eap.appliance.bus_sockets import segments
 from eap.appliance.child import Child, describe_end
-from eap.appliance.handover import EngineOptions, Handover
+from eap.appliance.handover import EngineOptions, Handover, SegmentHandover
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
 from eap.appliance.sockets import SharedSockets
@@ -31,6 +33,8 @@ from eap.pd.spec import StationSpec
 READY_TIMEOUT_NS = 20_000_000_000
 GRACE_NS = 1_000_000_000
 """How long a process may take to end when asked; the whole appliance has two seconds."""
+SEGMENT_GRACE_NS = 500_000_000
+"""The same for simulated segments, which end after the others."""
 
 logger = logging.getLogger(__name__)
 
@@ -80,7 +84,7 @@ def _choose(plant: Plant, wanted: Sequence[str]) -> tuple[StationSpec, ...]:
 
 
 class Supervisor:
-    """Runs the engine and the services of *stations* until told to stop."""
+    """Runs engine, services and simulated buses of *stations* until told to stop."""
 
     def __init__(
         self,
@@ -95,20 +99,35 @@ class Supervisor:
         self._folder = folder
         self._engine = Child("engine", "eap.appliance.engine_process")
         self._services = Child("services", "eap.appliance.services_process")
-        self._children = (self._engine, self._services)
-        self._sockets = sockets
+        self._segments: dict[str, Child] = {}
         self._restart_ns: dict[Child, int] = {}
         self._announced = False
         self._exit_code: int | None = None
-        self._handover = Handover(
+        common = Handover(
             supervisor=os.getpid(),
             folder=str(folder.path),
             plant=info.plant,
             plant_file=info.plant_file,
             stations=stations,
             sockets=sockets.descriptions,
+            buses=sockets.buses,
             options=options,
         )
+        self._given = _given_to_segments(self._segments, common)
+        self._given[self._engine] = (
+            replace(common, link_fd=sockets.engine_link, bus_fd=sockets.engine_bus),
+            sockets.engine_descriptors(),
+        )
+        self._given[self._services] = (
+            replace(
+                common,
+                link_fd=sockets.services_link,
+                bus_fd=sockets.services_bus,
+                control_fd=sockets.control,
+            ),
+            sockets.services_descriptors(),
+        )
+        self._children = tuple(self._given)
 
     def run(self) -> int:
         """Return the exit code when everything has ended."""
@@ -125,15 +144,7 @@ class Supervisor:
 
     def _start(self, child: Child) -> None:
         self._restart_ns.pop(child, None)
-        shared = self._sockets
-        if child is self._engine:
-            handover = msgspec.structs.replace(self._handover, link_fd=shared.engine_link)
-            descriptors = shared.engine_descriptors()
-        else:
-            handover = msgspec.structs.replace(
-                self._handover, link_fd=shared.services_link, control_fd=shared.control
-            )
-            descriptors = shared.services_descriptors()
+        handover, descriptors = self._given[child]
         child.start(handover, descriptors, monotonic_ns())
         self._write_info()
 
@@ -214,10 +225,15 @@ class Supervisor:
                 child.started_ns = now_ns
 
     def _end_children(self) -> None:
-        for child in self._children:
+        """End all: segments last, for the engine brings their slaves to rest."""
+        self._end((self._engine, self._services), GRACE_NS)
+        self._end(self._segments.values(), SEGMENT_GRACE_NS)
+
+    def _end(self, children: Collection[Child], grace_ns: int) -> None:
+        for child in children:
             child.ask_to_end(signal.SIGTERM)
-        deadline_ns = monotonic_ns() + GRACE_NS
-        while running := [child for child in self._children if child.pid]:
+        deadline_ns = monotonic_ns() + grace_ns
+        while running := [child for child in children if child.pid]:
             now_ns = monotonic_ns()
             if now_ns >= deadline_ns:
                 for child in running:
@@ -235,6 +251,7 @@ class Supervisor:
     def _write_info(self) -> None:
         self._info.engine = _process_info(self._engine)
         self._info.services = _process_info(self._services)
+        self._info.segments = {name: _process_info(child) for name, child in self._segments.items()}
         self._folder.write_info(self._info)
 
 
@@ -251,3 +268,15 @@ def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> A
 
 def _process_info(child: Child) -> ProcessInfo:
     return ProcessInfo(child.pid, child.restarts, child.report)
+
+
+def _given_to_segments(
+    children: dict[str, Child], common: Handover
+) -> dict[Child, tuple[Handover | SegmentHandover, list[int]]]:
+    """Add a child for each simulated segment; return what they are given."""
+    given: dict[Child, tuple[Handover | SegmentHandover, list[int]]] = {}
+    for owner, handover in segments(common.stations, common.buses, common.supervisor):
+        name = f"{owner.station}/{owner.port}"
+        child = children[name] = Child(f"segment {name}", "eap.appliance.segment_process")
+        given[child] = handover, [handover.frames_fd, handover.command_fd]
+    return given
