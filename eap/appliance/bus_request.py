@@ -11,7 +11,7 @@ from typing import TypeAlias
 import msgspec
 
 
-class Message(msgspec.Struct, frozen=True, kw_only=True):
+class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
     """Base of all requests; *bus* counts the bus ports of the appliance in the handover's order."""
 
     id: int
