@@ -127,7 +127,7 @@ class Failure(msgspec.Struct, frozen=True):
     """Mailbox error code."""
 
 
-class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="answer"):
     """The answer to one request: *failure*, or what the request says."""
 
     id: int
@@ -137,7 +137,10 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     report: BusReport | None = None
 
 
-class Hello(msgspec.Struct, frozen=True):
+class Hello(msgspec.Struct, frozen=True, tag="hello"):
     """The first message of an engine: what was asked of the one before is not answered."""
 
     pid: int
+
+
+FromEngine: TypeAlias = Answer | Hello
