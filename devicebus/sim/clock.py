@@ -1,6 +1,7 @@
 """The distributed clock of one slave: local time, system time, and the loop that steers it.
 
 ETG.1000.4, distributed clocks.  All times are nanoseconds; the clock never asks what time it is.
+Latch inputs, a part that not every controller has, are missing.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ _LOCKED_NS = 100_000
 """Larger errors come from offsets, not from the quartz."""
 _MAX_PPB = 1_000_000
 """The largest frequency error that the loop can take out, as an ESC's own limit is near 0.1 %."""
-_SYNC_OUT, _SYNC0 = 0x01, 0x02
+_SYNC_OUT, _SYNC0, _SYNC1 = 0x01, 0x02, 0x04
+_SYNC0_PENDING, _SYNC1_PENDING, _START_IS_PAST = 0x01, 0x02, 0x04
 
 
 class Clock:
@@ -29,7 +31,7 @@ class Clock:
     """
 
     __slots__ = ("_base_local", "_base_now", "_drift_ppb", "_last_write_ns", "_memory", "_rate_ppb",
-                 "_sync0_seen")  # fmt: skip
+                 "_start_ns", "_sync0_seen", "_sync1_seen")  # fmt: skip
 
     def __init__(
         self, memory: bytearray, *, drift_ppm: float = 0.0, local_start_ns: int = 0
@@ -40,7 +42,8 @@ class Clock:
         self._drift_ppb = round(drift_ppm * 1000)
         self._rate_ppb = 0
         self._last_write_ns: int | None = None
-        self._sync0_seen = 0
+        self._start_ns: int | None = None
+        self._sync0_seen = self._sync1_seen = 0
         self._set(Register.DC_SPEED_START, 0x1000, 2)
         memory[Register.DC_SYSTEM_TIME_FILTER] = 4
         memory[Register.DC_SPEED_FILTER] = 12
@@ -64,8 +67,25 @@ class Clock:
         return (self.local_time(now_ns) + self._get(Register.DC_SYSTEM_TIME_OFFSET, 8)) % _U64
 
     def refresh(self, now_ns: int) -> None:
-        """Put the current time into the registers, before they are read."""
-        self._set(Register.DC_SYSTEM_TIME, self.system_time(now_ns), 8)
+        """Put the current times into the registers, before a master reads them.
+
+        It gets the system time at which its frame passed the reference clock, so that all slaves
+        that keep the time answer the same.
+        """
+        time_ns = self.system_time(now_ns)
+        delay = self._get(Register.DC_SYSTEM_TIME_DELAY, 4)
+        self._set(Register.DC_SYSTEM_TIME, (time_ns - delay) % _U64, 8)
+        if self._start_ns is None:
+            return
+        first, period = self._sync1_times(self._start_ns)
+        cycle = self._get(Register.DC_SYNC0_CYCLE, 4)
+        sync0 = _next(self._start_ns, cycle, time_ns)
+        sync1 = _next(first, period, time_ns) if self.sync1_is_active else 0
+        self._set(Register.DC_START_TIME, sync0, 8)
+        self._set(Register.DC_NEXT_SYNC1, sync1, 8)
+        pending = _SYNC0_PENDING * (time_ns < self._start_ns)
+        pending |= _SYNC1_PENDING * (self.sync1_is_active and time_ns < first)
+        self._memory[Register.DC_ACTIVATION_STATUS] = pending
 
     def latch(self, now_ns: int, port_delays: tuple[int | None, ...]) -> None:
         """Note when a frame passed; a delay of None is a port that it did not pass."""
@@ -99,22 +119,60 @@ class Clock:
         """Forget what the loop has learnt, as a write to its parameters does."""
         self._last_write_ns = None
 
+    def activate(self, now_ns: int) -> None:
+        """Start or stop SYNC0 and SYNC1, as the activation register now says.
+
+        A start time that lies in the past starts nothing, as it does not in a controller either.
+        """
+        self._sync0_seen = self._sync1_seen = 0
+        self._start_ns = None
+        self._memory[Register.DC_ACTIVATION_STATUS] = 0
+        if not self._has(_SYNC_OUT | _SYNC0) or not self._get(Register.DC_SYNC0_CYCLE, 4):
+            return
+        start = self._get(Register.DC_START_TIME, 8)
+        if start < self.system_time(now_ns):
+            self._memory[Register.DC_ACTIVATION_STATUS] = _START_IS_PAST
+        else:
+            self._start_ns = start
+
     @property
     def sync0_is_active(self) -> bool:
-        """Whether SYNC0 is switched on with a cycle."""
-        active = self._memory[Register.DC_ACTIVATION]
-        return active & 3 == _SYNC_OUT | _SYNC0 and self._get(Register.DC_SYNC0_CYCLE, 4) > 0
+        """Whether SYNC0 is switched on with a cycle and begins, or has begun."""
+        return self._start_ns is not None
+
+    @property
+    def sync1_is_active(self) -> bool:
+        """Whether SYNC1 runs beside SYNC0."""
+        return self._start_ns is not None and self._has(_SYNC1)
 
     def take_sync0(self, now_ns: int) -> int:
         """Return how many SYNC0 pulses came since the last time."""
-        if not self.sync0_is_active:
-            self._sync0_seen = 0
+        if self._start_ns is None:
             return 0
-        since = self.system_time(now_ns) - self._get(Register.DC_START_TIME, 8)
-        pulses = since // self._get(Register.DC_SYNC0_CYCLE, 4) + 1 if since >= 0 else 0
-        fresh = max(0, pulses - self._sync0_seen)
-        self._sync0_seen = pulses
-        return fresh
+        cycle = self._get(Register.DC_SYNC0_CYCLE, 4)
+        pulses = _pulses(self._start_ns, cycle, self.system_time(now_ns))
+        fresh, self._sync0_seen = pulses - self._sync0_seen, max(pulses, self._sync0_seen)
+        return max(0, fresh)
+
+    def take_sync1(self, now_ns: int) -> int:
+        """Return how many SYNC1 pulses came since the last time."""
+        if self._start_ns is None or not self.sync1_is_active:
+            return 0
+        pulses = _pulses(*self._sync1_times(self._start_ns), self.system_time(now_ns))
+        fresh, self._sync1_seen = pulses - self._sync1_seen, max(pulses, self._sync1_seen)
+        return max(0, fresh)
+
+    def _sync1_times(self, start_ns: int) -> tuple[int, int]:
+        """Return when SYNC1 first comes, and its period.
+
+        It follows a SYNC0 by the SYNC1 cycle time; the SYNC0 pulses meanwhile start none.
+        """
+        sync0 = self._get(Register.DC_SYNC0_CYCLE, 4)
+        sync1 = self._get(Register.DC_SYNC1_CYCLE, 4)
+        return start_ns + sync1, (sync1 // sync0 + 1) * sync0 if sync0 else 0
+
+    def _has(self, bits: int) -> bool:
+        return self._memory[Register.DC_ACTIVATION] & bits == bits
 
     def _rebase(self, now_ns: int, step_ns: int) -> None:
         local = self.local_time(now_ns)
@@ -126,3 +184,13 @@ class Clock:
 
     def _set(self, at: int, value: int, size: int) -> None:
         self._memory[at : at + size] = value.to_bytes(size, "little")
+
+
+def _pulses(first_ns: int, period_ns: int, time_ns: int) -> int:
+    if time_ns < first_ns or not period_ns:
+        return 0
+    return (time_ns - first_ns) // period_ns + 1
+
+
+def _next(first_ns: int, period_ns: int, time_ns: int) -> int:
+    return (first_ns + _pulses(first_ns, period_ns, time_ns) * period_ns) % _U64

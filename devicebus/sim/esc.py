@@ -262,6 +262,8 @@ class Esc:
             self.clock.steer(bytes(self.memory[Register.DC_SYSTEM_TIME : last]), entry)
         if start < Register.DC_SYSTEM_TIME_FILTER + 2 and end > Register.DC_SYSTEM_TIME_OFFSET:
             self.clock.restart_loop()
+        if start <= Register.DC_ACTIVATION < end:
+            self.clock.activate(now_ns)
 
     def _read_memory(self, start: int, end: int) -> bytes | None:
         for channel in self._guards:

@@ -92,7 +92,10 @@ class Segment:
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
         times = [at for slave in self.slaves if (at := slave.next_timeout()) is not None]
-        return min(times, default=None)
+        if not times:
+            return None
+        # Slaves look at the time once in a while only: an earlier call would change nothing.
+        return max(min(times), self._poll_at_ns or 0)
 
     def handle_timeout(self, now_ns: int) -> None:
         """Let the slaves look at the time; more often than every millisecond costs nothing."""

@@ -86,13 +86,21 @@ class Slave:
             self._refuse(AlStatusCode.NO_OUTPUTS)
         if self._has_mailbox():
             self._move_messages(now_ns)
-        if self.esc.clock.take_sync0(now_ns) and self.state in _WITH_PROCESS_DATA:
+        if self._is_sync_pulse(now_ns) and self.state in _WITH_PROCESS_DATA:
             self._offer_inputs(now_ns)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
+        if not self.is_powered:
+            return None
         times = [at for at in (self.esc.watchdog.deadline_ns, self._deadline_ns) if at is not None]
         return min(times, default=None)
+
+    def _is_sync_pulse(self, now_ns: int) -> bool:
+        """Whether inputs are to be latched: by SYNC1 where it runs, else by SYNC0."""
+        clock = self.esc.clock
+        sync0 = clock.take_sync0(now_ns)
+        return clock.take_sync1(now_ns) > 0 if clock.sync1_is_active else sync0 > 0
 
     def fail(self, code: int) -> None:
         """Report an error of its own; in OP it falls back to SAFEOP."""

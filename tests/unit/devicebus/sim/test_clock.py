@@ -89,24 +89,88 @@ def test_new_parameters_restart_the_loop(memory):
     assert clock.local_time(2000) == 2000
 
 
+def activate(memory, clock, activation, *, start=1_000, sync0=500, sync1=0, now=0):
+    put(memory, Register.DC_START_TIME, start, 8)
+    put(memory, Register.DC_SYNC0_CYCLE, sync0, 4)
+    put(memory, Register.DC_SYNC1_CYCLE, sync1, 4)
+    memory[Register.DC_ACTIVATION] = activation
+    clock.activate(now)
+
+
+def test_what_a_master_reads_is_the_time_at_the_reference(memory):
+    clock = Clock(memory)
+    put(memory, Register.DC_SYSTEM_TIME_DELAY, 100, 4)
+    clock.local_time(0)
+    clock.refresh(1_000)
+    assert get(memory, Register.DC_SYSTEM_TIME, 8) == 900
+    assert clock.system_time(1_000) == 1_000
+    clock.steer((900).to_bytes(8, "little"), 1_000)
+    assert get(memory, Register.DC_SYSTEM_TIME_DIFFERENCE, 4) == 0
+
+
 def test_sync0_counts_cycles_since_its_start(memory):
     clock = Clock(memory)
     clock.local_time(0)
     assert clock.take_sync0(10**6) == 0
-    put(memory, Register.DC_START_TIME, 1_000, 8)
-    put(memory, Register.DC_SYNC0_CYCLE, 500, 4)
-    memory[Register.DC_ACTIVATION] = 3
+    activate(memory, clock, 3)
     assert clock.sync0_is_active
+    assert not clock.sync1_is_active
     assert clock.take_sync0(999) == 0
     assert clock.take_sync0(1_000) == 1
     assert clock.take_sync0(1_000) == 0
     assert clock.take_sync0(2_499) == 2
     memory[Register.DC_ACTIVATION] = 0
+    clock.activate(9_000)
     assert clock.take_sync0(10_000) == 0
 
 
 @pytest.mark.parametrize(("activation", "cycle"), [(1, 500), (2, 500), (3, 0)])
 def test_sync0_needs_both_bits_and_a_cycle(memory, activation, cycle):
-    put(memory, Register.DC_SYNC0_CYCLE, cycle, 4)
-    memory[Register.DC_ACTIVATION] = activation
-    assert not Clock(memory).sync0_is_active
+    clock = Clock(memory)
+    activate(memory, clock, activation, sync0=cycle)
+    assert not clock.sync0_is_active
+
+
+def test_sync0_that_should_have_begun_never_does(memory):
+    clock = Clock(memory, local_start_ns=5_000)
+    activate(memory, clock, 3)
+    assert not clock.sync0_is_active
+    assert memory[Register.DC_ACTIVATION_STATUS] == 4
+    assert clock.take_sync0(10**9) == 0
+
+
+@pytest.mark.parametrize(
+    ("sync1", "times"),
+    [
+        (0, [1_000, 1_500, 2_000]),
+        (200, [1_200, 1_700, 2_200]),
+        (500, [1_500, 2_500, 3_500]),
+        (1_100, [2_100, 3_600, 5_100]),
+    ],
+)
+def test_sync1_follows_sync0(memory, sync1, times):
+    clock = Clock(memory)
+    clock.local_time(0)
+    activate(memory, clock, 7, sync1=sync1)
+    assert clock.sync1_is_active
+    assert [clock.take_sync1(at - 1 + late) for at in times for late in (0, 1)] == [0, 1] * 3
+
+
+def test_next_pulses_are_shown(memory):
+    clock = Clock(memory)
+    clock.local_time(0)
+    activate(memory, clock, 7, sync1=200)
+    shown = []
+    for now in (500, 1_000, 1_100, 1_200, 2_250):
+        clock.refresh(now)
+        shown.append(
+            (
+                memory[Register.DC_ACTIVATION_STATUS],
+                get(memory, Register.DC_START_TIME, 8),
+                get(memory, Register.DC_NEXT_SYNC1, 8),
+            )
+        )
+    assert shown == [
+        (3, 1_000, 1_200), (2, 1_500, 1_200), (2, 1_500, 1_200), (0, 1_500, 1_700),
+        (0, 2_500, 2_700),
+    ]  # fmt: skip

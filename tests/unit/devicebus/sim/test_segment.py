@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.segment import Cable, Segment
+from devicebus.sim.spec import ClockSpec
 from devicebus.sim.wiring import CABLE_NS, FORWARD_NS, Side
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
@@ -137,6 +138,52 @@ def test_slaves_look_at_the_time_between_frames():
     assert deadline == 100_000_000
     bench.segment.handle_timeout(deadline)
     assert bench.slaves[0].state is AlState.SAFEOP
+
+
+@pytest.mark.parametrize("late_ns", [0, 100, 999_999, 5_000_000])
+def test_next_timeout_is_never_over(late_ns):
+    bench = line(2)
+    bench.bring(AlState.OP)
+    bench.cycle()
+    bench.now_ns = bench.segment.next_timeout() - 1
+    bench.read(Register.AL_STATUS, 6)
+    bench.now_ns += 1 + late_ns
+    bench.segment.handle_timeout(bench.now_ns)
+    due = bench.segment.next_timeout()
+    while due is not None:
+        assert due > bench.now_ns
+        bench.now_ns = due
+        bench.segment.handle_timeout(due)
+        due = bench.segment.next_timeout()
+    assert bench.slaves[0].state is AlState.SAFEOP
+
+
+def test_slave_without_power_waits_for_nothing():
+    bench = line(2)
+    bench.bring(AlState.OP)
+    bench.cycle()
+    bench.segment.switch(0, on=False)
+    assert bench.segment.next_timeout() is None
+
+
+def test_clocks_show_one_time_once_they_follow_the_reference():
+    slow = ClockSpec(drift_ppm=-80, start_ns=123_456_789)
+    bench = Bench(generic("a"), generic("b", clock=slow), generic("c"), cable_ns=700)
+    for number in (1, 2):
+        delay = number * (FORWARD_NS + 700)
+        station = STATION + number
+        bench.write(Register.DC_SYSTEM_TIME_DELAY, delay.to_bytes(4, "little"), station)
+        there = bench.slaves[number].esc.clock.local_time(0)
+        bench.write(Register.DC_SYSTEM_TIME_OFFSET, (-there % (1 << 64)).to_bytes(8, "little"),
+                    station)  # fmt: skip
+    for _ in range(3000):
+        bench.now_ns += 1_000_000
+        bench.send(Command.FRMW, STATION, Register.DC_SYSTEM_TIME, bytes(8))
+    times = [slave.esc.clock.system_time(bench.now_ns) for slave in bench.slaves]
+    assert max(times) - min(times) < 20
+    read = [bench.read(Register.DC_SYSTEM_TIME, 8, STATION + n).data for n in range(3)]
+    shown = [int.from_bytes(octets, "little") for octets in read]
+    assert max(shown) - min(shown) < 20
 
 
 @pytest.mark.parametrize("frames", [1, 3])
