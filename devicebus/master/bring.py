@@ -41,7 +41,7 @@ def bring(bus: Bus, unit: Unit, target: AlState) -> Procedure[None]:
     """
     if unit.found.fault:
         raise SiiError(unit.found.fault)
-    current = yield from acknowledge(unit.station)
+    unit.state = current = yield from acknowledge(unit.station)
     for step in path(current, target):
         yield from _prepare(bus, unit, current, step)
         yield from change_state(unit.station, step)

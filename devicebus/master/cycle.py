@@ -62,6 +62,9 @@ class Cycle:
         image: Outputs and inputs.
         knows_lrw: Whether all slaves let one datagram read and write.
         trouble: Called with the time when a cycle does not come back as expected.
+
+    Attributes:
+        is_good: Whether the last cycle has come back with the expected working counters.
     """
 
     def __init__(
@@ -81,6 +84,7 @@ class Cycle:
         )
         self._allowed: tuple[frozenset[int], ...] = ()
         self._judge()
+        self.is_good = False
         self._cycles = self._good = self._wkc_errors = self._lost = 0
         self._received = self._trip_ns = self._max_trip_ns = 0
 
@@ -102,6 +106,7 @@ class Cycle:
         if not accesses:
             return
         self._cycles += 1
+        self.is_good = False
         allowed = self._allowed
 
         def done(outcome: list[Reply] | FrameLostError, done_ns: int) -> None:
@@ -147,6 +152,7 @@ class Cycle:
         count = len(self._parts)
         self._received = sum(reply.wkc for reply in replies[:count])
         self.take_extra(replies[count:])
+        self.is_good = is_good
         if is_good:
             self._good += 1
         else:

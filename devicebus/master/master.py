@@ -11,14 +11,14 @@ from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.master.bring import bring
 from devicebus.master.bus import Bus, MasterSettings, Unit
-from devicebus.master.cycle import CycleStats
+from devicebus.master.cycle import Cycle, CycleStats
 from devicebus.master.event import Event
 from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
 from devicebus.master.mailstats import MailboxStats
 from devicebus.master.procedure import Procedure
 from devicebus.master.scan import FoundSlave, scan
-from devicebus.master.startup import start_up
+from devicebus.master.startup import shut_down, start_up
 from devicebus.master.task import Task
 from devicebus.master.watch import watch
 from devicebus.wire.alstatus import AlState
@@ -60,6 +60,11 @@ class Master:
         """Process data, None before it is laid out."""
         return self._bus.image
 
+    @property
+    def cycle(self) -> Cycle | None:
+        """The exchange of process data, None before it is laid out; for reading."""
+        return self._bus.cycle
+
     def bring_up(self, now_ns: int, target: AlState = AlState.OP) -> Task[None]:
         """Find the slaves and bring them to *target*; from then on they are kept there.
 
@@ -76,6 +81,13 @@ class Master:
         self._running = task
         task.watch(keep)
         return task
+
+    def shut_down(self, now_ns: int) -> Task[None]:
+        """Forget the slaves and bring them to INIT, where their outputs are off."""
+        if self._running is not None:
+            self._running.cancel()
+        self._running = self.run(shut_down(self._bus), now_ns, "shutting down the bus")
+        return self._running
 
     def scan(self, now_ns: int) -> Task[tuple[FoundSlave, ...]]:
         """Look who is there, without changing anybody's state."""

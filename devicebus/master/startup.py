@@ -1,21 +1,22 @@
-"""From an unknown bus to one that runs."""
+"""From an unknown bus to one that runs, and to one that rests."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from devicebus.errors import BusError
-from devicebus.master.access import bwr
+from devicebus.errors import BusError, StateTimeoutError
+from devicebus.master.access import brd, bwr
 from devicebus.master.bring import bring, read_process_data, set_clocks
 from devicebus.master.bus import Bus, Unit
 from devicebus.master.cycle import Cycle
+from devicebus.master.esm import POLL_NS, TIMEOUT_NS
 from devicebus.master.expected import check_bus
 from devicebus.master.image import BusImage
 from devicebus.master.layout import SlaveShape, lay_out
-from devicebus.master.procedure import Procedure, together
+from devicebus.master.procedure import Procedure, Sleep, together
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.register import AlControl, Register
+from devicebus.wire.register import AlControl, AlStatus, Register
 from eap.errors import EapError
 
 
@@ -50,6 +51,25 @@ def start_up(bus: Bus, target: AlState) -> Procedure[None]:
     yield from _bring_all(bus, units, AlState.SAFEOP)
     if target is AlState.OP:
         yield from _bring_all(bus, units, AlState.OP)
+
+
+def shut_down(bus: Bus) -> Procedure[None]:
+    """Bring all slaves to INIT, and keep nobody anywhere any more.
+
+    Raises:
+        StateTimeoutError: some stay in another state.
+        FrameLostError: nothing comes back.
+    """
+    bus.forget()
+    yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
+    _, now_ns = yield Sleep(0)
+    deadline_ns = now_ns + TIMEOUT_NS[AlState.INIT]
+    while now_ns < deadline_ns:
+        (reply,), _ = yield [brd(Register.AL_STATUS, AlStatus.SIZE)]
+        if AlStatus.decode(reply.data).state in {0, AlState.INIT}:
+            return
+        _, now_ns = yield Sleep(POLL_NS)
+    raise StateTimeoutError("some slaves are not in INIT within 5 s")
 
 
 def set_up_cycle(bus: Bus) -> None:

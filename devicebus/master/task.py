@@ -11,6 +11,10 @@ from eap.errors import EapError
 T = TypeVar("T")
 
 
+def _nothing() -> None:
+    """There is nothing to stop any more."""
+
+
 class Task(Generic[T]):
     """A procedure or a conversation that runs.
 
@@ -67,6 +71,7 @@ class Task(Generic[T]):
         self._tell()
 
     def _tell(self) -> None:
+        self._stop = _nothing  # whoever is behind it knows the task: this would be a circle
         watchers, self._watchers = self._watchers, []
         for callback in watchers:
             callback(self)

@@ -114,3 +114,13 @@ def test_a_bus_without_process_data_sends_nothing():
     cycle = Cycle(link := Link(), BusImage(lay_out([])), lambda now: None, knows_lrw=True)
     cycle.start(0)
     assert (link.frames_to_send(0), cycle.stats().cycles) == ([], 0)
+
+
+def test_whether_the_last_cycle_came_back_well_is_known_at_any_time():
+    f = Fixture()
+    f.round(7)
+    assert f.cycle.is_good
+    f.cycle.start(MS)
+    assert not f.cycle.is_good
+    f.round(6, now_ns=2 * MS)
+    assert not f.cycle.is_good

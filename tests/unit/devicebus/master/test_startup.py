@@ -2,7 +2,13 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.errors import AlStatusError, BusError, FrameLostError, IdentityError
+from devicebus.errors import (
+    AlStatusError,
+    BusError,
+    FrameLostError,
+    IdentityError,
+    StateTimeoutError,
+)
 from devicebus.master.bus import MasterSettings
 from devicebus.master.clocks import Sync0
 from devicebus.master.expected import ExpectedSlave
@@ -134,3 +140,22 @@ def test_a_bus_without_any_clock_runs_all_the_same():
     line = line_of(slave("a", clock=None), clocks=True)
     line.wait(line.core.bring_up(line.now_ns))
     assert states(line) == [AlState.OP]
+
+
+def test_a_bus_that_is_shut_down_stays_in_init():
+    line = line_of(*SLAVES)
+    line.wait(line.core.bring_up(line.now_ns))
+    assert line.core.cycle is not None
+    line.wait(line.core.shut_down(line.now_ns))
+    assert set(states(line)) == {AlState.INIT}
+    assert (line.core.units, line.core.cycle) == ({}, None)
+    line.elapse(500 * MS)
+    assert set(states(line)) == {AlState.INIT}
+
+
+def test_a_bus_that_does_not_rest_is_told():
+    line = line_of(slave("a"))
+    line.wait(line.core.bring_up(line.now_ns))
+    line.segment.slaves[0].refuses[AlState.INIT] = 0x11
+    with pytest.raises(StateTimeoutError, match="not in INIT within 5 s"):
+        line.wait(line.core.shut_down(line.now_ns))

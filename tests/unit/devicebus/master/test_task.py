@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import weakref
+
 import pytest
 
 from devicebus.errors import BusError
@@ -47,3 +49,16 @@ def test_cancelling_what_is_done_changes_nothing(task, stopped):
     task.finish(5)
     task.cancel()
     assert (task.result(), stopped) == (5, [])
+
+
+def test_nothing_is_kept_of_what_was_behind_a_task_that_is_done():
+    class Behind:
+        def stop(self):
+            raise AssertionError
+
+    behind = Behind()
+    gone = weakref.ref(behind)
+    done = Task("x", behind.stop)
+    done.finish(1)
+    del behind
+    assert gone() is None
