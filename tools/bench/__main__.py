@@ -28,7 +28,10 @@ from tools.bench.figures import (
 from tools.bench.network import ROOT
 from tools.bench.settings import Settings, quick
 
-NAMES = ("throughput", "latency", "lateness", "solar", "limits", "receive", "startup")
+NAMES = (
+    "throughput", "latency", "lateness", "solar", "limits", "receive", "startup",
+    "acyclic", "cycle", "segment",
+)  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
 BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"
 

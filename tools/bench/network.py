@@ -46,11 +46,11 @@ class Worker:
     def __init__(self, command: Sequence[str]) -> None:
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT)
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self, longer_s: float = 0.0) -> dict[str, Any]:
         """Wait for the next line; raise RuntimeError if the process ends or hangs instead."""
         output = self._process.stdout
         assert output is not None  # noqa: S101  it was asked for
-        ready, _, _ = select.select([output], [], [], _ANSWER_WITHIN_S)
+        ready, _, _ = select.select([output], [], [], _ANSWER_WITHIN_S + longer_s)
         line = output.readline() if ready else b""
         if not line:
             raise RuntimeError(f"{self._process.args!r} ended or hangs without an answer")

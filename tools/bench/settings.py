@@ -17,6 +17,7 @@ class Settings(msgspec.Struct, frozen=True):
     lateness_s: float = 12.0
     solar_s: float = 60.0
     search_s: float = 5.0
+    cycle_s: float = 60.0
     micro_repeats: int = 7
     started: float = msgspec.field(default_factory=monotonic)
 
@@ -34,5 +35,6 @@ def quick() -> Settings:
         lateness_s=2.0,
         solar_s=10.0,
         search_s=1.5,
+        cycle_s=5.0,
         micro_repeats=3,
     )

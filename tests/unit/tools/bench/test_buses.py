@@ -1,0 +1,18 @@
+"""Bus files for measurements."""
+
+from __future__ import annotations
+
+import pytest
+
+from eap.appliance.busfile import load_or_raise
+from tools.bench.buses import bus, encode
+
+
+@pytest.mark.parametrize("slaves", [1, 4, 16, 32, 64])
+def test_any_number_of_slaves_shares_the_octets(tmp_path, slaves: int) -> None:
+    path = tmp_path / "bus.yaml"
+    path.write_bytes(encode(bus(slaves, 512)))
+    segment = load_or_raise(path).build().segment
+    assert len(segment.slaves) == slaves
+    data = [each.device.process_data for each in segment.slaves]
+    assert sum(each.outputs.size + each.inputs.size for each in data) == 512

@@ -1,0 +1,40 @@
+"""What is said of a run of cycles, and what may not happen in one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tools.bench.cycle import SLAVES, figures
+from tools.bench.figures import Figure, Verdict
+
+TIMES = {"p50": 20_000, "p99": 50_000, "max": 200_000}
+
+
+def shown(**busy: int) -> dict[str, Figure]:
+    noted: dict[str, Any] = {
+        "cycles": 5000, "wkc_errors": 0, "lost": 0, "skipped": 0, "skipped_by_work": 0,
+        "unanswered": 0, "cpu": 0.25, "late_ns": TIMES, "trip_ns": TIMES,
+    }  # fmt: skip
+    answer = {
+        "slaves": SLAVES, "reads": 100, "octets": 1_500_000, "quiet": noted, "busy": noted | busy,
+    }  # fmt: skip
+    return {figure.name: figure for figure in figures(answer)}
+
+
+def test_cycles_skipped_by_the_master_itself_are_told_from_others() -> None:
+    found = shown(skipped=5, skipped_by_work=2)
+    assert found["cycles skipped by mailbox work"].value == 2
+    assert found["cycles skipped by mailbox work"].verdict is Verdict.MISSED
+    others = "cycles skipped while others had the processor, with and without mailbox traffic"
+    assert found[others].measured == "3 and 0"
+
+
+def test_times_are_in_microseconds() -> None:
+    assert shown()["lateness without"].measured == "p50 20 µs, p99 50 µs, max 200 µs"
+
+
+def test_a_missing_slave_is_no_measurement() -> None:
+    with pytest.raises(RuntimeError, match="3 slaves, there are 16"):
+        figures({"slaves": 3, "busy": {}, "quiet": {}})
