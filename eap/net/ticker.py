@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import os
+import platform
 import select
+import struct
 import time
 from functools import partial
 
@@ -15,6 +17,9 @@ _EVENTS = 8
 _LONG_NS = 1_000_000
 _LEAD_NS = 150_000
 _LARGEST_EVENT = 16
+# struct epoll_event: its 64 bits of data, of which Python uses the first half for the descriptor,
+# are packed behind the events on x86-64 only.
+_EVENT = struct.Struct("=Ii4x" if platform.machine() == "x86_64" else "=I4xi4x")
 
 _library = ctypes.CDLL(None, use_errno=True)
 
@@ -46,6 +51,7 @@ class Ticker:
         self._timer = -1
         self._registered: set[int] = set()
         self._events = bytearray(_EVENTS * _LARGEST_EVENT)
+        self._count = 0
 
     def register(self, fd: int) -> None:
         """Let *fd* end a wait when it becomes readable; it does so until it is read empty."""
@@ -67,12 +73,18 @@ class Ticker:
         That is a descriptor or a signal; a Python signal handler has run by the time this returns.
         A deadline in the past returns at once.
         """
+        self._count = 0
         rest_ns = deadline_ns - time.monotonic_ns()
         if rest_ns <= 0:
             return True
         if rest_ns > _LONG_NS and not self._wait_until(deadline_ns - _LEAD_NS):
             return False
         return self._wait_until(deadline_ns)
+
+    def arrivals(self) -> list[int]:
+        """Return the descriptors that the last wait found readable, at most eight of them."""
+        events = (_EVENT.unpack_from(self._events, n * _EVENT.size) for n in range(self._count))
+        return [fd for _, fd in events if fd in self._registered]
 
     def close(self) -> None:
         """Give the timer back."""
@@ -87,7 +99,7 @@ class Ticker:
         if not self._registered:
             return not self._sleep()
         self._set_timer()
-        self._poll()
+        self._count = self._poll()
         return time.monotonic_ns() >= at_ns
 
     def _open(self) -> None:
@@ -102,5 +114,4 @@ class Ticker:
             _library["timerfd_settime"], self._timer, _TIMER_ABSTIME, ctypes.c_void_p(address), None
         )
         events = ctypes.c_void_p(ctypes.addressof(ctypes.c_char.from_buffer(self._events)))
-        # Which descriptor it was is not asked: the clock says whether the deadline has passed.
         self._poll = partial(_library["epoll_wait"], self._epoll.fileno(), events, _EVENTS, -1)

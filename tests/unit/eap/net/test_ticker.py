@@ -93,3 +93,24 @@ def test_closing_twice_is_harmless(pipe):
     ticker.close()
     ticker.close()
     assert wait_us(ticker, 100)[0]
+
+
+def test_those_that_are_readable_are_named(ticker, pipe):
+    other, far = os.pipe()
+    try:
+        for fd in (pipe[0], other):
+            ticker.register(fd)
+        assert ticker.wait(time.monotonic_ns() + 1000)
+        assert ticker.arrivals() == []
+        os.write(pipe[1], b"x")
+        assert not ticker.wait(time.monotonic_ns() + LATER_NS)
+        assert ticker.arrivals() == [pipe[0]]
+        os.write(far, b"x")
+        assert not ticker.wait(time.monotonic_ns() + LATER_NS)
+        assert set(ticker.arrivals()) == {pipe[0], other}
+        assert ticker.wait(0)
+        assert ticker.arrivals() == []
+        ticker.unregister(other)
+    finally:
+        os.close(other)
+        os.close(far)
