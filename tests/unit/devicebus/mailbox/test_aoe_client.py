@@ -4,7 +4,7 @@ import pytest
 
 from devicebus.errors import MailboxProtocolError
 from devicebus.mailbox import aoe_client
-from devicebus.mailbox.aoe_server import AoeServer
+from devicebus.mailbox.aoe_server import AmsAnswer, AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
@@ -37,7 +37,9 @@ def test_exchange_takes_the_answer_to_its_request() -> None:
 
 
 def test_exchange_with_our_slave() -> None:
-    line = open_line(AOE, AoeServer(lambda header, data: data[::-1]), MailboxSizes())
+    line = open_line(
+        AOE, AoeServer(lambda header, data: AmsAnswer(data[::-1]), MailboxSizes()), MailboxSizes()
+    )
     header, data = line.run(aoe_client.exchange(READ, b"abc"))
     assert (header.source, header.error_code, data) == (SLAVE, 0, b"cba")
 
