@@ -1,4 +1,7 @@
-"""What the cyclic core asks of a network: the one seam between ``eap.pd`` and ``eap.net``."""
+"""What the cyclic core asks of networks: of one to other stations, and of a bus of slaves.
+
+The one seam between ``eap.pd`` and whatever brings frames to a wire.
+"""
 
 from __future__ import annotations
 
@@ -45,3 +48,34 @@ class Channel(Protocol):
     @property
     def minimum_size(self) -> int:
         """Shortest buffer to hand over; shorter frames are padded with zeros."""
+
+
+class CyclicBus(Protocol):
+    """The slaves of one bus port, as a station's cycle sees them.
+
+    An exchange takes a cycle and is waited for by nobody: its frames leave at the end of one cycle,
+    with the outputs of that cycle, and what they bring is taken at the start of the next.  No call
+    waits or raises: a bus that cannot work counts that and says why where it is asked, and the
+    cycles of all stations go on.
+    """
+
+    def take_inputs(self) -> None:
+        """Put what the last exchange brought, inputs and states, into the station's image.
+
+        Called in each cycle, while the engine's region is marked as changing.
+        """
+
+    def exchange(self, now_ns: int) -> None:
+        """Take the outputs out of the station's image and start the next exchange."""
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has to be called, None for never."""
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Time passed; early calls are harmless."""
+
+    def receive(self, now_ns: int) -> None:
+        """Take the frames that are there; called in each cycle before its inputs are taken.
+
+        Also called as soon as frames arrive.  The image stays untouched.
+        """

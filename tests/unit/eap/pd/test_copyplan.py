@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.pd.copyplan import CopyPlan, Move
+
+SOURCE_SIZE = 24
+SOURCES = st.binary(min_size=SOURCE_SIZE, max_size=SOURCE_SIZE)
+
+
+def bits_of(octets: Iterable[int]) -> list[int]:
+    return [octet >> bit & 1 for octet in octets for bit in range(8)]
+
+
+def octets_of(bits: list[int]) -> bytes:
+    return bytes(
+        sum(bit << n for n, bit in enumerate(bits[at : at + 8])) for at in range(0, len(bits), 8)
+    )
+
+
+def copied_bit_by_bit(moves: Iterable[Move], source: bytes, target: bytes) -> bytes:
+    before, after = bits_of(source), bits_of(target)
+    for move in moves:
+        for bit in range(move.bits):
+            after[move.target_bit + bit] = before[move.source_bit + bit]
+    return octets_of(after)
+
+
+def copied(plan: CopyPlan, source: bytes, target: bytes) -> bytes:
+    memory = bytearray(target)
+    plan.run(memoryview(source), memoryview(memory))
+    return bytes(memory)
+
+
+@st.composite
+def plans(draw: st.DrawFn) -> tuple[list[Move], int]:
+    """Moves that write each bit at most once, often side by side; and the size of the target."""
+    moves, end = [], draw(st.integers(0, 20))
+    source = draw(st.integers(0, 20))
+    for _ in range(draw(st.integers(0, 8))):
+        bits = draw(st.integers(1, 70))
+        if draw(st.booleans()):
+            gap = draw(st.integers(0, 18))
+            end += gap
+            source += gap
+        if draw(st.integers(0, 3)) == 0:
+            source = draw(st.integers(0, 8 * SOURCE_SIZE - bits))
+        if source + bits > 8 * SOURCE_SIZE:
+            source = 0
+        moves.append(Move(source, end, bits))
+        source, end = source + bits, end + bits
+    draw(st.randoms()).shuffle(moves)
+    return moves, end // 8 + 2
+
+
+@given(plans(), SOURCES, st.integers(0, 255))
+def test_every_plan_does_what_copying_bit_by_bit_does(planned, source, filling):
+    moves, size = planned
+    target = bytes([filling]) * size
+    assert copied(CopyPlan(moves), source, target) == copied_bit_by_bit(moves, source, target)
+
+
+@given(plans(), SOURCES, st.integers(0, 255), st.data())
+def test_bits_in_use_stay_though_others_are_copied_along(planned, source, filling, data):
+    moves, size = planned
+    target = bytes([filling]) * size
+    written = {bit for move in moves for bit in range(move.target_bit, move.target_bit + move.bits)}
+    others = sorted(set(range(8 * size)) - written)
+    used = data.draw(st.sets(st.sampled_from(others))) if others else set()
+    plan = CopyPlan(moves, used=[(bit, 1) for bit in sorted(used)])
+    expected = bits_of(copied_bit_by_bit(moves, source, target))
+    got = bits_of(copied(plan, source, target))
+    assert [got[bit] for bit in sorted(used | written)] == [
+        expected[bit] for bit in sorted(used | written)
+    ]
+    assert plan.operations <= CopyPlan(moves).operations
+
+
+def test_moves_side_by_side_are_one_copy_in_whatever_order_they_come():
+    moves = [Move(8 * n, 64 + 8 * n, 8) for n in (3, 0, 2, 1)] + [(32, 96, 5), (37, 101, 3)]
+    assert CopyPlan(moves).operations == 1
+
+
+def test_bits_of_one_octet_are_taken_in_one_step():
+    plan = CopyPlan([(bit, 15 - bit, 1) for bit in range(8)])
+    assert plan.operations == 1
+    assert copied(plan, b"\x0b", b"\0\xff") == b"\0\xd0"
+
+
+def test_padding_that_nobody_uses_is_copied_along():
+    """Two slaves of 4 bits and one of 16, each from an octet on, then another variable's bit."""
+    moves = [*(Move(bit, 80 + bit, 1) for bit in range(4)), Move(8, 88, 1), Move(16, 96, 16)]
+    assert CopyPlan(moves).operations == 3
+    plan = CopyPlan(moves, used=[(0, 80), (112, 1)])
+    assert plan.operations == 1
+    assert copied(plan, b"\x03\x01\x34\x12", bytes(15)) == bytes(10) + b"\x03\x01\x34\x12\0"
+    # With a bit in use between two of them they stay apart.
+    assert CopyPlan(moves, used=[(90, 1)]).operations == 3
+    assert CopyPlan(moves, used=[(80, 16)]).operations == 3
+
+
+def test_a_plan_may_copy_within_one_memory():
+    memory = bytearray(b"\x01\x02\x03\0\0\0\0")
+    CopyPlan([(0, 32, 16), (17, 24, 1)]).run(memory, memoryview(memory))
+    assert memory == b"\x01\x02\x03\x01\x01\x02\0"
+
+
+def test_an_empty_plan_does_nothing():
+    assert copied(CopyPlan([]), b"", b"\x55") == b"\x55"
+    assert CopyPlan([], used=[(0, 3)]).operations == 0
+
+
+@pytest.mark.parametrize("move", [(0, 0, 0), (-1, 0, 1), (0, -1, 1)])
+def test_what_is_no_copy_is_refused(move):
+    with pytest.raises(ValueError, match="expected at least 1 bit, from bit 0 on"):
+        CopyPlan([move])
+
+
+def test_a_bit_that_two_moves_write_is_refused():
+    with pytest.raises(ValueError, match="write the same bit"):
+        CopyPlan([(0, 0, 4), (0, 3, 4)])
