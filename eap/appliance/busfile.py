@@ -11,13 +11,17 @@ from pathlib import Path
 
 import msgspec
 
+from devicebus.master.pdo import PdoEntry, channels_from_sii
 from devicebus.sim.devices.build import build_segment, build_slave
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.spec import BusSpec, SlaveSpec
+from devicebus.wire import sii
+from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave
 from eap.config.convert import convert_to
 from eap.config.document import read
 from eap.config.finding import Finding, Report, near, one_of
 from eap.errors import ConfigError
+from eap.od.dictionary import ObjectDictionary
 
 MAX_RESOURCE = 16 << 20
 """Octets of the largest file that a bus file may refer to."""
@@ -28,6 +32,8 @@ class Bus(msgspec.Struct, frozen=True):
 
     spec: BusSpec
     resources: dict[str, bytes]
+    revised: frozenset[int] = frozenset()
+    """Numbers of the slaves whose revision the file gives."""
 
     def build(self) -> FaultySegment:
         """Make the segment with the script of its faults."""
@@ -48,7 +54,9 @@ def load(path: Path) -> BusResult:
     spec = None if root is None else convert_to(BusSpec, root, report, "bus")
     if spec is None or report.findings():
         return BusResult(None, report.findings())
-    bus = Bus(spec, {})
+    slaves = range(len(spec.slaves))
+    revised = frozenset(n for n in slaves if f"slaves[{n}].revision" in report.lines)
+    bus = Bus(spec, {}, revised)
     for number, slave in enumerate(spec.slaves):
         at = f"slaves[{number}]"
         for name in _files(slave):
@@ -70,6 +78,58 @@ def load_or_raise(path: Path) -> Bus:
     if result.bus is None:
         raise ConfigError("\n".join(str(finding) for finding in result.findings))
     return result.bus
+
+
+def describe(path: Path) -> BusDescription | tuple[Finding, ...]:
+    """Return what a plant is to know of the bus file at *path*, or all that is wrong with it.
+
+    That is what a master finds on such a bus.  What the file leaves open may be anything on a real
+    one: revisions that it does not give, serial numbers and aliases that are 0.
+    """
+    result = load(path)
+    if result.bus is None:
+        return result.findings
+    bus = result.bus
+    return BusDescription(
+        tuple(
+            _describe(bus, spec, has_revision=number in bus.revised)
+            for number, spec in enumerate(bus.spec.slaves)
+        )
+    )
+
+
+def _describe(bus: Bus, spec: SlaveSpec, *, has_revision: bool) -> DescribedSlave:
+    slave = build_slave(spec, bus.resources)
+    image = sii.decode(slave.esc.image)
+    channels = channels_from_sii(image)
+    outputs, inputs = (
+        tuple(
+            _describe_entry(entry, slave.device.dictionary)
+            for channel in channels
+            if channel.is_output is is_output
+            for pdo in channel.pdos
+            for entry in pdo.entries
+        )
+        for is_output in (True, False)
+    )
+    return DescribedSlave(
+        name=spec.name,
+        vendor=image.fixed.vendor,
+        product=image.fixed.product,
+        revision=image.fixed.revision if has_revision else None,
+        serial=image.fixed.serial or None,
+        alias=image.fixed.alias or None,
+        outputs=outputs,
+        inputs=inputs,
+    )
+
+
+def _describe_entry(entry: PdoEntry, dictionary: ObjectDictionary) -> DescribedEntry:
+    place = entry.index, entry.subindex, entry.bit_length
+    if not entry.index:
+        return DescribedEntry("", "", *place)
+    known = dictionary.entry(entry.index, entry.subindex)
+    return DescribedEntry(known.name, known.kind.text, *place)
 
 
 def _files(slave: SlaveSpec) -> Iterator[str]:

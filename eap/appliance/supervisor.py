@@ -23,10 +23,11 @@ from msgspec.structs import replace
 from eap.appliance.bus_sockets import segments
 from eap.appliance.child import Child, describe_end
 from eap.appliance.handover import EngineOptions, Handover, SegmentHandover
+from eap.appliance.plantfile import load_plant, require_own_buses
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
 from eap.appliance.sockets import SharedSockets
-from eap.config.load import Plant, load
+from eap.config.load import Plant
 from eap.errors import ConfigError
 from eap.pd.spec import StationSpec
 
@@ -56,6 +57,7 @@ def run(
     """
     plant = _load(plant_file)
     chosen = _choose(plant, stations)
+    require_own_buses(chosen)
     logging.basicConfig(format="supervisor: %(message)s", level=logging.INFO)
     subset = [station.name for station in chosen] if stations else []
     with (
@@ -67,7 +69,7 @@ def run(
 
 
 def _load(plant_file: Path) -> Plant:
-    result = load(plant_file)
+    result = load_plant(plant_file)
     if result.plant is None:
         raise ConfigError("\n".join(str(finding) for finding in result.findings))
     return result.plant

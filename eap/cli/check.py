@@ -28,9 +28,9 @@ def check(ctx: click.Context, plant: Path, as_json: bool) -> None:
 
     Exits with 2 when anything is.
     """
-    from eap.config.load import load  # yaml and msgspec; --help must not wait for them
+    from eap.appliance.plantfile import load_plant  # yaml and msgspec; --help must not wait
 
-    result = load(plant)
+    result = load_plant(plant)
     if as_json:
         write_json({"ok": not result.findings, "findings": result.findings})
     elif result.plant:

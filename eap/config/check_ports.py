@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from ipaddress import IPv4Address
 
+from eap.codec.ethercat import EAP_PORT
+from eap.config.check_buses import INTERFACE, check_bus_port
 from eap.config.destination import is_group, takes_tcp
 from eap.config.finding import Report
 from eap.config.index import Index
@@ -83,35 +85,43 @@ def _check_order(station: Station, report: Report) -> None:
     for port in station.ports:
         if port.kind is PortKind.BUS:
             bus_seen = True
-            report.add(
-                f"{port.at}.kind",
-                f"port {port.name}: bus ports come with the device bus",
-                "kind: eap in this version",
-            )
         elif bus_seen:
             report.add(port.at, f"EAP port {port.name} after a bus port", "EAP ports first")
 
 
 def _check_port(port: Port, report: Report) -> None:
     path = f"{port.at}.interface"
+    _check_keys(port, report)
     try:
         uri = InterfaceUri.parse(port.interface)
     except ValueError as exc:
-        report.add(path, f"interface: {exc}", "such as udp://127.0.1.1 or ethernet://eth0")
-        return
-    if port.kind is PortKind.BUS:
-        return
-    if uri.scheme not in _EAP_SCHEMES:
-        report.add(path, f"{uri.scheme}:// is no interface of an EAP port", "udp, ethernet or tcp")
+        is_bus = port.kind is PortKind.BUS
+        expected = INTERFACE if is_bus else "such as udp://127.0.1.1 or ethernet://eth0"
+        report.add(path, f"interface: {exc}", expected)
         return
     if uri.scheme == "ethernet" and (len(uri.host) > _MAX_INTERFACE_NAME or "/" in uri.host):
         expected = f"a name of at most {_MAX_INTERFACE_NAME} characters"
         report.add(path, f"{uri.host!r} is no interface name", expected)
+    if port.kind is PortKind.BUS:
+        check_bus_port(port, uri, report)
+        return
+    if uri.scheme not in _EAP_SCHEMES:
+        report.add(path, f"{uri.scheme}:// is no interface of an EAP port", "udp, ethernet or tcp")
+        return
     if uri.scheme in {"udp", "tcp"} and not _is_own(uri.host):
         report.add(path, f"{uri.host} is no address of a host", "the address of this station")
     if uri.options and uri.scheme != "loop":
         report.add(path, f"{uri.scheme}:// takes no options", f"{uri.scheme}://{uri.host}")
     _check_options(port, uri, report)
+
+
+def _check_keys(port: Port, report: Report) -> None:
+    is_bus = port.kind is PortKind.BUS
+    for key in Port.EAP_KEYS if is_bus else Port.BUS_KEYS:
+        if f"{port.at}.{key}" in report.lines:
+            what, other = ("bus", "EAP") if is_bus else ("EAP", "bus")
+            message = f"{port.name} is a port of kind {port.kind.value}, {key} belongs to {other}"
+            report.add(f"{port.at}.{key}", f"{message} ports", f"no {key} on {what} ports")
 
 
 def _is_own(host: str) -> bool:
@@ -140,18 +150,45 @@ def _check_addresses(index: Index, report: Report) -> None:
     first: dict[tuple[str, ...], str] = {}
     for (station, name), uri in index.uris.items():
         port = index.ports[station, name]
-        keys: list[tuple[str, ...]] = []
-        if uri.scheme == "udp":
-            keys.append(("UDP", uri.host, str(uri.port)))
-        if takes_tcp(port, uri):
-            keys.append(("TCP", uri.host, str(uri.port)))
-        if uri.scheme == "ethernet" and port.kind is PortKind.EAP:
-            # Stations share an interface, ports of one station would take each frame twice.
-            keys.append((station, uri.host, str(port.vlan.id if port.vlan else 0)))
-        for key in keys:
+        path = f"{port.at}.interface"
+        for key in _own_keys(station, port, uri):
             if key in first:
                 line = report.line_of(first[key])
                 message = f"{uri} is used twice (first in line {line})"
-                report.add(f"{port.at}.interface", message, "an address of its own for each port")
+                report.add(path, message, "an address of its own for each port")
                 break
-            first[key] = f"{port.at}.interface"
+            first[key] = path
+    _check_segments(index, report)
+
+
+def _own_keys(station: str, port: Port, uri: InterfaceUri) -> Iterator[tuple[str, ...]]:
+    """Yield what nobody else may have of what *port* needs."""
+    if uri.scheme == "udp":
+        yield "UDP", uri.host, str(uri.port or EAP_PORT)
+    if port.kind is PortKind.EAP and takes_tcp(port, uri):
+        yield "TCP", uri.host, str(uri.port or EAP_PORT)
+    if uri.scheme == "ethernet":
+        # Stations share an interface, ports of one station would take each frame twice.
+        vid = port.vlan.id if port.vlan and port.kind is PortKind.EAP else 0
+        yield station, port.kind.value, uri.host, str(vid)
+
+
+def _check_segments(index: Index, report: Report) -> None:
+    """Report EAP ports on the interface that a bus of the same station is wired to."""
+    buses = {
+        (station, uri.host): index.ports[station, name]
+        for (station, name), uri in index.uris.items()
+        if uri.scheme == "ethernet" and index.ports[station, name].kind is PortKind.BUS
+    }
+    for (station, name), uri in index.uris.items():
+        port = index.ports[station, name]
+        bus = buses.get((station, uri.host))
+        if bus is None or uri.scheme != "ethernet" or port.kind is PortKind.BUS:
+            continue
+        line = report.line_of(f"{port.at}.interface")
+        message = f"the slaves of {bus.name} would pass on and send back the frames of {name}"
+        report.add(
+            f"{bus.at}.interface",
+            f"{uri} is the interface of {name} too (line {line}): {message}",
+            "an interface of its own for a bus",
+        )

@@ -87,19 +87,19 @@ def _check_pd(index: Index, report: Report, station: Station, pd: Publish) -> No
     if not pd.variables and f"{pd.at}.variables[0]" not in report.lines:
         report.add(f"{pd.at}.variables", f"PD {pd.name!r} has no variables", "at least one")
     for position, name in enumerate(pd.variables):
-        if index.type_text(station, name) is None and not _is_unread(index, report, station, name):
-            names = [*station.variables]
-            for subscription in station.subscribe:
-                names += index.received(subscription)
+        if index.type_text(station, name) is None and not is_unread(index, report, station, name):
+            names = index.names(station)
             message = f"station {station.name} has no variable {name!r}{near(name, names)}"
             report.add(f"{pd.at}.variables[{position}]", message, one_of(names))
     _check_triggers(pd, report)
     _check_times(index, report, station, pd)
 
 
-def _is_unread(index: Index, report: Report, station: Station, name: str) -> bool:
+def is_unread(index: Index, report: Report, station: Station, name: str) -> bool:
     """Tell whether *name* may belong to something that was reported already."""
     if name in report.broken:
+        return True
+    if any(name.startswith(f"{port}.") for port in index.unread_buses(station)):
         return True
     return any(
         name.startswith(f"{subscription.name}.") and not index.publishers(subscription)

@@ -41,11 +41,22 @@ def check_variables(index: Index, report: Report, folder: Path) -> None:
             if subscription.variables is None
             for name in index.received(subscription)
         ]
+        names += [
+            (port.at, name)
+            for port in station.ports
+            if (bus := index.buses.get((station.name, port.name))) is not None
+            for name in bus.variables
+        ]
         check_names(names, "variable", report)
         for path, (name, variable) in (own | received).items():
             _check_variable(path, name, variable, report)
         for name, source in station.sources.items():
-            _check_source(station, name, source, report, folder)
+            if name in index.bus_variables(station):
+                message = f"{name!r} is on a bus, so it cannot have a source"
+                expected = "a source for a variable of the station, and a link from that one"
+                report.add(f"{station.at}.sources.{name}", message, expected)
+            else:
+                _check_source(station, name, source, report, folder)
 
 
 def _check_variable(path: str, name: str, variable: Variable, report: Report) -> None:

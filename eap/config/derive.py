@@ -12,13 +12,18 @@ from pathlib import Path
 import msgspec
 
 from eap.codec import datatypes
+from eap.config.check_buses import bus_file
 from eap.config.destination import IP_BROADCAST, group_of, resolve
 from eap.config.index import Index, SentPd
+from eap.config.links import ends, in_order, is_bitwise
 from eap.config.structs import From, Port, Publish, Station, Subscribe, Variable
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.spec import (
+    BusPortSpec,
     CsvSource,
     HostSource,
+    LinkSpec,
+    PortKind,
     PortSpec,
     RxPdSpec,
     Source,
@@ -63,19 +68,26 @@ def _station(index: Index, station: Station, phase_us: int, folder: Path) -> Sta
         name=station.name,
         net_id=str(NetId.parse(station.net_id)),
         cycle_us=index.cycle_us(station),
-        ports=tuple(_port(index, station, port) for port in station.ports),
+        ports=tuple(
+            _bus_port(index, station, port, folder)
+            if port.kind is PortKind.BUS
+            else _port(index, station, port)
+            for port in station.ports
+        ),
         phase_us=phase_us,
         variables=tuple(_variables(index, station)),
         sources=tuple(_source(source, folder) for source in station.sources.values()),
         frames=tuple(_frames(index, station)),
         subscriptions=tuple(_subscription(index, each) for each in station.subscribe),
+        links=tuple(_links(index, station)),
     )
 
 
 def _variables(index: Index, station: Station) -> Iterator[VariableSpec]:
+    linked = {link.target for link in station.links}
     for name, variable in station.variables.items():
         source = station.sources.get(name)
-        writer = Writer.APPLICATION if source is None else Writer.ENGINE
+        writer = Writer.ENGINE if source is not None or name in linked else Writer.APPLICATION
         if isinstance(source, HostSource | CsvSource):
             writer = Writer.SERVICES
         yield _variable(name, variable, writer)
@@ -90,6 +102,34 @@ def _variables(index: Index, station: Station) -> Iterator[VariableSpec]:
                 unit, comment = (told.unit, told.comment) if told else ("", "")
                 copy = Variable(type=text, unit=unit, comment=comment)
                 yield _variable(name, copy, Writer.ENGINE)
+    for name, on_bus in index.bus_variables(station).items():
+        is_free = on_bus.is_output and name not in linked
+        writer = Writer.APPLICATION if is_free else Writer.ENGINE
+        yield VariableSpec(name, on_bus.type, writer, comment=on_bus.comment)
+
+
+def _links(index: Index, station: Station) -> Iterator[LinkSpec]:
+    """Yield the links as they are to run: each behind those that write what it reads."""
+    ways = [
+        ends(link, _type(index, station, link.source), _type(index, station, link.target))
+        for link in station.links
+    ]
+    for position in in_order(ways):
+        link, way = station.links[position], ways[position]
+        yield LinkSpec(
+            source=link.source,
+            target=link.target,
+            source_bit=way.source.start,
+            target_bit=way.target.start,
+            bits=way.source.bits if is_bitwise(link) else 0,
+            scale=1.0 if link.scale is None else link.scale,
+            offset=link.offset or 0.0,
+            swap=link.swap,
+        )
+
+
+def _type(index: Index, station: Station, name: str) -> datatypes.DataType:
+    return datatypes.parse(index.type_text(station, name) or "")
 
 
 def _variable(name: str, variable: Variable, writer: Writer) -> VariableSpec:
@@ -181,6 +221,20 @@ def _port(index: Index, station: Station, port: Port) -> PortSpec:
         broadcast=port.broadcast or any(each.host == IP_BROADCAST for each in destinations),
         tcp=port.tcp,
         wake=port.wake,
+    )
+
+
+def _bus_port(index: Index, station: Station, port: Port, folder: Path) -> PortSpec:
+    uri = InterfaceUri.parse(port.interface)
+    file = bus_file(port, folder)[1]
+    path = "" if file is None else str(file.resolve())
+    slaves = index.buses[station.name, port.name].slaves
+    return PortSpec(
+        name=port.name,
+        kind=port.kind,
+        interface=str(InterfaceUri("sim", path) if uri.scheme == "sim" else uri),
+        net_id=str(NetId.parse(port.net_id)),
+        bus=BusPortSpec(path, slaves, port.target, port.clocks),
     )
 
 

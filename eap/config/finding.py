@@ -39,6 +39,7 @@ class Report:
         self.lines: dict[str, int] = {}
         self.broken: set[str] = set()
         self._findings: dict[tuple[int, str, str], Finding] = {}
+        self._adopted: list[Finding] = []
 
     def add(self, path: str, message: str, expected: str, *, line: int | None = None) -> None:
         """Report *message* at *path*; without *line* the one of the path or of what holds it."""
@@ -48,6 +49,10 @@ class Report:
             (where, message, expected), Finding(self.file, where, path, message, expected)
         )
 
+    def adopt(self, findings: Iterable[Finding]) -> None:
+        """Take over what is wrong with another file."""
+        self._adopted += findings
+
     def line_of(self, path: str) -> int:
         """Return the line of *path*, or of the nearest thing around it that the file has."""
         while path and path not in self.lines:
@@ -55,8 +60,9 @@ class Report:
         return self.lines.get(path, 0)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return all findings in the order of the file."""
-        return tuple(sorted(self._findings.values(), key=lambda finding: finding.line))
+        """Return all findings in the order of the file, then those of other files."""
+        own = sorted(self._findings.values(), key=lambda finding: finding.line)
+        return (*own, *self._adopted)
 
 
 def near(name: str, known: Iterable[str]) -> str:

@@ -5,12 +5,14 @@ Names that occur twice stand for their first owner; the second one is a finding 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from math import lcm
+from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 from eap.codec import datatypes
 from eap.codec.values import DataType
+from eap.config.bus import BusDescription, BusVariable, name_bus
 from eap.config.structs import Frame, From, PlantFile, Port, Publish, Station, Subscribe
 from eap.ids import InterfaceUri
 from eap.pd.spec import PortKind
@@ -34,10 +36,28 @@ class SentPd(NamedTuple):
 
 
 class Index:
-    """The plant by names; what cannot be resolved is simply absent."""
+    """The plant by names; what cannot be resolved is simply absent.
 
-    def __init__(self, plant: PlantFile) -> None:
+    Args:
+        plant: The file.
+        buses: What is known of the buses by station and port, None where that cannot be read.
+    """
+
+    def __init__(
+        self,
+        plant: PlantFile,
+        buses: Mapping[tuple[str, str], BusDescription | None] = MappingProxyType({}),
+    ) -> None:
         self.plant = plant
+        self.buses = {
+            key: name_bus(key[1], description)
+            for key, description in buses.items()
+            if description is not None
+        }
+        self._unread = [key for key, description in buses.items() if description is None]
+        self._bus_variables: dict[str, dict[str, BusVariable]] = {}
+        for (name, _), bus in self.buses.items():
+            self._bus_variables.setdefault(name, {}).update(bus.variables)
         self.stations = _first((s.name, s) for s in plant.stations)
         self.ports = _first(((s.name, p.name), p) for s in plant.stations for p in s.ports)
         self.frames = _first(((s.name, f.name), f) for s in plant.stations for f in s.frames)
@@ -65,6 +85,21 @@ class Index:
         port = self.ports.get((station.name, name))
         return port if port is not None and port.kind is PortKind.EAP else None
 
+    def bus_variables(self, station: Station) -> dict[str, BusVariable]:
+        """Return the variables that *station* has because of its buses."""
+        return self._bus_variables.get(station.name, {})
+
+    def unread_buses(self, station: Station) -> list[str]:
+        """Return the bus ports of *station* whose description could not be read."""
+        return [port for name, port in self._unread if name == station.name]
+
+    def names(self, station: Station) -> list[str]:
+        """Return the names of all variables of *station*."""
+        names = [*station.variables]
+        for subscription in station.subscribe:
+            names += self.received(subscription)
+        return [*names, *self.bus_variables(station)]
+
     def publishers(self, subscription: Subscribe) -> list[SentPd]:
         """Return the PDs of this plant that *subscription* names: one, none, or several for any."""
         source = subscription.source
@@ -91,6 +126,8 @@ class Index:
         """Return the type of a variable of *station* as written, None if it has no such one."""
         if name in station.variables:
             return station.variables[name].type
+        if name in (on_bus := self.bus_variables(station)):
+            return on_bus[name].type
         for subscription in station.subscribe:
             if subscription.variables is not None:
                 if name in subscription.variables:

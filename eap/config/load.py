@@ -6,6 +6,9 @@ from pathlib import Path
 
 import msgspec
 
+from eap.config.bus import DescribeBus
+from eap.config.check_buses import describe_buses
+from eap.config.check_links import check_links
 from eap.config.check_ports import check_ports
 from eap.config.check_publish import check_publish
 from eap.config.check_subscribe import check_subscribe
@@ -32,18 +35,22 @@ class LoadResult(msgspec.Struct, frozen=True):
     findings: tuple[Finding, ...]
 
 
-def load(path: Path) -> LoadResult:
-    """Read, check and complete the plant file at *path*; never raises for what the file holds."""
+def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
+    """Read, check and complete the plant file at *path*; never raises for what the file holds.
+
+    *describe_bus* reads the bus files that it names; their findings are told after its own.
+    """
     report = Report(str(path))
     root = read(path, report)
     plant_file = None if root is None else convert(root, report)
     if plant_file is None:
         return LoadResult(None, report.findings())
-    index = Index(plant_file)
+    index = Index(plant_file, describe_buses(plant_file, path.parent, describe_bus, report))
     check_ports(index, report)
     check_variables(index, report, path.parent)
     check_publish(index, report)
     check_subscribe(index, report)
+    check_links(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)
     return LoadResult(Plant(plant_file.plant, derive(index, path.parent)), ())

@@ -11,13 +11,16 @@ from typing import Annotated, ClassVar, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from eap.pd.spec import OnChangeSpec, PortKind, Source, Substitute, Wake
+from eap.pd.spec import BusTarget, OnChangeSpec, PortKind, Source, Substitute, Wake
 
 U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
 Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
 Milliseconds = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
 DeviceCycle = Annotated[int, Meta(ge=100, le=60_000_000)]
 Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
+MAX_BITS = 8 * 0xFFFF
+"""Of the largest variable."""
+BitOffset = Annotated[int, Meta(ge=0, le=MAX_BITS - 1)]
 Plain: TypeAlias = bool | int | float | str | list[bool | int | float]
 
 
@@ -40,7 +43,10 @@ class Vlan(Section, frozen=True):
 
 
 class Port(Section, frozen=True):
-    """A port; the NetID of an EAP port is the publisher ID of its frames."""
+    """A port; the NetID of an EAP port is the publisher ID of its frames.
+
+    *interface* and *bus* name bus files by their path from the plant file on.
+    """
 
     name: str
     kind: PortKind
@@ -51,6 +57,12 @@ class Port(Section, frozen=True):
     broadcast: bool = False
     tcp: bool = False
     wake: Wake = Wake.CYCLE
+    bus: str = ""
+    target: BusTarget = BusTarget.OP
+    clocks: bool = False
+
+    EAP_KEYS: ClassVar[tuple[str, ...]] = ("vlan", "join", "broadcast", "tcp", "wake")
+    BUS_KEYS: ClassVar[tuple[str, ...]] = ("bus", "target", "clocks")
 
 
 class Variable(Section, frozen=True):
@@ -112,6 +124,19 @@ class Subscribe(Section, frozen=True):
     foreign: bool = False
 
 
+class Link(Section, frozen=True):
+    """One variable of a station follows another one."""
+
+    source: str = msgspec.field(name="from")
+    target: str = msgspec.field(name="to")
+    from_bit: BitOffset | None = None
+    to_bit: BitOffset | None = None
+    bits: Annotated[int, Meta(ge=1, le=MAX_BITS)] | None = None
+    scale: float | None = None
+    offset: float | None = None
+    swap: bool = False
+
+
 class Station(Section, frozen=True):
     """A router with its ports, and what the station sends and receives."""
 
@@ -125,9 +150,9 @@ class Station(Section, frozen=True):
     frames: tuple[Frame, ...] = ()
     publish: tuple[Publish, ...] = ()
     subscribe: tuple[Subscribe, ...] = ()
+    links: tuple[Link, ...] = ()
 
     LATER: ClassVar[dict[str, str]] = {
-        "links": "links between ports",
         "routes": "routes of the AoE router",
         "access": "access rules",
     }

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import pytest
 
+from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave
+from eap.config.check_buses import describe_buses
 from eap.config.convert import convert
 from eap.config.document import read
-from eap.config.finding import Report
+from eap.config.finding import Finding, Report
 from eap.config.index import Index
 from eap.config.load import load
 
@@ -32,6 +34,42 @@ stations:
       - {name: seen, port: eap0, from: left/state, timeout_ms: 50, variables: {a: REAL, b: UDINT}}
 """
 
+EAP_PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+BUS = BusDescription(
+    (
+        DescribedSlave(
+            name="valves",
+            vendor=1,
+            product=2,
+            outputs=(
+                DescribedEntry("valve", "BOOL", 0x7000, 1, 1),
+                DescribedEntry("lamp", "BOOL", 0x7000, 2, 1),
+                DescribedEntry("", "", 0, 0, 6),
+                DescribedEntry("speed", "INT", 0x7000, 3, 16),
+            ),
+            inputs=(
+                DescribedEntry("limit", "BOOL", 0x6000, 1, 1),
+                DescribedEntry("", "", 0, 0, 7),
+                DescribedEntry("status word", "UINT", 0x6000, 2, 16),
+            ),
+        ),
+    )
+)
+"""What a file called line.yaml tells in the tests."""
+
+
+def describe(path):
+    """Stand for the reader of bus files, which belongs to the appliance."""
+    if "broken" in path.name:
+        return (Finding(str(path), 3, "slaves[0]", "kind is 'x'", "one of a, b"),)
+    return BUS
+
+
+def bus_port(more="", interface="sim://line.yaml"):
+    """Return the edit that gives the left station a bus port."""
+    bus = f"{{name: bus0, kind: bus, interface: {interface}, net_id: 127.0.9.1.3.1{more}}}"
+    return EAP_PORT, f"{EAP_PORT}\n      - {bus}"
+
 
 def edited(*edits):
     text = PLANT
@@ -48,7 +86,9 @@ def load_plant(tmp_path):
     def load_edited(*edits):
         path = tmp_path / "plant.yaml"
         path.write_text(edited(*edits))
-        return load(path)
+        for name in ("line.yaml", "broken.yaml"):
+            (tmp_path / name).touch()
+        return load(path, describe)
 
     return load_edited
 
@@ -73,6 +113,8 @@ def index(tmp_path):
         path = tmp_path / "plant.yaml"
         path.write_text(edited(*edits))
         report = Report(str(path))
-        return Index(convert(read(path, report), report))
+        plant = convert(read(path, report), report)
+        (tmp_path / "line.yaml").touch()
+        return Index(plant, describe_buses(plant, tmp_path, describe, report))
 
     return of

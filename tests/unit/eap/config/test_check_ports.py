@@ -57,27 +57,22 @@ def test_options_belong_to_their_kind_of_interface(findings, uri, more, finding)
     assert any(each.startswith(f"6: {finding}") for each in found), found
 
 
-def test_bus_ports_are_not_in_this_version_and_come_last(findings):
-    bus = "      - {name: bus0, kind: bus, interface: sim://bus.yaml, net_id: 127.0.9.1.3.1}\n"
+def test_bus_ports_come_last(findings):
+    bus = "      - {name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}\n"
     old = "      - {name: eap0, kind: eap, interface: " + LEFT
-    assert findings((old, bus + old)) == [
-        "6: port bus0: bus ports come with the device bus; kind: eap in this version",
-        "7: EAP port eap0 after a bus port; EAP ports first",
-    ]
-    assert findings((old, old + "\n" + bus.rstrip())) == [
-        "7: port bus0: bus ports come with the device bus; kind: eap in this version"
-    ]
+    assert findings((old, bus + old)) == ["7: EAP port eap0 after a bus port; EAP ports first"]
+    assert findings((old, old + "\n" + bus.rstrip())) == []
 
 
 def test_a_station_needs_a_port_and_a_plant_a_station(findings, tmp_path):
     old = '    ports:\n      - {name: eap0, kind: eap, interface: "udp://127.0.9.2", '
     found = findings((old + "net_id: 127.0.9.2.2.1}\n", "    ports: []\n"))
     assert "18: station right has no ports; an EAP port" in found
-    from eap.config.load import load
+    from eap.appliance.plantfile import load_plant
 
     path = tmp_path / "empty.yaml"
     path.write_text("plant: empty\nstations: []\n")
-    assert [str(f) for f in load(path).findings] == [
+    assert [str(f) for f in load_plant(path).findings] == [
         f"{path}:2: the plant has no stations; expected at least one station"
     ]
 

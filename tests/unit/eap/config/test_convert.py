@@ -36,7 +36,6 @@ from eap.config.finding import Report
         ("variables: {a: REAL, b: UDINT}", "variables: [a, b]", "21: variables is a list; a map"),
         ("variables: {a: REAL, b: UDINT}", "variables: {a: REAL, b: {}}", "21: b has no type; th"),
         ("variables: [speed, count]", "variables: speed", "15: variables is 'speed'; a list"),
-        ("    sources:", "    links: []\n    sources:", "10: links (links between ports): this"),
         ("    sources:", "    routes: []\n    sources:", "10: routes (routes of the AoE router)"),
         ("    sources:", "    access: []\n    sources:", "10: access (access rules): this version"),
         ("plant: pair", "plant: pair\ny-note: 1", "2: unknown key 'y-note'; one of plant,"),
@@ -89,11 +88,11 @@ def test_errors_of_shape_and_of_sense_are_found_together_and_without_echo(findin
 
 
 def test_a_document_that_is_no_mapping_is_one_finding(tmp_path):
-    from eap.config.load import load
+    from eap.appliance.plantfile import load_plant
 
     path = tmp_path / "list.yaml"
     path.write_text("- plant")
-    [finding] = load(path).findings
+    [finding] = load_plant(path).findings
     assert finding.message == "plant is a list"
     assert finding.expected == "a mapping with plant, stations"
 

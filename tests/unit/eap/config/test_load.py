@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eap.appliance.plantfile import load_plant as load_shipped
 from eap.codec import datatypes, pdo
-from eap.config.load import load
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec
 
@@ -17,7 +17,7 @@ PLANTS = Path(__file__).parents[4] / "config"
 
 @pytest.fixture(params=sorted(PLANTS.glob("*.yaml")), ids=lambda path: path.name)
 def shipped(request):
-    result = load(request.param)
+    result = load_shipped(request.param)
     assert [str(finding) for finding in result.findings] == []
     return result.plant
 
@@ -33,7 +33,7 @@ def test_a_station_travels_as_json(shipped):
 
 
 def test_the_demo_is_the_ring_that_the_contract_describes():
-    plant = load(PLANTS / "demo.yaml").plant
+    plant = load_shipped(PLANTS / "demo.yaml").plant
     assert [s.name for s in plant.stations] == ["island-01", "island-02", "island-03"]
     assert [s.ports[0].interface for s in plant.stations] == [
         f"udp://127.0.1.{n}" for n in (1, 2, 3)
@@ -43,7 +43,7 @@ def test_the_demo_is_the_ring_that_the_contract_describes():
 
 
 def test_the_solar_line_has_the_sizes_of_the_contract():
-    plant = load(PLANTS / "solar-line.yaml").plant
+    plant = load_shipped(PLANTS / "solar-line.yaml").plant
     sizes = {600: 0, 1024: 0}
     received = 0
     for station in plant.stations:
@@ -112,5 +112,5 @@ def test_no_content_is_a_traceback(tmp_path_factory, changes):
         words[position] = word
     path = tmp_path_factory.getbasetemp() / "odd.yaml"
     path.write_text(" ".join(words))
-    result = load(path)
+    result = load_shipped(path)
     assert (result.plant is None) == bool(result.findings)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.config.load import load
+from eap.appliance.plantfile import load_plant
 from eap.pd.layout import VAR_CTRL
 from eap.pd.report import station_status
 from eap.pd.spec import OnChangeSpec, StationSpec, TriggerSpec, TxFrameSpec, TxPdSpec
@@ -69,7 +69,7 @@ stations:
 def read(tmp_path: Path, text: str) -> tuple[StationSpec | None, list[str]]:
     path = tmp_path / "plant.yaml"
     path.write_text(text)
-    result = load(path)
+    result = load_plant(path)
     station = result.plant.stations[0] if result.plant else None
     return station, [finding.message for finding in result.findings]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.config.load import load
+from eap.appliance.plantfile import load_plant
 from tools.bench.plants import line
 
 
@@ -14,7 +14,7 @@ from tools.bench.plants import line
 def test_a_line_of_any_length_is_a_plant(tmp_path: Path, islands: int) -> None:
     file = tmp_path / "line.yaml"
     file.write_bytes(line(islands, 500))
-    result = load(file)
+    result = load_plant(file)
     assert not result.findings
     assert result.plant is not None
     assert [s.cycle_us for s in result.plant.stations] == [500] * (islands + 1)

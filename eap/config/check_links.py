@@ -1,0 +1,145 @@
+"""Checks of links: both ends exist and fit, nobody else writes the target, none go in a circle."""
+
+from __future__ import annotations
+
+from eap.codec import datatypes
+from eap.codec.values import DataType
+from eap.config.check_publish import is_unread
+from eap.config.finding import Report, near, one_of
+from eap.config.index import Index
+from eap.config.links import Ends, ends, find_circles, is_bitwise, is_scaled
+from eap.config.structs import Link, Station
+
+_TARGET = "a variable of the station's own, or an output of a bus"
+
+
+def check_links(index: Index, report: Report) -> None:
+    """Report every link that cannot run, or that would write what somebody else writes."""
+    for station in index.plant.stations:
+        known: list[tuple[Link, Ends]] = []
+        for link in station.links:
+            source = _kind(index, report, station, f"{link.at}.from", link.source)
+            target = _kind(index, report, station, f"{link.at}.to", link.target)
+            if target is not None:
+                _check_writer(index, report, station, link)
+            if source is None or target is None or not _fits(link, source, target, report):
+                continue
+            known.append((link, ends(link, source, target)))
+        _check_once(known, report)
+        _check_circles(known, report)
+
+
+def _kind(index: Index, report: Report, station: Station, path: str, name: str) -> DataType | None:
+    """Return the type of a variable; None, with a finding, if there is none."""
+    text = index.type_text(station, name)
+    if text is None:
+        if not is_unread(index, report, station, name):
+            names = index.names(station)
+            message = f"station {station.name} has no variable {name!r}{near(name, names)}"
+            report.add(path, message, one_of(names))
+        return None
+    try:
+        return datatypes.parse(text)
+    except ValueError:
+        return None  # reported with the variable
+
+
+def _check_writer(index: Index, report: Report, station: Station, link: Link) -> None:
+    name = link.target
+    on_bus = index.bus_variables(station).get(name)
+    if name in station.variables:
+        if name not in station.sources:
+            return
+        line = report.line_of(f"{station.at}.sources.{name}")
+        reason = f"has a source (line {line})"
+    elif on_bus is None:
+        reason = "is received"
+    elif on_bus.is_output:
+        return
+    else:
+        reason = "comes from a bus"
+    report.add(f"{link.at}.to", f"{name!r} {reason}, so no link can write it", _TARGET)
+
+
+def _fits(link: Link, source: DataType, target: DataType, report: Report) -> bool:
+    """Tell whether a link can be between these types, after reporting why not."""
+    if is_bitwise(link):
+        return _fits_bitwise(link, source, target, report)
+    shown = f"{link.source} is {source.text}, {link.target} is {target.text}"
+    if is_scaled(link):
+        return _fits_scaled(link, source, target, shown, report)
+    if link.swap:
+        if source.size == target.size > 1 and not (source.is_bits or target.is_bits):
+            return True
+        report.add(f"{link.at}.swap", shown, "two variables of as many octets, at least 2")
+        return False
+    if source != target:
+        expected = (
+            f"both alike, or bits: {min(source.bit_length, target.bit_length)}, scale or swap"
+        )
+        report.add(link.at, shown, expected)
+        return False
+    return True
+
+
+def _fits_bitwise(link: Link, source: DataType, target: DataType, report: Report) -> bool:
+    for key in ("scale", "offset", "swap"):
+        if getattr(link, key):
+            report.add(
+                f"{link.at}.{key}", f"the link copies bits and has a {key}", "one of the two"
+            )
+            return False
+    for key, bit, name, kind in (
+        ("from_bit", link.from_bit or 0, link.source, source),
+        ("to_bit", link.to_bit or 0, link.target, target),
+    ):
+        if bit >= kind.bit_length:
+            message = f"{name} is {kind.text} and has no bit {bit}"
+            report.add(f"{link.at}.{key}", message, f"0 to {kind.bit_length - 1}")
+            return False
+        if link.bits is not None and bit + link.bits > kind.bit_length:
+            message = f"{name} is {kind.text} and has no {link.bits} bits from bit {bit} on"
+            report.add(f"{link.at}.bits", message, f"at most {kind.bit_length - bit}")
+            return False
+    return True
+
+
+def _fits_scaled(
+    link: Link, source: DataType, target: DataType, shown: str, report: Report
+) -> bool:
+    key = "scale" if link.scale is not None else "offset"
+    if link.scale == 0:
+        report.add(f"{link.at}.scale", "scale is 0", "another number")
+        return False
+    if not (_is_number(source) and _is_number(target)):
+        report.add(f"{link.at}.{key}", shown, f"numbers such as INT or REAL where there is a {key}")
+        return False
+    if link.swap and source.is_bits:
+        report.add(f"{link.at}.swap", shown, "a source of at least 2 octets")
+        return False
+    return True
+
+
+def _is_number(kind: DataType) -> bool:
+    return kind.scalar_range is not None and kind.text != "BOOL"
+
+
+def _check_once(links: list[tuple[Link, Ends]], report: Report) -> None:
+    first: dict[str, list[tuple[Link, Ends]]] = {}
+    for link, both in links:
+        others = first.setdefault(link.target, [])
+        twice = next((other for other, span in others if span.target.overlaps(both.target)), None)
+        others.append((link, both))
+        if twice is not None:
+            line = report.line_of(f"{twice.at}.to")
+            message = f"{link.target!r} is linked twice (first in line {line})"
+            report.add(
+                f"{link.at}.to", message, "one link for each variable, or for each bit of it"
+            )
+
+
+def _check_circles(links: list[tuple[Link, Ends]], report: Report) -> None:
+    for circle in find_circles([both for _, both in links]):
+        members = [links[position][0] for position in circle]
+        way = " → ".join([members[0].source, *(link.target for link in members)])
+        report.add(members[0].at, f"links go in a circle: {way}", "one of them to be left out")
