@@ -8,6 +8,7 @@ EapError
     ├── AlStatusError           a slave refused a state
     ├── StateTimeoutError       a slave did not reach a state in time
     ├── SiiError                an EEPROM cannot be read, written or understood
+    ├── MailboxSizeError        a message does not fit a slave's mailbox
     ├── MailboxTimeoutError     a slave did not answer in its mailbox
     ├── MailboxRefusedError     a slave answered with a mailbox error
     ├── MailboxProtocolError    a slave's answer breaks the protocol
@@ -59,6 +60,10 @@ class StateTimeoutError(BusError):
 
 class SiiError(BusError):
     """An EEPROM cannot be read, written or understood."""
+
+
+class MailboxSizeError(BusError):
+    """A message does not fit a slave's mailbox; nothing was sent."""
 
 
 class MailboxTimeoutError(BusError):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Ask, Conversation, reading
-from eap.codec.ams import AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.codec.ams import AmsHeader, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxType
-from eap.errors import CodecError
 
 
 def exchange(
@@ -15,20 +14,8 @@ def exchange(
 
     The answer has the invoke id and the command of the request, and comes from where that went.
     """
-
-    def accepts(packet: bytes) -> bool:
-        try:
-            found = AmsHeader.decode(packet)
-        except CodecError:
-            return True
-        return (
-            bool(found.state_flags & StateFlags.RESPONSE)
-            and (found.invoke_id, found.command) == (header.invoke_id, header.command)
-            and (found.source, found.source_port) == (header.target, header.target_port)
-        )
-
     packet = encode_packet(header, data)
-    message = yield Ask(MailboxType.AOE, packet, accepts, timeout_ns)
+    message = yield Ask(MailboxType.AOE, packet, timeout_ns=timeout_ns)
     with reading(f"AoE answer of {header.target}:{header.target_port}"):
         answer, body = decode_packet(message.data)
     return answer, bytes(body)

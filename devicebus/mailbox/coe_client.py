@@ -1,8 +1,8 @@
 """SDO uploads and downloads as conversations: the master's side of CoE (ETG.1000.6).
 
-An answer is known by index and subindex, a segment by its toggle bit; what does not fit is late or
-meant for somebody else and never taken.  Refusals are raised as SdoAbortError, broken answers as
-MailboxProtocolError, after an abort that tells the slave.
+An answer is known by index and subindex, a segment by its toggle bit (:mod:`match`).  Refusals
+are raised as SdoAbortError, broken answers as MailboxProtocolError, after an abort that tells the
+slave.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def upload(
     """
     sdo = _Sdo(index, subindex)
     plain = encode_plain(SdoRequest.UPLOAD, index, subindex, complete=complete)
-    head, rest = yield from sdo.ask(plain, SdoResponse.UPLOAD)
+    head, rest = yield from sdo.ask(plain)
     if head.expedited:
         return head.data
     size = head.value
@@ -63,7 +63,7 @@ def upload(
     toggle = 0
     while len(content) < size:
         asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
-        body = yield from sdo.ask_segment(asked, SdoResponse.UPLOAD_SEGMENT, toggle)
+        body = yield from sdo.ask_segment(asked)
         with reading(f"segment of {sdo}"):
             segment, data = decode_segment(body)
         content += data
@@ -100,7 +100,7 @@ def download(
     first = encode_initiate(
         SdoRequest.DOWNLOAD, index, subindex, data, complete=complete, room=room
     )
-    yield from sdo.ask(first, SdoResponse.DOWNLOAD)
+    yield from sdo.ask(first)
     progress.done = len(data) if len(data) <= EXPEDITED_SIZE else min(room, len(data))
     step = sizes.to_slave - SEGMENT_OVERHEAD
     toggle = 0
@@ -108,7 +108,7 @@ def download(
         piece = data[progress.done : progress.done + step]
         last = progress.done + len(piece) == len(data)
         segment = encode_segment(SdoRequest.DOWNLOAD_SEGMENT, piece, toggle=toggle, last=last)
-        yield from sdo.ask_segment(segment, SdoResponse.DOWNLOAD_SEGMENT, toggle)
+        yield from sdo.ask_segment(segment)
         progress.done += len(piece)
         toggle ^= 1
 
@@ -123,36 +123,20 @@ class _Sdo:
     def __str__(self) -> str:
         return f"SDO 0x{self.index:04X}:{self.subindex:02X}"
 
-    def ask(self, body: bytes, response: SdoResponse) -> Conversation[tuple[SdoHeader, bytes]]:
+    def ask(self, body: bytes) -> Conversation[tuple[SdoHeader, bytes]]:
         """Send the first message of a transfer; return the head of the answer and the rest."""
-
-        def accepts(data: bytes) -> bool:
-            return self._aborts(data) or (
-                _service(data) is CoeService.SDO_RESPONSE
-                and (len(data) < _SHORTEST or (data[2] >> 5 == response and self._is_named(data)))
-            )
-
         request = encode_message(CoeService.SDO_REQUEST, body)
-        data = (yield Ask(MailboxType.COE, request, accepts)).data
+        data = (yield Ask(MailboxType.COE, request)).data
         with reading(f"answer to {self}"):
             head = SdoHeader.decode(data, CoeHeader.SIZE)
         if head.specifier == SdoResponse.ABORT:
             raise SdoAbortError(head.value, self.index, self.subindex)
-        return head, data[_SHORTEST:]
+        return head, data[CoeHeader.SIZE + SdoHeader.SIZE :]
 
-    def ask_segment(self, body: bytes, response: SdoResponse, toggle: int) -> Conversation[bytes]:
+    def ask_segment(self, body: bytes) -> Conversation[bytes]:
         """Send a segment or ask for one; return the answer behind its CoE header."""
-
-        def accepts(data: bytes) -> bool:
-            if self._aborts(data):
-                return True
-            if _service(data) is not CoeService.SDO_RESPONSE:
-                return False
-            head = data[2:3]
-            return not head or (head[0] >> 5 == response and head[0] >> 4 & 1 == toggle)
-
         request = encode_message(CoeService.SDO_REQUEST, body)
-        data = (yield Ask(MailboxType.COE, request, accepts)).data
+        data = (yield Ask(MailboxType.COE, request)).data
         with reading(f"segment of {self}"):
             head = SdoSegmentHeader.decode(data, CoeHeader.SIZE)
             if head.specifier == SdoResponse.ABORT:
@@ -165,19 +149,3 @@ class _Sdo:
         abort = encode_abort(self.index, self.subindex, code)
         yield Ask(MailboxType.COE, abort, expects_reply=False)
         raise MailboxProtocolError(f"{self}: {reason}")
-
-    def _is_named(self, data: bytes) -> bool:
-        return (data[3] | data[4] << 8, data[5]) == (self.index, self.subindex)
-
-    def _aborts(self, data: bytes) -> bool:
-        known = _service(data) in {CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE}
-        aborts = known and len(data) >= _SHORTEST and data[2] >> 5 == SdoResponse.ABORT
-        return aborts and self._is_named(data)
-
-
-_SHORTEST = CoeHeader.SIZE + SdoHeader.SIZE
-
-
-def _service(data: bytes) -> CoeService | None:
-    number = data[1] >> 4 if len(data) > 1 else 0
-    return CoeService(number) if number in CoeService._value2member_map_ else None

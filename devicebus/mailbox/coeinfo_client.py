@@ -6,6 +6,7 @@ import struct
 
 from devicebus.errors import MailboxProtocolError
 from devicebus.mailbox.conversation import Ask, Conversation, reading
+from devicebus.mailbox.match import INFO_START
 from eap.codec.coe import CoeHeader, CoeService, encode_message
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import (
@@ -23,7 +24,8 @@ from eap.od.info import ListType, ValueInfo
 
 MAX_SIZE = 0x20002
 """Octets of the longest description: a list of all indexes there can be."""
-_START = CoeHeader.SIZE + SdoInfoHeader.SIZE
+_MAX_LATE = 16
+"""Fragments of other answers that are dropped before a request gives up."""
 
 
 def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:
@@ -35,7 +37,7 @@ def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:
     """
     what = f"object list {list_type.name}"
     request = ListRequest(list_type).encode()
-    body = yield from _ask(what, SdoInfoOpcode.LIST_REQUEST, request, key_size=2)
+    body = yield from _ask(what, SdoInfoOpcode.LIST_REQUEST, request)
     if len(body) % 2:
         raise MailboxProtocolError(f"{what}: {len(body)} octets, expected whole indexes")
     return list(struct.unpack(f"<{len(body) // 2}H", body))[1:]
@@ -45,7 +47,7 @@ def object_description(index: int) -> Conversation[ObjectDescription]:
     """Read what the slave says of an object; raises as object_list() does."""
     what = f"object description 0x{index:04X}"
     request = ObjectRequest(index).encode()
-    body = yield from _ask(what, SdoInfoOpcode.OBJECT_REQUEST, request, key_size=2, index=index)
+    body = yield from _ask(what, SdoInfoOpcode.OBJECT_REQUEST, request, index=index)
     with reading(what):
         return ObjectDescription.decode(body)
 
@@ -57,7 +59,7 @@ def entry_description(
     what = f"entry description 0x{index:04X}:{subindex:02X}"
     request = EntryRequest(index, subindex, value_info).encode()
     body = yield from _ask(
-        what, SdoInfoOpcode.ENTRY_REQUEST, request, key_size=3, index=index, subindex=subindex
+        what, SdoInfoOpcode.ENTRY_REQUEST, request, index=index, subindex=subindex
     )
     with reading(what):
         return EntryDescription.decode(body)
@@ -69,9 +71,8 @@ def read_pdo(service: CoeService, number: int) -> Conversation[bytes]:
         CoeService.TX_PDO: CoeService.TX_PDO_REMOTE_REQUEST,
         CoeService.RX_PDO: CoeService.RX_PDO_REMOTE_REQUEST,
     }[service]
-    key = CoeHeader(number, service=service).encode()
     request = encode_message(remote, b"", number=number)
-    message = yield Ask(MailboxType.COE, request, lambda data: data.startswith(key))
+    message = yield Ask(MailboxType.COE, request)
     return message.data[CoeHeader.SIZE :]
 
 
@@ -86,44 +87,33 @@ def _ask(
     opcode: SdoInfoOpcode,
     request: bytes,
     *,
-    key_size: int,
     index: int = 0,
     subindex: int = 0,
 ) -> Conversation[bytes]:
-    """Send a request; return the bodies of all fragments of the answer.
-
-    The first *key_size* octets of the body are those of the request.
-    """
-    answer = SdoInfoOpcode(opcode + 1)
-    key = request[:key_size]
+    """Send a request; return the bodies of all fragments of the answer."""
     sent = encode_message(CoeService.SDO_INFORMATION, SdoInfoHeader(opcode).encode() + request)
     body = b""
     left: int | None = None
+    late = 0
     while left != 0:
-        expected = left
-
-        def accepts(data: bytes, expected: int | None = expected) -> bool:
-            if len(data) < 2 or data[1] >> 4 != CoeService.SDO_INFORMATION:
-                return False
-            found = data[2] & 0x7F if len(data) >= _START else SdoInfoOpcode.ERROR
-            if found != answer:
-                return found == SdoInfoOpcode.ERROR
-            if expected is None:
-                return data.startswith(key, _START)
-            return int.from_bytes(data[4:6], "little") < expected
-
-        message = yield Ask(MailboxType.COE, sent if left is None else None, accepts)
+        if left is None:
+            message = yield Ask(MailboxType.COE, sent)
+        else:
+            message = yield Ask(MailboxType.COE, sent[:INFO_START], listen=True)
         with reading(what):
             header = SdoInfoHeader.decode(message.data, CoeHeader.SIZE)
             if header.opcode is SdoInfoOpcode.ERROR:
-                code = InfoError.decode(message.data, _START).abort_code
+                code = InfoError.decode(message.data, INFO_START).abort_code
                 raise SdoAbortError(code, index, subindex)
+        if left is not None and header.fragments_left >= left and late < _MAX_LATE:
+            late += 1
+            continue
         if left is not None and header.fragments_left != left - 1:
             raise MailboxProtocolError(
                 f"{what}: {left} fragments left, then {header.fragments_left}"
             )
         left = header.fragments_left
-        body += message.data[_START:]
+        body += message.data[INFO_START:]
         if len(body) > MAX_SIZE:
             raise MailboxProtocolError(f"{what}: more than {MAX_SIZE} octets")
     return body

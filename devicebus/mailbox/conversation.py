@@ -2,7 +2,7 @@
 
     def read_twice() -> Conversation[bytes]:
         first = yield Ask(MailboxType.COE, request)
-        more = yield Ask(MailboxType.COE, None)      # only listen for another message
+        more = yield Ask(MailboxType.COE, request, listen=True)  # another message, nothing is sent
         return first.data + more.data
 
 The runner sends the request, waits, and resumes the generator with the reply.  It throws
@@ -12,7 +12,7 @@ mailbox error, and closes it to cancel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -26,19 +26,14 @@ RESPONSE_TIMEOUT_NS = 2_000_000_000
 """How long a slave may take to answer, unless a protocol says otherwise (ESI default)."""
 
 
-def _accept_any(data: bytes) -> bool:
-    del data
-    return True
-
-
 class Ask(NamedTuple):
-    """What a conversation wants next."""
+    """What a conversation wants next; :func:`devicebus.mailbox.match.answers` knows its reply."""
 
     type: MailboxType
-    data: bytes | None
-    """What to send behind the mailbox header; None only listens."""
-    accepts: Callable[[bytes], bool] = _accept_any
-    """Whether a message of that type answers it; others are late or unsolicited and not for it."""
+    request: bytes
+    """What to send behind the mailbox header."""
+    listen: bool = False
+    """Whether to send nothing, and only wait for one more message that answers *request*."""
     timeout_ns: int = RESPONSE_TIMEOUT_NS
     delay_ns: int = 0
     """Wait this long before sending, as after a busy reply."""

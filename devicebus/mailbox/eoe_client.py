@@ -24,22 +24,19 @@ def set_ip(settings: IpSettings, *, port: int = 0) -> Conversation[None]:
         CodecError: the name is too long.
     """
     request = encode_message(EoeType.SET_IP_REQUEST, settings.encode(), port=port)
-    yield from _ask("EoE set IP", request, EoeType.SET_IP_RESPONSE)
+    yield from _ask("EoE set IP", request)
 
 
 def get_ip(*, port: int = 0) -> Conversation[IpSettings]:
     """Read a slave's Ethernet settings; raises as set_ip() does."""
     request = encode_message(EoeType.GET_IP_REQUEST, port=port)
-    body = yield from _ask("EoE get IP", request, EoeType.GET_IP_RESPONSE)
+    body = yield from _ask("EoE get IP", request)
     with reading("EoE get IP"):
         return IpSettings.decode(body)
 
 
-def _ask(what: str, request: bytes, answer: EoeType) -> Conversation[bytes]:
-    def accepts(data: bytes) -> bool:
-        return not data or data[0] & 0x0F == answer
-
-    message = yield Ask(MailboxType.EOE, request, accepts)
+def _ask(what: str, request: bytes) -> Conversation[bytes]:
+    message = yield Ask(MailboxType.EOE, request)
     with reading(what):
         _, result, body = decode_message(message.data)
     if result != EoeResult.OK:

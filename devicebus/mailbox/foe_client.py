@@ -6,10 +6,10 @@ message at a time.  Each message waits for the answer to the one before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 
-from devicebus.errors import FoeError, MailboxProtocolError, MailboxTimeoutError
-from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress, reading
+from devicebus.errors import FoeError, MailboxProtocolError, MailboxSizeError, MailboxTimeoutError
+from devicebus.mailbox.conversation import Ask, Conversation, Progress, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import (
     DATA_OVERHEAD,
@@ -49,7 +49,7 @@ def read(
         FoeError: the slave refuses.
         MailboxProtocolError: it breaks the protocol, or the file is longer than *max_size*.
         MailboxTimeoutError: it is busy for too long.
-        ValueError: the name does not fit the mailbox.
+        MailboxSizeError: the name does not fit the mailbox.
     """
     foe = _Transfer(f"FoE read of {name!r}")
     progress = progress or Progress()
@@ -57,8 +57,7 @@ def read(
     sent = _request(FoeOpcode.READ, password, name, sizes)
     expected = 1
     while True:
-        follows = _is_first if expected == 1 else _is_not(expected - 1)
-        header, data = yield from foe.ask(sent, FoeOpcode.DATA, follows)
+        header, data = yield from foe.ask(sent)
         if header.number != expected:
             yield from foe.give_up(
                 FoeErrorCode.PACKET_NUMBER, f"packet {header.number}, expected {expected}"
@@ -100,13 +99,13 @@ def write(
         FoeError: the slave refuses.
         MailboxProtocolError: it breaks the protocol.
         MailboxTimeoutError: it is busy for too long.
-        ValueError: the name does not fit the mailbox.
+        MailboxSizeError: the name does not fit the mailbox.
     """
     foe = _Transfer(f"FoE write of {name!r}")
     progress = progress or Progress()
     room = sizes.to_slave - DATA_OVERHEAD
     sent = _request(FoeOpcode.WRITE, password, name, sizes)
-    yield from foe.ask(sent, FoeOpcode.ACK, lambda number: number == 0)
+    yield from foe.ask(sent)
     number = 0
     size = room
     while size == room:
@@ -118,7 +117,7 @@ def write(
         number += 1
         size = len(data)
         sent = encode_message(FoeOpcode.DATA, number, data)
-        header, _ = yield from foe.ask(sent, FoeOpcode.ACK, _is_not(number - 1))
+        header, _ = yield from foe.ask(sent)
         if header.number != number:
             yield from foe.give_up(
                 FoeErrorCode.PACKET_NUMBER, f"packet {header.number} confirmed, sent was {number}"
@@ -131,7 +130,9 @@ def _request(opcode: FoeOpcode, password: int, name: str, sizes: MailboxSizes) -
     octets = name.encode()
     room = sizes.to_slave - DATA_OVERHEAD
     if len(octets) > room:
-        raise ValueError(f"{name!r} has {len(octets)} octets, the mailbox has room for {room}")
+        raise MailboxSizeError(
+            f"file name {name!r} has {len(octets)} octets, the slave's mailbox has room for {room}"
+        )
     return encode_message(opcode, password, octets)
 
 
@@ -145,33 +146,15 @@ def _take(source: Callable[[int], bytes], size: int) -> bytes:
     return data
 
 
-def _is_first(number: int) -> bool:
-    # What follows packet 1 belongs to a transfer before this one: late, and not wrong.
-    return number <= 1
-
-
-def _is_not(late: int) -> Callable[[int], bool]:
-    # The number before comes twice when a reply is repeated; any other is wrong, not late.
-    return lambda number: number != late
-
-
 class _Transfer:
     """What reading and writing have in common."""
 
     def __init__(self, what: str) -> None:
         self.what = what
 
-    def ask(
-        self, sent: bytes, opcode: FoeOpcode, accepts_number: Callable[[int], bool]
-    ) -> Generator[Ask, Message, tuple[FoeHeader, bytes]]:
+    def ask(self, sent: bytes) -> Conversation[tuple[FoeHeader, bytes]]:
         """Send a message, again while the slave is busy; return header and body of the answer."""
-
-        def accepts(data: bytes) -> bool:
-            if len(data) < FoeHeader.SIZE or data[0] in {FoeOpcode.ERROR, FoeOpcode.BUSY}:
-                return True
-            return data[0] == opcode and accepts_number(int.from_bytes(data[2:6], "little"))
-
-        ask = Ask(MailboxType.FOE, sent, accepts, STEP_TIMEOUT_NS)
+        ask = Ask(MailboxType.FOE, sent, timeout_ns=STEP_TIMEOUT_NS)
         for _ in range(BUSY_LIMIT):
             message = yield ask
             with reading(self.what):

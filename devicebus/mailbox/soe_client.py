@@ -29,6 +29,8 @@ MAX_SIZE = 0x80020
 """Octets of the longest answer: eight elements that are lists as long as there can be."""
 _MAX_LATE = 16
 """Answers to others, in fragments, that are dropped before a read gives up."""
+_NAMELESS = 2
+"""Octets of a request before the IDN, which fragments do not carry."""
 POLL_DELAY_NS = 10_000_000
 EXECUTION_TIMEOUT_NS = 60_000_000_000
 
@@ -55,11 +57,11 @@ def read(
     left: int | None = None
     late = 0
     while True:
-        accepts = _Accepts(SoeOpcode.READ_RESPONSE, drive, number, is_gathering=left is not None)
         if left is None and not late:
-            message = yield Ask(MailboxType.SOE, request, accepts, delay_ns=delay_ns)
+            message = yield Ask(MailboxType.SOE, request, delay_ns=delay_ns)
         else:
-            message = yield Ask(MailboxType.SOE, None, accepts)
+            named = request if left is None else request[:_NAMELESS]
+            message = yield Ask(MailboxType.SOE, named, listen=True)
         with reading(what):
             header, body = decode_message(message.data)
         is_foreign = not header.incomplete and header.idn != number
@@ -109,9 +111,7 @@ def write(
     for fragment in fragments:
         yield Ask(MailboxType.SOE, fragment, expects_reply=False)
         progress.done += room
-    is_gathering = bool(fragments)
-    accepts = _Accepts(SoeOpcode.WRITE_RESPONSE, drive, idn.number, is_gathering=is_gathering)
-    message = yield Ask(MailboxType.SOE, last, accepts)
+    message = yield Ask(MailboxType.SOE, last)
     with reading(what):
         answer, body = decode_message(message.data)
     if answer.error:
@@ -150,24 +150,6 @@ def execute(
         raise SoeError(f"{what}: failed", code=SoeErrorCode.GENERAL)
     if state & DataState.EXECUTING:
         raise MailboxTimeoutError(f"{what}: not done after {timeout_ns / 1e9:g} s")
-
-
-class _Accepts:
-    """Which messages answer a request."""
-
-    def __init__(self, opcode: SoeOpcode, drive: int, number: int, *, is_gathering: bool) -> None:
-        self._first = opcode | drive << 5
-        self._number = number
-        self._is_gathering = is_gathering
-
-    def __call__(self, data: bytes) -> bool:
-        if len(data) < SoeHeader.SIZE:
-            return True
-        if data[0] & 0xE7 != self._first:
-            return False
-        is_incomplete = bool(data[0] & 0x08)
-        is_named = int.from_bytes(data[2:4], "little") == self._number
-        return is_incomplete or is_named or self._is_gathering
 
 
 def _refusal(what: str, body: memoryview) -> SoeError:

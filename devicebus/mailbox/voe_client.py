@@ -12,9 +12,7 @@ def exchange(
 ) -> Conversation[bytes]:
     """Send data to a slave; return the data of its answer of the same vendor and type."""
     head = VoeHeader(vendor_id, vendor_type).encode()
-    message = yield Ask(
-        MailboxType.VOE, head + data, lambda answer: answer.startswith(head), timeout_ns
-    )
+    message = yield Ask(MailboxType.VOE, head + data, timeout_ns=timeout_ns)
     return message.data[VoeHeader.SIZE :]
 
 

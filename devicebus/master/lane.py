@@ -101,7 +101,7 @@ class Lanes:
                 ready.append(lane.active)
         if not ready:
             return None
-        job = next((each for each in ready if each.ask.data is None), ready[0])
+        job = next((each for each in ready if each.ask.listen), ready[0])
         self._lanes[job.ask.type] = self._lanes.pop(job.ask.type)
         return job
 

@@ -8,6 +8,7 @@ have answered what timed out is taken for late.
 from __future__ import annotations
 
 from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.match import answers
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.eoe import EoeHeader, EoeType
 from eap.codec.mailbox import MailboxHeader, MailboxType
@@ -73,7 +74,7 @@ class ReplyJudge:
 
 
 def _fits(header: MailboxHeader, data: bytes, ask: Ask) -> bool:
-    return header.type == ask.type and ask.accepts(data)
+    return header.type == ask.type and answers(ask.type, ask.request, data)
 
 
 def is_unsolicited(kind: MailboxType, data: bytes) -> bool:

@@ -14,6 +14,7 @@ from devicebus.errors import (
     BusError,
     MailboxProtocolError,
     MailboxRefusedError,
+    MailboxSizeError,
     MailboxTimeoutError,
 )
 from devicebus.mailbox.conversation import Ask, Conversation, Message
@@ -100,9 +101,10 @@ class Mailbox:
                 task.finish(end.value)
             return task
         job = Job(conversation, ask, f"slave {self.station}: {name}", requester)
-        if not self._is_open:
+        refusal = self._refusal_of(ask, job.task.name)
+        if refusal is not None:
             conversation.close()
-            job.task.fail(BusError(f"{job.task.name}: the slave's mailbox is closed"))
+            job.task.fail(refusal)
             return job.task
         job.ready_ns = now_ns + ask.delay_ns
         self._lanes.add(job)
@@ -125,6 +127,17 @@ class Mailbox:
         """Return a snapshot of the counters."""
         return self._tally.stats(
             repeats=self._port.repeats, duplicates=self._watch.repeated, gaps=self._watch.gaps
+        )
+
+    def _refusal_of(self, ask: Ask, who: str) -> BusError | None:
+        """Why a request cannot be sent."""
+        if not self._is_open:
+            return BusError(f"{who}: the slave's mailbox is closed")
+        size = MailboxHeader.SIZE + len(ask.request)
+        if ask.listen or size <= self.sizes.to_slave:
+            return None
+        return MailboxSizeError(
+            f"{who}: a message of {size} octets, the slave's mailbox holds {self.sizes.to_slave}"
         )
 
     def _begin(self, work: Procedure[None], now_ns: int) -> None:
@@ -165,7 +178,7 @@ class Mailbox:
         except EapError as exc:
             error = exc
             self._tally.fail(exc)
-            if isinstance(exc, MailboxTimeoutError) and ask.data is not None:
+            if isinstance(exc, MailboxTimeoutError) and not ask.listen:
                 self._lanes.judge(ask.type).expire(ask)
         _, now_ns = yield Sleep(0)
         if error is None:
@@ -177,8 +190,11 @@ class Mailbox:
         return now_ns
 
     def _exchange(self, ask: Ask, deadline_ns: int) -> Procedure[Message]:
-        if ask.data is not None:
-            early = yield from self._send(ask, ask.data, deadline_ns)
+        refusal = self._refusal_of(ask, f"slave {self.station}")
+        if refusal is not None:
+            raise refusal
+        if not ask.listen:
+            early = yield from self._send(ask, deadline_ns)
             if early is not None:
                 return early
             if not ask.expects_reply:
@@ -198,17 +214,12 @@ class Mailbox:
             pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)
             is_full = yield from self._port.is_full()
 
-    def _send(self, ask: Ask, data: bytes, deadline_ns: int) -> Procedure[Message | None]:
+    def _send(self, ask: Ask, deadline_ns: int) -> Procedure[Message | None]:
         """Write a request; return its reply if that came while it was written again."""
         self._counter = next_counter(self._counter)
         address = self._lanes.judge(ask.type).next_address()
         header = MailboxHeader(0, address, type=ask.type, counter=self._counter)
-        message = encode_message(header, data)
-        if len(message) > self.sizes.to_slave:
-            raise BusError(
-                f"slave {self.station}: a message of {len(message)} octets, its mailbox holds"
-                f" {self.sizes.to_slave}"
-            )
+        message = encode_message(header, ask.request)
         maybe_there = False
         while True:
             posted = yield from self._port.post(message)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from devicebus.errors import MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
 from devicebus.mailbox.conversation import Progress
 from eap.appliance.bus_session import BusSession
@@ -52,7 +53,7 @@ def get_file(
             file.flush()
             os.fsync(file.fileno())
         partial.replace(target)
-    except ValueError as exc:
+    except MailboxSizeError as exc:
         raise ConfigError(f"file {name!r}: {exc}") from None
     except OSError as exc:
         raise EnvironmentalError(f"{target} cannot be written: {exc.strerror}") from None
@@ -95,7 +96,7 @@ def put_file(
                 f"FoE write of {name!r}",
                 lambda: report(progress.done, progress.total),
             )
-    except ValueError as exc:
+    except MailboxSizeError as exc:
         raise ConfigError(f"file {name!r}: {exc}") from None
     except OSError as exc:
         raise EnvironmentalError(f"{source} cannot be read: {exc.strerror}") from None

@@ -16,6 +16,7 @@ import pytest
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.counter import CounterWatch, next_counter
+from devicebus.mailbox.match import answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from devicebus.mailbox.server import MailboxServer
 from eap.codec.mailbox import (
@@ -76,7 +77,8 @@ class Line:
                 else:
                     ask = talk.send(message)
         except StopIteration as end:
-            return end.value
+            result: T = end.value
+            return result
 
     def run_partly(self, talk: Conversation[object], steps: int) -> None:
         """Cancel a conversation after so many exchanges, or let it end before."""
@@ -98,18 +100,18 @@ class Line:
         return self.others
 
     def _exchange(self, ask: Ask) -> Message:
-        if ask.data is not None:
+        if not ask.listen:
             self.now_ns += ask.delay_ns
             self._send(ask)
         return self._receive(ask) if ask.expects_reply else Message(ask.type, b"")
 
     def _send(self, ask: Ask) -> None:
-        if ask.data is None:
+        if ask.listen:
             return
-        self.sent.append(ask.data)
+        self.sent.append(ask.request)
         self._counter = next_counter(self._counter)
         message = encode_message(
-            MailboxHeader(0, type=ask.type, counter=self._counter), ask.data
+            MailboxHeader(0, type=ask.type, counter=self._counter), ask.request
         ).ljust(self.server.sizes.to_slave, b"\xee")
         while (fault := self.choose()) is not Fault.NONE:
             if fault is Fault.CONFIRMATION_LOST:
@@ -126,7 +128,7 @@ class Line:
             elif message.type is MailboxType.ERR:
                 detail = MailboxErrorReply.decode(message.data).detail
                 raise MailboxRefusedError("refused", detail=detail)
-            elif message.type is ask.type and ask.accepts(message.data):
+            elif message.type is ask.type and answers(ask.type, ask.request, message.data):
                 return message
             else:
                 self.others.append(message)

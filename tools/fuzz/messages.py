@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Conversation, Message
+from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.match import answers
 from eap.codec.mailbox import MailboxType
 
 T = TypeVar("T")
@@ -21,6 +22,13 @@ def cut(data: bytes) -> Iterator[bytes]:
         at += 1 + size
 
 
+def _next_answer(ask: Ask, rest: Iterator[bytes]) -> bytes | None:
+    for n, data in enumerate(rest):
+        if n % 2 or answers(ask.type, ask.request, data):
+            return data
+    return None
+
+
 def answer_with(talk: Conversation[T], kind: MailboxType, answers: Iterable[bytes]) -> T:
     """Run a conversation to its end; when no answer is left it gets a time-out.
 
@@ -33,7 +41,7 @@ def answer_with(talk: Conversation[T], kind: MailboxType, answers: Iterable[byte
             if not ask.expects_reply:
                 ask = talk.send(Message(kind, b""))
                 continue
-            found = next((data for n, data in enumerate(rest) if n % 2 or ask.accepts(data)), None)
+            found = _next_answer(ask, rest)
             if found is None:
                 ask = talk.throw(MailboxTimeoutError("no answer is left"))
             else:

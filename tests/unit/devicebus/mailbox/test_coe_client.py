@@ -127,7 +127,7 @@ def test_answer_that_breaks_the_protocol(
     if abort is None:
         assert all(ask.expects_reply for ask in asked)
     else:
-        assert asked[-1].data == bytes.fromhex("0020 80 1810 01") + abort.to_bytes(4, "little")
+        assert asked[-1].request == bytes.fromhex("0020 80 1810 01") + abort.to_bytes(4, "little")
         assert not asked[-1].expects_reply
 
 

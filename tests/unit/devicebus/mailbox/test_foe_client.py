@@ -12,9 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
-from devicebus.errors import BusError, FoeError, MailboxProtocolError, MailboxTimeoutError
+from devicebus.errors import (
+    BusError,
+    FoeError,
+    MailboxProtocolError,
+    MailboxSizeError,
+    MailboxTimeoutError,
+)
 from devicebus.mailbox import foe_client
-from devicebus.mailbox.conversation import Progress
+from devicebus.mailbox.conversation import Message, Progress
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
@@ -88,7 +94,7 @@ def test_busy_slave_is_asked_again_after_a_while() -> None:
     assert asked == ["02 00 00 00 00 00 66"] * 2 + ["03 00 01 00 00 00 61 62"] * 3
     talk = foe_client.write(NAME, io.BytesIO(b"ab").read, SIZES)
     assert next(talk).delay_ns == 0
-    busy = foe_client.Message(FOE, bytes.fromhex(BUSY))
+    busy = Message(FOE, bytes.fromhex(BUSY))
     assert talk.send(busy).delay_ns == foe_client.BUSY_DELAY_NS
 
 
@@ -163,7 +169,9 @@ def test_write_that_breaks_the_protocol(answers: list[str], reason: str) -> None
 
 
 def test_name_longer_than_the_mailbox_is_refused_at_once() -> None:
-    with pytest.raises(ValueError, match="'abcde' has 5 octets, the mailbox has room for 4"):
+    with pytest.raises(
+        MailboxSizeError, match="'abcde' has 5 octets, the slave's mailbox has room for 4"
+    ):
         next(foe_client.read("abcde", bytearray().extend, SIZES))
 
 
@@ -181,7 +189,7 @@ def test_slave_is_told_when_our_side_fails() -> None:
         def watch(talk: foe_client.Conversation[int] = talk, asked: list = asked) -> object:
             ask = next(talk)
             while True:
-                asked.append(ask.data)
+                asked.append(ask.request)
                 ask = talk.send((yield ask))
 
         with pytest.raises(OSError, match="disk on fire"):

@@ -10,12 +10,12 @@ from eap.codec.mailbox import MailboxType
 COE, FOE = MailboxType.COE, MailboxType.FOE
 
 
-def talk(kind, data):
-    yield Ask(kind, data)
+def talk(kind, *, listen):
+    yield Ask(kind, b"", listen=listen)
 
 
-def job(name, requester="r", kind=COE, data=b"", ready_ns=0):
-    conversation = talk(kind, data)
+def job(name, requester="r", kind=COE, listen=False, ready_ns=0):
+    conversation = talk(kind, listen=listen)
     made = Job(conversation, next(conversation), name, requester)
     made.ready_ns = ready_ns
     return made
@@ -57,7 +57,7 @@ def test_protocols_take_turns_message_by_message():
 def test_who_only_listens_goes_first():
     lanes = Lanes()
     lanes.add(job("file", kind=FOE))
-    lanes.add(job("fragments", data=None))
+    lanes.add(job("fragments", listen=True))
     assert [lanes.take(0).task.name for _ in range(3)] == ["fragments"] * 3
 
 

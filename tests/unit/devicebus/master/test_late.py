@@ -8,7 +8,8 @@ from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxHeader, MailboxType
 
 COE, FOE, ERR = MailboxType.COE, MailboxType.FOE, MailboxType.ERR
-ASK = Ask(COE, b"", lambda data: data == b"yes")
+YES, NO = (bytes.fromhex(f"0030 43 1810 0{n} 00000000") for n in (1, 2))
+ASK, ASK_OTHER = (Ask(COE, bytes.fromhex(f"0020 40 1810 0{n} 00000000")) for n in (1, 3))
 
 
 @pytest.fixture
@@ -16,7 +17,7 @@ def judge():
     return ReplyJudge()
 
 
-def give(judge, data=b"yes", *, address=0, kind=COE, ask=ASK):
+def give(judge, data=YES, *, address=0, kind=COE, ask=ASK):
     return judge.answers(MailboxHeader(0, address, type=kind), data, ask)
 
 
@@ -24,7 +25,7 @@ def test_replies_are_told_by_protocol_and_content(judge):
     assert judge.next_address() == 0
     assert give(judge)
     assert give(judge, address=1001)
-    assert not give(judge, b"no")
+    assert not give(judge, NO)
     assert not give(judge, kind=FOE)
     assert give(judge, kind=ERR)
 
@@ -53,7 +54,7 @@ def test_tags_go_round_and_are_never_0(judge):
 def test_without_echo_the_first_fitting_reply_is_the_late_one(judge):
     judge.expire(ASK)
     judge.next_address()
-    assert not give(judge, b"no")
+    assert not give(judge, NO)
     assert not give(judge)
     assert give(judge)
 
@@ -70,7 +71,7 @@ def test_without_echo_a_lost_reply_costs_one_more_time_out_and_not_two(judge):
 def test_a_late_reply_that_nobody_could_confuse_is_settled(judge):
     judge.expire(ASK)
     judge.next_address()
-    assert not give(judge, ask=Ask(COE, b"", lambda data: data == b"other"))
+    assert not give(judge, ask=ASK_OTHER)
     assert give(judge)
 
 

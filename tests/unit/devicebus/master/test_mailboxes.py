@@ -10,6 +10,7 @@ from devicebus.errors import (
     BusError,
     MailboxProtocolError,
     MailboxRefusedError,
+    MailboxSizeError,
     MailboxTimeoutError,
     WorkingCounterError,
 )
@@ -86,11 +87,24 @@ def test_refusals_reach_who_asked(line, box):
 
 
 def test_a_message_that_does_not_fit_is_refused_before_it_is_sent(line, box):
-    def large():
-        yield Ask(MailboxType.COE, bytes(300))
+    frames = line.frames
 
-    with pytest.raises(BusError, match="306 octets, its mailbox holds 256"):
-        line.wait(start(line, box, large()))
+    def large():
+        yield Ask(MailboxType.COE, bytes(251))
+
+    def grows():
+        yield from vendor()
+        yield from large()
+
+    refused = start(line, box, large())
+    with pytest.raises(MailboxSizeError, match=r"a request: .* 257 octets, .* mailbox holds 256"):
+        refused.result()
+    assert line.frames == frames
+    with pytest.raises(MailboxSizeError):
+        line.wait(start(line, box, grows()))
+    assert box.stats().sent == 1
+    line.wait(start(line, box, vendor()))
+    assert server(line).stats().gaps == 0
 
 
 def test_conversations_that_end_before_they_begin(line, box):
@@ -281,7 +295,7 @@ def test_a_conversation_may_wait_send_without_reply_and_listen(line, box):
 
     def talk():
         sent = yield Ask(MailboxType.VOE, b"one", expects_reply=False)
-        first = yield Ask(MailboxType.VOE, None)
+        first = yield Ask(MailboxType.VOE, b"one", listen=True)
         late = yield Ask(MailboxType.VOE, b"two", delay_ns=50 * MS)
         return sent.data, first.data, late.data
 

@@ -105,10 +105,10 @@ def test_a_choice_is_written_in_the_order_that_slaves_want():
 def test_a_mapping_is_written_as_index_subindex_and_bits():
     writing = write_choice(PdoChoice(mapping={0x1600: ((0x7010, 2, 16),)}), MailboxSizes())
     first = next(writing)
-    assert first.data[3:6] == b"\x00\x16\x00"
+    assert first.request[3:6] == b"\x00\x16\x00"
     answer = encode_message(CoeService.SDO_RESPONSE, b"\x60\x00\x16\x00" + bytes(4))
     second = writing.send(Message(MailboxType.COE, answer))
-    assert second.data[5:] == b"\x01\x10\x02\x10\x70"
+    assert second.request[5:] == b"\x01\x10\x02\x10\x70"
 
 
 def response(index, subindex, octets):
