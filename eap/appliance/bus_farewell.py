@@ -1,0 +1,24 @@
+"""What ends a transfer in a slave's mailbox for somebody who has left in the middle of it.
+
+A slave that knows of no transfer ignores it, so it may be sent whenever that is not known.
+"""
+
+from __future__ import annotations
+
+from devicebus.mailbox.conversation import Ask
+from eap.codec import foe
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import encode_abort
+from eap.od.abort import AbortCode
+
+FAREWELLS = {
+    MailboxType.COE: Ask(
+        MailboxType.COE, encode_abort(0, 0, AbortCode.GENERAL), expects_reply=False
+    ),
+    MailboxType.FOE: Ask(
+        MailboxType.FOE,
+        foe.encode_message(foe.FoeOpcode.ERROR, foe.FoeErrorCode.NOT_DEFINED),
+        expects_reply=False,
+    ),
+}
+"""By protocol; others have no transfers that stay open."""

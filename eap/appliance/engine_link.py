@@ -1,0 +1,143 @@
+"""Services' end of the pair on which the engine takes requests for its buses.
+
+Answers are matched by number.  An engine that dies leaves the pair open and says nothing, so an
+answer has a time-out, and a request that waits for long asks now and then whether anybody is there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from time import monotonic_ns
+
+import msgspec
+
+from eap.appliance.bus_failure import to_error
+from eap.appliance.bus_request import Answer, Cancel, Describe, FromEngine, Hello, Request
+from eap.errors import EngineGoneError
+
+LOOK_S = 1.0
+"""An engine that says nothing at all for this long, though it was asked, is gone."""
+
+_MAX_MESSAGE = 1 << 20
+_BATCH = 64
+
+logger = logging.getLogger(__name__)
+
+
+class EngineLink:
+    """Asks the engine; to be made inside the loop that serves it.
+
+    Args:
+        sock: This end of the pair; closed by :meth:`close`.
+        look_s: As LOOK_S.
+    """
+
+    def __init__(self, sock: socket.socket, *, look_s: float = LOOK_S) -> None:
+        self._socket = sock
+        self._socket.setblocking(False)
+        self._look_s = look_s
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(sock, self._receive)
+        self._encoder = msgspec.msgpack.Encoder()
+        self._decoder = msgspec.msgpack.Decoder(FromEngine)
+        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        # Numbers of a process before this one do not come again: late answers to it match nothing.
+        self._last_id = monotonic_ns()
+        self._heard_s = 0.0
+        self.on_restart: Callable[[], None] | None = None
+
+    async def ask(self, make: Callable[[int], Request], timeout_s: float) -> Answer:
+        """Send the request that *make* returns for its number, and wait for the answer.
+
+        Whoever is cancelled here asks the engine to forget the request.
+
+        Raises:
+            EngineGoneError: no engine answers, or it was started again meanwhile.
+            BusError: it answers that it could not do it.
+        """
+        request = make(self._next_id())
+        future: asyncio.Future[Answer] = self._loop.create_future()
+        self._waiting[request.id] = future
+        try:
+            self.post(request)
+            answer = await self._wait(future, request.bus, self._loop.time() + timeout_s)
+        except (asyncio.CancelledError, EngineGoneError):
+            with suppress(EngineGoneError):
+                self.post(Cancel(id=request.id, bus=request.bus))
+            raise
+        finally:
+            del self._waiting[request.id]
+        if answer.failure is not None:
+            raise to_error(answer.failure)
+        return answer
+
+    def tell(self, make: Callable[[int], Request]) -> None:
+        """Send a request whose answer nobody waits for; raises as :meth:`post` does."""
+        self.post(make(self._next_id()))
+
+    def post(self, request: Request) -> None:
+        """Send one message.
+
+        Raises:
+            EngineGoneError: there is no room: nobody takes messages.
+        """
+        try:
+            self._socket.send(self._encoder.encode(request))
+        except OSError as exc:
+            raise EngineGoneError(f"the engine takes no requests: {exc.strerror}") from None
+
+    def close(self) -> None:
+        """Let go of the pair."""
+        self._loop.remove_reader(self._socket)
+        self._socket.close()
+
+    async def _wait(self, future: asyncio.Future[Answer], bus: int, end_s: float) -> Answer:
+        looked_s: float | None = None
+        while True:
+            rest_s = min(self._look_s, end_s - self._loop.time())
+            await asyncio.wait({future}, timeout=max(0.0, rest_s))
+            now_s = self._loop.time()
+            if future.done():
+                return future.result()
+            if now_s >= end_s or (looked_s is not None and self._heard_s < looked_s):
+                raise EngineGoneError("the engine does not answer")
+            looked_s = now_s
+            self.tell(lambda number: Describe(id=number, bus=bus))
+
+    def _next_id(self) -> int:
+        self._last_id += 1
+        return self._last_id
+
+    def _receive(self) -> None:
+        for _ in range(_BATCH):
+            try:
+                octets = self._socket.recv(_MAX_MESSAGE)
+            except OSError:
+                return
+            if not octets:  # the supervisor has closed both ends: everything ends
+                self._loop.remove_reader(self._socket)
+                return
+            self._take(octets)
+
+    def _take(self, octets: bytes) -> None:
+        try:
+            message = self._decoder.decode(octets)
+        except msgspec.MsgspecError as exc:
+            logger.warning("an answer of the engine cannot be read: %s", exc)
+            return
+        self._heard_s = self._loop.time()
+        if isinstance(message, Hello):
+            self._restarted()
+        elif (future := self._waiting.get(message.id)) is not None and not future.done():
+            future.set_result(message)
+
+    def _restarted(self) -> None:
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(EngineGoneError("the engine was started again"))
+        if self.on_restart is not None:
+            self.on_restart()

@@ -1,0 +1,218 @@
+"""The engine's side of the buses in the loop of the test: a master on slaves in memory.
+
+Each request is done at once, so that only what the test wants to happen takes time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.master.access import Access
+from devicebus.master.bus import MasterSettings
+from devicebus.master.master import Master
+from devicebus.master.procedure import Procedure
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import Command
+from eap.appliance.bus_failure import to_failure
+from eap.appliance.bus_request import (
+    Answer,
+    AskMailbox,
+    Bring,
+    BusReport,
+    Cancel,
+    Describe,
+    Failure,
+    Hello,
+    Outcome,
+    Request,
+    SlaveReport,
+    Transfer,
+)
+from eap.appliance.handover import PortName
+from eap.codec.mailbox import MailboxType
+from eap.errors import EapError
+from tests.support.loopbus import LoopBus
+
+PORT = PortName("left", "bus0")
+CYCLE_NS = 2_000_000
+
+
+class FakeBus:
+    """A master and its slaves.
+
+    Attributes:
+        is_up: What is said of it.
+    """
+
+    def __init__(self, line: LoopBus, target: AlState = AlState.PREOP) -> None:
+        self.line = line
+        self.is_up = True
+        self.master = Master(MasterSettings(frame_timeout_ns=1_000_000))
+        self._cycle_ns = 0
+        self.finish(self.master.bring_up(line.now_ns, target))
+
+    def finish(self, task: Any) -> Any:
+        """Let time go on until a task is done."""
+        while not task.is_done:
+            self._step()
+        return task.result()
+
+    def _step(self) -> None:
+        master, now_ns = self.master, self.line.clock()
+        if now_ns >= self._cycle_ns:
+            self._cycle_ns = now_ns + CYCLE_NS
+            master.start_cycle(now_ns)
+        for frame in master.frames_to_send(now_ns):
+            self.line.segment.receive_frame(bytearray(frame), now_ns, origin=b"")
+        self.line.segment.handle_timeout(now_ns)
+        for back in self.line.segment.frames_to_send(now_ns):
+            master.receive_frame(bytes(back.frame), now_ns)
+        master.handle_timeout(now_ns)
+
+    def do(self, request: Request) -> dict[str, Any]:
+        """Return the fields of the answer, or raise."""
+        master, now_ns = self.master, self.line.now_ns
+        if isinstance(request, Describe):
+            return {"report": self.report()}
+        if isinstance(request, AskMailbox):
+            talk = _one(_ask_of(request))
+            return {"data": self.finish(master.converse(request.station, talk, now_ns))}
+        if isinstance(request, Transfer):
+            accesses = [
+                Access(Command(each[0]), *each[1:]) for each in map(_fields, request.datagrams)
+            ]
+            replies = self.finish(master.run(_transfer(accesses), now_ns))
+            return {"outcomes": tuple(Outcome(r.wkc, r.data, r.tries) for r in replies)}
+        assert isinstance(request, Bring)
+        stations = [request.station] if request.station else list(master.units)
+        for station in stations:
+            self.finish(master.request_state(station, AlState(request.target), now_ns))
+        return {}
+
+    def report(self) -> BusReport:
+        """Say how it is."""
+        if not self.is_up:
+            return BusReport(is_up=False, fault="no frame comes back")
+        return BusReport(
+            is_up=True,
+            slaves=tuple(_slave(unit) for unit in self.master.units.values()),
+            frames_sent=self.master.stats().link.sent,
+        )
+
+
+def _slave(unit: Any) -> SlaveReport:
+    identity, box = unit.found.identity, unit.mailbox
+    return SlaveReport(
+        station=unit.station,
+        name=unit.name,
+        vendor=identity.vendor,
+        product=identity.product,
+        revision=identity.revision,
+        serial=identity.serial,
+        alias=unit.found.alias,
+        state=unit.state,
+        target=unit.target,
+        to_slave=box.sizes.to_slave if box else 0,
+        to_master=box.sizes.to_master if box else 0,
+        protocols=unit.found.sii.fixed.protocols,
+    )
+
+
+def _fields(record: Any) -> Sequence[Any]:
+    return msgspec.structs.astuple(record)
+
+
+def _ask_of(request: AskMailbox) -> Ask:
+    return Ask(
+        MailboxType(request.type),
+        request.request,
+        request.listen,
+        request.timeout_ns,
+        request.delay_ns,
+        request.expects_reply,
+    )
+
+
+def _one(ask: Ask) -> Conversation[bytes]:
+    message = yield ask
+    return message.data
+
+
+def _transfer(accesses: Sequence[Access]) -> Procedure[Sequence[Any]]:
+    replies, _ = yield accesses
+    return replies
+
+
+class FakeEngine:
+    """Answers requests inside the running loop.
+
+    Attributes:
+        requests: All that came.
+        holds: Requests are not answered while it is set; :meth:`release` does them.
+    """
+
+    def __init__(self, *buses: FakeBus) -> None:
+        self.buses = buses
+        self.requests: list[Request] = []
+        self.holds = False
+        self._held: list[Request] = []
+        self._awaited = 0
+        self._enough = asyncio.Event()
+        self._sock, self.services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._sock.setblocking(False)
+        asyncio.get_running_loop().add_reader(self._sock, self._receive)
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._sock)
+        self._sock.close()
+
+    def say_hello(self) -> None:
+        """Be a new engine."""
+        self._send(Hello(1))
+
+    def release(self) -> None:
+        """Do what was held back, and nothing is any more."""
+        self.holds = False
+        held, self._held = self._held, []
+        for request in held:
+            self._take(request)
+
+    async def wait_for(self, count: int) -> None:
+        """Wait until so many requests have come."""
+        self._awaited = count
+        await self._enough.wait()
+
+    def of(self, kind: type) -> list[Any]:
+        """Return the requests of one kind."""
+        return [request for request in self.requests if isinstance(request, kind)]
+
+    def _receive(self) -> None:
+        octets = self._sock.recv(1 << 20)
+        request: Request = msgspec.msgpack.decode(octets, type=Request)
+        self.requests.append(request)
+        if len(self.requests) == self._awaited:
+            self._enough.set()
+        if self.holds:
+            self._held.append(request)
+        else:
+            self._take(request)
+
+    def _take(self, request: Request) -> None:
+        if isinstance(request, Cancel):
+            return
+        try:
+            fields = self.buses[request.bus].do(request)
+        except EapError as exc:
+            fields = {"failure": to_failure(exc)}
+        except IndexError:
+            fields = {"failure": Failure("BusError", "no such bus")}
+        self._send(Answer(id=request.id, **fields))
+
+    def _send(self, message: Any) -> None:
+        self._sock.send(msgspec.msgpack.encode(message))
