@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from eap.codec.ams import AmsHeader, StateFlags
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.eoe import EoeHeader
 from eap.codec.foe import FoeHeader, FoeOpcode
@@ -23,6 +23,7 @@ from eap.errors import CodecError
 
 INFO_START = CoeHeader.SIZE + SdoInfoHeader.SIZE
 """Where the body of an SDO information message begins."""
+_FRAGMENT = AmsCommand.FRAGMENT.to_bytes(2, "little")
 _SDO_END = CoeHeader.SIZE + SdoHeader.SIZE
 _INFO_KEYS: dict[int, int] = {
     SdoInfoOpcode.LIST_REQUEST: 2,
@@ -160,3 +161,22 @@ def answers(kind: MailboxType, request: bytes, reply: bytes) -> bool:
     if len(request) < _SHORTEST.get(kind, 0):
         return False
     return kind in _ANSWERS and _ANSWERS[kind](request, reply)
+
+
+def has_more(kind: MailboxType, reply: bytes) -> bool:
+    """Say whether fragments may follow a message; only the last one of AoE does not tell."""
+    match kind:
+        case MailboxType.COE:
+            is_info = len(reply) >= INFO_START and _service(reply) == CoeService.SDO_INFORMATION
+            return is_info and reply[4:6] != b"\0\0"
+        case MailboxType.SOE:
+            return len(reply) >= SoeHeader.SIZE and bool(reply[0] & 0x08)
+        case MailboxType.AOE:
+            return is_aoe_fragment(reply)
+    return False
+
+
+def is_aoe_fragment(reply: bytes) -> bool:
+    """Say whether a packet is a part of another one, and not the acknowledgement of one."""
+    flags = int.from_bytes(reply[18:20], "little")
+    return reply[16:18] == _FRAGMENT and not flags & StateFlags.RESPONSE

@@ -41,8 +41,8 @@ class Job:
 class Lane:
     """The conversations of one protocol with one slave; *judge* knows their replies."""
 
-    def __init__(self) -> None:
-        self.judge = ReplyJudge()
+    def __init__(self, kind: MailboxType) -> None:
+        self.judge = ReplyJudge(kind)
         self.active: Job | None = None
         self._waiting: dict[Hashable, deque[Job]] = {}
 
@@ -87,7 +87,7 @@ class Lanes:
         return self._lane(kind).judge
 
     def _lane(self, kind: MailboxType) -> Lane:
-        return self._lanes.setdefault(kind, Lane())
+        return self._lanes.setdefault(kind, Lane(kind))
 
     def take(self, now_ns: int) -> Job | None:
         """Return whose turn it is, if anybody may go on now.

@@ -193,7 +193,11 @@ class Mailbox:
         refusal = self._refusal_of(ask, f"slave {self.station}")
         if refusal is not None:
             raise refusal
-        if not ask.listen:
+        if ask.listen:
+            kept = self._lanes.judge(ask.type).take_kept(ask)
+            if kept is not None:
+                return Message(ask.type, kept)
+        else:
             early = yield from self._send(ask, deadline_ns)
             if early is not None:
                 return early
@@ -255,7 +259,10 @@ class Mailbox:
         if ask is not None and self._lanes.judge(ask.type).answers(header, data, ask):
             if header.type == MailboxType.ERR:
                 raise self._refusal(data)
+            self._lanes.judge(ask.type).took(data)
             return Message(header.type, data)
+        if self._lanes.judge(header.type).keep(data):
+            return None
         if is_unsolicited(header.type, data):
             self._tally.unsolicited += 1
             self._report(Unsolicited(self.station, header.type, data))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devicebus.mailbox.match import answers
+from devicebus.mailbox.match import answers, has_more
 from eap.codec.ams import AmsHeader, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.ids import NetId
@@ -127,6 +127,27 @@ def test_aoe_answer_that_is_cut_is_left_to_the_conversation() -> None:
     assert answers(AOE, ASKED, ASKED[:31])
 
 
+@pytest.mark.parametrize(
+    ("kind", "reply", "expected"),
+    [
+        (COE, "0080 82 00 0200 0100", True),
+        (COE, "0080 82 00 0000 0100", False),
+        (COE, "0030 82 00 0200 0100", False),
+        (COE, "0080 82", False),
+        (SOE, "2a 40 0300 0100", True),
+        (SOE, "22 40 2000 0100", False),
+        (SOE, "2a", False),
+        (FOE, "0300 01000000", False),
+        (AOE, ASKED.hex(), False),
+        (AOE, encode_packet(AmsHeader(SLAVE, 1, HERE, 1, 0x0902, 6), b"").hex(), True),
+        (AOE, encode_packet(AmsHeader(SLAVE, 1, HERE, 1, 0x0902, 5), b"").hex(), False),
+    ],
+)
+def test_which_messages_fragments_follow(kind: MailboxType, reply: str, *, expected: bool) -> None:
+    assert has_more(kind, bytes.fromhex(reply)) is expected
+
+
 @given(st.sampled_from(list(MailboxType)), st.binary(max_size=12), st.binary(max_size=12))
 def test_any_octets_are_judged(kind: MailboxType, request_: bytes, reply: bytes) -> None:
     assert answers(kind, request_, reply) in {True, False}
+    assert has_more(kind, reply) in {True, False}

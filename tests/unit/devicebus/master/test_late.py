@@ -14,7 +14,7 @@ ASK, ASK_OTHER = (Ask(COE, bytes.fromhex(f"0020 40 1810 0{n} 00000000")) for n i
 
 @pytest.fixture
 def judge():
-    return ReplyJudge()
+    return ReplyJudge(COE)
 
 
 def give(judge, data=YES, *, address=0, kind=COE, ask=ASK):
@@ -98,8 +98,49 @@ def test_without_echo_a_mailbox_error_may_be_late_too(judge):
         (FOE, bytes(6), False),
         (MailboxType.VOE, bytes(6), True),
         (MailboxType.AOE, bytes(32), True),
+        (MailboxType.AOE, bytes(18) + b"\5\0" + bytes(12), False),
+        (MailboxType.AOE, bytes(16) + b"\2\x09\6\0" + bytes(12), False),
+        (MailboxType.AOE, b"news", False),
         (ERR, b"\1\0\2\0", False),
     ],
 )
 def test_what_slaves_send_unasked(kind, data, expected):
     assert is_unsolicited(kind, data) is expected
+
+
+LISTED = Ask(COE, bytes.fromhex("0080 01 00 0000 0100"))
+PARTS = [bytes.fromhex(f"0080 {head} 00{n:02x}10") for n, head in
+         enumerate(("82 00 0200 0100", "82 00 0100", "02 00 0000"))]  # fmt: skip
+EMERGENCY = encode_message(CoeService.EMERGENCY, bytes(8))
+REST = Ask(COE, LISTED.request[:6], listen=True)
+
+
+def test_fragments_that_come_before_somebody_listens_are_kept(judge):
+    judge.next_address()
+    assert not judge.keep(PARTS[1])
+    assert give(judge, PARTS[0], ask=LISTED)
+    judge.took(PARTS[0])
+    assert not judge.keep(EMERGENCY)
+    assert judge.keep(PARTS[1])
+    assert judge.keep(PARTS[2])
+    assert not judge.keep(PARTS[2])
+    assert [judge.take_kept(REST) for _ in range(3)] == [*PARTS[1:], None]
+
+
+def test_what_was_kept_is_forgotten_with_the_next_request(judge):
+    judge.took(PARTS[0])
+    assert judge.keep(PARTS[1])
+    judge.next_address()
+    assert judge.take_kept(REST) is None
+    assert not judge.keep(PARTS[1])
+
+
+def test_not_all_is_kept(judge):
+    judge.took(PARTS[0])
+    assert sum(judge.keep(PARTS[1]) for _ in range(100)) == 64
+
+
+def test_kept_messages_that_answer_something_else_are_dropped(judge):
+    judge.took(PARTS[0])
+    judge.keep(YES)
+    assert judge.take_kept(REST) is None

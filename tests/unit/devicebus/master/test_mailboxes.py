@@ -262,12 +262,12 @@ EMERGENCY = encode_message(CoeService.EMERGENCY, bytes(range(8)))
 
 def test_what_comes_unasked_is_told_and_disturbs_no_request(line, box):
     protocols = server(line).protocols
-    protocols[MailboxType.AOE] = talker = Talker()
-    protocols[MailboxType.AOE].unasked = [b"news"]
+    protocols[MailboxType.VOE] = talker = Talker()
+    talker.unasked = [b"news"]
     line.elapse(2 * MS)
     box.look(line.now_ns)
     line.elapse(2 * MS)
-    assert line.heard == [(1001, MailboxType.AOE, b"news")]
+    assert line.heard == [(1001, MailboxType.VOE, b"news")]
     talker.unasked = [b"more"] * 3
     line.elapse(2 * MS)
     assert line.wait(start(line, box, vendor())) == VENDOR
@@ -306,6 +306,25 @@ def test_a_conversation_may_wait_send_without_reply_and_listen(line, box):
     assert line.now_ns - begun < 10 * MS
     assert line.wait(waiting) == (b"", b"one", b"two")
     assert line.now_ns - begun >= 50 * MS
+
+
+def test_fragments_wait_for_who_comes_back_for_them(line, box):
+    """Who asks from another process listens a while after the slave has sent the rest."""
+
+    def ask(request, **options):
+        return (yield Ask(MailboxType.COE, request, **options)).data
+
+    request = encode_message(CoeService.SDO_INFORMATION, bytes.fromhex("01 00 0000 0100"))
+    server(line).sizes.set(128, 16)
+    parts = [line.wait(start(line, box, ask(request)))]
+    while left := int.from_bytes(parts[-1][4:6], "little"):
+        line.elapse(20 * MS)
+        box.look(line.now_ns)
+        line.elapse(20 * MS)
+        parts.append(line.wait(start(line, box, ask(request[:6], listen=True))))
+        assert int.from_bytes(parts[-1][4:6], "little") == left - 1
+    assert len(parts) > 3
+    assert box.stats().late == 0
 
 
 def test_errors_of_files_end_the_conversation_only(line, box):
