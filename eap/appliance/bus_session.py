@@ -19,6 +19,7 @@ from typing import TypeAlias, TypeVar
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.attach import attach
 from devicebus.master.bring import bring, read_process_data
 from devicebus.master.bus import Bus, MasterSettings, Unit
 from devicebus.master.link import LinkStats
@@ -27,7 +28,6 @@ from devicebus.master.scan import scan
 from devicebus.master.startup import set_up_cycle
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_attach import attach
 from eap.errors import EapError
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
