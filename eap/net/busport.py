@@ -1,7 +1,8 @@
 """The socket of a master: frames of type 1 go out to a bus and come back through it.
 
-On Ethernet the first slave controller marks a frame as processed in its source address; what is not
-marked was never at a slave.  By UDP a bus answers whoever asked it; a simulated segment in another
+On Ethernet frames come back with the source address they left with, and are known by it: what others
+say on the same network is not taken.  The first slave controller sets a bit in that address
+(ETG.1000.4); it is not asked for, since emulated controllers leave it as it was.  By UDP a bus answers whoever asked it; a simulated segment in another
 process is at the other end of a pair.
 """
 
@@ -75,7 +76,7 @@ class BusPort:
                 raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
             if not self._header:
                 return data or None
-            if len(data) > _HEADER and data[6] & _PROCESSED:
+            if len(data) > _HEADER and _source(data) == _source(self._header):
                 return data[_HEADER:]
 
 
@@ -107,6 +108,10 @@ def _open_udp(address: str, port: int) -> socket.socket:
         sock.close()
         raise EnvironmentalError(f"udp://{address}:{port}: {error.strerror}") from None
     return sock
+
+
+def _source(data: bytes) -> bytes:
+    return bytes((data[6] | _PROCESSED,)) + data[7:12]
 
 
 def _ethernet_header(sock: socket.socket) -> bytes:

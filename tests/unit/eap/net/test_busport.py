@@ -10,6 +10,7 @@ import pytest
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
+from eap.net.packetsocket import open_type1
 from eap.net.segmentsocket import SegmentSocket, open_segment
 from tests.unit.eap.net.conftest import ip
 
@@ -94,8 +95,57 @@ def test_ethernet(cable):
         far.close()
 
 
+class Mirror:
+    """A slave end that leaves the source address as it is, or answers somebody else."""
+
+    def __init__(self, interface):
+        self._sock = open_type1(interface)
+
+    def fileno(self):
+        return self._sock.fileno()
+
+    def answer(self, *, somebody_else=False):
+        data = bytearray(self._sock.recv(2048))
+        if somebody_else:
+            data[6] |= 0x02
+            data[11] ^= 0xFF
+        self._sock.send(data)
+
+    def close(self):
+        self._sock.close()
+
+
+@pytest.fixture
+def mirror(cable):
+    near, distant = cable
+    ends = open_bus_port(InterfaceUri.parse(f"ethernet://{near}")), Mirror(distant)
+    yield ends
+    for end in ends:
+        end.close()
+
+
 @pytest.mark.root
-def test_what_was_at_no_slave_is_not_taken(cable):
+def test_slave_that_does_not_mark_frames_is_heard(mirror):
+    master, far = mirror
+    master.send(FRAME)
+    assert select.select([far], [], [], 5)[0]
+    far.answer()
+    assert select.select([master], [], [], 5)[0]
+    assert master.receive()[: len(FRAME)] == FRAME
+
+
+@pytest.mark.root
+def test_marked_answer_to_another_master_is_not_taken(mirror):
+    master, far = mirror
+    master.send(FRAME)
+    assert select.select([far], [], [], 5)[0]
+    far.answer(somebody_else=True)
+    assert select.select([master], [], [], 5)[0]
+    assert master.receive() is None
+
+
+@pytest.mark.root
+def test_frame_of_another_master_is_not_taken(cable):
     near, distant = cable
     master = open_bus_port(InterfaceUri.parse(f"ethernet://{near}"))
     other = open_bus_port(InterfaceUri.parse(f"ethernet://{distant}"))
