@@ -1,9 +1,9 @@
 """The socket of a master: frames of type 1 go out to a bus and come back through it.
 
-On Ethernet frames come back with the source address they left with, and are known by it: what others
-say on the same network is not taken.  The first slave controller sets a bit in that address
-(ETG.1000.4); it is not asked for, since emulated controllers leave it as it was.  By UDP a bus answers whoever asked it; a simulated segment in another
-process is at the other end of a pair.
+On Ethernet frames come back with the source address they left with, and are known by it: what
+others say on the same network is not taken.  The first slave controller sets a bit in that address
+(ETG.1000.4); it is not asked for, since emulated controllers leave it as it was.  By UDP a bus
+answers whoever asked it; a simulated segment in another process is at the other end of a pair.
 """
 
 from __future__ import annotations
