@@ -15,6 +15,7 @@ from devicebus.master.pdo import PdoEntry, channels_from_sii
 from devicebus.sim.devices.build import build_segment, build_slave
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.spec import BusSpec, SlaveSpec
+from devicebus.sim.wiring import Side, find_way
 from devicebus.wire import sii
 from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave
 from eap.config.convert import convert_to
@@ -90,15 +91,22 @@ def describe(path: Path) -> BusDescription | tuple[Finding, ...]:
     if result.bus is None:
         return result.findings
     bus = result.bus
-    return BusDescription(
-        tuple(
-            _describe(bus, spec, has_revision=number in bus.revised)
-            for number, spec in enumerate(bus.spec.slaves)
-        )
-    )
+    return BusDescription(tuple(_describe(bus, number) for number in _line(bus.spec)))
 
 
-def _describe(bus: Bus, spec: SlaveSpec, *, has_revision: bool) -> DescribedSlave:
+def _line(spec: BusSpec) -> tuple[int, ...]:
+    """Return the slaves in the order in which a frame comes to them: branches change it."""
+    links: dict[tuple[int, int], tuple[int, int] | Side] = {(0, 0): Side.PRIMARY}
+    numbers = {slave.name: number for number, slave in enumerate(spec.slaves)}
+    for number, slave in enumerate(spec.slaves[1:], 1):
+        parent = numbers[slave.after] if slave.after else number - 1
+        links[number, 0] = parent, slave.port
+        links[parent, slave.port] = number, 0
+    return find_way(links, (0, 0)).order
+
+
+def _describe(bus: Bus, number: int) -> DescribedSlave:
+    spec = bus.spec.slaves[number]
     slave = build_slave(spec, bus.resources)
     image = sii.decode(slave.esc.image)
     channels = channels_from_sii(image)
@@ -116,7 +124,7 @@ def _describe(bus: Bus, spec: SlaveSpec, *, has_revision: bool) -> DescribedSlav
         name=spec.name,
         vendor=image.fixed.vendor,
         product=image.fixed.product,
-        revision=image.fixed.revision if has_revision else None,
+        revision=image.fixed.revision if number in bus.revised else None,
         serial=image.fixed.serial or None,
         alias=image.fixed.alias or None,
         outputs=outputs,
