@@ -1,0 +1,115 @@
+"""What a master tells, in words that fit into a cell of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+
+from devicebus.master.diagnosis import BusDiagnosis, SlaveDiagnosis
+from devicebus.master.event import (
+    BusBack,
+    BusLost,
+    Event,
+    SlaveBack,
+    SlaveFailed,
+    SlaveLeft,
+    SlaveLost,
+)
+from devicebus.master.mailboxes import Unsolicited
+from devicebus.master.master import MasterStats
+from devicebus.wire.alstatus import name_of, state_name
+from eap.codec.coe import CoeHeader, Emergency
+
+_MS = 1_000_000
+Names = Mapping[int, str]
+
+
+def after(duration_ns: int) -> str:
+    """Write a duration in milliseconds, short ones with decimals."""
+    decimals = 2 if duration_ns < _MS else 1 if duration_ns < 10 * _MS else 0
+    return f"{duration_ns / _MS:.{decimals}f} ms"
+
+
+def describe_events(events: Sequence[Event], names: Names, start_ns: int) -> list[str]:
+    """Write events with the time since the fault began; equal ones are counted."""
+    texts = [(_describe(event, names), _time_of(event)) for event in events]
+    lines = []
+    for text, group in groupby(texts, key=lambda entry: entry[0]):
+        times = [at_ns for _, at_ns in group]
+        when = "" if times[0] is None else f", {after(times[0] - start_ns)}"
+        lines.append(f"{text}{when}" + (f" ({len(times)} times)" if len(times) > 1 else ""))
+    return lines
+
+
+def counters(before: MasterStats, now: MasterStats) -> str:
+    """Write what was counted between two looks, without what stayed 0."""
+    parts = []
+    if before.cycle is not None and now.cycle is not None:
+        parts += [
+            (now.cycle.lost - before.cycle.lost, "cycles lost"),
+            (now.cycle.wkc_errors - before.cycle.wkc_errors, "cycles with a wrong WKC"),
+        ]
+    parts += [
+        (now.link.lost - before.link.lost, "frames lost"),
+        (now.link.late - before.link.late, "frames late"),
+    ]
+    for name, what in (("repeats", "repeat requests"), ("timeouts", "time-outs of mailboxes")):
+        both = [sum(getattr(each, name) for each in s.mailboxes.values()) for s in (before, now)]
+        parts.append((max(0, both[1] - both[0]), what))
+    return ", ".join(f"{count} {what}" for count, what in parts if count)
+
+
+def describe_diagnosis(found: BusDiagnosis, names: Names, ahead_ns: int | None) -> str:
+    """Write what is not as it should be: states, counters, and where errors start."""
+    lines = [line for slave in found.slaves for line in _slave(slave, names)]
+    if found.first_fault is not None:
+        fault = found.first_fault
+        there = f", next to `{names[fault.neighbour]}`" if fault.neighbour is not None else ""
+        lines.append(f"errors start at `{names[fault.station]}`, port {fault.port}{there}")
+    if ahead_ns is not None:
+        lines.append(f"the clock is {ahead_ns} ns ahead of the reference")
+    return "; ".join(lines) or "nothing"
+
+
+def _slave(slave: SlaveDiagnosis, names: Names) -> Iterator[str]:
+    name = f"`{names[slave.station]}`"
+    if not slave.answers:
+        yield f"{name} does not answer"
+        return
+    if slave.state != "OP":
+        code = f", 0x{slave.code:04X} {slave.text}" if slave.code else ""
+        yield f"{name} in {slave.state}{code}"
+    for port in slave.ports:
+        kinds = (
+            (port.invalid_frames, "invalid frames"),
+            (port.physical, "physical errors"),
+            (port.forwarded, "forwarded errors"),
+            (port.lost_links, "lost links"),
+        )
+        shown = ", ".join(f"{count} {what}" for count, what in kinds if count)
+        if shown:
+            yield f"{name} port {port.port}: {shown}"
+
+
+def _time_of(event: Event) -> int | None:
+    return None if isinstance(event, Unsolicited) else event.at_ns
+
+
+def _describe(event: Event, names: Names) -> str:
+    match event:
+        case BusLost() | BusBack():
+            return f"`{type(event).__name__}`"
+        case SlaveLost():
+            return f"`SlaveLost` {names[event.station]}"
+        case SlaveLeft():
+            status = f"{state_name(event.status)}, 0x{event.code:04X} {name_of(event.code)}"
+            return f"`SlaveLeft` {names[event.station]}: {status}"
+        case SlaveBack():
+            missed = f"missed for {after(event.duration_ns)}"
+            return f"`SlaveBack` {names[event.station]}: {missed}"
+        case SlaveFailed():
+            return f"`SlaveFailed` {names[event.station]}: {event.reason}"
+        case Unsolicited():
+            emergency = Emergency.decode(event.data, CoeHeader.SIZE)
+            code = f"emergency 0x{emergency.error_code:04X}"
+            return f"`Unsolicited` {names[event.station]}: {code}"
