@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import cache
 from typing import Any
 
-from devicebus.errors import MailboxRefusedError
+from devicebus.errors import MailboxProtocolError, MailboxRefusedError
 from devicebus.mailbox import coe_client, coeinfo_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
@@ -130,12 +130,14 @@ def _dumped(bus: BusSession, unit: Unit, index: int, subindex: int) -> dict[str,
     except SdoAbortError as exc:
         gaps = {AbortCode.NO_SUBINDEX, AbortCode.NO_OBJECT}
         return None if exc.code in gaps else {"name": "", "error": str(exc)}
+    except MailboxProtocolError as exc:  # one bad description is no reason to lose all others
+        return {"name": "", "error": str(exc)}
     row: dict[str, Any] = {"name": entry.name, "access": _access(entry)}
     if not entry.access & Access.READ_ANY:
         return row | _shown(_kind(entry), None, complete=False)
     try:
         octets = bus.converse(unit, lambda _: coe_client.upload(index, subindex), name)
-    except SdoAbortError as exc:
+    except (SdoAbortError, MailboxProtocolError) as exc:
         return row | {"error": str(exc)}
     return row | _shown(_kind(entry), octets, complete=False)
 
@@ -153,7 +155,7 @@ def _kind_of_entry(index: int, subindex: int) -> Conversation[DataType | None]:
     """Ask the slave for an entry's type; None if it does not tell."""
     try:
         entry = yield from coeinfo_client.entry_description(index, subindex)
-    except (SdoAbortError, MailboxRefusedError):
+    except (SdoAbortError, MailboxRefusedError, MailboxProtocolError):
         return None
     return _kind(entry)
 
