@@ -98,6 +98,11 @@ class Cycle:
         """Whether a slave takes part."""
         return self._presence.get(station, Presence.AWAY)
 
+    @property
+    def is_full(self) -> bool:
+        """Whether the last cycle has come back well from all slaves that should take part."""
+        return self.is_good and self._received == self._expected > 0
+
     def start(self, now_ns: int) -> None:
         """Queue this cycle's datagrams."""
         self._link.start_cycle()
@@ -127,7 +132,7 @@ class Cycle:
             self._good,
             self._wkc_errors,
             self._lost,
-            sum(max(each) for each in self._allowed),
+            self._expected,
             self._received,
             self._trip_ns,
             self._max_trip_ns,
@@ -191,6 +196,7 @@ class Cycle:
                     counts |= more
             allowed.append(frozenset(counts))
         self._allowed = tuple(allowed)
+        self._expected = sum(map(max, allowed))
         self._is_whole = [
             all(self._presence[each.station] is Presence.PRESENT for each in self._members(number))
             for number in range(len(self._image.layout.groups))

@@ -68,14 +68,14 @@ class Master:
     def bring_up(self, now_ns: int, target: AlState = AlState.OP) -> Task[None]:
         """Find the slaves and bring them to *target*; from then on they are kept there.
 
-        What ran before ends.  OP needs cycles: call :meth:`start_cycle` all the while.
+        What ran before ends.  OP needs cycles: call :meth:`start_cycle` all the while.  Once
+        process data is laid out, slaves that fail are tried again and the others are kept.
         """
-        if self._running is not None:
-            self._running.cancel()
+        self._stop()
         task = self._bus.runner.start(start_up(self._bus, target), now_ns, "bringing up the bus")
 
         def keep(done: Task[None]) -> None:
-            if done.error is None:
+            if self._running is done and (done.error is None or self._bus.cycle is not None):
                 self._running = self.run(watch(self._bus), now_ns, "watching the bus")
 
         self._running = task
@@ -84,8 +84,7 @@ class Master:
 
     def shut_down(self, now_ns: int) -> Task[None]:
         """Forget the slaves and bring them to INIT, where their outputs are off."""
-        if self._running is not None:
-            self._running.cancel()
+        self._stop()
         self._running = self.run(shut_down(self._bus), now_ns, "shutting down the bus")
         return self._running
 
@@ -182,6 +181,11 @@ class Master:
                 if unit.mailbox is not None
             },
         )
+
+    def _stop(self) -> None:
+        running, self._running = self._running, None
+        if running is not None:
+            running.cancel()
 
     def _has_mailbox(self) -> bool:
         return any(unit.mailbox is not None for unit in self._bus.units.values())

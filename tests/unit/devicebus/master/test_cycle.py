@@ -120,7 +120,18 @@ def test_whether_the_last_cycle_came_back_well_is_known_at_any_time():
     f = Fixture()
     f.round(7)
     assert f.cycle.is_good
+    assert f.cycle.is_full
     f.cycle.start(MS)
     assert not f.cycle.is_good
     f.round(6, now_ns=2 * MS)
     assert not f.cycle.is_good
+
+
+def test_a_cycle_without_one_who_should_take_part_is_good_but_not_full():
+    f = Fixture()
+    f.cycle.set_presence(3, Presence.UNSURE)
+    f.round(6)
+    assert f.cycle.is_good
+    assert not f.cycle.is_full
+    f.round(7)
+    assert f.cycle.is_full

@@ -95,6 +95,18 @@ def test_whoever_refuses_is_named():
     assert lines[2].startswith("  c: slave 1003: refuses OP")
 
 
+def test_one_that_refuses_does_not_keep_the_others_from_running():
+    line = line_of(slave("a"), slave("b"), slave("c"))
+    line.segment.slaves[1].refuses[AlState.OP] = 0x1A
+    with pytest.raises(AlStatusError):
+        line.wait(line.core.bring_up(line.now_ns))
+    line.elapse(300 * MS)
+    assert states(line) == [AlState.OP, AlState.SAFEOP, AlState.OP]
+    line.segment.slaves[1].refuses.clear()
+    line.elapse(1500 * MS)
+    assert set(states(line)) == {AlState.OP}
+
+
 def test_a_bus_that_is_not_there():
     line = line_of(slave("a"))
     line.segment.cut(0)

@@ -1,0 +1,273 @@
+"""Where services asks the engine for something on a bus, step by step.
+
+Neither side waits for the other: a request that cannot be taken is refused at once, and an answer
+that services does not read is dropped.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+
+from devicebus.errors import BusError
+from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.master.access import Access, Reply
+from devicebus.master.link import MAX_DATA
+from devicebus.master.procedure import Procedure
+from devicebus.master.task import Task
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import Command
+from eap.appliance.bus_failure import to_failure
+from eap.appliance.bus_report import report_bus
+from eap.appliance.bus_request import (
+    Answer,
+    AskMailbox,
+    Bring,
+    Cancel,
+    Describe,
+    Hello,
+    Outcome,
+    Request,
+    Transfer,
+)
+from eap.appliance.bus_target import bring_all, bring_one
+from eap.appliance.engine_bus import EngineBus
+from eap.codec.mailbox import MailboxType
+from eap.errors import EapError
+
+T = TypeVar("T")
+
+PER_WAKE_UP = 16
+MAX_OUTSTANDING = 1024
+MAX_PER_SLAVE = 64
+MAX_DATAGRAMS = 256
+"""Of one transfer."""
+MAX_TRIES = 8
+_MAX_MESSAGE = 1 << 18
+_ALLOWED = frozenset(
+    (
+        *(Command.NOP, Command.APRD, Command.APWR, Command.APRW, Command.FPRD),
+        *(Command.FPWR, Command.FPRW, Command.BRD),
+    )
+)
+"""What does not disturb the slaves that others talk to: no logical ones, none that write to all."""
+
+_Place = tuple[int, int]
+
+
+class _Errand(NamedTuple):
+    """A request that is under way."""
+
+    task: Task[Any]
+    place: _Place
+    """Bus and station, 0 for a bus as a whole."""
+
+
+class BusDesk:
+    """Takes requests from *sock* and answers them.
+
+    Attributes:
+        malformed: Messages that were none.
+        dropped: Answers that services did not take.
+    """
+
+    def __init__(self, sock: socket.socket, buses: Sequence[EngineBus]) -> None:
+        self.malformed = 0
+        self.dropped = 0
+        self._sock = sock
+        self._buses = buses
+        self._decoder = msgspec.msgpack.Decoder(Request)
+        self._errands: dict[int, _Errand] = {}
+        self._places: Counter[_Place] = Counter()
+        sock.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when there is a request."""
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._sock.close()
+
+    def greet(self) -> None:
+        """Say that a new engine is here."""
+        self._send(Hello(os.getpid()))
+
+    def serve(self, now_ns: int) -> None:
+        """Take a few of the requests that wait."""
+        for _ in range(PER_WAKE_UP):
+            try:
+                message = self._sock.recv(_MAX_MESSAGE)
+            except OSError:
+                return
+            try:
+                request = self._decoder.decode(message)
+            except msgspec.MsgspecError:
+                self.malformed += 1
+                continue
+            if isinstance(request, Cancel):
+                self._cancel(request.id)
+            else:
+                self._serve_one(request, now_ns)
+
+    def _serve_one(self, request: Describe | AskMailbox | Transfer | Bring, now_ns: int) -> None:
+        self._cancel(request.id)  # whoever used the number before does not wait any more
+        try:
+            if not 0 <= request.bus < len(self._buses):
+                raise BusError(f"there is no bus {request.bus}, there are {len(self._buses)}")
+            bus = self._buses[request.bus]
+            match request:
+                case Describe():
+                    self._send(Answer(id=request.id, report=report_bus(bus)))
+                case AskMailbox():
+                    self._ask(bus, request, now_ns)
+                case Transfer():
+                    self._transfer(bus, request, now_ns)
+                case Bring():
+                    self._bring(bus, request, now_ns)
+        except EapError as exc:
+            self._send(Answer(id=request.id, failure=to_failure(exc)))
+
+    def _ask(self, bus: EngineBus, request: AskMailbox, now_ns: int) -> None:
+        self._check_room((request.bus, request.station))
+        try:
+            kind = MailboxType(request.type)
+        except ValueError:
+            raise BusError(f"there is no mailbox protocol {request.type}") from None
+        ask = Ask(
+            kind,
+            request.request,
+            listen=request.listen,
+            timeout_ns=request.timeout_ns,
+            delay_ns=request.delay_ns,
+            expects_reply=request.expects_reply,
+        )
+        task = bus.master.converse(
+            request.station, _one_ask(ask), now_ns, name=f"{kind.name} request", requester=self
+        )
+        self._watch(bus, request, request.station, task, _data_answer, now_ns)
+
+    def _transfer(self, bus: EngineBus, request: Transfer, now_ns: int) -> None:
+        self._check_room((request.bus, 0))
+        accesses = [
+            _access(each.command, each.adp, each.ado, each.data, each.tries)
+            for each in request.datagrams
+        ]
+        if not 1 <= len(accesses) <= MAX_DATAGRAMS:
+            raise BusError(f"{len(accesses)} datagrams, expected 1 to {MAX_DATAGRAMS}")
+        task = bus.master.run(_one_step(accesses), now_ns, "a transfer")
+        self._watch(bus, request, 0, task, _outcomes_answer, now_ns)
+
+    def _bring(self, bus: EngineBus, request: Bring, now_ns: int) -> None:
+        self._check_room((request.bus, request.station))
+        try:
+            target = AlState(request.target)
+        except ValueError:
+            raise BusError(
+                f"there is no state {request.target}, expected 1, 2, 3, 4 or 8"
+            ) from None
+        task = (
+            bring_one(bus.master, request.station, target, now_ns)
+            if request.station
+            else bring_all(bus.master, target, now_ns)
+        )
+        self._watch(bus, request, request.station, task, _plain_answer, now_ns)
+
+    def _check_room(self, place: _Place) -> None:
+        if len(self._errands) >= MAX_OUTSTANDING:
+            raise BusError(f"{MAX_OUTSTANDING} requests are under way already")
+        if self._places[place] >= MAX_PER_SLAVE:
+            raise BusError(f"{MAX_PER_SLAVE} requests to slave {place[1]} are under way already")
+
+    def _watch(
+        self,
+        bus: EngineBus,
+        request: AskMailbox | Transfer | Bring,
+        station: int,
+        task: Task[T],
+        answer: Callable[[int, T], Answer],
+        now_ns: int,
+    ) -> None:
+        """Answer when *task* is done, and remember it until then."""
+        place = request.bus, station
+        self._errands[request.id] = _Errand(task, place)
+        self._places[place] += 1
+
+        def done(task: Task[T]) -> None:
+            if self._forget(request.id, task):
+                error = task.error
+                self._send(
+                    Answer(id=request.id, failure=to_failure(error))
+                    if error is not None
+                    else answer(request.id, task.result())
+                )
+
+        task.watch(done)
+        bus.keep(task, now_ns)
+
+    def _cancel(self, number: int) -> None:
+        errand = self._errands.get(number)
+        if errand is not None:
+            self._forget(number, errand.task)
+            errand.task.cancel()
+
+    def _forget(self, number: int, task: Task[Any]) -> bool:
+        """Return whether somebody still waited for *task*."""
+        errand = self._errands.get(number)
+        if errand is None or errand.task is not task:
+            return False
+        del self._errands[number]
+        self._places[errand.place] -= 1
+        if not self._places[errand.place]:
+            del self._places[errand.place]
+        return True
+
+    def _send(self, message: Answer | Hello) -> None:
+        try:
+            self._sock.send(msgspec.msgpack.encode(message))
+        except OSError:
+            self.dropped += 1
+
+
+def _one_ask(ask: Ask) -> Conversation[bytes]:
+    message = yield ask
+    return message.data
+
+
+def _one_step(accesses: Sequence[Access]) -> Procedure[list[Reply]]:
+    replies, _ = yield accesses
+    return list(replies)
+
+
+def _access(command: int, adp: int, ado: int, data: bytes, tries: int) -> Access:
+    if command not in _ALLOWED:
+        names = ", ".join(sorted(each.name for each in _ALLOWED))
+        raise BusError(
+            f"datagram with command {command}: it would disturb the slaves while they exchange"
+            f" process data; expected one of {names}"
+        )
+    if not (0 <= adp <= 0xFFFF and 0 <= ado <= 0xFFFF and 1 <= len(data) <= MAX_DATA):
+        raise BusError(
+            f"datagram to 0x{adp:X}:0x{ado:X} with {len(data)} octets, expected addresses of 16"
+            f" bits and 1 to {MAX_DATA} octets"
+        )
+    return Access(Command(command), adp, ado, data, min(max(tries, 1), MAX_TRIES))
+
+
+def _data_answer(number: int, data: bytes) -> Answer:
+    return Answer(id=number, data=data)
+
+
+def _outcomes_answer(number: int, replies: list[Reply]) -> Answer:
+    outcomes = tuple(Outcome(reply.wkc, reply.data, reply.tries) for reply in replies)
+    return Answer(id=number, outcomes=outcomes)
+
+
+def _plain_answer(number: int, result: None) -> Answer:
+    del result
+    return Answer(id=number)
