@@ -81,6 +81,7 @@ class Esc:
         self.watchdog = Watchdog(self.memory)
         self.channels = tuple(SyncChannel(self.memory, n) for n in range(given.sync_managers))
         self._guards: tuple[SyncChannel, ...] = ()
+        self._areas: dict[tuple[int, int], SyncChannel] = {}
         self.windows: tuple[Window, ...] = ()
         self.set_al_status(AlState.INIT, 0)
         self.ecat_event = 0
@@ -216,8 +217,11 @@ class Esc:
                     self.al_event |= AlEvent.AL_CONTROL
             case 0x02:
                 self.event_mask = self._word(Register.ECAT_EVENT_MASK)
-            case 0x03 | 0x04:
+            case 0x03:
                 self._clear_counters(start, end)
+            case 0x04:
+                self._clear_counters(start, end)
+                self.watchdog.configure()
             case 0x05:
                 self._eeprom_written(start, end)
             case 0x06:
@@ -240,6 +244,7 @@ class Esc:
             if start < at + 8 and end > at and (channel.configure() or start <= at + 6 < end):
                 self.al_event |= AlEvent.SM_ACTIVATION
         self._guards = tuple(channel for channel in self.channels if channel.is_enabled)
+        self._areas = _find_areas(self._guards)
 
     def _clear_counters(self, start: int, end: int) -> None:
         groups = (
@@ -266,17 +271,23 @@ class Esc:
             self.clock.activate(now_ns)
 
     def _read_memory(self, start: int, end: int) -> bytes | None:
+        channel = self._areas.get((start, end))
+        if channel is not None:
+            return self._read_guarded(channel, start, end)
         for channel in self._guards:
             if start < channel.end and end > channel.start:
                 if start < channel.start or end > channel.end:
                     return self._read_across(start, end)
-                event = channel.read_by_master(start, end)
-                if event < 0:
-                    return None
-                self.al_event |= event
-                return bytes(self.memory[start:end])
+                return self._read_guarded(channel, start, end)
         data = bytes(self.memory[start:end])
         return data.ljust(end - start, b"\0") if data else None
+
+    def _read_guarded(self, channel: SyncChannel, start: int, end: int) -> bytes | None:
+        event = channel.read_by_master(start, end)
+        if event < 0:
+            return None
+        self.al_event |= event
+        return bytes(self.memory[start:end])
 
     def _read_across(self, start: int, end: int) -> bytes | None:
         return self._join(
@@ -291,6 +302,9 @@ class Esc:
 
     def _write_memory(self, start: int, data: bytes, now_ns: int) -> bool:
         end = start + len(data)
+        channel = self._areas.get((start, end))
+        if channel is not None:
+            return self._write_guarded(channel, start, data, now_ns)
         for channel in self._guards:
             if start < channel.end and end > channel.start:
                 if start < channel.start or end > channel.end:
@@ -300,17 +314,20 @@ class Esc:
                         for at, last in places
                     ]
                     return any(done)
-                event = channel.write_by_master(start, data)
-                if event > 0:
-                    self.al_event |= event
-                    if channel.watches:
-                        self.watchdog.feed(now_ns)
-                return event >= 0
+                return self._write_guarded(channel, start, data, now_ns)
         if start >= len(self.memory):
             return False
         room = len(self.memory) - start
         self.memory[start : start + min(room, len(data))] = data[:room]
         return True
+
+    def _write_guarded(self, channel: SyncChannel, start: int, data: bytes, now_ns: int) -> bool:
+        event = channel.write_by_master(start, data)
+        if event > 0:
+            self.al_event |= event
+            if channel.watches:
+                self.watchdog.feed(now_ns)
+        return event >= 0
 
     def _split(self, start: int, end: int) -> list[tuple[int, int]]:
         edges = {start, end}
@@ -320,6 +337,17 @@ class Esc:
 
     def _word(self, at: int) -> int:
         return self.memory[at] | self.memory[at + 1] << 8
+
+
+def _find_areas(guards: tuple[SyncChannel, ...]) -> dict[tuple[int, int], SyncChannel]:
+    """Return the sync managers by area, but for those that another one overlaps."""
+    return {
+        (each.start, each.end): each
+        for each in guards
+        if all(
+            other is each or other.end <= each.start or each.end <= other.start for other in guards
+        )
+    }
 
 
 _FRESH = frozenset((0x02, 0x09))

@@ -64,78 +64,81 @@ def _window(unit: Fmmu) -> Window:
     )
 
 
-def read_windows(
-    memory: Memory, windows: Iterable[Window], address: int, size: int, now_ns: int
-) -> list[tuple[int, int, int]]:
-    """Read what *windows* map of ``address`` to ``address + size``.
+class Piece(NamedTuple):
+    """What a window shares with a datagram."""
 
-    Returns:
-        For each part that could be read: its first bit in the data, its bits, their value.
-    """
-    parts = []
+    first: int
+    """Its octets in the data, up to *end*."""
+    end: int
+    physical: int
+    """Its octets in the memory, *size* of them."""
+    size: int
+    mask: int
+    """As many ones as it has bits; 0 for whole octets on both sides."""
+    shift: int
+    """Bits in front of it in the data."""
+    physical_shift: int
+    """Bits in front of it in the memory."""
+
+
+def find_pieces(windows: Iterable[Window], address: int, size: int) -> tuple[Piece, ...]:
+    """Return what *windows* map of ``address`` to ``address + size``."""
+    pieces = []
     for window in windows:
-        if not window.can_read:
+        begin = 8 * (window.first - address) + window.first_bit
+        start = max(begin, 0)
+        bits = min(begin + window.bits, 8 * size) - start
+        if bits <= 0:
             continue
-        shared = _shared_bits(window, address, size)
-        if shared is None:
-            continue
-        start, bits = shared
-        physical, shift = _physical(window, address, start)
-        octets = memory.read(physical, (shift + bits + 7) // 8, now_ns)
-        if octets is not None:
-            value = int.from_bytes(octets, "little") >> shift & (1 << bits) - 1
-            parts.append((start, bits, value))
-    return parts
-
-
-def insert_parts(data: bytearray, parts: Iterable[tuple[int, int, int]]) -> None:
-    """Put the values that :func:`read_windows` found into *data*."""
-    for start, bits, value in parts:
         first, shift = divmod(start, 8)
-        end = first + (shift + bits + 7) // 8
-        if not shift and not bits % 8:
-            data[first:end] = value.to_bytes(end - first, "little")
+        offset, physical_shift = divmod(window.physical_bit + start - begin, 8)
+        pieces.append(
+            Piece(
+                first,
+                first + (shift + bits + 7) // 8,
+                window.physical + offset,
+                (physical_shift + bits + 7) // 8,
+                0 if window.is_whole else (1 << bits) - 1,
+                shift,
+                physical_shift,
+            )
+        )
+    return tuple(pieces)
+
+
+def read_pieces(memory: Memory, pieces: Iterable[Piece], now_ns: int) -> list[tuple[Piece, bytes]]:
+    """Read what can be read, to be inserted later: a datagram's own data is written first."""
+    found = []
+    for piece in pieces:
+        octets = memory.read(piece.physical, piece.size, now_ns)
+        if octets is not None:
+            found.append((piece, octets))
+    return found
+
+
+def insert_pieces(frame: bytearray, start: int, found: Iterable[tuple[Piece, bytes]]) -> None:
+    """Put what :func:`read_pieces` found into the data at *start* of *frame*."""
+    for piece, octets in found:
+        first, end = start + piece.first, start + piece.end
+        if not piece.mask:
+            frame[first:end] = octets
             continue
-        old = int.from_bytes(data[first:end], "little")
-        mask = (1 << bits) - 1 << shift
-        data[first:end] = (old & ~mask | value << shift).to_bytes(end - first, "little")
+        value = int.from_bytes(octets, "little") >> piece.physical_shift & piece.mask
+        old = int.from_bytes(frame[first:end], "little") & ~(piece.mask << piece.shift)
+        frame[first:end] = (old | value << piece.shift).to_bytes(end - first, "little")
 
 
-def write_windows(
-    memory: Memory, windows: Iterable[Window], address: int, data: bytes, now_ns: int
+def write_pieces(
+    memory: Memory, pieces: Iterable[Piece], frame: bytearray, start: int, now_ns: int
 ) -> bool:
-    """Write what *windows* map of *data*; return whether anything was written."""
+    """Write from the data at *start* of *frame*; return whether anything was written."""
     written = False
-    for window in windows:
-        if not window.can_write:
-            continue
-        shared = _shared_bits(window, address, len(data))
-        if shared is None:
-            continue
-        start, bits = shared
-        physical, shift = _physical(window, address, start)
-        first, frame_shift = divmod(start, 8)
-        if window.is_whole:
-            written |= memory.write(physical, data[first : first + bits // 8], now_ns)
-            continue
-        end = first + (frame_shift + bits + 7) // 8
-        value = int.from_bytes(data[first:end], "little") >> frame_shift & (1 << bits) - 1
-        size = (shift + bits + 7) // 8
-        mask = (1 << bits) - 1 << shift
-        old = int.from_bytes(memory.peek(physical, size), "little")
-        octets = (old & ~mask | value << shift).to_bytes(size, "little")
-        written |= memory.write(physical, octets, now_ns)
+    for piece in pieces:
+        octets = bytes(frame[start + piece.first : start + piece.end])
+        if piece.mask:
+            value = int.from_bytes(octets, "little") >> piece.shift & piece.mask
+            old = int.from_bytes(memory.peek(piece.physical, piece.size), "little")
+            old &= ~(piece.mask << piece.physical_shift)
+            octets = (old | value << piece.physical_shift).to_bytes(piece.size, "little")
+        written |= memory.write(piece.physical, octets, now_ns)
     return written
-
-
-def _shared_bits(window: Window, address: int, size: int) -> tuple[int, int] | None:
-    begin = 8 * (window.first - address) + window.first_bit
-    start = max(begin, 0)
-    end = min(begin + window.bits, 8 * size)
-    return (start, end - start) if start < end else None
-
-
-def _physical(window: Window, address: int, start: int) -> tuple[int, int]:
-    begin = 8 * (window.first - address) + window.first_bit
-    offset, shift = divmod(window.physical_bit + start - begin, 8)
-    return window.physical + offset, shift

@@ -6,6 +6,7 @@ made when the slave leaves PreOp; from then on the dictionary refuses to change 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from eap.od.dictionary import ObjectDictionary
@@ -23,12 +24,59 @@ class Mapped(NamedTuple):
     bits: int
 
 
-class Side(NamedTuple):
-    """All outputs or all inputs."""
+class _Whole(NamedTuple):
+    """An entry on whole octets, *first* to *end*."""
 
-    parts: tuple[Mapped, ...] = ()
-    size: int = 0
-    """Octets."""
+    entry: Entry
+    first: int
+    end: int
+
+
+class _Bits(NamedTuple):
+    """What shares the octets from *first* to *end*: entries, and the shift and mask of each."""
+
+    places: tuple[tuple[Entry, int, int], ...]
+    first: int
+    end: int
+
+
+class Side:
+    """All outputs or all inputs, or one PDO.
+
+    Attributes:
+        parts: What is mapped, in order.
+        size: Octets.
+    """
+
+    def __init__(self, parts: Iterable[Mapped] = ()) -> None:
+        self.parts = tuple(parts)
+        self.size = (sum(part.bits for part in self.parts) + 7) // 8
+        self._runs = tuple(_runs(self.parts))
+
+    def unpack(self, data: bytes) -> None:
+        """Give the octets of *data* to the entries."""
+        for run in self._runs:
+            if isinstance(run, _Whole):
+                run.entry.octets = data[run.first : run.end]
+                continue
+            word = int.from_bytes(data[run.first : run.end], "little")
+            for entry, shift, mask in run.places:
+                entry.octets = (word >> shift & mask).to_bytes(entry.kind.size, "little")
+
+    def pack(self) -> bytes:
+        """Return the octets of all entries."""
+        pieces = []
+        for run in self._runs:
+            size = run.end - run.first
+            if isinstance(run, _Whole):
+                octets = run.entry.octets
+                pieces.append(octets if len(octets) == size else octets[:size].ljust(size, b"\0"))
+                continue
+            word = 0
+            for entry, shift, mask in run.places:
+                word |= (int.from_bytes(entry.octets, "little") & mask) << shift
+            pieces.append(word.to_bytes(size, "little"))
+        return b"".join(pieces)
 
 
 class ProcessData:
@@ -45,46 +93,30 @@ class ProcessData:
 
     def configure(self) -> None:
         """Read assignment and mapping; what maps an entry that does not exist counts as padding."""
-        self.outputs = self._plan(OUTPUTS)
-        self.inputs = self._plan(INPUTS)
+        self.outputs = self._plan(self._numbers(OUTPUTS))
+        self.inputs = self._plan(self._numbers(INPUTS))
 
-    def write_outputs(self, data: bytes) -> None:
-        """Give the octets of a master's outputs to their entries."""
-        word = int.from_bytes(data, "little")
-        for entry, start, bits in self.outputs.parts:
-            if entry is None:
-                continue
-            if start % 8 or bits % 8:
-                value = word >> start & (1 << bits) - 1
-                entry.octets = value.to_bytes(entry.kind.size, "little")
-            else:
-                entry.octets = data[start // 8 : (start + bits) // 8]
+    def read_pdo(self, index: int) -> bytes | None:
+        """Return the octets of one PDO, assigned or not; None if it is not there."""
+        return self._plan([index]).pack() if index in self._dictionary else None
 
-    def read_inputs(self) -> bytes:
-        """Return the octets of the inputs."""
-        data = bytearray(self.inputs.size)
-        for entry, start, bits in self.inputs.parts:
-            if entry is None:
-                continue
-            first, shift = divmod(start, 8)
-            if not shift and not bits % 8:
-                data[first : first + bits // 8] = entry.octets.ljust(bits // 8, b"\0")
-                continue
-            value = (int.from_bytes(entry.octets, "little") & (1 << bits) - 1) << shift
-            end = first + (shift + bits + 7) // 8
-            old = int.from_bytes(data[first:end], "little")
-            data[first:end] = (old | value).to_bytes(end - first, "little")
-        return bytes(data)
+    def write_pdo(self, index: int, data: bytes) -> bool:
+        """Give the octets of one PDO to its entries; return False if it has not this size."""
+        plan = self._plan([index])
+        if index not in self._dictionary or len(data) != plan.size:
+            return False
+        plan.unpack(data)
+        return True
 
-    def _plan(self, assignment: int) -> Side:
+    def _plan(self, pdos: Iterable[int]) -> Side:
         parts = []
         end = 0
-        for pdo in self._numbers(assignment):
+        for pdo in pdos:
             for mapping in self._numbers(pdo):
                 bits = mapping & 0xFF
                 parts.append(Mapped(self._entry(mapping >> 16, mapping >> 8 & 0xFF), end, bits))
                 end += bits
-        return Side(tuple(parts), (end + 7) // 8)
+        return Side(parts)
 
     def _numbers(self, index: int) -> list[int]:
         if index not in self._dictionary:
@@ -100,3 +132,24 @@ class ProcessData:
         if index not in self._dictionary:
             return None
         return self._dictionary[index].entries.get(subindex)
+
+
+def _runs(parts: Iterable[Mapped]) -> Iterator[_Whole | _Bits]:
+    """Take together what shares octets; what has octets of its own is copied as a whole."""
+    places: list[tuple[Entry, int, int]] = []
+    first = end = 0
+    for part in parts:
+        aligned = end == 8 * first
+        end = part.start + part.bits
+        if aligned and part.entry is not None and not part.bits % 8:
+            yield _Whole(part.entry, first, end // 8)
+            first = end // 8
+            continue
+        if part.entry is not None:
+            mask = min((1 << part.bits) - 1, (1 << 8 * part.entry.kind.size) - 1)
+            places.append((part.entry, part.start - 8 * first, mask))
+        if not end % 8:
+            yield _Bits(tuple(places), first, end // 8)
+            places, first = [], end // 8
+    if end > 8 * first:
+        yield _Bits(tuple(places), first, (end + 7) // 8)

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from operator import attrgetter
+from typing import NamedTuple
 
 from devicebus.sim.esc import Esc
-from devicebus.sim.fmmu import insert_parts, read_windows, write_windows
+from devicebus.sim.fmmu import Piece, Window, find_pieces, insert_pieces, read_pieces, write_pieces
 from devicebus.wire.datagram import OVERHEAD, Command
 from devicebus.wire.register import Register
 from eap.codec.ethercat import EtherCatHeader, FrameType
@@ -28,6 +30,18 @@ _BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
 _MULTIPLE = frozenset((Command.ARMW, Command.FRMW))
 _LOGICAL_WRITES: dict[int, int] = {Command.LWR: 1, Command.LRW: 2}
 _LOGICAL = frozenset((Command.LRD, *_LOGICAL_WRITES))
+_NOP, _LAST, _LWR = int(Command.NOP), int(Command.FRMW), int(Command.LWR)
+_CAN_READ, _CAN_WRITE = attrgetter("can_read"), attrgetter("can_write")
+_MAX_PLANS = 64
+"""A master that sends other logical addresses in every frame gains nothing by plans."""
+
+
+class _Share(NamedTuple):
+    """What of a logical datagram concerns one controller."""
+
+    esc: Esc
+    reads: tuple[Piece, ...]
+    writes: tuple[Piece, ...]
 
 
 class Chain:
@@ -43,6 +57,8 @@ class Chain:
         self._escs = tuple(escs)
         self._closed_at = closed_at
         self._stations: dict[int, list[Esc]] | None = None
+        self._plans: dict[tuple[int, int], tuple[_Share, ...]] = {}
+        self._planned: list[tuple[Window, ...]] = []
 
     def process(self, frame: bytearray, now_ns: int) -> bool:
         """Work on *frame* in place; return False if a controller takes it out of the ring."""
@@ -74,26 +90,27 @@ class Chain:
     ) -> None:
         adp, ado, length = where
         start = offset + _SIZE
-        data = frame[start : start + length]
-        if command in _LOGICAL:
-            count = self._logical(command, ado << 16 | adp, data, now_ns)
-        elif command in _MULTIPLE:
-            count = self._read_multiple_write(command, adp, ado, data, now_ns)
-        elif command == Command.NOP or command > Command.FRMW:
-            count = 0
-        else:
-            count = self._access(command, self._addressed(command, adp), ado, data, now_ns)
-        if command in _BY_POSITION or command in _BROADCAST:
-            struct.pack_into("<H", frame, offset + 2, (adp + len(self._escs)) & 0xFFFF)
-        self._add_irq(frame, offset + 8)
-        if not count:
-            return
         end = start + length
-        frame[start:end] = data
-        wkc = frame[end] | frame[end + 1] << 8
-        frame[end : end + 2] = ((wkc + count) & 0xFFFF).to_bytes(2, "little")
-        if command not in _LOGICAL and ado < _ADDRESS_END:
-            self._stations = None
+        if command in _LOGICAL:
+            count = self._logical(frame, start, command, (ado << 16 | adp, length), now_ns)
+        else:
+            data = frame[start:end]
+            if command in _MULTIPLE:
+                count = self._read_multiple_write(command, adp, ado, data, now_ns)
+            elif command == _NOP or command > _LAST:
+                count = 0
+            else:
+                count = self._access(command, self._addressed(command, adp), ado, data, now_ns)
+            if command in _BY_POSITION or command in _BROADCAST:
+                struct.pack_into("<H", frame, offset + 2, (adp + len(self._escs)) & 0xFFFF)
+            if count:
+                frame[start:end] = data
+                if ado < _ADDRESS_END:
+                    self._stations = None
+        self._add_irq(frame, offset + 8)
+        if count:
+            wkc = (frame[end] | frame[end + 1] << 8) + count
+            frame[end : end + 2] = (wkc & 0xFFFF).to_bytes(2, "little")
 
     def _addressed(self, command: int, adp: int) -> Sequence[Esc]:
         if command in _BROADCAST:
@@ -142,21 +159,32 @@ class Chain:
                 count += 1
         return count
 
-    def _logical(self, command: int, address: int, data: bytearray, now_ns: int) -> int:
+    def _logical(
+        self, frame: bytearray, start: int, command: int, where: tuple[int, int], now_ns: int
+    ) -> int:
         count = 0
-        writes = _LOGICAL_WRITES.get(command, 0)
-        reads = command != Command.LWR
-        for esc in self._escs:
-            windows = esc.windows
-            if not windows:
-                continue
-            parts = read_windows(esc, windows, address, len(data), now_ns) if reads else []
-            if writes and write_windows(esc, windows, address, bytes(data), now_ns):
-                count += writes
-            if parts:
+        writing = _LOGICAL_WRITES.get(command, 0)
+        reading = command != _LWR
+        for esc, reads, writes in self._plan(where):
+            found = read_pieces(esc, reads, now_ns) if reading and reads else None
+            if writing and writes and write_pieces(esc, writes, frame, start, now_ns):
+                count += writing
+            if found:
                 count += 1
-                insert_parts(data, parts)
+                insert_pieces(frame, start, found)
         return count
+
+    def _plan(self, where: tuple[int, int]) -> tuple[_Share, ...]:
+        """Return who takes part in datagrams of this address and length; kept for the next one."""
+        windows = [esc.windows for esc in self._escs]
+        if windows != self._planned or len(self._plans) >= _MAX_PLANS:
+            self._plans.clear()
+            self._planned = windows
+        plan = self._plans.get(where)
+        if plan is None:
+            shares = (_share(esc, *where) for esc in self._escs if esc.windows)
+            plan = self._plans[where] = tuple(each for each in shares if each is not None)
+        return plan
 
     def _add_irq(self, frame: bytearray, at: int) -> None:
         irq = 0
@@ -166,3 +194,11 @@ class Chain:
         if irq:
             frame[at] |= irq & 0xFF
             frame[at + 1] |= irq >> 8
+
+
+def _share(esc: Esc, address: int, size: int) -> _Share | None:
+    reads, writes = (
+        find_pieces((window for window in esc.windows if chosen(window)), address, size)
+        for chosen in (_CAN_READ, _CAN_WRITE)
+    )
+    return _Share(esc, reads, writes) if reads or writes else None

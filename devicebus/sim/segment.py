@@ -81,10 +81,13 @@ class Segment:
         if chain is None:
             return None
         survives = chain.process(frame, now_ns)
+        rewire = False
         for slave in self._reached[side]:
-            if slave.esc.al_event:
+            esc = slave.esc
+            if esc.al_event:
                 slave.run(now_ns)
-        if self._loops_changed():
+            rewire |= esc.loops_changed
+        if rewire:
             self._rewire()
         way = self._ways[side]
         return way.comes_out if survives and way is not None else None
@@ -104,9 +107,6 @@ class Segment:
         self._poll_at_ns = now_ns + POLL_NS
         for slave in self.slaves:
             slave.handle_timeout(now_ns)
-
-    def _loops_changed(self) -> bool:
-        return any(slave.esc.loops_changed for slave in self._reached[Side.PRIMARY])
 
     def _rewire(self) -> None:
         links = self._links()

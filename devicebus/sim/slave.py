@@ -16,7 +16,9 @@ OUTPUTS_TIMEOUT_NS = 200_000_000
 """How long a slave on its way to OP waits for the first outputs (ESI default, back to SafeOp)."""
 
 _IDENTIFY = 0x20
-_MAILBOX_EVENTS = AlEvent.SM_ACTIVATION | AlEvent.SM0 | AlEvent.SM0 << 1
+_AL_CONTROL, _SM_ACTIVATION = int(AlEvent.AL_CONTROL), int(AlEvent.SM_ACTIVATION)
+_SM0 = int(AlEvent.SM0)
+_MAILBOX_EVENTS = _SM_ACTIVATION | _SM0 | _SM0 << 1
 _WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT))
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
@@ -65,14 +67,14 @@ class Slave:
     def run(self, now_ns: int) -> None:
         """Act on what the controller has seen since the last time."""
         event, self.esc.al_event = self.esc.al_event, 0
-        if event & AlEvent.AL_CONTROL:
+        if event & _AL_CONTROL:
             self._obey(now_ns)
-        if event & AlEvent.SM_ACTIVATION:
+        if event & _SM_ACTIVATION:
             self._check_channels(now_ns)
         if event & _MAILBOX_EVENTS and self._has_mailbox():
             self._serve_mailbox(event)
             self._move_messages(now_ns)
-        if self.state in _WITH_PROCESS_DATA and event >= AlEvent.SM0:
+        if event >= _SM0 and self.device.al_state in _WITH_PROCESS_DATA:
             self._exchange(now_ns)
 
     def handle_timeout(self, now_ns: int) -> None:
@@ -247,13 +249,15 @@ class Slave:
                     self._deadline_ns = None
                     self._enter(AlState.OP)
                 if self.state is AlState.OP:
-                    process_data.write_outputs(data)
+                    process_data.outputs.unpack(data)
         self._offer_inputs(now_ns)
 
     def _offer_inputs(self, now_ns: int) -> None:
-        self.device.step(now_ns)
-        if self.device.process_data.inputs.size:
-            self.esc.channels[self.device.input_channel].put(self.device.process_data.read_inputs())
+        device = self.device
+        device.step(now_ns)
+        inputs = device.process_data.inputs
+        if inputs.size:
+            self.esc.channels[device.input_channel].put(inputs.pack())
 
 
 _STATES = frozenset(AlState)

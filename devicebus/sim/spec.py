@@ -104,6 +104,7 @@ class MailboxSpec(msgspec.Struct, frozen=True, kw_only=True):
     soe: bool = False
     eoe: bool = False
     voe: bool = False
+    aoe: bool = False
 
 
 class ClockSpec(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,6 +10,9 @@ from __future__ import annotations
 from devicebus.wire.register import Register, SmStatus
 
 _BUFFERED_EMPTY = 0x30
+_WRITTEN, _READ, _FULL = map(int, SmStatus)
+_NEXT_BUFFER = (0x10, 0x20, 0x00, 0x00)
+"""Bits 4 and 5 of the status by what they are now; 3 is before the first buffer."""
 _ACTIVATE, _STATUS, _PDI_CONTROL = 6, 5, 7
 
 
@@ -25,13 +28,14 @@ class SyncChannel:
         is_stuck: A fault: what the master wrote is never taken.
     """
 
-    __slots__ = ("_buffer", "_dirty", "_memory", "_open", "_register", "_setting", "_waiting",
-                 "end", "event", "is_enabled", "is_mailbox", "is_stuck", "master_writes",
-                 "start", "watches")  # fmt: skip
+    __slots__ = ("_buffer", "_dirty", "_memory", "_open", "_register", "_setting", "_status_at",
+                 "_waiting", "end", "event", "is_enabled", "is_mailbox", "is_stuck",
+                 "master_writes", "start", "watches")  # fmt: skip
 
     def __init__(self, memory: bytearray, number: int) -> None:
         self._memory = memory
         self._register = Register.SYNC_MANAGER + 8 * number
+        self._status_at = self._register + _STATUS
         self.event = 0x100 << number
         self.is_stuck = False
         self._setting: bytes | None = None
@@ -69,7 +73,7 @@ class SyncChannel:
     @property
     def is_full(self) -> bool:
         """Whether a mailbox holds a message."""
-        return bool(self._memory[self._register + _STATUS] & SmStatus.MAILBOX_FULL)
+        return bool(self._memory[self._status_at] & _FULL)
 
     @property
     def is_locked(self) -> bool:
@@ -110,9 +114,7 @@ class SyncChannel:
             return 0
         self._open = False
         self._set_status(
-            SmStatus.READ_INTERRUPT
-            if self.is_mailbox
-            else self._status & ~SmStatus.WRITE_INTERRUPT | SmStatus.READ_INTERRUPT
+            _READ if self.is_mailbox else self._memory[self._status_at] & ~_WRITTEN | _READ
         )
         return self.event
 
@@ -135,7 +137,7 @@ class SyncChannel:
         self._open = False
         self._dirty = True
         if self.is_mailbox:
-            self._set_status(SmStatus.MAILBOX_FULL | SmStatus.WRITE_INTERRUPT)
+            self._set_status(_FULL | _WRITTEN)
         else:
             self._buffer = bytes(self._memory[self.start : self.end])
             self._next_buffer()
@@ -148,7 +150,7 @@ class SyncChannel:
         self._dirty = False
         if not self.is_mailbox:
             return self._buffer
-        self._set_status(SmStatus.READ_INTERRUPT)
+        self._set_status(_READ)
         return bytes(self._memory[self.start : self.end])
 
     def put(self, data: bytes) -> bool:
@@ -158,7 +160,7 @@ class SyncChannel:
             if self.is_full:
                 return False
             self._memory[self.start : self.end] = octets
-            self._set_status(SmStatus.MAILBOX_FULL | SmStatus.WRITE_INTERRUPT)
+            self._set_status(_FULL | _WRITTEN)
             return True
         if self._open:
             self._waiting = octets
@@ -172,13 +174,9 @@ class SyncChannel:
         self._dirty = False
         self._set_status(0)
 
-    @property
-    def _status(self) -> int:
-        return self._memory[self._register + _STATUS]
-
     def _set_status(self, status: int) -> None:
-        self._memory[self._register + _STATUS] = status
+        self._memory[self._status_at] = status
 
     def _next_buffer(self) -> None:
-        buffer = ((self._status >> 4 & 3) + 1) % 3 if self._status >> 4 != 3 else 0
-        self._set_status(buffer << 4 | SmStatus.WRITE_INTERRUPT)
+        buffer = self._memory[self._status_at] >> 4 & 3
+        self._memory[self._status_at] = _NEXT_BUFFER[buffer] | _WRITTEN

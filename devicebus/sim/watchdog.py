@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from devicebus.wire.register import Register
 
+_STATUS = int(Register.WATCHDOG_STATUS)
 _TICK_NS = 40
 """The ESC counts in steps of 25 MHz."""
 
@@ -13,9 +14,10 @@ class Watchdog:
 
     Attributes:
         deadline_ns: When it runs out; None while nothing has fed it or it is switched off.
+        timeout_ns: How long outputs may stay away; 0 switches the watchdog off.
     """
 
-    __slots__ = ("_memory", "deadline_ns")
+    __slots__ = ("_memory", "deadline_ns", "timeout_ns")
 
     def __init__(self, memory: bytearray) -> None:
         self._memory = memory
@@ -23,26 +25,25 @@ class Watchdog:
         memory[Register.WATCHDOG_DIVIDER : Register.WATCHDOG_DIVIDER + 2] = b"\xc2\x09"
         for at in (Register.WATCHDOG_PDI, Register.WATCHDOG_PROCESS_DATA):
             memory[at : at + 2] = b"\xe8\x03"
-        memory[Register.WATCHDOG_STATUS] = 1
+        memory[_STATUS] = 1
+        self.configure()
 
-    @property
-    def timeout_ns(self) -> int:
-        """How long outputs may stay away; 0 switches the watchdog off."""
+    def configure(self) -> None:
+        """Take over the registers."""
         at, memory = Register.WATCHDOG_DIVIDER, self._memory
         divider = int.from_bytes(memory[at : at + 2], "little") + 2
         at = Register.WATCHDOG_PROCESS_DATA
-        return divider * _TICK_NS * int.from_bytes(memory[at : at + 2], "little")
+        self.timeout_ns = divider * _TICK_NS * int.from_bytes(memory[at : at + 2], "little")
 
     def feed(self, now_ns: int) -> None:
         """Outputs have come."""
-        timeout = self.timeout_ns
-        self.deadline_ns = now_ns + timeout if timeout else None
-        self._memory[Register.WATCHDOG_STATUS] = 1
+        self.deadline_ns = now_ns + self.timeout_ns if self.timeout_ns else None
+        self._memory[_STATUS] = 1
 
     def stop(self) -> None:
         """Outputs are not expected any more."""
         self.deadline_ns = None
-        self._memory[Register.WATCHDOG_STATUS] = 1
+        self._memory[_STATUS] = 1
 
     def check(self, now_ns: int) -> bool:
         """Return whether it has run out just now."""
@@ -50,6 +51,6 @@ class Watchdog:
             return False
         self.deadline_ns = None
         memory = self._memory
-        memory[Register.WATCHDOG_STATUS] = 0
+        memory[_STATUS] = 0
         memory[Register.WATCHDOG_COUNTER] = min(memory[Register.WATCHDOG_COUNTER] + 1, 255)
         return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devicebus.sim.fmmu import active_windows, insert_parts, read_windows, write_windows
+from devicebus.sim.fmmu import active_windows, find_pieces, insert_pieces, read_pieces, write_pieces
 from devicebus.wire.register import Fmmu
 
 
@@ -38,6 +38,23 @@ def unit(logical, length, physical, kind=3, *, bits=(0, 7, 0)):
     return Fmmu(logical, length, bits[0], bits[1], physical, bits[2], kind, 1)
 
 
+def read(memory, units, address, size):
+    chosen = [each for each in units if each.can_read]
+    return read_pieces(memory, find_pieces(chosen, address, size), 0)
+
+
+def write(memory, units, address, data):
+    chosen = [each for each in units if each.can_write]
+    pieces = find_pieces(chosen, address, len(data))
+    return write_pieces(memory, pieces, bytearray(b"?" + data), 1, 0)
+
+
+def insert(data, found):
+    frame = bytearray(b"??") + data
+    insert_pieces(frame, 2, found)
+    data[:] = frame[2:]
+
+
 def test_only_active_units_with_a_length_count():
     off = Fmmu(0, 4, type=1, activate=0)
     assert windows(off, unit(0, 0, 0), unit(8, 2, 3)) == windows(unit(8, 2, 3))
@@ -46,28 +63,28 @@ def test_only_active_units_with_a_length_count():
 
 def test_octets_are_read_where_both_overlap():
     memory = Memory(bytes(range(256)))
-    parts = read_windows(memory, windows(unit(100, 4, 10)), 98, 4, 0)
+    parts = read(memory, windows(unit(100, 4, 10)), 98, 4)
     data = bytearray(b"\xee" * 4)
-    insert_parts(data, parts)
+    insert(data, parts)
     assert data == b"\xee\xee\x0a\x0b"
-    assert read_windows(memory, windows(unit(100, 4, 10)), 104, 8, 0) == []
+    assert read(memory, windows(unit(100, 4, 10)), 104, 8) == []
 
 
 def test_direction_and_refusal():
     memory = Memory()
-    assert read_windows(memory, windows(unit(0, 2, 0, kind=2)), 0, 2, 0) == []
-    assert not write_windows(memory, windows(unit(0, 2, 0, kind=1)), 0, b"ab", 0)
-    assert read_windows(memory, windows(unit(0, 2, 200)), 0, 2, 0) == []
-    assert not write_windows(memory, windows(unit(0, 2, 200)), 0, b"ab", 0)
+    assert read(memory, windows(unit(0, 2, 0, kind=2)), 0, 2) == []
+    assert not write(memory, windows(unit(0, 2, 0, kind=1)), 0, b"ab")
+    assert read(memory, windows(unit(0, 2, 200)), 0, 2) == []
+    assert not write(memory, windows(unit(0, 2, 200)), 0, b"ab")
 
 
 def test_bits_leave_their_neighbours_alone():
     memory = Memory(b"\xff" * 256)
     one_bit = windows(unit(0, 1, 5, bits=(3, 3, 6)))
-    assert write_windows(memory, one_bit, 0, b"\x00", 0)
+    assert write(memory, one_bit, 0, b"\x00")
     assert memory.octets[5] == 0b1011_1111
     data = bytearray(b"\xff")
-    insert_parts(data, read_windows(memory, one_bit, 0, 1, 0))
+    insert(data, read(memory, one_bit, 0, 1))
     assert data == b"\xf7"
 
 
@@ -106,8 +123,8 @@ def test_like_one_bit_at_a_time(each, sent, content):
             expected_data |= (before >> physical & 1) << place
     memory = Memory(content + bytes(224))
     data = bytearray(sent)
-    parts = read_windows(memory, windows(each), address, 8, 0)
-    write_windows(memory, windows(each), address, sent, 0)
-    insert_parts(data, parts)
+    parts = read(memory, windows(each), address, 8)
+    write(memory, windows(each), address, sent)
+    insert(data, parts)
     assert int.from_bytes(data, "little") == expected_data
     assert int.from_bytes(memory.octets[:32], "little") == expected_memory

@@ -26,7 +26,7 @@ def mapped(kinds: list[str], assign: int, pdo: int) -> ObjectDictionary:
 def test_nothing_assigned_is_nothing():
     process_data = ProcessData(ObjectDictionary())
     process_data.configure()
-    assert (process_data.outputs.size, process_data.read_inputs()) == (0, b"")
+    assert (process_data.outputs.size, process_data.inputs.pack()) == (0, b"")
 
 
 def test_plan_by_hand():
@@ -36,7 +36,7 @@ def test_plan_by_hand():
     process_data = ProcessData(dictionary)
     process_data.configure()
     assert process_data.inputs.size == 6
-    assert process_data.read_inputs() == bytes.fromhex("010203 ffff01")
+    assert process_data.inputs.pack() == bytes.fromhex("010203 ffff01")
 
 
 def test_padding_and_missing_entries_take_room():
@@ -44,8 +44,30 @@ def test_padding_and_missing_entries_take_room():
     dictionary.add(array(0x1600, "PDO", "UDINT", [8, 0x9999_0008, 0x2000_0008, 0x2000_0908], RW))
     process_data = ProcessData(dictionary)
     process_data.configure()
-    process_data.write_outputs(b"abcd")
+    process_data.outputs.unpack(b"abcd")
     assert (process_data.outputs.size, dictionary.entry(0x2000, 0).octets) == (4, b"c")
+
+
+def test_pdo_that_is_not_assigned():
+    dictionary = mapped(["USINT", "BOOL"], 0x1C12, 0x1600)
+    process_data = ProcessData(dictionary)
+    assert process_data.write_pdo(0x1600, b"\7\1")
+    assert process_data.read_pdo(0x1600) == b"\7\1"
+    assert not process_data.write_pdo(0x1600, b"\7")
+    assert not process_data.write_pdo(0x1601, b"")
+    assert process_data.read_pdo(0x1601) is None
+
+
+def test_short_texts_and_wide_mappings_keep_their_places():
+    dictionary = ObjectDictionary([variable(0x2000, "t", "STRING(4)", RW, "ab"),
+                                   variable(0x2001, "n", "USINT", RW, 255)])  # fmt: skip
+    dictionary.add(array(0x1A00, "PDO", "UDINT", [0x2000_0020, 0x2001_000C, 4], RW))
+    dictionary.add(array(0x1C13, "assign", "UINT", [0x1A00], RW))
+    process_data = ProcessData(dictionary)
+    process_data.configure()
+    assert process_data.inputs.pack() == b"ab\0\0\xff\0"
+    process_data.inputs.unpack(b"wxyz\x12\xff")
+    assert dictionary.entry(0x2001, 0).octets == b"\x12"
 
 
 @given(st.lists(st.sampled_from(sorted(KINDS)), min_size=1, max_size=8), st.data())
@@ -56,7 +78,7 @@ def test_outputs_come_back_as_inputs(kinds, data):
     bits = sum(KINDS[kind] for kind in kinds)
     word = data.draw(st.integers(0, (1 << bits) - 1))
     octets = word.to_bytes((bits + 7) // 8, "little")
-    plan.write_outputs(octets)
+    plan.outputs.unpack(octets)
     outputs.add(array(0x1C13, "assign", "UINT", [0x1600]))
     plan.configure()
-    assert plan.read_inputs() == octets
+    assert plan.inputs.pack() == octets

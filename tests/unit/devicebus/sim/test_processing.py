@@ -133,6 +133,23 @@ def test_logical_read_and_write_move_the_right_octets():
     assert send(chain, Command.LRD, 4, 1, b"uv")[:2] == (b"uv", 0)
 
 
+def test_new_units_count_at_once():
+    chain, _ = line(2)
+    map_octets(chain, 1001, 0x10000, 1, 1)
+    assert send(chain, Command.LRD, 0, 1, b"\0")[:2] == (b"\x10", 1)
+    map_octets(chain, 1002, 0x10000, 1, 1)
+    assert send(chain, Command.LRD, 0, 1, b"\0")[:2] == (b"\x20", 2)
+    send(chain, Command.FPWR, 1002, 0x0600, bytes(16))
+    assert send(chain, Command.LRD, 0, 1, b"\0")[:2] == (b"\x10", 1)
+
+
+def test_any_number_of_places_may_be_asked_for():
+    chain, _ = line(1)
+    map_octets(chain, 1001, 0x10000, 0x10, 1)
+    counts = [send(chain, Command.LRD, at, 1, b"\0").wkc for at in range(100)]
+    assert counts == [1] * 16 + [0] * 84
+
+
 def test_mailbox_state_can_be_mapped():
     chain, escs = line(1)
     unit = Fmmu(0x10000, 1, 0, 0, 0x080D, 3, 1, 1)

@@ -43,5 +43,6 @@ def test_zero_switches_it_off_and_stop_ends_it(memory):
     watchdog.stop()
     assert not watchdog.check(10**12)
     memory[0x0420:0x0422] = bytes(2)
+    watchdog.configure()
     watchdog.feed(0)
     assert watchdog.deadline_ns is None
