@@ -24,6 +24,7 @@ from eap.errors import CodecError
 INFO_START = CoeHeader.SIZE + SdoInfoHeader.SIZE
 """Where the body of an SDO information message begins."""
 _FRAGMENT = AmsCommand.FRAGMENT.to_bytes(2, "little")
+_AMS_REST = 16
 _SDO_END = CoeHeader.SIZE + SdoHeader.SIZE
 _INFO_KEYS: dict[int, int] = {
     SdoInfoOpcode.LIST_REQUEST: 2,
@@ -123,11 +124,23 @@ def _answers_aoe(request: bytes, reply: bytes) -> bool:
         asked, found = AmsHeader.decode(request), AmsHeader.decode(reply)
     except CodecError:
         return True
-    return (
-        bool(found.state_flags & StateFlags.RESPONSE)
-        and (found.invoke_id, found.command) == (asked.invoke_id, asked.command)
-        and (found.source, found.source_port) == (asked.target, asked.target_port)
-    )
+    if (found.source, found.source_port) != (asked.target, asked.target_port):
+        return False
+    if is_aoe_fragment(reply):
+        return _continues_aoe(asked, found, reply[AmsHeader.SIZE :])
+    is_response = bool(found.state_flags & StateFlags.RESPONSE)
+    return is_response and (found.invoke_id, found.command) == (asked.invoke_id, asked.command)
+
+
+def _continues_aoe(asked: AmsHeader, found: AmsHeader, body: bytes) -> bool:
+    if asked.command == AmsCommand.FRAGMENT:  # the acknowledgement of the fragment before
+        return found.invoke_id == asked.invoke_id + 1
+    if found.invoke_id & 0xFFFF or len(body) < _AMS_REST:
+        return True
+    # The first fragment begins with the header that it had as a whole, from the command on.
+    is_response = body[2] & StateFlags.RESPONSE
+    keys = int.from_bytes(body[:2], "little"), int.from_bytes(body[12:16], "little")
+    return bool(is_response) and keys == (asked.command, asked.invoke_id)
 
 
 def _answers_eoe(request: bytes, reply: bytes) -> bool:

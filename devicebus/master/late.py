@@ -57,7 +57,7 @@ class ReplyJudge:
         self._tag = self._tag or _TAG
 
     def took(self, data: bytes) -> None:
-        """A message was handed to whoever waits for it: fragments may follow."""
+        """A part was sent or handed to whoever waits for it: what belongs to it may follow."""
         self._has_more = has_more(self._kind, data)
 
     def keep(self, data: bytes) -> bool:

@@ -202,6 +202,7 @@ class Mailbox:
             if early is not None:
                 return early
             if not ask.expects_reply:
+                self._lanes.judge(ask.type).took(ask.request)
                 return Message(ask.type, b"")
         pause_ns = FIRST_PAUSE_NS
         is_full = True  # a quick slave has answered by now: look at once, and look only then
