@@ -6,8 +6,10 @@ records, so that they cannot disagree about a name.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from enum import StrEnum, auto
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -31,15 +33,17 @@ class ErrorCode(StrEnum):
     VERSION = auto()
     UNKNOWN_METHOD = auto()
     UNKNOWN_NAME = auto()
-    """No such station or variable here."""
+    """No such station, port, variable or conversation here."""
     VALUE = auto()
-    """Not a value of the variable's type."""
+    """Not a value of the variable's type, or not a command of a simulated bus."""
     REFUSED = auto()
-    """Somebody else writes this variable."""
+    """Somebody else writes this variable, or this bus does not allow it."""
     BUSY = auto()
-    """A limit is reached: clients, subscriptions, or the length of an answer."""
+    """A limit is reached: clients, subscriptions, conversations, or the length of an answer."""
     UNAVAILABLE = auto()
-    """The process image cannot be read now."""
+    """The process image cannot be read now, or there is no engine."""
+    BUS = auto()
+    """A bus or a slave did not do it; the kind says in which way."""
     INTERNAL = auto()
 
 
@@ -52,11 +56,15 @@ class Request(msgspec.Struct, frozen=True):
     params: dict[str, Any] = {}
 
 
-class Failure(msgspec.Struct, frozen=True):
+class Failure(msgspec.Struct, frozen=True, omit_defaults=True):
     """Why a request was not done."""
 
     code: str
     message: str
+    kind: str = ""
+    """With code ``bus``: the name of one of ``devicebus.errors``."""
+    detail: int = 0
+    """Its number, as ``bus_failure`` packs it."""
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -119,6 +127,8 @@ class UnsubscribeParameters(Parameters, frozen=True):
     subscription: int
 
 
+ParametersT = TypeVar("ParametersT", bound=Parameters)
+
 _REQUEST = msgspec.json.Decoder(Request)
 _REPLY = msgspec.json.Decoder(Reply)
 
@@ -135,6 +145,20 @@ def decode_request(line: bytes) -> Request:
             code=ErrorCode.VERSION,
         )
     return request
+
+
+def parameters(params: dict[str, Any], kind: type[ParametersT]) -> ParametersT:
+    """Check *params*; raise ControlError that names the first wrong one."""
+    try:
+        return msgspec.convert(params, kind)
+    except msgspec.ValidationError as exc:
+        raise ControlError(f"params: {exc}", code=ErrorCode.BAD_REQUEST) from None
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """Return ``, did you mean …?``, or nothing if no known name comes near."""
+    found = get_close_matches(name, list(known), n=1)
+    return f", did you mean {found[0]}?" if found else ""
 
 
 def request_id(line: bytes) -> int | None:
@@ -170,7 +194,12 @@ def encode_result(number: int | None, result: Any) -> bytes:
 
 def encode_error(number: int | None, error: ControlError) -> bytes:
     """Return the line of a refusal."""
-    return _line({"v": VERSION, "id": number, "error": {"code": error.code, "message": str(error)}})
+    return encode_failure(number, Failure(error.code, str(error)))
+
+
+def encode_failure(number: int | None, failure: Failure) -> bytes:
+    """Return the line of a refusal that says more than an error does."""
+    return _line({"v": VERSION, "id": number, "error": failure})
 
 
 def encode_event(subscription: int, event: dict[str, Any]) -> bytes:

@@ -2,39 +2,54 @@
 
 Rule: a client can only delay itself.  Nothing is queued for it: a subscription takes its next look
 at the values when the last line has left, and who takes nothing for SLOW_READER_S is disconnected.
+What a client waits for on a bus is cancelled when it leaves, and what it has open there is ended.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import select
 import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Any
 
+from devicebus.errors import BusError
+from eap.appliance.bus_failure import to_failure
+from eap.appliance.bus_methods import BusConnection, Buses
 from eap.appliance.control import (
     MAX_CLIENTS,
     MAX_LINE,
     MAX_SUBSCRIPTIONS,
     SLOW_READER_S,
     ErrorCode,
+    Failure,
+    Request,
     UnsubscribeParameters,
     decode_request,
     encode_error,
     encode_event,
+    encode_failure,
     encode_result,
+    parameters,
     request_id,
 )
-from eap.appliance.methods import Methods, Watch, parameters
+from eap.appliance.control_bus import BUS_METHODS
+from eap.appliance.methods import Methods, Watch
 from eap.errors import ControlError, ImageError
 
 logger = logging.getLogger(__name__)
 
 
 class ControlServer:
-    """Serve *methods* on a listening Unix socket."""
+    """Serve *methods*, and those on *buses*, on a listening Unix socket."""
 
-    def __init__(self, methods: Methods, *, slow_reader_s: float = SLOW_READER_S) -> None:
+    def __init__(
+        self, methods: Methods, buses: Buses, *, slow_reader_s: float = SLOW_READER_S
+    ) -> None:
         self._methods = methods
+        self._buses = buses
         self._slow_reader_s = slow_reader_s
         self._clients = 0
 
@@ -55,10 +70,16 @@ class ControlServer:
 
     async def serve_client(self, connection: socket.socket) -> None:
         """Answer one client until it leaves."""
-        reader, writer = await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE)
+        loop = asyncio.get_running_loop()
+        reader = _Reader(connection, loop)
+        transport, protocol = await loop.connect_accepted_socket(
+            lambda: asyncio.StreamReaderProtocol(reader, loop=loop), connection
+        )
+        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
         self._clients += 1
+        bus = BusConnection(self._buses)
         try:
-            client = _Client(self._methods, writer, self._slow_reader_s)
+            client = _Client(self._methods, bus, writer, self._slow_reader_s)
             if self._clients > MAX_CLIENTS:
                 reason = f"{MAX_CLIENTS} clients are connected, which is all there is room for"
                 await client.send(encode_error(None, ControlError(reason, code=ErrorCode.BUSY)))
@@ -67,15 +88,60 @@ class ControlServer:
         except* (OSError, TimeoutError) as group:
             logger.debug("control client left: %s", group.exceptions[0])
         finally:
+            bus.close()
             self._clients -= 1
-            writer.transport.abort()
+            transport.abort()
+
+
+class _Reader(asyncio.StreamReader):
+    """Reads lines, and notices at once when the client has gone while it waits for an answer."""
+
+    def __init__(self, connection: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__(limit=MAX_LINE, loop=loop)
+        self._connection = connection
+        self._clock = loop.time
+        self._has_gone = False
+        self._wait: asyncio.Timeout | None = None
+
+    @asynccontextmanager
+    async def while_there(self) -> AsyncIterator[None]:
+        """Raise TimeoutError in a block that waits when the client has gone."""
+        self._wait = asyncio.timeout_at(self._clock() if self._has_gone else None)
+        try:
+            async with self._wait:
+                yield
+        finally:
+            self._wait = None
+
+    def feed_eof(self) -> None:
+        """Take the end of what the client sends; it may still wait for answers."""
+        super().feed_eof()
+        poll = select.poll()
+        poll.register(self._connection, 0)
+        if poll.poll(0):  # hung up: not only its sending side is closed
+            self._note_end()
+
+    def set_exception(self, exc: Exception) -> None:
+        """Take the end of a connection that broke."""
+        super().set_exception(exc)
+        self._note_end()
+
+    def _note_end(self) -> None:
+        self._has_gone = True
+        if self._wait is not None:
+            self._wait.reschedule(self._clock())
 
 
 class _Client:
     def __init__(
-        self, methods: Methods, writer: asyncio.StreamWriter, slow_reader_s: float
+        self,
+        methods: Methods,
+        bus: BusConnection,
+        writer: asyncio.StreamWriter,
+        slow_reader_s: float,
     ) -> None:
         self._methods = methods
+        self._bus = bus
         self._writer = writer
         self._slow_reader_s = slow_reader_s
         self._subscriptions: dict[int, asyncio.Task[None]] = {}
@@ -87,10 +153,10 @@ class _Client:
         async with asyncio.timeout(self._slow_reader_s):
             await self._writer.drain()
 
-    async def run(self, reader: asyncio.StreamReader) -> None:
+    async def run(self, reader: _Reader) -> None:
         async with asyncio.TaskGroup() as group:
             while line := await self._next_line(reader):
-                await self._answer(line, group)
+                await self._answer(line, reader, group)
             for task in self._subscriptions.values():
                 task.cancel()
 
@@ -106,7 +172,7 @@ class _Client:
             await self.send(encode_error(None, error))
             return b""
 
-    async def _answer(self, line: bytes, group: asyncio.TaskGroup) -> None:
+    async def _answer(self, line: bytes, reader: _Reader, group: asyncio.TaskGroup) -> None:
         number = None
         try:
             request = decode_request(line)
@@ -114,21 +180,32 @@ class _Client:
             if request.method == "subscribe":
                 await self._subscribe(number, request.params, group)
                 return
-            if request.method == "unsubscribe":
-                result = self._unsubscribe(request.params)
-            else:
-                result = self._methods.call(request.method, request.params)
+            async with reader.while_there():
+                result = await self._call(request)
+        except TimeoutError:
+            raise
         except ControlError as exc:
             await self.send(encode_error(request_id(line) if number is None else number, exc))
         except ImageError as exc:
             error = ControlError(str(exc), code=ErrorCode.UNAVAILABLE)
             await self.send(encode_error(number, error))
+        except BusError as exc:
+            why = to_failure(exc)
+            failure = Failure(ErrorCode.BUS, why.message, why.kind, why.detail)
+            await self.send(encode_failure(number, failure))
         except Exception:
             logger.exception("control method failed")
             error = ControlError("this request failed inside", code=ErrorCode.INTERNAL)
             await self.send(encode_error(number, error))
         else:
             await self.send(encode_result(number, result))
+
+    async def _call(self, request: Request) -> Any:
+        if request.method == "unsubscribe":
+            return self._unsubscribe(request.params)
+        if request.method in BUS_METHODS:
+            return await self._bus.call(request.method, request.params)
+        return await self._methods.call(request.method, request.params)
 
     async def _subscribe(
         self, number: int | None, params: dict[str, Any], group: asyncio.TaskGroup

@@ -91,8 +91,9 @@ class EngineLink:
             raise EngineGoneError(f"the engine takes no requests: {exc.strerror}") from None
 
     def close(self) -> None:
-        """Let go of the pair."""
-        self._loop.remove_reader(self._socket)
+        """Let go of the pair; the loop may have ended."""
+        if not self._loop.is_closed():
+            self._loop.remove_reader(self._socket)
         self._socket.close()
 
     async def _wait(self, future: asyncio.Future[Answer], bus: int, end_s: float) -> Answer:

@@ -1,19 +1,19 @@
 """What the control protocol can be asked for, answered from the process images.
 
-Rule: nothing here waits.  An image is read by copying, a value is written under the lock that also
-keeps user programs apart, and the engine notices neither.
+Rule: what is about images does not wait.  An image is read by copying, a value is written under the
+lock that also keeps user programs apart, and the engine notices neither.  Only ``status`` waits a
+little, for what the engine says of its buses; what is done on buses is in :mod:`bus_methods`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from difflib import get_close_matches
-from typing import Any, TypeVar
-
-import msgspec
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from inspect import isawaitable
+from typing import Any
 
 from eap.appliance import control
-from eap.appliance.control import VERSION, ErrorCode
+from eap.appliance.control import VERSION, ErrorCode, near, parameters
+from eap.appliance.control_bus import BUS_METHODS
 from eap.codec import datatypes
 from eap.errors import ControlError, WriterConflictError
 from eap.net.image_file import ImageFile
@@ -25,11 +25,9 @@ from eap.pd.words import RxWord, StationWord
 
 MIN_PERIOD_MS = 10
 
-ParametersT = TypeVar("ParametersT", bound=control.Parameters)
-
 
 class Methods:
-    """All methods but the two that belong to a connection (subscribe, unsubscribe).
+    """All methods but those that belong to a connection (subscriptions, and what is on buses).
 
     Args:
         identity: What ``hello`` says beside the protocol's version.
@@ -43,7 +41,7 @@ class Methods:
         identity: Mapping[str, Any],
         files: Mapping[str, ImageFile],
         *,
-        status: Callable[[], dict[str, Any]],
+        status: Callable[[], Awaitable[dict[str, Any]]],
         stop: Callable[[], None],
     ) -> None:
         self._identity = identity
@@ -60,16 +58,17 @@ class Methods:
             "stop": self._ask_to_stop,
         }
 
-    def call(self, method: str, params: dict[str, Any]) -> Any:
+    async def call(self, method: str, params: dict[str, Any]) -> Any:
         """Return the result of one method; raise ControlError or ImageError if it is not done."""
         try:
             function = self._methods[method]
         except KeyError:
-            known = [*self._methods, "subscribe", "unsubscribe"]
+            known = [*self._methods, "subscribe", "unsubscribe", *BUS_METHODS]
             raise ControlError(
-                f"no method {method!r}{_near(method, known)}", code=ErrorCode.UNKNOWN_METHOD
+                f"no method {method!r}{near(method, known)}", code=ErrorCode.UNKNOWN_METHOD
             ) from None
-        return function(params)
+        result = function(params)
+        return await result if isawaitable(result) else result
 
     def watch(self, params: dict[str, Any]) -> Watch:
         """Check the parameters of ``subscribe`` and return what makes its events."""
@@ -88,9 +87,9 @@ class Methods:
         parameters(params, control.NoParameters)
         return {"version": VERSION, **self._identity, "stations": list(self._files)}
 
-    def _get_status(self, params: dict[str, Any]) -> dict[str, Any]:
+    async def _get_status(self, params: dict[str, Any]) -> dict[str, Any]:
         parameters(params, control.NoParameters)
-        return self._status()
+        return await self._status()
 
     def _pd_list(self, params: dict[str, Any]) -> list[dict[str, Any]]:
         wanted = parameters(params, control.PdListParameters).station
@@ -145,7 +144,7 @@ class Methods:
             return self._files[station]
         except KeyError:
             raise ControlError(
-                f"no station {station!r} here{_near(station, self._files)}",
+                f"no station {station!r} here{near(station, self._files)}",
                 code=ErrorCode.UNKNOWN_NAME,
             ) from None
 
@@ -185,14 +184,6 @@ class Watch:
         return event
 
 
-def parameters(params: dict[str, Any], kind: type[ParametersT]) -> ParametersT:
-    """Check *params*; raise ControlError that names the first wrong one."""
-    try:
-        return msgspec.convert(params, kind)
-    except msgspec.ValidationError as exc:
-        raise ControlError(f"params: {exc}", code=ErrorCode.BAD_REQUEST) from None
-
-
 def _snapshot(image: Image, places: list[VariablePlace]) -> dict[str, Any]:
     """Return the values of *places*; those of one writer belong to one moment."""
     cycle = image.words[StationWord.CYCLE]
@@ -225,7 +216,7 @@ def _places(image: Image, names: Iterable[str]) -> list[VariablePlace]:
     if unknown:
         raise ControlError(
             f"station {image.layout.station} has no variable {unknown[0]!r}"
-            f"{_near(unknown[0], image.places)}",
+            f"{near(unknown[0], image.places)}",
             code=ErrorCode.UNKNOWN_NAME,
         )
     return [image.places[name] for name in chosen]
@@ -242,8 +233,3 @@ def _checked(place: VariablePlace, value: Any) -> Any:
         return datatypes.parse(place.type).from_plain(value)
     except ValueError as exc:
         raise ControlError(f"variable {place.name}: {exc}", code=ErrorCode.VALUE) from None
-
-
-def _near(name: str, known: Iterable[str]) -> str:
-    near = get_close_matches(name, list(known), n=1)
-    return f", did you mean {near[0]}?" if near else ""

@@ -1,7 +1,7 @@
 """The services process: everything of an appliance that may take its time.
 
 It is started by the supervisor with one argument, the descriptor of its handover.  Whatever happens
-here, the engine goes on: the two share images, and a pair of sockets on which neither waits.
+here, the engine goes on: the two share images, and pairs of sockets on which it never waits.
 """
 
 from __future__ import annotations
@@ -16,13 +16,25 @@ from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from time import monotonic_ns
+from typing import Any
 
+from eap.appliance.bus_client import BusClient
+from eap.appliance.bus_methods import Buses
 from eap.appliance.control_server import ControlServer
 from eap.appliance.discards import DiscardCounters, Refusal
-from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind, tell_ready
+from eap.appliance.engine_link import EngineLink
+from eap.appliance.handover import (
+    NO_DESCRIPTOR,
+    Handover,
+    PortName,
+    SharedSocket,
+    SocketKind,
+    tell_ready,
+)
 from eap.appliance.intake import FrameIntake, watch_channel
 from eap.appliance.methods import Methods
 from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.segment_link import SegmentLink
 from eap.appliance.sources import play_sources
 from eap.appliance.status import ProcessMeter, appliance_status
 from eap.appliance.tcp_door import TcpDoor
@@ -35,6 +47,8 @@ from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 
 IMAGE_PATIENCE_S = 15.0
+STATUS_PATIENCE_S = 0.3
+"""How long ``status`` waits for what the engine says of its buses."""
 _IMAGE_PAUSE_S = 0.01
 
 
@@ -60,8 +74,10 @@ class Services:
         # Not before: whoever waits for images of an engine that failed just ends.
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
         self._watch_sockets()
+        buses = self._buses()
+        server = ControlServer(self._methods(files, buses), buses)
         async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(ControlServer(self._methods(files)).serve(self._listener))]
+            tasks = [group.create_task(server.serve(self._listener))]
             tasks += [group.create_task(door.serve()) for door in self._doors()]
             tasks += [
                 group.create_task(play_sources(station, files[station.name]))
@@ -83,7 +99,7 @@ class Services:
                     raise
             await asyncio.sleep(_IMAGE_PAUSE_S)
 
-    def _methods(self, files: dict[str, ImageFile]) -> Methods:
+    def _methods(self, files: dict[str, ImageFile], buses: Buses) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
             DiscardCounters(self._folder.discards("engine"), self._names)
@@ -91,14 +107,36 @@ class Services:
         images = [file.image for file in files.values()]
         release = version("eap-appliance")
         identity = {"release": release, "plant": self._handover.plant, "pid": os.getpid()}
+
+        async def status() -> dict[str, Any]:
+            return appliance_status(
+                self._folder.read_info(),
+                images,
+                (engine.stats(), self._counters.stats()),
+                meter,
+                await buses.reports(STATUS_PATIENCE_S),
+            )
+
         return Methods(
             identity,
             files,
-            status=lambda: appliance_status(
-                self._folder.read_info(), images, (engine.stats(), self._counters.stats()), meter
-            ),
+            status=status,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
         )
+
+    def _buses(self) -> Buses:
+        handover = self._handover
+        if handover.bus_fd == NO_DESCRIPTOR:
+            return Buses(handover.stations, None, {})
+        link = EngineLink(socket.socket(fileno=handover.bus_fd))
+        self._resources.callback(link.close)
+        segments = {}
+        for bus in handover.buses:
+            if bus.command_fd != NO_DESCRIPTOR:
+                segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
+                self._resources.callback(segments[bus.owner].close)
+        client = BusClient(link, [bus.owner for bus in handover.buses])
+        return Buses(handover.stations, client, segments)
 
     def _watch_sockets(self) -> None:
         now_ns = monotonic_ns()

@@ -8,12 +8,16 @@ from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
 from typing import Any
 
+from eap.appliance.bus_request import BusReport
+from eap.appliance.bus_status import bus_document, bus_link
+from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.interface import interface_of, link_is_up
 from eap.pd.image import Image
 from eap.pd.report import station_status
+from eap.pd.spec import PortKind
 from eap.pd.words import StationWord
 
 VERSION = 1
@@ -56,15 +60,28 @@ def appliance_status(
     images: Iterable[Image],
     discarded: Sequence[Mapping[str, Mapping[str, int]]],
     meter: ProcessMeter,
+    buses: Mapping[PortName, BusReport],
 ) -> dict[str, Any]:
-    """Return the whole answer; *discarded* is what each process turned away, by station."""
+    """Return the whole answer.
+
+    Args:
+        info: What the supervisor tells.
+        images: Of all stations.
+        discarded: What each process turned away, by station.
+        meter: Of the processes.
+        buses: What the engine says of its buses, of none if it does not answer.
+    """
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
     stations = []
     for image in images:
         station = station_status(image, monotonic_ns(), time_ns())
         station["cycle_age_us"] = _cycle_age_us(image)
         for port in station["ports"]:
-            port["link"] = link_state(port["interface"])
+            if port["kind"] == PortKind.BUS:
+                report = buses.get(PortName(station["name"], port["name"]))
+                port.update(bus_document(report), link=bus_link(report))
+            else:
+                port["link"] = link_state(port["interface"])
         counts = station["discarded"]
         for by_station in discarded:
             for reason, count in by_station.get(image.layout.station, {}).items():
@@ -79,6 +96,9 @@ def appliance_status(
             "supervisor": {"pid": info.supervisor, **meter.measure(info.supervisor, now_ns)},
             "engine": engine,
             "services": _process(info.services, meter, now_ns),
+            "segments": {
+                name: _process(process, meter, now_ns) for name, process in info.segments.items()
+            },
         },
         "stations": stations,
     }

@@ -9,6 +9,7 @@ import socket
 import pytest
 
 from eap.appliance import control_server
+from eap.appliance.bus_methods import Buses
 from eap.appliance.control import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.appliance.control_server import ControlServer
 from eap.appliance.methods import Methods
@@ -17,13 +18,16 @@ from eap.errors import TornReadError
 pytestmark = pytest.mark.net
 
 
-def torn():
+async def torn():
     raise TornReadError("torn", writer="engine")
 
 
 @pytest.fixture
 def methods(files):
     return Methods({"plant": "demo"}, files, status=torn, stop=lambda: 1 / 0)
+
+
+NO_BUSES = Buses((), None, {})
 
 
 class Talk:
@@ -55,7 +59,7 @@ class Talk:
 
 def test_requests_are_answered_in_order(methods):
     async def talk():
-        async with Talk(ControlServer(methods)) as client:
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
             for number in range(3):
                 client.say(f'{{"v":1,"id":{number},"method":"hello"}}')
             assert [(await client.hear())["id"] for _ in range(3)] == [0, 1, 2]
@@ -65,7 +69,7 @@ def test_requests_are_answered_in_order(methods):
 
 def test_refusals_keep_the_connection(methods):
     async def talk():
-        async with Talk(ControlServer(methods)) as client:
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
             client.say("what?")
             assert (await client.hear())["error"]["code"] == "bad_request"
             client.say('{"v":2,"id":7,"method":"hello"}')
@@ -81,7 +85,7 @@ def test_refusals_keep_the_connection(methods):
 
 def test_a_line_without_end_is_refused_and_ends_the_connection(methods):
     async def talk():
-        async with Talk(ControlServer(methods)) as client:
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
             client.say(b"x" * (MAX_LINE + 1))
             assert "1048576" in (await client.hear())["error"]["message"]
             assert await client.reader.read() == b""
@@ -91,7 +95,7 @@ def test_a_line_without_end_is_refused_and_ends_the_connection(methods):
 
 def test_subscriptions_run_beside_requests_until_unsubscribed(methods):
     async def talk():
-        async with Talk(ControlServer(methods)) as client:
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
             answer = await client.ask("subscribe", station="left", names=["name"], period_ms=10)
             number = answer["result"]["subscription"]
             event = await client.hear()
@@ -117,7 +121,7 @@ def test_there_are_limits_on_subscriptions_and_clients(methods, monkeypatch):
     monkeypatch.setattr(control_server, "MAX_CLIENTS", 1)
 
     async def talk():
-        server = ControlServer(methods)
+        server = ControlServer(methods, NO_BUSES)
         async with Talk(server) as client:
             for _ in range(MAX_SUBSCRIPTIONS):
                 answer = await client.ask("subscribe", station="left", on="change", names=["name"])
@@ -136,7 +140,7 @@ def test_there_are_limits_on_subscriptions_and_clients(methods, monkeypatch):
 
 def test_who_does_not_read_is_disconnected(methods):
     async def talk():
-        server = ControlServer(methods, slow_reader_s=0.05)
+        server = ControlServer(methods, NO_BUSES, slow_reader_s=0.05)
         ours, theirs = socket.socketpair()
         with ours:
             ours.sendall(b'{"v":1,"method":"variables","params":{"station":"left"}}\n' * 2000)
@@ -150,7 +154,7 @@ def test_a_listener_serves_many(methods, tmp_path):
         with socket.socket(socket.AF_UNIX) as listener:
             listener.bind(str(tmp_path / "control"))
             listener.listen()
-            serving = asyncio.ensure_future(ControlServer(methods).serve(listener))
+            serving = asyncio.ensure_future(ControlServer(methods, NO_BUSES).serve(listener))
             for _ in range(2):
                 reader, writer = await asyncio.open_unix_connection(str(tmp_path / "control"))
                 writer.write(b'{"v":1,"id":1,"method":"hello"}\n')

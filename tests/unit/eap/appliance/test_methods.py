@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 
@@ -11,6 +12,14 @@ from eap.appliance.control import ErrorCode
 from eap.appliance.methods import Methods
 from eap.errors import ControlError
 from eap.pd.spec import Writer
+
+
+async def status():
+    return {"version": 1}
+
+
+def call(methods: Methods, method: str, params: dict):
+    return asyncio.run(methods.call(method, params))
 
 
 @pytest.fixture
@@ -23,40 +32,40 @@ def methods(files, stopped):
     return Methods(
         {"plant": "demo", "release": "0"},
         files,
-        status=lambda: {"version": 1},
+        status=status,
         stop=lambda: stopped.append(True),
     )
 
 
 def refusal(methods: Methods, method: str, params: dict) -> ControlError:
     with pytest.raises(ControlError) as caught:
-        methods.call(method, params)
+        call(methods, method, params)
     return caught.value
 
 
 def test_hello_status_and_stop(methods, stopped):
-    assert methods.call("hello", {}) == {
+    assert call(methods, "hello", {}) == {
         "version": 1,
         "plant": "demo",
         "release": "0",
         "stations": ["left", "right"],
     }
-    assert methods.call("status", {}) == {"version": 1}
-    assert methods.call("stop", {}) == {"stopping": True}
+    assert call(methods, "status", {}) == {"version": 1}
+    assert call(methods, "stop", {}) == {"stopping": True}
     assert stopped == [True]
 
 
 def test_pd_list_of_one_and_of_all(methods):
-    rows = methods.call("pd_list", {})
+    rows = call(methods, "pd_list", {})
     assert [(row["station"], row["direction"], row["name"]) for row in rows] == [
         ("left", "tx", "state"),
         ("right", "rx", "left-state"),
     ]
-    assert methods.call("pd_list", {"station": "left"}) == rows[:1]
+    assert call(methods, "pd_list", {"station": "left"}) == rows[:1]
 
 
 def test_variables_with_type_and_writer(methods):
-    rows = {row["name"]: row for row in methods.call("variables", {"station": "left"})}
+    rows = {row["name"]: row for row in call(methods, "variables", {"station": "left"})}
     assert rows["setpoint"] == {
         "name": "setpoint",
         "type": "REAL[2]",
@@ -69,25 +78,26 @@ def test_variables_with_type_and_writer(methods):
 
 def test_what_is_written_is_read(methods):
     values = {"setpoint": [1, 2.5], "running": True, "name": "xyz"}
-    assert methods.call("write", {"station": "left", "values": values}) == {"written": 3}
-    answer = methods.call("read", {"station": "left", "names": ["setpoint", "running", "name"]})
+    assert call(methods, "write", {"station": "left", "values": values}) == {"written": 3}
+    answer = call(methods, "read", {"station": "left", "names": ["setpoint", "running", "name"]})
     assert answer["values"] == {"setpoint": [1.0, 2.5], "running": True, "name": "xyz"}
     assert answer["station"] == "left"
-    everything = methods.call("read", {"station": "left"})["values"]
+    everything = call(methods, "read", {"station": "left"})["values"]
     assert everything["load"] == 0
     assert everything["name"] == "xyz"
 
 
 def test_received_values_have_a_quality(methods):
-    answer = methods.call("read", {"station": "right", "names": ["ticks"]})
+    answer = call(methods, "read", {"station": "right", "names": ["ticks"]})
     assert answer["quality"] == {"ticks": None}
-    assert methods.call("read", {"station": "left", "names": ["ticks"]})["quality"] == {}
+    assert call(methods, "read", {"station": "left", "names": ["ticks"]})["quality"] == {}
 
 
 @pytest.mark.parametrize(
     ("method", "params", "code", "text"),
     [
         ("red", {}, ErrorCode.UNKNOWN_METHOD, "did you mean read"),
+        ("bus_opn", {}, ErrorCode.UNKNOWN_METHOD, "did you mean bus_open"),
         ("read", {"station": "lefd"}, ErrorCode.UNKNOWN_NAME, "did you mean left"),
         (
             "read",
@@ -118,7 +128,7 @@ def test_refusals_have_a_code_and_a_hint(methods, method, params, code, text):
 
 def test_nothing_is_written_when_one_value_is_wrong(methods):
     refusal(methods, "write", {"station": "left", "values": {"running": True, "setpoint": "x"}})
-    assert methods.call("read", {"station": "left", "names": ["running"]})["values"] == {
+    assert call(methods, "read", {"station": "left", "names": ["running"]})["values"] == {
         "running": False
     }
 
@@ -144,7 +154,7 @@ def test_a_user_program_that_writes_is_named(methods, files):
         assert error.code == ErrorCode.REFUSED
         assert f"process {program.pid}" in str(error)
         program.stdin.close()
-    assert methods.call("write", {"station": "left", "values": {"running": True}})["written"] == 1
+    assert call(methods, "write", {"station": "left", "values": {"running": True}})["written"] == 1
 
 
 def test_a_watch_by_period_tells_all_and_by_change_what_changed(methods, files):

@@ -62,10 +62,10 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     monkeypatch.setattr(status, "monotonic_ns", lambda: 9_000_000_000)
     images[1].words[StationWord.CYCLE_AT_NS] = 4_000_000_000
     discarded = ({"left": {"other_vlan": 1}}, {"left": {"mailbox": 3}})
-    document = appliance_status(info, images, discarded, ProcessMeter())
+    document = appliance_status(info, images, discarded, ProcessMeter(), {})
     assert (document["version"], document["plant"]) == (1, "demo")
     processes = document["processes"]
-    assert set(processes) == {"supervisor", "engine", "services"}
+    assert set(processes) == {"supervisor", "engine", "services", "segments"}
     assert processes["supervisor"]["pid"] == os.getpid()
     assert processes["engine"]["restarts"] == 2
     assert processes["engine"]["realtime"] == {"scheduler": "fifo 50"}
