@@ -103,7 +103,7 @@ class EngineBus:
         self._plan: BusPlan | None = None
         self._outputs: list[tuple[memoryview, CopyPlan]] = []
         self._starting: Task[None] | None = None
-        self._start_fault = "it has not been started yet"
+        self._start_fault = "it is being brought up"
         self._wire_fault = ""
         self._retry_ns: int | None = None
         self._due_ns: int | None = None
@@ -177,7 +177,6 @@ class EngineBus:
     def _start(self, now_ns: int) -> None:
         self._retry_ns = None
         self._starting = self.master.bring_up(now_ns, AlState[self.spec.target])
-        self._start_fault = self._start_fault or "it is being brought up"
         self._send(now_ns)
 
     def _end_start(self, task: Task[None], now_ns: int) -> None:

@@ -28,7 +28,11 @@ stations:
     cycle_us: {cycle_us}
     ports:
       - {{name: eap0, kind: eap, interface: "loop://x", net_id: 5.1.1.1.2.1}}
-      - {{name: bus0, kind: bus, interface: "sim://bus.yaml", net_id: 5.1.1.1.3.1, target: {target}}}
+      - name: bus0
+        kind: bus
+        interface: sim://bus.yaml
+        net_id: 5.1.1.1.3.1
+        target: {target}
 """
 BUS = """
 bus: b
