@@ -111,6 +111,11 @@ class Mailbox:
         self._begin(self._serve(), now_ns)
         return job.task
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether something is sent or read."""
+        return self._is_busy
+
     def look(self, now_ns: int) -> None:
         """Read what the slave has sent unasked, if nothing else is going on."""
         if self._is_open:

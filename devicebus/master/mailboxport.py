@@ -21,7 +21,7 @@ TRIES = 8
 """How often a frame is sent at most: a message that is half done is worth some patience."""
 
 _IN = Register.SYNC_MANAGER + SyncManager.SIZE
-_STATUS = _IN + 5
+STATUS = _IN + 5
 _ACTIVATE = _IN + 6
 _PDI_CONTROL = _IN + 7
 
@@ -81,7 +81,7 @@ class MailboxPort:
 
     def is_full(self) -> Procedure[bool]:
         """Say whether the slave has a message."""
-        (status,) = yield from read(self.station, _STATUS, 1, "mailbox status", tries=TRIES)
+        (status,) = yield from read(self.station, STATUS, 1, "mailbox status", tries=TRIES)
         return bool(status & SmStatus.MAILBOX_FULL)
 
     def fetch(self) -> Procedure[bytes | None]:

@@ -15,6 +15,7 @@ from devicebus.master.cycle import Cycle, CycleStats
 from devicebus.master.event import Event
 from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
+from devicebus.master.look import look_around
 from devicebus.master.mailstats import MailboxStats
 from devicebus.master.procedure import Procedure
 from devicebus.master.scan import FoundSlave, scan
@@ -49,6 +50,7 @@ class Master:
         self._bus = Bus(settings or MasterSettings())
         self._running: Task[None] | None = None
         self._look_ns = 0
+        self._look: Task[None] | None = None
 
     @property
     def units(self) -> dict[int, Unit]:
@@ -161,9 +163,8 @@ class Master:
         self._bus.runner.handle_timeout(now_ns)
         if now_ns >= self._look_ns and self._has_mailbox():
             self._look_ns = now_ns + LOOK_NS
-            for unit in self._bus.units.values():
-                if unit.mailbox is not None:
-                    unit.mailbox.look(now_ns)
+            if self._look is None or self._look.is_done:
+                self._look = self.run(look_around(self._bus), now_ns, "looking into mailboxes")
 
     def next_event(self) -> Event | None:
         """Take the oldest event."""
