@@ -105,6 +105,8 @@ class BusDesk:
                 message = self._sock.recv(_MAX_MESSAGE)
             except OSError:
                 return
+            if not message:
+                return
             try:
                 request = self._decoder.decode(message)
             except msgspec.MsgspecError:

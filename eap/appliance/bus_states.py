@@ -18,25 +18,26 @@ class BusStates:
 
     def __init__(self, port: str, slaves: Sequence[BusSlaveSpec], image: Image) -> None:
         self._image = image
-        self._slaves = [
-            (f"{port}.{slave.name}.{STATE}", slave.station)
-            for slave in slaves
-            if f"{port}.{slave.name}.{STATE}" in image.places
+        self._stations = [slave.station for slave in slaves]
+        self._names = [
+            f"{port}.{STATE}",
+            f"{port}.{WKC_OK}",
+            *(f"{port}.{slave.name}.{STATE}" for slave in slaves),
         ]
-        names = (f"{port}.{STATE}", f"{port}.{WKC_OK}", *(name for name, _ in self._slaves))
-        self._shown: dict[str, int] = {name: -1 for name in names if name in image.places}
+        self._shown = [-1] * len(self._names)
 
     def show(self, master: Master) -> None:
         """Store what has changed; the caller stands in the engine's writing."""
-        units = master.units
-        states = [_state(unit) for unit in units.values()]
-        cycle = master.cycle
-        values = [min(states, default=0), int(cycle is not None and cycle.is_full)]
-        values += [_state(units.get(station)) for _, station in self._slaves]
-        for (name, shown), value in zip(list(self._shown.items()), values, strict=True):
-            if value != shown:
-                self._shown[name] = value
+        units, cycle = master.units, master.cycle
+        lowest = min([_state(unit) for unit in units.values()], default=0)
+        values = [lowest, int(cycle is not None and cycle.is_full)]
+        values += [_state(units.get(station)) for station in self._stations]
+        if values == self._shown:
+            return
+        for name, value, shown in zip(self._names, values, self._shown, strict=True):
+            if value != shown and name in self._image.places:
                 self._image.store(name, bytes((value,)))
+        self._shown = values
 
 
 def _state(unit: Unit | None) -> int:
