@@ -56,8 +56,8 @@ def describe_buses(
             if file not in known:
                 known[file] = _describe(file, describe, report)
             description = known[file]
-        if description is not None:
-            _check_names(path, port, description, report)
+        if description is not None and not _has_names(path, port, description, report):
+            description = None
         found.setdefault((station.name, port.name), description)
     return found
 
@@ -88,7 +88,13 @@ def _describe(file: Path, describe: DescribeBus, report: Report) -> BusDescripti
     return None
 
 
-def _check_names(path: str, port: Port, description: BusDescription, report: Report) -> None:
-    for slave in description.slaves:
-        if not slave.name or any(each.isspace() or each == "/" for each in slave.name):
-            report.add(path, f"port {port.name} has a slave {slave.name!r}", _SLAVE_NAME)
+def _has_names(path: str, port: Port, description: BusDescription, report: Report) -> bool:
+    """Tell whether all slaves can be addressed, after reporting those that cannot."""
+    wrong = [
+        slave.name
+        for slave in description.slaves
+        if not slave.name or any(each.isspace() or each == "/" for each in slave.name)
+    ]
+    for name in wrong:
+        report.add(path, f"port {port.name} has a slave {name!r}", _SLAVE_NAME)
+    return not wrong

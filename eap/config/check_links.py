@@ -12,6 +12,8 @@ from eap.config.structs import Link, Station
 
 _TARGET = "a variable of the station's own, or an output of a bus"
 
+_KEYS = ("from_bit", "to_bit", "bits", "scale", "offset", "swap")
+
 
 def check_links(index: Index, report: Report) -> None:
     """Report every link that cannot run, or that would write what somebody else writes."""
@@ -63,6 +65,8 @@ def _check_writer(index: Index, report: Report, station: Station, link: Link) ->
 
 def _fits(link: Link, source: DataType, target: DataType, report: Report) -> bool:
     """Tell whether a link can be between these types, after reporting why not."""
+    if any(report.has(f"{link.at}.{key}") for key in _KEYS):
+        return False
     if is_bitwise(link):
         return _fits_bitwise(link, source, target, report)
     shown = f"{link.source} is {source.text}, {link.target} is {target.text}"
@@ -114,7 +118,7 @@ def _fits_scaled(
     if not (_is_number(source) and _is_number(target)):
         report.add(f"{link.at}.{key}", shown, f"numbers such as INT or REAL where there is a {key}")
         return False
-    if link.swap and source.is_bits:
+    if link.swap and source.size < 2:
         report.add(f"{link.at}.swap", shown, "a source of at least 2 octets")
         return False
     return True

@@ -53,6 +53,10 @@ class Report:
         """Take over what is wrong with another file."""
         self._adopted += findings
 
+    def has(self, path: str) -> bool:
+        """Tell whether something is wrong at *path* itself."""
+        return any(finding.path == path for finding in self._findings.values())
+
     def line_of(self, path: str) -> int:
         """Return the line of *path*, or of the nearest thing around it that the file has."""
         while path and path not in self.lines:

@@ -6,8 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from devicebus.master.pdo import channels_from_sii
+from devicebus.master.scan import scan
 from eap.appliance import busfile
+from eap.config.bus import DescribedEntry
 from eap.errors import ConfigError
+from tests.support.busline import Bench, Line, run
 
 BUSES = Path(__file__).parents[4] / "config" / "buses"
 GOOD = """\
@@ -88,3 +92,66 @@ def test_resource_that_is_too_large(tmp_path, monkeypatch):
     monkeypatch.setattr(busfile, "MAX_RESOURCE", 2)
     (finding, *_) = busfile.load(write(tmp_path)).findings
     assert "too large" in finding.message
+
+
+def described(tmp_path, text=GOOD):
+    return busfile.describe(write(tmp_path, text)).slaves
+
+
+def test_description_has_what_a_master_finds(tmp_path):
+    coupler, analogue = described(tmp_path)
+    assert (coupler.name, coupler.vendor, coupler.product) == ("a", 0x0E5A, 1)
+    assert (coupler.inputs, coupler.outputs) == ((), ())
+    assert analogue.product == 3
+    assert analogue.inputs == (DescribedEntry("level", "INT", 0x6000, 1, 16),)
+
+
+def test_description_of_bits_has_their_padding(tmp_path):
+    digital = "digital\n    outputs: [{name: x}, {name: y}]\n    mailbox: null"
+    text = GOOD.replace("analogue", digital).replace("type: INT", "type: BOOL")
+    [_, slave] = described(tmp_path, text)
+    assert [(e.name, e.type, e.index, e.bit_length) for e in slave.outputs] == [
+        ("x", "BOOL", 0x7000, 1),
+        ("y", "BOOL", 0x7000, 1),
+        ("", "", 0, 6),
+    ]
+    assert [e.bit_length for e in slave.inputs] == [1, 7]
+
+
+def test_what_a_bus_file_leaves_open_may_be_anything(tmp_path):
+    given = "name: b\n    revision: 0x10000\n    serial: 5\n    alias: 6"
+    first, second = described(tmp_path, GOOD.replace("name: b", given))
+    assert (first.revision, first.serial, first.alias) == (None, None, None)
+    assert (second.revision, second.serial, second.alias) == (0x10000, 5, 6)
+
+
+def test_slaves_are_in_the_order_in_which_frames_come_to_them(tmp_path):
+    branch = "  - {name: c, kind: coupler, after: a, port: 3}\n  - {name: d, kind: coupler}\n"
+    text = GOOD.replace("faults:", f"{branch}faults:")
+    assert [slave.name for slave in described(tmp_path, text)] == ["a", "c", "d", "b"]
+    names = [slave.name for slave in busfile.describe(BUSES / "io.yaml").slaves]
+    assert names == ["coupler", "inputs", "outputs", "level"]
+
+
+def test_findings_take_the_place_of_a_description(tmp_path):
+    path = write(tmp_path, GOOD.replace("kind: coupler", "kind: x"))
+    assert busfile.describe(path) == busfile.load(path).findings
+    assert busfile.describe(path)
+
+
+@pytest.mark.parametrize("path", sorted(BUSES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_master_finds_a_bus_as_it_is_described(path):
+    expected = busfile.describe(path).slaves
+    found = run(Line(Bench(), busfile.load_or_raise(path).build().segment), scan())
+    assert [slave.station for slave in found] == [1001 + n for n in range(len(expected))]
+    for slave, known in zip(found, expected, strict=True):
+        assert (slave.identity.vendor, slave.identity.product) == (known.vendor, known.product)
+        channels = channels_from_sii(slave.sii)
+        for is_output, entries in ((True, known.outputs), (False, known.inputs)):
+            assert [(e.index, e.subindex, e.bit_length) for e in entries] == [
+                (entry.index, entry.subindex, entry.bit_length)
+                for channel in channels
+                if channel.is_output is is_output
+                for pdo in channel.pdos
+                for entry in pdo.entries
+            ]

@@ -34,7 +34,6 @@ stations:
       - {name: seen, port: eap0, from: left/state, timeout_ms: 50, variables: {a: REAL, b: UDINT}}
 """
 
-EAP_PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
 BUS = BusDescription(
     (
         DescribedSlave(
@@ -63,12 +62,6 @@ def describe(path):
     if "broken" in path.name:
         return (Finding(str(path), 3, "slaves[0]", "kind is 'x'", "one of a, b"),)
     return BUS
-
-
-def bus_port(more="", interface="sim://line.yaml"):
-    """Return the edit that gives the left station a bus port."""
-    bus = f"{{name: bus0, kind: bus, interface: {interface}, net_id: 127.0.9.1.3.1{more}}}"
-    return EAP_PORT, f"{EAP_PORT}\n      - {bus}"
 
 
 def edited(*edits):

@@ -193,3 +193,23 @@ def test_a_received_variable_may_be_sent_again(load_plant):
     assert load_plant((old, old + relay % "b, a")).plant
     taken_over = load_plant((old, "timeout_ms: 50}" + relay % "seen.count, seen.speed")).plant
     assert taken_over.stations[1].frames[0].pds[0].variables == ("seen.count", "seen.speed")
+
+
+def test_what_is_on_a_bus_may_be_sent(findings):
+    port = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+    bus = "{name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}"
+
+    def sent(name, *more):
+        return findings((port, f"{port}\n      - {bus}"), ("[speed, count]", name), *more)
+
+    free = ("{a: REAL, b: UDINT}", "{a: BOOL}")
+    assert sent("[bus0.valves.limit]", free) == []
+    found = sent("[bus0.valves.limits]")
+    assert found[0].startswith(
+        "16: station left has no variable 'bus0.valves.limits', did you mean 'bus0.valves.limit'?"
+    )
+    assert sent("[bus0.valves.state, bus0.valves.speed]") == [
+        "22: a is REAL, but left/state sends bus0.valves.state as BYTE (line 16); BYTE",
+        "22: b is UDINT, but left/state sends bus0.valves.speed as INT (line 16); INT",
+    ]
+    assert len(sent("[bus0.valves.limit]", ("line.yaml", "broken.yaml"))) == 1

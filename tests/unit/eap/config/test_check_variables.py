@@ -104,3 +104,15 @@ def test_a_csv_file_is_read_through(findings, tmp_path, content, finding):
     (tmp_path / "oven.csv").write_text(content)
     found = findings(source("speed", "{kind: csv, file: oven.csv, column: heat}"))
     assert not found if finding is None else found[0].startswith(finding), found
+
+
+def test_what_is_on_a_bus_has_no_source(findings):
+    port = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+    bus = "{name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}"
+    more = f"{COUNTER}\n      bus0.valves.speed: {{kind: counter}}"
+    assert findings((port, f"{port}\n      - {bus}"), (COUNTER, more)) == [
+        (
+            "13: 'bus0.valves.speed' is on a bus, so it cannot have a source; "
+            "a source for a variable of the station, and a link from that one"
+        )
+    ]

@@ -2,12 +2,19 @@ from __future__ import annotations
 
 import pytest
 
-from eap.pd.spec import OnChangeSpec, Substitute, TriggerSpec, Wake, Writer
+from eap.pd.spec import LinkSpec, OnChangeSpec, Substitute, TriggerSpec, Wake, Writer
 
 PD = "id: 1, version: 3,"
 FROM = "from: left/state"
 VARIABLES = ", variables: {a: REAL, b: UDINT}}"
+LEFT_PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+COUNTER = "count: {kind: counter}"
 RIGHT_PORT = "net_id: 127.0.9.2.2.1"
+
+
+def bus_port(more="", interface="sim://line.yaml"):
+    bus = f"{{name: bus0, kind: bus, interface: {interface}, net_id: 127.0.9.1.3.1{more}}}"
+    return LEFT_PORT, f"{LEFT_PORT}\n      - {bus}"
 
 
 @pytest.fixture
@@ -136,3 +143,75 @@ def test_stations_are_staggered_unless_they_say_when(stations):
     own = ("net_id: 127.0.9.2.1.1", "net_id: 127.0.9.2.1.1\n    phase_us: 7\n    cycle_us: 500")
     right = stations(own)[1]
     assert (right.phase_us, right.cycle_us) == (7, 500)
+
+
+def test_a_bus_port_is_complete(stations, tmp_path):
+    left, _ = stations(bus_port())
+    port = left.ports[1]
+    file = str((tmp_path / "line.yaml").resolve())
+    assert (port.kind, port.interface, port.net_id) == ("bus", f"sim://{file}", "127.0.9.1.3.1")
+    assert (port.bus.file, port.bus.target, port.bus.clocks) == (file, "OP", False)
+    [slave] = port.bus.slaves
+    assert (slave.name, slave.station, slave.vendor, slave.product) == ("valves", 1001, 1, 2)
+    assert [entry.variable for entry in slave.outputs] == [
+        "bus0.valves.valve",
+        "bus0.valves.lamp",
+        "",
+        "bus0.valves.speed",
+    ]
+    assert [entry.bit_length for entry in slave.inputs] == [1, 7, 16]
+
+
+def test_a_real_bus_has_its_interface_and_may_be_described(stations, tmp_path):
+    uri = "ethernet://eth1"
+    left, _ = stations(bus_port(", bus: line.yaml, target: SAFEOP, clocks: true", uri))
+    assert left.ports[1].interface == uri
+    assert left.ports[1].bus.file == str((tmp_path / "line.yaml").resolve())
+    assert (left.ports[1].bus.target, left.ports[1].bus.clocks) == ("SAFEOP", True)
+    left, _ = stations(bus_port("", uri))
+    assert (left.ports[1].bus.file, left.ports[1].bus.slaves) == ("", ())
+    assert [v.name for v in left.variables][2:] == ["bus0.state", "bus0.wkc_ok"]
+
+
+def test_an_output_belongs_to_its_link_or_to_the_application(stations):
+    links = (
+        "\n    links:\n      - {from: bus0.valves.limit, to: bus0.valves.valve}\n"
+        "      - {from: bus0.valves.speed, to: speed, scale: 0.5}"
+    )
+    left, _ = stations(bus_port(), (COUNTER, COUNTER + links))
+    assert {v.name: v.writer for v in left.variables if "count" not in v.name} == {
+        "speed": Writer.ENGINE,
+        "bus0.state": Writer.ENGINE,
+        "bus0.wkc_ok": Writer.ENGINE,
+        "bus0.valves.state": Writer.ENGINE,
+        "bus0.valves.valve": Writer.ENGINE,
+        "bus0.valves.lamp": Writer.APPLICATION,
+        "bus0.valves.speed": Writer.APPLICATION,
+        "bus0.valves.limit": Writer.ENGINE,
+        "bus0.valves.status_word": Writer.ENGINE,
+    }
+
+
+def test_links_are_complete_and_in_the_order_in_which_they_run(stations):
+    links = (
+        "\n    links:\n      - {from: a, to: bus0.valves.valve}\n"
+        "      - {from: bus0.valves.status_word, from_bit: 3, to: a}\n"
+        "      - {from: bus0.valves.speed, to: speed, scale: 0.5, offset: -1, swap: true}"
+    )
+    more = ("count: UDINT", "count: UDINT\n      a: BOOL")
+    left, _ = stations(bus_port(), more, (COUNTER, COUNTER + links))
+    assert left.links == (
+        LinkSpec("bus0.valves.status_word", "a", source_bit=3, bits=1),
+        LinkSpec("a", "bus0.valves.valve"),
+        LinkSpec("bus0.valves.speed", "speed", scale=0.5, offset=-1.0, swap=True),
+    )
+
+
+def test_bus_variables_are_taken_over_by_subscribers(stations):
+    _, right = stations(
+        bus_port(), (VARIABLES, "}"), ("[speed, count]", "[bus0.valves.limit, bus0.valves.speed]")
+    )
+    assert [(v.name, v.type, v.writer) for v in right.variables] == [
+        ("seen.bus0.valves.limit", "BOOL", Writer.ENGINE),
+        ("seen.bus0.valves.speed", "INT", Writer.ENGINE),
+    ]

@@ -36,3 +36,20 @@ def test_near_suggests_only_what_is_near():
 def test_one_of_nothing_says_so():
     assert one_of(["a", "b"]) == "one of a, b"
     assert one_of([]) == "none (there are none here)"
+
+
+def test_findings_of_other_files_come_last():
+    report = Report("p.yaml")
+    report.adopt([Finding("bus.yaml", 1, "", "wrong", "right")])
+    report.add("a", "first", "x", line=2)
+    assert [str(f) for f in report.findings()] == [
+        "p.yaml:2: first; expected x",
+        "bus.yaml:1: wrong; expected right",
+    ]
+
+
+def test_a_report_knows_where_something_is_wrong():
+    report = Report("p.yaml")
+    report.add("a.b", "first", "x", line=2)
+    assert report.has("a.b")
+    assert not report.has("a")

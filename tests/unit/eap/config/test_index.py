@@ -6,6 +6,8 @@ from eap.config.index import parse_types
 from eap.config.structs import From
 
 PD = "id: 1, version: 3,"
+PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+BUS = "{name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}"
 VARIABLES = ", variables: {a: REAL, b: UDINT}}"
 
 
@@ -82,3 +84,30 @@ def test_types_are_all_or_none():
     assert [kind.text for kind in parse_types(["U16", "real"])] == ["UINT", "REAL"]
     assert parse_types(["UINT", None]) is None
     assert parse_types(["UINT", "NUMBER"]) is None
+
+
+def test_variables_of_a_bus_have_types_wherever_they_are_taken_over(index):
+    plant = index(
+        (PORT, f"{PORT}\n      - {BUS}"),
+        (VARIABLES, "}"),
+        ("[speed, count]", "[speed, bus0.valves.status_word, bus0.valves.state]"),
+    )
+    left, right = plant.stations["left"], plant.stations["right"]
+    assert plant.type_text(left, "bus0.valves.limit") == "BOOL"
+    assert plant.type_text(left, "bus0.valves.none") is None
+    assert plant.type_text(right, "seen.bus0.valves.status_word") == "UINT"
+    assert plant.names(right) == [
+        "seen.speed",
+        "seen.bus0.valves.status_word",
+        "seen.bus0.valves.state",
+    ]
+    assert plant.names(left)[:4] == ["speed", "count", "bus0.state", "bus0.wkc_ok"]
+    assert plant.bus_variables(right) == {}
+    assert plant.unread_buses(left) == []
+
+
+def test_a_bus_that_cannot_be_read_is_known_as_such(index):
+    plant = index((PORT, f"{PORT}\n      - {BUS.replace('line', 'none')}"))
+    assert plant.unread_buses(plant.stations["left"]) == ["bus0"]
+    assert plant.unread_buses(plant.stations["right"]) == []
+    assert plant.buses == {}
