@@ -72,6 +72,10 @@ def _fits(link: Link, source: DataType, target: DataType, report: Report) -> boo
     shown = f"{link.source} is {source.text}, {link.target} is {target.text}"
     if is_scaled(link):
         return _fits_scaled(link, source, target, shown, report)
+    return _fits_whole(link, source, target, shown, report)
+
+
+def _fits_whole(link: Link, source: DataType, target: DataType, shown: str, report: Report) -> bool:
     if link.swap:
         if source.size == target.size > 1 and not (source.is_bits or target.is_bits):
             return True

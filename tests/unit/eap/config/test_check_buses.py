@@ -97,8 +97,8 @@ def test_an_eap_port_is_not_on_the_interface_of_a_bus(findings):
     found = findings(*shared, ('"udp://127.0.9.2"', '"ethernet://eth1"'))
     assert found == [
         (
-            "7: ethernet://eth1 is the interface of eap0 too (line 6): the slaves of bus0 would pass"
-            " on and send back the frames of eap0; an interface of its own for a bus"
+            "7: ethernet://eth1 is the interface of eap0 too (line 6): the slaves of bus0 would"
+            " pass on and send back the frames of eap0; an interface of its own for a bus"
         )
     ]
 
