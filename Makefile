@@ -10,7 +10,7 @@ ARGS ?=
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench clean
+.PHONY: help setup demo valve test check bench clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-6s %s\n", $$1, $$2 }' Makefile
@@ -26,6 +26,9 @@ setup: .venv/.stamp-dev  ## prepare .venv (done once, and again when pyproject.t
 
 demo: setup  ## run the demo plant and show its values moving; Ctrl-C ends it
 	@$(BIN)/python tools/demo.py $(if $(SECONDS),--seconds '$(SECONDS)')
+
+valve: setup  ## a limit switch on one station's bus opens a valve on another's, through EAP
+	@$(BIN)/python tools/valve_demo.py
 
 # Tests with sockets and processes come last, a file at a time with nothing beside it: see tests/conftest.py.
 test: setup  ## run all tests; as root, first install the programs they use
