@@ -1,11 +1,11 @@
-"""The cycle of all stations of one process: who is due when."""
+"""The cycles of all stations of one process, and the timers of their buses: who is due when."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from heapq import heapify, heapreplace
 
-from eap.pd.link import Channel
+from eap.pd.link import Channel, CyclicBus
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 
@@ -16,6 +16,7 @@ class Engine:
     def __init__(self, stations: Sequence[Station]) -> None:
         self._stations = stations
         self._arrivals: list[Channel] = []
+        self._buses: list[CyclicBus] = []
         self._due: list[tuple[int, int]] = []
 
     def drain_on_arrival(self, channels: Iterable[Channel]) -> None:
@@ -23,7 +24,8 @@ class Engine:
         self._arrivals.extend(channels)
 
     def start(self, now_ns: int) -> None:
-        """Bring all stations to Op."""
+        """Bring all stations, with the buses that they have now, to Op."""
+        self._buses = [bus for station in self._stations for bus in station.buses]
         self._due = [(station.start(now_ns), index) for index, station in enumerate(self._stations)]
         heapify(self._due)
 
@@ -33,16 +35,23 @@ class Engine:
             station.stop()
 
     def next_timeout(self) -> int:
-        """Return when the next station is due, on the clock that gives ``now_ns``."""
-        return self._due[0][0]
+        """Return when the next station or bus is due, on the clock that gives ``now_ns``."""
+        due_ns = self._due[0][0]
+        for bus in self._buses:
+            bus_ns = bus.next_timeout()
+            if bus_ns is not None and bus_ns < due_ns:
+                due_ns = bus_ns
+        return due_ns
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Run the station that is due first; early calls are harmless.
+        """Run the station that is due first, else the bus; early calls are harmless.
 
-        One a call, so that whoever calls reads the clock again before the next.
+        One a call, so that whoever calls reads the clock again before the next.  A station runs
+        the timers of its own buses in its cycle, so a bus is late for no longer than that.
         """
         due_ns, index = self._due[0]
         if due_ns > now_ns:
+            self._handle_bus(now_ns)
             return
         station = self._stations[index]
         station.cycle(due_ns, now_ns)
@@ -54,6 +63,18 @@ class Engine:
         heapreplace(self._due, (following_ns, index))
 
     def receive(self, now_ns: int) -> None:
-        """Take pending frames between cycles, of the channels that asked for it."""
+        """Take pending frames between cycles, of the channels that asked for it and of buses."""
         for channel in self._arrivals:
             channel.drain(now_ns)
+        for bus in self._buses:
+            bus.receive(now_ns)
+
+    def _handle_bus(self, now_ns: int) -> None:
+        """Let the bus go on whose time came first."""
+        first, first_ns = None, now_ns + 1
+        for bus in self._buses:
+            bus_ns = bus.next_timeout()
+            if bus_ns is not None and bus_ns < first_ns:
+                first, first_ns = bus, bus_ns
+        if first is not None:
+            first.handle_timeout(now_ns)

@@ -8,20 +8,12 @@ from __future__ import annotations
 
 import math
 import random
-import struct
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
 from eap.pd.image import Image
-from eap.pd.layout import VariablePlace
 from eap.pd.spec import CounterSource, EngineSource, RampSource, RandomSource, SineSource
-
-_CODES = {
-    (int, 1): "b", (int, 2): "h", (int, 4): "i", (int, 8): "q", (float, 4): "f", (float, 8): "d",
-}  # fmt: skip
 
 
 class Generators:
@@ -44,22 +36,11 @@ def _step(image: Image, source: EngineSource) -> Callable[[int], None]:
     limits = kind.scalar_range
     whole = limits is not None and isinstance(limits[0], int)
     value = _function(source, image.layout.cycle_us, finish=round if whole else float)
-    store = _store(image, place, kind)
+    store = image.storer(place.name)
     if limits is None or not whole:
         return lambda cycle: store(value(cycle))
     low, span = int(limits[0]), int(limits[1]) - int(limits[0]) + 1
     return lambda cycle: store((value(cycle) - low) % span + low)
-
-
-def _store(image: Image, place: VariablePlace, kind: DataType) -> Callable[[Any], None]:
-    """Return what stores a value that is known to fit: one call for the usual numbers."""
-    limits = kind.scalar_range
-    code = "" if limits is None or kind.is_bits else _CODES.get((type(limits[0]), kind.size), "")
-    if not code:
-        return lambda value: image.write(place.name, value)
-    if limits is not None and limits[0] >= 0:
-        code = code.upper()
-    return partial(struct.Struct(f"<{code}").pack_into, image.memory, place.bit_offset // 8)
 
 
 def _random_step(

@@ -10,8 +10,10 @@ This module works on any writable buffer; ``eap.net.image_file`` maps one from a
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -23,6 +25,11 @@ from eap.pd.spec import Writer
 
 READ_ATTEMPTS = 1000
 """Spread over a tenth of a second by the pauses of a mapped file: a busy host stalls that long."""
+
+_CODES = {
+    (int, 1): "b", (int, 2): "h", (int, 4): "i", (int, 8): "q", (float, 4): "f", (float, 8): "d",
+}  # fmt: skip
+"""Of those numbers that one call packs; capitals for those without a sign."""
 
 
 def _no_pause() -> None:
@@ -93,6 +100,18 @@ class Image:
         mask = (1 << length) - 1 << bit
         word = int.from_bytes(self.memory[offset:end], "little") & ~mask | octets[0] << bit
         self.memory[offset:end] = word.to_bytes(end - offset, "little")
+
+    def storer(self, name: str) -> Callable[[Any], None]:
+        """Return what stores numbers that are known to fit in one variable, again and again."""
+        place = self._place(name)
+        kind = datatypes.parse(place.type)
+        limits = kind.scalar_range
+        code = "" if limits is None or kind.is_bits else _CODES.get((type(limits[0]), kind.size))
+        if not code:
+            return lambda value: self.store(name, kind.encode(value))
+        if limits is not None and limits[0] >= 0:
+            code = code.upper()
+        return partial(struct.Struct(f"<{code}").pack_into, self.memory, place.bit_offset // 8)
 
     @contextmanager
     def writing(self, writer: Writer) -> Iterator[None]:

@@ -5,6 +5,8 @@ directory: this layout as JSON, so that a program that attaches needs no plant f
 
 A received PD lies in the engine's region as it travels: eight octets of PD header, then the data.
 PDs that follow each other in a frame also follow each other here, so that one copy takes them all.
+Behind them lie the inputs of slaves, as they travel as well, then their outputs in the region of
+whoever writes them.
 """
 
 from __future__ import annotations
@@ -16,7 +18,15 @@ import msgspec
 
 from eap.codec import datatypes, pdo
 from eap.codec.pd import PdHeader
-from eap.pd.spec import Record, RxPdSpec, StationSpec, Substitute, VariableSpec, Writer
+from eap.pd.busplace import mirror
+from eap.pd.spec import (
+    BusEntrySpec,
+    Record,
+    StationSpec,
+    Substitute,
+    VariableSpec,
+    Writer,
+)
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 
 MAGIC = b"EAPIMAGE"
@@ -144,13 +154,12 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
     rx_words = [words.take(RxWord.SIZE) for _ in spec.subscriptions]
 
     octets = _Allocator(WORDS_OFFSET + 8 * words.used)
-    named = {variable.name: variable for variable in spec.variables}
-    places: dict[str, VariablePlace] = {}
-    regions = {}
-
     start = octets.used
-    rx = tuple(_rx_places(spec.subscriptions, rx_words, named, places, octets))
+    places: dict[str, VariablePlace] = {}
+    rx = tuple(_rx_places(spec, rx_words, places, octets))
+    regions = {}
     for writer in Writer:
+        _place_on_bus(spec, writer, types, places, octets)
         _place_variables(
             (v for v in spec.variables if v.writer is writer and v.name not in places),
             places,
@@ -210,6 +219,27 @@ def _place_variables(
         places[variable.name] = _place(variable, 8 * offset)
 
 
+def _place_on_bus(
+    spec: StationSpec,
+    writer: Writer,
+    types: dict[str, datatypes.DataType],
+    places: dict[str, VariablePlace],
+    octets: _Allocator,
+) -> None:
+    """Place what *writer* writes of the slaves' process data: all inputs, then outputs."""
+    slaves = [slave for port in spec.ports if port.bus for slave in port.bus.slaves]
+    sides: list[tuple[BusEntrySpec, ...]] = [slave.inputs for slave in slaves]
+    sides += [slave.outputs for slave in slaves]
+    named = {variable.name: variable for variable in spec.variables if variable.writer is writer}
+    for entries in sides:
+        own = [entry.variable for entry in entries if entry.variable in named]
+        if own:
+            plan = mirror(entries, types)
+            first_bit = 8 * octets.take(plan.size)
+            for name in own:
+                places[name] = _place(named[name], first_bit + plan.bit_offsets[name])
+
+
 def _place(variable: VariableSpec, bit_offset: int) -> VariablePlace:
     return VariablePlace(
         variable.name,
@@ -248,13 +278,13 @@ def _tx_places(
 
 
 def _rx_places(
-    subscriptions: tuple[RxPdSpec, ...],
+    spec: StationSpec,
     words: list[int],
-    named: dict[str, VariableSpec],
     places: dict[str, VariablePlace],
     octets: _Allocator,
 ) -> Iterable[RxPlace]:
-    for pd, first_word in zip(subscriptions, words, strict=True):
+    named = {variable.name: variable for variable in spec.variables}
+    for pd, first_word in zip(spec.subscriptions, words, strict=True):
         plan = pdo.layout([datatypes.parse(named[name].type) for name in pd.variables])
         offset = octets.take(PdHeader.SIZE + plan.size)
         data = 8 * (offset + PdHeader.SIZE)

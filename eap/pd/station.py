@@ -1,27 +1,37 @@
 """One station: its process image, its ports, and what happens in each of its cycles.
 
-The order within a cycle is written down here and nowhere else: take all pending frames, apply
-time-outs, compute generated variables, look at what others wrote, decide which PDs are due, patch
-their frames and send them.
+The order within a cycle is written down here and nowhere else: take all pending frames, of other
+stations and of buses; apply time-outs; take the inputs that the last exchange of each bus brought;
+compute generated variables; look at what services and applications wrote; run the links; decide
+which PDs are due, patch their frames and send them; send the outputs of each bus, which starts its
+next exchange.  The engine's region is marked as changing from the first frame to the last link, so
+that a reader sees inputs and what follows from them in one cycle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeAlias
 
 from eap.ids import NetId
 from eap.pd.device import Device, DeviceState, Request
 from eap.pd.generator import Generators
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
-from eap.pd.link import Channel, Taker
+from eap.pd.link import Channel, CyclicBus, OutFrame, Taker
+from eap.pd.links import Links
 from eap.pd.publisher import Publisher
-from eap.pd.spec import EngineSource, StationSpec
+from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
 
 _CYCLE = int(StationWord.CYCLE)
 _CYCLE_AT_NS = int(StationWord.CYCLE_AT_NS)
+_put_cycle = struct.Struct("2q").pack_into
+"""Writes CYCLE and CYCLE_AT_NS, which lie side by side."""
+_CYCLE_OFFSET = 8 * _CYCLE
 _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
 _FUTEX = int(StationWord.FUTEX)
 _WAITERS = int(StationWord.WAITERS)
@@ -32,6 +42,10 @@ _LATENESS_MAX_NS = int(StationWord.LATENESS_MAX_NS)
 WAKE_FOR_CYCLES = 100
 """Cycles after the last announcement of a waiting program in which waiters are woken."""
 
+_Choose: TypeAlias = Callable[[int, int], list[OutFrame]]
+_Send: TypeAlias = Callable[[Sequence[OutFrame], int], Sequence[OutFrame]]
+_Sent: TypeAlias = Callable[[Sequence[OutFrame], int], None]
+
 _UNREAD_FOR_US = 10_000
 """How long frames may wait at a port without subscriptions: they will only be counted."""
 
@@ -39,12 +53,17 @@ _UNREAD_FOR_US = 10_000
 class Station:
     """Runs the cycle of one station.
 
-    Build it, hand :attr:`takers` to the channels, :meth:`connect` them, then :meth:`start`.
+    Build it, hand :attr:`takers` to the channels, :meth:`connect` them and its buses, then
+    :meth:`start`.
 
     Args:
         spec: The checked specification.
         image: Its process image, fresh or left by an earlier engine of the same layout.
         wake: Wakes the programs that wait for the next cycle.
+
+    Attributes:
+        buses: Those that take part in its cycle.
+        takers: By port: who takes the frames that its channel receives.
     """
 
     def __init__(self, spec: StationSpec, image: Image, wake: Callable[[], None]) -> None:
@@ -57,10 +76,15 @@ class Station:
         self._inputs = Inputs(image)
         generated = [s for s in spec.sources if isinstance(s, EngineSource)]
         self._generators = Generators(image, generated)
-        self._has_own_variables = bool(generated)
-        self._publishers: list[tuple[Publisher, Channel]] = []
+        self._run_links = Links(image, self.memory_of, spec.links).run if spec.links else None
+        self._computes = bool(generated or spec.links)
+        """Whether more is to be written than what is received from other stations."""
+        self._has_own_variables = self._computes
+        self.buses: list[CyclicBus] = []
+        self._publishers: list[Publisher] = []
+        self._senders: list[tuple[_Choose, _Send, _Sent]] = []
         self._channels: list[Channel] = []
-        self._drains: list[Callable[[int], int]] = []
+        self._drains: list[Callable[[int], object]] = []
         self._rarely: list[Callable[[int], int]] = []
         self._rarely_every = max(1, _UNREAD_FOR_US // spec.cycle_us)
         layout = image.layout
@@ -75,8 +99,9 @@ class Station:
                 self.cycle_ns,
             )
             for port in spec.ports
+            if port.kind is PortKind.EAP
         }
-        self._supervisors = [
+        self._supervisors: list[Callable[[int], None]] = [
             subscriber.handle_timeout
             for subscriber in self._subscribers.values()
             if subscriber.has_timeouts
@@ -84,7 +109,6 @@ class Station:
         self.takers: dict[str, Taker] = {
             name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
         }
-        """By port: who takes the frames that its channel receives."""
 
     def connect(self, port: str, channel: Channel) -> None:
         """Send the frames of *port* through *channel*, and drain it.
@@ -104,7 +128,9 @@ class Station:
         if frames:
             net_id = next(p.net_id for p in self.spec.ports if p.name == port)
             publisher = Publisher(self.image, self._inputs, NetId.parse(net_id), channel, frames)
-            self._publishers.append((publisher, channel))
+            self._publishers.append(publisher)
+            # Bound once: a publisher's cycle is so short that three lookups show.
+            self._senders.append((publisher.frames_to_send, channel.send, publisher.sent))
 
     def drain_also(self, channel: Channel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""
@@ -112,6 +138,20 @@ class Station:
             self._channels.append(channel)
             self._drains.append(channel.drain)
             self._has_own_variables = True
+
+    def connect_bus(self, bus: CyclicBus) -> None:
+        """Exchange process data with *bus* in each cycle."""
+        self.buses.append(bus)
+        self._drains.append(bus.receive)
+        self._supervisors.append(partial(_run_due, bus))
+        self._has_own_variables = self._computes = True
+
+    def memory_of(self, writer: Writer) -> memoryview:
+        """Return where the cycle reads the variables of *writer*, as long as the image.
+
+        What the engine does not write itself is a copy that does not change within a cycle.
+        """
+        return self.image.memory if writer is Writer.ENGINE else self._inputs.memory
 
     def start(self, now_ns: int) -> int:
         """Go to Op; return when the first cycle is due.
@@ -149,17 +189,20 @@ class Station:
         """Run one cycle that was due at *due_ns*."""
         words = self._words
         cycle = words[_CYCLE] + 1
-        words[_CYCLE] = cycle
-        words[_CYCLE_AT_NS] = due_ns
+        _put_cycle(words, _CYCLE_OFFSET, cycle, due_ns)
         if self._has_own_variables or not cycle % self._rarely_every:
-            self._write_own_variables(cycle, now_ns)
-        if self._inputs.refresh():
-            for publisher, _ in self._publishers:
+            changed = self._write_own_variables(cycle, now_ns)
+        else:
+            changed = self._inputs.refresh()
+        if changed:
+            for publisher in self._publishers:
                 publisher.read_controls()
-        for publisher, channel in self._publishers:
-            frames = publisher.frames_to_send(cycle, now_ns)
+        for frames_to_send, send, sent in self._senders:
+            frames = frames_to_send(cycle, now_ns)
             if frames:
-                publisher.sent(channel.send(frames, now_ns), now_ns)
+                sent(send(frames, now_ns), now_ns)
+        for bus in self.buses:
+            bus.exchange(now_ns)
         late_ns = now_ns - due_ns
         late_us = late_ns // 1000
         bin_ = BIN_OF_US[late_us] if 0 <= late_us < _BINS_KNOWN else histogram_bin(late_us)
@@ -171,10 +214,11 @@ class Station:
         if cycle - words[_WAITERS] <= WAKE_FOR_CYCLES:
             self._wake()
 
-    def _write_own_variables(self, cycle: int, now_ns: int) -> None:
-        """Take what arrived, apply time-outs, compute what is generated."""
+    def _write_own_variables(self, cycle: int, now_ns: int) -> bool:
+        """Write all that the engine writes; return whether others wrote something."""
         words = self._words
-        words[_SEQUENCE] += 1
+        sequence = words[_SEQUENCE]
+        words[_SEQUENCE] = sequence + 1
         for drain in self._drains:
             drain(now_ns)
         if not cycle % self._rarely_every:
@@ -182,5 +226,21 @@ class Station:
                 drain(now_ns)
         for apply_timeouts in self._supervisors:
             apply_timeouts(now_ns)
-        self._generators.run(cycle)
-        words[_SEQUENCE] += 1
+        if self._computes:
+            for bus in self.buses:
+                bus.take_inputs()
+            self._generators.run(cycle)
+            changed = self._inputs.refresh()
+            if self._run_links is not None:
+                self._run_links()
+        else:
+            changed = self._inputs.refresh()
+        words[_SEQUENCE] = sequence + 2
+        return changed
+
+
+def _run_due(bus: CyclicBus, now_ns: int) -> None:
+    """Run the timers of *bus* if the cycle has kept them waiting."""
+    due_ns = bus.next_timeout()
+    if due_ns is not None and due_ns <= now_ns:
+        bus.handle_timeout(now_ns)

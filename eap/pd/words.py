@@ -79,7 +79,9 @@ class StationWord(IntEnum):
     LATENESS_MAX_NS = 16
     DISCARDED = 17
     LATENESS = DISCARDED + len(DISCARDS)
-    SIZE = LATENESS + HISTOGRAM_BINS
+    LINKS_HELD = LATENESS + HISTOGRAM_BINS
+    """Values that no link could pass on, because their source was infinite or no number."""
+    SIZE = LINKS_HELD + 1
 
 
 class FrameWord(IntEnum):

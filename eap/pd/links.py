@@ -1,0 +1,197 @@
+"""Links: in each cycle variables of a station get the values of others of its variables.
+
+Rule 1: a link may read what an earlier one of the same cycle wrote; those that do not depend on
+each other are copied together.
+Rule 2: between numbers, a link with a scale or an offset, or from one type to another, computes its
+value, rounds it if the target holds whole numbers, and keeps it within the limits of its type.  A
+source that is infinite or no number says nothing then: the target keeps its value, and the
+station counts that.
+Rule 3: every other link copies bits, whatever they mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from math import isfinite
+from typing import Any, NamedTuple
+
+from eap.codec import datatypes
+from eap.codec.datatypes import DataType
+from eap.pd.copyplan import CopyPlan, Move
+from eap.pd.image import Image
+from eap.pd.layout import VariablePlace
+from eap.pd.spec import LinkSpec, Writer
+from eap.pd.words import StationWord
+
+_HELD = int(StationWord.LINKS_HELD)
+
+
+class _End(NamedTuple):
+    """One end of a link."""
+
+    place: VariablePlace
+    kind: DataType
+    memory: memoryview
+
+    @property
+    def octets(self) -> slice:
+        """Where the variable lies; for those that are no bit fields."""
+        first = self.place.bit_offset // 8
+        return slice(first, first + self.kind.size)
+
+
+class _Way(NamedTuple):
+    """A link between its ends, and the bits of the image that it reads and writes."""
+
+    link: LinkSpec
+    source: _End
+    target: _End
+    reads: range
+    writes: range
+
+    @property
+    def is_computed(self) -> bool:
+        """Whether a number comes out that has to be computed."""
+        link, source, target = self.link, self.source.kind, self.target.kind
+        if link.scale != 1.0 or link.offset:
+            return True
+        if link.bits or source == target or (link.swap and source.size == target.size):
+            return False
+        return source.scalar_range is not None and target.scalar_range is not None
+
+
+class Links:
+    """Runs all links of one station.
+
+    Args:
+        image: The station's image; every target is in the engine's region.
+        memory_of: Returns where the variables of a writer are read.
+        links: In the order in which they run.
+    """
+
+    def __init__(
+        self, image: Image, memory_of: Callable[[Writer], memoryview], links: Iterable[LinkSpec]
+    ) -> None:
+        def end(name: str) -> _End:
+            place = image.places[name]
+            return _End(place, datatypes.parse(place.type), memory_of(place.writer))
+
+        ways = [_way(link, end(link.source), end(link.target)) for link in links]
+        self._steps = [step for stage in _stages(ways) for step in _steps(image, stage)]
+
+    def run(self) -> None:
+        """Give every target its value; the engine's region is marked as changing."""
+        for step in self._steps:
+            step()
+
+
+def _way(link: LinkSpec, source: _End, target: _End) -> _Way:
+    first, where = source.place.bit_offset, target.place.bit_offset
+    length, room = source.kind.bit_length, target.kind.bit_length
+    way = _Way(link, source, target, range(first, first + length), range(where, where + room))
+    if way.is_computed or link.swap:
+        return way
+    bits = link.bits or min(length - link.source_bit, room - link.target_bit)
+    return way._replace(
+        reads=way.reads[link.source_bit :][:bits], writes=way.writes[link.target_bit :][:bits]
+    )
+
+
+def _stages(ways: Iterable[_Way]) -> list[list[_Way]]:
+    """Divide *ways* so that those of one stage can run in any order, stage after stage."""
+    stages: list[list[_Way]] = []
+    read_in: dict[int, int] = {}
+    written_in: dict[int, int] = {}
+    for way in ways:
+        before = [written_in[bit] for bit in way.reads if bit in written_in]
+        for bit in way.writes:
+            before += [stage[bit] for stage in (read_in, written_in) if bit in stage]
+        number = max(before, default=-1) + 1
+        for bit in way.reads:
+            read_in[bit] = max(number, read_in.get(bit, 0))
+        written_in.update(dict.fromkeys(way.writes, number))
+        stages += [[] for _ in range(number + 1 - len(stages))]
+        stages[number].append(way)
+    return stages
+
+
+def _steps(image: Image, stage: Iterable[_Way]) -> Iterator[Callable[[], None]]:
+    moves: dict[Writer, list[Move]] = {}
+    memories: dict[Writer, memoryview] = {}
+    for way in stage:
+        source = way.source
+        if way.is_computed:
+            yield _computed(image, way)
+        elif way.link.swap:
+            yield _swapped(image.memory, way)
+        else:
+            writer = source.place.writer
+            memories[writer] = source.memory
+            move = Move(way.reads.start, way.writes.start, len(way.writes))
+            moves.setdefault(writer, []).append(move)
+    for writer, memory in memories.items():
+        yield partial(CopyPlan(moves[writer]).run, memory, image.memory)
+
+
+def _swapped(memory: memoryview, way: _Way) -> Callable[[], None]:
+    reversed_octets = way.source.memory[way.source.octets][::-1]
+    where = way.target.octets
+
+    def copy() -> None:
+        memory[where] = reversed_octets
+
+    return copy
+
+
+def _computed(image: Image, way: _Way) -> Callable[[], None]:
+    read = _reader(way.source, swap=way.link.swap)
+    value = _function(way.link, way.source.kind, way.target.kind)
+    store = image.storer(way.target.place.name)
+    words = image.words
+
+    def compute() -> None:
+        number = read()
+        if isfinite(number):
+            store(value(number))
+        else:
+            words[_HELD] += 1
+
+    return compute
+
+
+def _reader(source: _End, *, swap: bool) -> Callable[[], Any]:
+    memory, kind = source.memory, source.kind
+    first, shift = divmod(source.place.bit_offset, 8)
+    if kind.is_bits:
+        mask = (1 << kind.bit_length) - 1
+        two = memory[first : first + 2]
+        return lambda: int.from_bytes(two, "little") >> shift & mask
+    octets = memory[source.octets]
+    if swap:
+        backward = octets[::-1]
+        return lambda: kind.decode(bytes(backward), 0)
+    return lambda: kind.decode(octets, 0)
+
+
+def _function(link: LinkSpec, source: DataType, target: DataType) -> Callable[[Any], Any]:
+    """Return what computes the target's number from a finite one of the source."""
+    low, high = target.scalar_range or (0, 0)
+    rounds = isinstance(low, int)
+    scale, offset = link.scale, link.offset
+    if rounds and _is_whole(source) and scale.is_integer() and offset.is_integer():
+        scale, offset = int(scale), int(offset)  # exact, also beyond the 53 bits of a float
+
+    def compute(number: Any) -> Any:
+        result = number * scale + offset
+        if result < low:
+            return low
+        if result > high:
+            return high
+        return round(result) if rounds else float(result)
+
+    return compute
+
+
+def _is_whole(kind: DataType) -> bool:
+    return kind.scalar_range is not None and isinstance(kind.scalar_range[0], int)
