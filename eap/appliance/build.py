@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
 
 from eap.appliance.discards import DiscardCounters, Refusal, Tally
+from eap.appliance.engine_buses import EngineBuses
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.appliance.passing import PassedConnection
 from eap.appliance.runtime import ApplianceFolder
@@ -41,11 +42,12 @@ class EnginePlant:
 
     Attributes:
         engine: Runs them.
-        arrival_fds: Descriptors to wake up for, besides the cycle.
+        buses: The slaves below them.
+        arrivals: Descriptors to wake up for besides the cycle, and what to call then.
     """
 
     def __init__(self, handover: Handover) -> None:
-        self.arrival_fds: list[int] = []
+        self.arrivals: dict[int, Callable[[int], object]] = {}
         self._resources = ExitStack()
         self._handover = handover
         folder = ApplianceFolder(Path(handover.folder))
@@ -54,7 +56,6 @@ class EnginePlant:
         self._batch = ReceiveBatch()
         self._tallies: list[Tally] = []
         self._tcp_ports: dict[PortName, TcpPort] = {}
-        self._on_arrival: list[Channel] = []
         self._counters = self._resources.enter_context(
             DiscardCounters(folder.discards("engine"), [s.name for s in handover.stations])
         )
@@ -69,14 +70,17 @@ class EnginePlant:
                 self._open_interface(shared)
             elif shared.kind is not SocketKind.TCP:
                 self._open_datagrams(shared)
+        self.buses = EngineBuses(handover, self._stations)
+        self._resources.callback(self.buses.close)
+        self.arrivals.update(self.buses.arrivals)
         self.engine = Engine(list(self._stations.values()))
-        self.engine.drain_on_arrival(self._on_arrival)
 
     def start(self, now_ns: int) -> None:
         """Bring all stations to Op, and let programs that attach see who runs them."""
         for file in self._files.values():
             file.image.words[StationWord.ENGINE_PID] = os.getpid()
         self.engine.start(now_ns)
+        self.buses.start(now_ns)
 
     def add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
         """Take frames from a connection that services accepted, for all ports behind it."""
@@ -99,8 +103,12 @@ class EnginePlant:
             tally.publish()
 
     def stop(self) -> None:
-        """Bring all stations out of Op and wake who waits for a cycle that will not come."""
+        """Bring all stations out of Op and wake who waits for a cycle that will not come.
+
+        Slaves come to rest, for at most REST_NS.
+        """
         self.engine.stop()
+        self.buses.rest()
         for file in self._files.values():
             file.image.words[StationWord.ENGINE_PID] = 0
             file.wake_waiters()
@@ -173,8 +181,7 @@ class EnginePlant:
 
     def _wake_on_arrival(self, owners: Iterable[PortName], channel: SocketChannel) -> None:
         if any(self._handover.port(owner).wake is Wake.ARRIVAL for owner in owners):
-            self._on_arrival.append(channel)
-            self.arrival_fds.append(channel.fileno())
+            self.arrivals[channel.fileno()] = channel.drain
 
     def _taker(self, name: PortName) -> Taker:
         return self._stations[name.station].takers[name.port]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from devicebus.errors import BusError
+from devicebus.errors import BusError, FrameLostError
 from devicebus.master.bus import MasterSettings
 from devicebus.master.expected import ExpectedSlave
 from devicebus.master.image import BusImage
@@ -27,6 +27,8 @@ from eap.pd.spec import BusPortSpec, PortSpec, Writer
 
 RETRY_NS = 2_000_000_000
 """Between two attempts to bring a bus up."""
+SILENT_RETRY_NS = 100_000_000
+"""The same while nothing comes back at all: nobody is disturbed then."""
 BATCH = 64
 """Frames taken in one go; the rest waits until the cycles have had their turn."""
 _LONG_CYCLE_NS = 20_000_000
@@ -185,7 +187,8 @@ class EngineBus:
         self.is_up = task.error is None or self.master.cycle is not None
         self._start_fault = "" if self.is_up else str(task.error)
         if not self.is_up:
-            self._retry_ns = now_ns + RETRY_NS
+            is_silent = isinstance(task.error, FrameLostError)
+            self._retry_ns = now_ns + (SILENT_RETRY_NS if is_silent else RETRY_NS)
 
     def _begin_anew(self, exc: Exception, now_ns: int) -> None:
         """The master cannot go on: replace it."""

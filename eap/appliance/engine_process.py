@@ -40,11 +40,12 @@ def run_cycles(plant: EnginePlant, link: socket.socket, stop: StopFlag) -> None:
     look_ns = 0
     ticker = Ticker()
     try:
-        for fd in plant.arrival_fds:
+        for fd in plant.arrivals:
             ticker.register(fd)
         while not stop.is_set:
             if not ticker.wait(engine.next_timeout()):
-                engine.receive(monotonic_ns())
+                for fd in ticker.arrivals():
+                    plant.arrivals[fd](monotonic_ns())
                 continue
             now_ns = monotonic_ns()
             engine.handle_timeout(now_ns)

@@ -101,8 +101,8 @@ def test_udp_ports_share_nothing_but_the_network(start, shared):
     stations = [left(), right(eap_port(2, wake=Wake.ARRIVAL))]
     running = start(stations, shared(*stations))
     running.run_cycles(3)
-    running.plant.engine.receive(1)
-    assert len(running.plant.arrival_fds) == 1
+    (take,) = running.plant.arrivals.values()
+    take(1)
     assert running.values("right")["ticks"] >= 2
 
 

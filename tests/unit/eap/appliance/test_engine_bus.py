@@ -7,7 +7,7 @@ import pytest
 
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import AlState
-from eap.appliance.engine_bus import RETRY_NS, master_settings
+from eap.appliance.engine_bus import RETRY_NS, SILENT_RETRY_NS, master_settings
 from eap.pd.spec import BusPortSpec, BusTarget
 from tests.support.cyclic import MS
 from tests.support.enginebus import BUS, BusRig
@@ -107,7 +107,7 @@ def test_wire_that_is_cut_at_the_start(tmp_path):
     assert "no frame came back" in rig.bus.fault
     assert rig.value("state") == 0
     rig.wire.is_deaf = False
-    rig.wait_op()
+    assert rig.wait_op() < 2 * SILENT_RETRY_NS
     assert rig.bus.is_up
 
 
