@@ -1,18 +1,31 @@
-"""The EEPROM behind an ESC and the registers by which a master reaches it (ETG.1000.4)."""
+"""The EEPROM behind an ESC and the registers by which a master reaches it (ETG.1000.4).
+
+A command takes its time: until then the controller is busy and takes no other.
+"""
 
 from __future__ import annotations
 
 from devicebus.wire import sii
 from devicebus.wire.register import EepromCommand, Register
 
+READ_NS = 50_000
+WRITE_NS = 1_000_000
+RELOAD_NS = 500_000
 _WORDS = 2
+_BUSY = 0x8000
 _COMMAND_ERROR = 0x2000
 _WRITE_ENABLE_ERROR = 0x4000
 _CRC_ERROR = 0x0800
 _READ_EIGHT = 0x0040
 _TWO_BYTES = 0x0080
 _WRITE_ENABLE = 0x0001
+_COMMAND = 0x0700
 _OWNED_BY_PDI = 0x01
+_DURATION: dict[int, int] = {
+    EepromCommand.READ: READ_NS,
+    EepromCommand.WRITE: WRITE_NS,
+    EepromCommand.RELOAD: RELOAD_NS,
+}
 
 
 class Eeprom:
@@ -20,23 +33,75 @@ class Eeprom:
 
     Args:
         memory: Of the ESC.
-        image: Octets, kept and changed by writes.
+        image: Octets, changed by writes.
+
+    Attributes:
+        extra_ns: A fault: how much longer each command takes.
+        is_broken: A fault: no command is acknowledged.
+        busy_until_ns: When the command under way is done; None while there is none.
     """
 
-    __slots__ = ("_memory", "image")
+    __slots__ = ("_control", "_memory", "busy_until_ns", "extra_ns", "image", "is_broken")
 
-    def __init__(self, memory: bytearray, image: bytes) -> None:
+    def __init__(self, memory: bytearray, image: bytearray) -> None:
         self._memory = memory
-        self.image = bytearray(image)
+        self.image = image
+        self.extra_ns = 0
+        self.is_broken = False
+        self.busy_until_ns: int | None = None
+        self._control = 0
         self._status(0)
-        self.load(power_on=True)
+        self._load(power_on=True)
 
     @property
     def is_masters(self) -> bool:
         """Whether the master may use the interface now."""
         return not self._memory[Register.EEPROM_CONFIGURATION] & _OWNED_BY_PDI
 
-    def load(self, *, power_on: bool = False) -> None:
+    def ownership_written(self) -> None:
+        """The master gave the interface away, or took it by force (bit 1)."""
+        memory = self._memory
+        if memory[Register.EEPROM_CONFIGURATION] & 2:
+            memory[Register.EEPROM_PDI_ACCESS] = 0
+
+    def control_written(self, now_ns: int) -> None:
+        """Begin with the command that was written to the control register."""
+        at = Register.EEPROM_CONTROL
+        control = int.from_bytes(self._memory[at : at + 2], "little")
+        command = control >> 8 & 7
+        self._status(0)
+        if command == EepromCommand.NONE:
+            return
+        if command not in _DURATION:
+            self._status(_COMMAND_ERROR)
+        elif command == EepromCommand.WRITE and not control & _WRITE_ENABLE:
+            self._status(_WRITE_ENABLE_ERROR)
+        else:
+            self._control = control
+            self.busy_until_ns = now_ns + _DURATION[command] + self.extra_ns
+            self._status(_BUSY | control & _COMMAND)
+
+    def settle(self, now_ns: int) -> None:
+        """Finish the command that is done by now."""
+        if self.busy_until_ns is None or now_ns < self.busy_until_ns:
+            return
+        self.busy_until_ns = None
+        self._status(_COMMAND_ERROR if self.is_broken else 0)
+        if not self.is_broken:
+            self._execute(self._control >> 8 & 7)
+
+    def _execute(self, command: int) -> None:
+        at = Register.EEPROM_ADDRESS
+        offset = int.from_bytes(self._memory[at : at + 4], "little") * _WORDS
+        if command == EepromCommand.READ:
+            octets = self.image[offset : offset + 8]
+            self._memory[Register.EEPROM_DATA : Register.EEPROM_DATA + 8] = octets.ljust(8, b"\xff")
+        elif command == EepromCommand.WRITE:
+            self._write_word(offset)
+        else:
+            self._load()
+
+    def _load(self, *, power_on: bool = False) -> None:
         """Load the configuration words; an image with a wrong check sum loads nothing.
 
         The alias is taken over at power-on only.
@@ -51,33 +116,6 @@ class Eeprom:
         if power_on:
             memory[Register.STATION_ALIAS : Register.STATION_ALIAS + 2] = self.image[8:10]
 
-    def ownership_written(self) -> None:
-        """The master gave the interface away, or took it by force (bit 1)."""
-        memory = self._memory
-        if memory[Register.EEPROM_CONFIGURATION] & 2:
-            memory[Register.EEPROM_PDI_ACCESS] = 0
-
-    def control_written(self) -> None:
-        """Execute the command that was written to the control register."""
-        at = Register.EEPROM_CONTROL
-        control = int.from_bytes(self._memory[at : at + 2], "little")
-        self._status(0)
-        command = control >> 8 & 7
-        at = Register.EEPROM_ADDRESS
-        offset = int.from_bytes(self._memory[at : at + 4], "little") * _WORDS
-        if command == EepromCommand.READ:
-            octets = self.image[offset : offset + 8]
-            self._memory[Register.EEPROM_DATA : Register.EEPROM_DATA + 8] = octets.ljust(8, b"\xff")
-        elif command == EepromCommand.WRITE:
-            if control & _WRITE_ENABLE:
-                self._write_word(offset)
-            else:
-                self._status(_WRITE_ENABLE_ERROR)
-        elif command == EepromCommand.RELOAD:
-            self.load()
-        elif command != EepromCommand.NONE:
-            self._status(_COMMAND_ERROR)
-
     def _write_word(self, offset: int) -> None:
         if offset + _WORDS > len(self.image):
             self._status(_COMMAND_ERROR)
@@ -85,7 +123,7 @@ class Eeprom:
         at = Register.EEPROM_DATA
         self.image[offset : offset + _WORDS] = self._memory[at : at + _WORDS]
 
-    def _status(self, errors: int) -> None:
+    def _status(self, bits: int) -> None:
         at = Register.EEPROM_CONTROL
-        status = errors | _READ_EIGHT | _TWO_BYTES
+        status = bits | _READ_EIGHT | _TWO_BYTES
         self._memory[at : at + 2] = status.to_bytes(2, "little")

@@ -58,8 +58,17 @@ class Esc:
 
     def __init__(self, image: bytes, settings: EscSettings | None = None) -> None:
         self.settings = settings or EscSettings()
-        self.image = image
+        self._image = bytearray(image)
         self.power_on()
+
+    @property
+    def image(self) -> bytes:
+        """What its EEPROM holds."""
+        return bytes(self._image)
+
+    @image.setter
+    def image(self, image: bytes) -> None:
+        self._image[:] = image
 
     def power_on(self) -> None:
         """Begin with the values after a reset; the EEPROM keeps its content."""
@@ -74,7 +83,7 @@ class Esc:
         self.loops_changed = False
         self.port_delays: tuple[int | None, ...] = (0,) + (None,) * (PORTS - 1)
         self._describe()
-        self.eeprom = Eeprom(self.memory, self.image)
+        self.eeprom = Eeprom(self.memory, self._image)
         self.clock = Clock(
             self.memory, drift_ppm=given.drift_ppm, local_start_ns=given.local_start_ns
         )
@@ -177,7 +186,7 @@ class Esc:
             done = self.write(address, data[:room], now_ns)
             return self._write_memory(REGISTERS, data[room:], now_ns) or done
         marks = self._writable[address:end]
-        if not self.eeprom.is_masters and address <= Register.EEPROM_CONTROL < end:
+        if address < _EEPROM_END and end > _EEPROM and not self._takes_eeprom(now_ns):
             return False
         if _YES not in marks:
             return False
@@ -200,10 +209,17 @@ class Esc:
         if page == 0x09:
             self.clock.refresh(now_ns + (self.port_delays[0] or 0))
             return
+        if page == 0x05:
+            self.eeprom.settle(now_ns)
+            return
         at = Register.ECAT_EVENT
         memory[at : at + 2] = self._events().to_bytes(2, "little")
         at = Register.AL_EVENT
         memory[at : at + 4] = self.al_event.to_bytes(4, "little")
+
+    def _takes_eeprom(self, now_ns: int) -> bool:
+        self.eeprom.settle(now_ns)
+        return self.eeprom.is_masters and self.eeprom.busy_until_ns is None
 
     def _events(self) -> int:
         full = sum(1 << 4 + n for n, each in enumerate(self.channels[:8]) if each.is_full)
@@ -223,7 +239,7 @@ class Esc:
                 self._clear_counters(start, end)
                 self.watchdog.configure()
             case 0x05:
-                self._eeprom_written(start, end)
+                self._eeprom_written(start, end, now_ns)
             case 0x06:
                 self.windows = active_windows(self.memory, self.settings.fmmus)
             case 0x08:
@@ -231,12 +247,11 @@ class Esc:
             case 0x09:
                 self._clock_written(start, end, now_ns)
 
-    def _eeprom_written(self, start: int, end: int) -> None:
+    def _eeprom_written(self, start: int, end: int, now_ns: int) -> None:
         if start <= Register.EEPROM_CONFIGURATION < end:
             self.eeprom.ownership_written()
         if start <= Register.EEPROM_CONTROL < end:
-            self.eeprom.control_written()
-            self.image = bytes(self.eeprom.image)
+            self.eeprom.control_written(now_ns)
 
     def _sync_managers_written(self, start: int, end: int) -> None:
         for number, channel in enumerate(self.channels):
@@ -350,4 +365,5 @@ def _find_areas(guards: tuple[SyncChannel, ...]) -> dict[tuple[int, int], SyncCh
     }
 
 
-_FRESH = frozenset((0x02, 0x09))
+_FRESH = frozenset((0x02, 0x05, 0x09))
+_EEPROM, _EEPROM_END = int(Register.EEPROM_CONTROL), int(Register.EEPROM_DATA) + 8

@@ -12,7 +12,10 @@ from itertools import count
 from typing import Any, NamedTuple
 
 from devicebus.sim.devices.objects import parse_entry
+from devicebus.sim.devices.pdoobjects import TX_PDO
+from devicebus.sim.findentry import find_entry
 from devicebus.sim.segment import Segment
+from devicebus.sim.slave import Slave
 from devicebus.sim.slavefault import SLAVE_FAULTS
 from devicebus.sim.spec import FaultKind, FaultSpec
 from devicebus.sim.wiring import Side
@@ -61,6 +64,8 @@ class FaultySegment:
             raise ValueError(f"fault {spec.kind.value}: no slave {spec.slave!r} (one of {known})")
         if spec.kind is FaultKind.SDO:
             parse_entry(spec.object)
+        if spec.kind is FaultKind.TX_PDO and not 0 <= parse_entry(spec.object)[0] - TX_PDO < 0x200:
+            raise ValueError(f"fault tx-pdo: {spec.object} is no TxPDO (0x1A00 to 0x1BFF)")
         if spec.kind is FaultKind.REFUSE and spec.state not in AlState.__members__:
             known = ", ".join(AlState.__members__)
             raise ValueError(f"fault refuse: no state {spec.state!r} (one of {known})")
@@ -82,6 +87,34 @@ class FaultySegment:
         """End the fault that *spec* describes."""
         self.check(spec)
         self._switch(spec, now_ns, on=False)
+
+    def set_value(self, slave: str, entry: str, value: object, now_ns: int) -> None:
+        """Let an entry of a slave keep *value*, whatever changes it otherwise.
+
+        Args:
+            slave: Its name.
+            entry: Name of an input, an output or another entry, or such as ``0x6000:1``.
+            value: Of the entry's type.
+            now_ns: The time.
+
+        Raises:
+            ValueError: there is no such slave or entry, or it has no such value.
+        """
+        found = self._slave(slave)
+        found.device.override(*find_entry(found.device, entry), value)
+        found.offer_inputs(now_ns)
+
+    def release(self, slave: str, entry: str, now_ns: int) -> None:
+        """End :meth:`set_value`; raise ValueError if there was none."""
+        found = self._slave(slave)
+        if not found.device.release(*find_entry(found.device, entry)):
+            raise ValueError(f"{slave}: {entry} was not set")
+        found.offer_inputs(now_ns)
+
+    def _slave(self, name: str) -> Slave:
+        if name not in self._numbers:
+            raise ValueError(f"no slave {name!r} (one of {', '.join(self._numbers)})")
+        return self.segment.slaves[self._numbers[name]]
 
     def receive_frame(
         self, frame: bytearray, now_ns: int, *, side: Side = Side.PRIMARY, origin: Any = None

@@ -70,7 +70,7 @@ class Slave:
         if event & _AL_CONTROL:
             self._obey(now_ns)
         if event & _SM_ACTIVATION:
-            self._check_channels(now_ns)
+            self._check_channels()
         if event & _MAILBOX_EVENTS and self._has_mailbox():
             self._serve_mailbox(event)
             self._move_messages(now_ns)
@@ -97,6 +97,11 @@ class Slave:
             return None
         times = [at for at in (self.esc.watchdog.deadline_ns, self._deadline_ns) if at is not None]
         return min(times, default=None)
+
+    def offer_inputs(self, now_ns: int) -> None:
+        """Show the master what has changed apart from its frames."""
+        if self.is_powered and self.state in _WITH_PROCESS_DATA:
+            self._offer_inputs(now_ns)
 
     def _is_sync_pulse(self, now_ns: int) -> bool:
         """Whether inputs are to be latched: by SYNC1 where it runs, else by SYNC0."""
@@ -200,15 +205,25 @@ class Slave:
         self._code = code
         self.esc.set_al_status(self.state | ERROR, code)
 
-    def _check_channels(self, now_ns: int) -> None:
+    def _check_channels(self) -> None:
         """The master has changed a sync manager: that must not happen under running data."""
-        if self.state not in _WITH_PROCESS_DATA or self.esc.emulates_device:
+        if self.esc.emulates_device:
             return
-        code = check_process_data(self.esc, self.device)
-        if code:
-            self.esc.watchdog.stop()
-            self.device.al_state = AlState.PREOP
-            self._refuse(code)
+        if self._has_mailbox() and not check_mailbox(self.esc):
+            boot = self.state is AlState.BOOT
+            self._fall(AlState.INIT, AlStatusCode.MAILBOX_BOOT if boot else
+                       AlStatusCode.MAILBOX_PREOP)  # fmt: skip
+            return
+        if self.state in _WITH_PROCESS_DATA:
+            code = check_process_data(self.esc, self.device)
+            if code:
+                self._fall(AlState.PREOP, code)
+
+    def _fall(self, state: AlState, code: int) -> None:
+        self.esc.watchdog.stop()
+        self._deadline_ns = None
+        self.device.al_state = state
+        self._refuse(code)
 
     def _has_mailbox(self) -> bool:
         return self.device.mailbox is not None and self.state in _WITH_MAILBOX

@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.foe_server import FoeServer
+from devicebus.sim.devices.drive import Axes
 from devicebus.sim.devices.objects import parse_entry
+from devicebus.sim.devices.pdoobjects import TX_PDO
 from devicebus.sim.faultydictionary import FaultyDictionary
 from devicebus.sim.slave import Slave
 from devicebus.sim.spec import FaultKind, FaultSpec
@@ -39,12 +41,37 @@ def _sdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
 
 
 def _emergency(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
-    """Report an error code, and with the end of the fault that there is none any more."""
+    """Report an error code, and with the end of the fault that there is none any more.
+
+    The axis of a drive fails besides, until it is reset.
+    """
+    del now_ns
+    device = slave.device
+    code = spec.code & 0xFFFF if on else 0
+    drives = device.behaviour.drives if isinstance(device.behaviour, Axes) else ()
+    if code and spec.axis < len(drives):
+        drives[spec.axis].fail(code)
+    else:
+        device.report_error(code, axis=spec.axis)
+
+
+def _tx_pdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Send a TxPDO through the mailbox that nobody asked for."""
     del now_ns
     mailbox = slave.device.mailbox
     server = mailbox.protocols.get(MailboxType.COE) if mailbox else None
-    if isinstance(server, CoeServer):
-        server.send_emergency(spec.code & 0xFFFF if on else 0, int(on))
+    index, _ = parse_entry(spec.object)
+    data = slave.device.process_data.read_pdo(index)
+    if on and isinstance(server, CoeServer) and data is not None:
+        server.send_tx_pdo(index - TX_PDO, data)
+
+
+def _eeprom(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Slow the EEPROM down; without a delay it acknowledges nothing."""
+    del now_ns
+    eeprom = slave.esc.eeprom
+    eeprom.extra_ns = 1000 * spec.delay_us if on else 0
+    eeprom.is_broken = on and not spec.delay_us
 
 
 def _al_error(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
@@ -70,7 +97,9 @@ SLAVE_FAULTS: dict[FaultKind, Callable[[Slave, FaultSpec, int, bool], None]] = {
     FaultKind.MAILBOX: _mailbox,
     FaultKind.FOE: _foe,
     FaultKind.SDO: _sdo,
+    FaultKind.EEPROM: _eeprom,
     FaultKind.EMERGENCY: _emergency,
+    FaultKind.TX_PDO: _tx_pdo,
     FaultKind.AL_ERROR: _al_error,
     FaultKind.REFUSE: _refuse,
     FaultKind.DRIFT: _drift,

@@ -9,6 +9,8 @@ from devicebus.sim.syncmanager import SyncChannel
 from devicebus.wire.alstatus import AlState, AlStatusCode
 from devicebus.wire.register import Register
 
+_BUFFERS = 3
+
 ALLOWED: dict[AlState, frozenset[AlState]] = {
     AlState.INIT: frozenset((AlState.INIT, AlState.PREOP, AlState.BOOT)),
     AlState.PREOP: frozenset((AlState.INIT, AlState.PREOP, AlState.SAFEOP)),
@@ -43,6 +45,8 @@ def check_process_data(esc: Esc, device: Device) -> AlStatusCode:
             return code
         if size and (channel.is_mailbox or channel.master_writes is not written):
             return AlStatusCode.SYNC_MANAGER
+        if size and any(_meet(channel, each) for each in esc.channels if each is not channel):
+            return AlStatusCode.SYNC_MANAGER
     return AlStatusCode.NO_ERROR
 
 
@@ -52,6 +56,13 @@ def check_clock(esc: Esc, device: Device) -> AlStatusCode:
     if (asked or device.needs_sync0) and not esc.clock.sync0_is_active:
         return AlStatusCode.DC_SYNC_CONFIGURATION
     return AlStatusCode.NO_ERROR
+
+
+def _meet(buffered: SyncChannel, other: SyncChannel) -> bool:
+    """Whether a channel lies where the three buffers of *buffered* are."""
+    end = buffered.start + _BUFFERS * buffered.length
+    other_end = other.start + (1 if other.is_mailbox else _BUFFERS) * other.length
+    return other.length > 0 and buffered.start < other_end and other.start < end
 
 
 def _is_mailbox(channel: SyncChannel) -> bool:

@@ -46,7 +46,8 @@ class ChannelSpec(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     type: str = "BOOL"
     object: str = ""
-    """Such as ``0x6041:0``; left out, the next of 0x6000 for inputs, of 0x7000 for outputs."""
+    """Such as ``0x6041:0``; left out, the next of 0x6000 for inputs, of 0x7000 for outputs;
+    ``0`` for padding that has no entry."""
     value: Value = 0
     noise: float = 0.0
     """Inputs: largest deviation from *value*, in steps of the type."""
@@ -56,6 +57,10 @@ class ChannelSpec(msgspec.Struct, frozen=True, kw_only=True):
     """Inputs: the same from a file with one value a line."""
     follows: str = ""
     """Inputs: the output of this slave that they show."""
+    pdo: U16 = 0
+    """The PDO that maps it; left out, 0x1A00 for inputs and 0x1600 for outputs."""
+    assigned: bool = True
+    """Whether that PDO is part of the process data until a master assigns others."""
     period_ms: Annotated[int, Meta(ge=1, le=3_600_000)] = 10
     """How long each value of *values*, of *csv* or of the noise lasts."""
 
@@ -133,6 +138,8 @@ class SlaveSpec(msgspec.Struct, frozen=True, kw_only=True):
     mailbox: MailboxSpec | None = MailboxSpec()
     clock: ClockSpec | None = ClockSpec()
     boot: bool = True
+    axes: Annotated[int, Meta(ge=1, le=8)] = 1
+    """Kind ``drive``: how many axes it has."""
     inputs: tuple[ChannelSpec, ...] = ()
     outputs: tuple[ChannelSpec, ...] = ()
     objects: tuple[ObjectSpec, ...] = ()
@@ -153,6 +160,8 @@ class FaultKind(Enum):
     MAILBOX = "mailbox"
     FOE = "foe"
     SDO = "sdo"
+    EEPROM = "eeprom"
+    TX_PDO = "tx-pdo"
     EMERGENCY = "emergency"
     AL_ERROR = "al-error"
     REFUSE = "refuse"
@@ -172,6 +181,8 @@ class FaultSpec(msgspec.Struct, frozen=True, kw_only=True):
     object: str = ""
     code: U32 = 0
     """SDO abort code, AL status code, or error code of an emergency."""
+    axis: Annotated[int, Meta(ge=0, le=7)] = 0
+    """Of a drive, for its emergency."""
     state: str = ""
     drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
 

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import partial
 
 from devicebus.sim.device import Device
+from devicebus.sim.devices.drive import Axes
 from devicebus.sim.devices.kinds import behave, complete, device_type
-from devicebus.sim.devices.objects import build_dictionary
+from devicebus.sim.devices.objects import INPUTS, OUTPUTS, build_dictionary, places
 from devicebus.sim.devices.protocols import build_mailbox
-from devicebus.sim.devices.siibuild import build_image, plan_channels
+from devicebus.sim.devices.siibuild import RAM, build_image, plan_channels
 from devicebus.sim.esc import Esc, EscSettings
 from devicebus.sim.segment import Cable, Segment
 from devicebus.sim.slave import Slave
-from devicebus.sim.spec import BusSpec, SlaveSpec
+from devicebus.sim.spec import BusSpec, ClockSpec, SlaveSpec
 
+_MII = 3
 _NONE: Mapping[str, bytes] = {}
 
 
-def build_slave(spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE) -> Slave:
-    """Make one slave; *resources* are the files that *spec* names.
+def build_slave(
+    spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE, *, ports: Iterable[int] = (0, 1)
+) -> Slave:
+    """Make one slave.
+
+    Args:
+        spec: What it is.
+        resources: The files that *spec* names.
+        ports: Those that it has.
 
     Raises:
         ValueError: a data type, a value or an entry in *spec* cannot be.
     """
     spec = complete(spec, resources)
     dictionary = build_dictionary(spec, device_type(spec))
-    behaviour, parameters = behave(spec, dictionary, resources)
+    behaviour, drives = behave(spec, dictionary, resources)
     device = Device(
         spec.name,
         dictionary,
@@ -33,6 +43,7 @@ def build_slave(spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE) -> Slav
         has_boot=spec.boot and spec.mailbox is not None,
         needs_sync0=spec.clock is not None and spec.clock.needs_sync0,
         identification=spec.alias,
+        channels=_channels(spec),
     )
     device.process_data.configure()
     layout = plan_channels(
@@ -41,10 +52,13 @@ def build_slave(spec: SlaveSpec, resources: Mapping[str, bytes] = _NONE) -> Slav
     device.output_channel = layout.output_channel
     device.input_channel = layout.input_channel
     if spec.mailbox is not None:
-        device.mailbox = build_mailbox(spec.mailbox, spec.files, device, parameters)
+        device.mailbox = build_mailbox(spec.mailbox, spec.files, device, drives)
+    if isinstance(behaviour, Axes):
+        for axis, drive in enumerate(behaviour.drives):
+            drive.report = partial(device.report_error, axis=axis)
     emulates = spec.mailbox is None and not layout.channels[0].length + layout.channels[1].length
-    image = build_image(spec, dictionary, layout, emulates=emulates)
-    return Slave(Esc(image, _settings(spec)), device)
+    image = build_image(spec, dictionary, layout, emulates=emulates, ports=ports)
+    return Slave(Esc(image, _settings(spec, ports)), device)
 
 
 def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Segment:
@@ -53,7 +67,6 @@ def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Segme
     Raises:
         ValueError: a slave cannot be made as described, or is wired to one that comes later.
     """
-    slaves = [build_slave(spec, resources) for spec in bus.slaves]
     numbers = {spec.name: number for number, spec in enumerate(bus.slaves)}
     cables = []
     for number, spec in enumerate(bus.slaves[1:], 1):
@@ -61,12 +74,33 @@ def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Segme
         if parent >= number:
             raise ValueError(f"{spec.name} is wired to {spec.after}, which comes later")
         cables.append(Cable(number, parent, spec.port))
+    ports = [{0, 1} for _ in bus.slaves]
+    for cable in cables:
+        ports[cable.parent].add(cable.parent_port)
+    slaves = [
+        build_slave(spec, resources, ports=there)
+        for spec, there in zip(bus.slaves, ports, strict=True)
+    ]
     ring_end = (len(slaves) - 1, 1) if bus.ring else None
     return Segment(slaves, cables, ring_end=ring_end, cable_ns=bus.cable_ns)
 
 
-def _settings(spec: SlaveSpec) -> EscSettings:
-    clock = spec.clock
-    if clock is None:
-        return EscSettings(has_dc=False)
-    return EscSettings(drift_ppm=clock.drift_ppm, local_start_ns=clock.start_ns)
+def _channels(spec: SlaveSpec) -> dict[str, tuple[int, int]]:
+    sides = ((spec.inputs, INPUTS), (spec.outputs, OUTPUTS))
+    return {
+        channel.name: place
+        for channels, base in sides
+        for channel, place in zip(channels, places(channels, base), strict=True)
+        if place[0]
+    }
+
+
+def _settings(spec: SlaveSpec, ports: Iterable[int]) -> EscSettings:
+    clock = spec.clock or ClockSpec()
+    return EscSettings(
+        ram=RAM,
+        port_descriptor=sum(_MII << 2 * port for port in ports),
+        has_dc=spec.clock is not None,
+        drift_ppm=clock.drift_ppm,
+        local_start_ns=clock.start_ns,
+    )

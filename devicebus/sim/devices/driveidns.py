@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from devicebus.errors import SoeError
 from devicebus.mailbox.soe_parameter import SoeParameter
 from devicebus.mailbox.soe_procedure import Procedure
-from devicebus.sim.devices.cia402 import DriveCommand, DriveState
+from devicebus.sim.devices.cia402 import DriveState
 from devicebus.sim.devices.drive import Drive
 from eap.codec.soe import Display, Idn, SoeAttribute
+from eap.codec.soeerror import SoeErrorCode, name_of
 
 _SWITCH_ON = 0xE000
 _SHUTDOWN, _ENABLE = 0x0006, 0x000F
 _RESET_NS = 10_000_000
+_HOMING_NS = 50_000_000
 _WORD = SoeAttribute(length=1, display=Display.HEXADECIMAL)
 _WORD_READ_ONLY = SoeAttribute(
     length=1, display=Display.HEXADECIMAL, protected_preop=1, protected_safeop=1, protected_op=1
@@ -56,6 +59,12 @@ def _words(drive: Drive) -> Iterator[SoeParameter]:
     )
     reset = Procedure(duration_ns=_RESET_NS, finish=lambda: _reset(drive))
     yield SoeParameter("S-0-0099", "Reset class 1 diagnostic", _COMMAND, procedure=reset)
+    home = Procedure(
+        duration_ns=_HOMING_NS,
+        start=lambda: _check_enabled(drive),
+        finish=lambda: _home(drive),
+    )
+    yield SoeParameter("S-0-0148", "Drive controlled homing", _COMMAND, procedure=home)
 
 
 def _set_points(drive: Drive) -> Iterator[SoeParameter]:
@@ -109,5 +118,18 @@ def _status(drive: Drive) -> bytes:
 
 
 def _reset(drive: Drive) -> bool:
-    drive.machine.process(DriveCommand.FAULT_RESET)
+    drive.reset()
     return True
+
+
+def _check_enabled(drive: Drive) -> None:
+    if not drive.machine.is_enabled:
+        code = SoeErrorCode.COMMAND_NOT_NOW
+        raise SoeError(name_of(code), code=code)
+
+
+def _home(drive: Drive) -> bool:
+    """Call the place where the axis is 0; an axis that was switched off meanwhile fails."""
+    if drive.machine.is_enabled:
+        drive.entry(0x607A).value = drive.entry(0x6064).value = 0
+    return drive.machine.is_enabled

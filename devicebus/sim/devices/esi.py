@@ -91,6 +91,7 @@ def _mailbox(device: Element) -> MailboxSpec | None:
         soe=mailbox.find("SoE") is not None,
         eoe=mailbox.find("EoE") is not None,
         voe=mailbox.find("VoE") is not None,
+        aoe=mailbox.find("AoE") is not None,
     )
 
 

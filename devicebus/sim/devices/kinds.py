@@ -44,14 +44,15 @@ def device_type(spec: SlaveSpec) -> int:
 
 def behave(
     spec: SlaveSpec, dictionary: ObjectDictionary, resources: Mapping[str, bytes]
-) -> tuple[Behaviour | None, list[SoeParameter]]:
-    """Return the behaviour of a device, if it has one, and its IDNs.
+) -> tuple[Behaviour | None, dict[int, list[SoeParameter]]]:
+    """Return the behaviour of a device, if it has one, and the IDNs of each of its axes.
 
     Raises:
         ValueError: an input cannot get its values from where it should.
     """
     if spec.kind is DeviceKind.DRIVE:
-        axis = drive.Drive(dictionary)
-        return axis, driveidns.parameters(axis, spec.name)
+        axes = drive.Axes(drive.Drive(dictionary, axis) for axis in range(spec.axes))
+        idns = (driveidns.parameters(axis, spec.name) for axis in axes.drives)
+        return axes, dict(enumerate(idns))
     signals = Signals(spec, dictionary, resources)
-    return signals or None, []
+    return signals or None, {}

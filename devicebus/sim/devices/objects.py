@@ -8,7 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from devicebus.sim.devices.pdoobjects import assignment, mapping
+from devicebus.sim.devices.pdoobjects import (
+    PDOS,
+    RX_ASSIGN,
+    RX_PDO,
+    TX_ASSIGN,
+    TX_PDO,
+    assignment,
+    mapping,
+)
 from devicebus.sim.faultydictionary import FaultyDictionary
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
 from eap.codec import datatypes
@@ -28,7 +36,6 @@ from eap.od.model import (
     variable,
 )
 
-RX_PDO, TX_PDO = 0x1600, 0x1A00
 OUTPUTS, INPUTS = 0x7000, 0x6000
 _ACCESS = {
     AccessKind.READ: RO,
@@ -78,20 +85,36 @@ def build_dictionary(spec: SlaveSpec, device_type: int) -> ObjectDictionary:
     dictionary = FaultyDictionary(_identity(spec, device_type))
     for each in spec.objects:
         dictionary.add(_object(each))
-    sides = (
-        (spec.outputs, OUTPUTS, RX_PDO, 0x1C12, RW | Access.RX_MAPPABLE),
-        (spec.inputs, INPUTS, TX_PDO, 0x1C13, RO | Access.TX_MAPPABLE),
-    )
-    for channels, base, pdo, assign, access in sides:
-        mapped = []
-        for channel, (index, subindex) in zip(channels, places(channels, base), strict=True):
-            entry = _add_entry(dictionary, index, subindex, channel, access)
-            mapped.append((index, subindex, entry.kind.bit_length))
-        if mapped:
-            dictionary.add(mapping(pdo, mapped, "RxPDO" if pdo == RX_PDO else "TxPDO"))
-        dictionary.add(assignment(assign, [pdo] if mapped else [], dictionary))
+    _add_side(dictionary, spec.outputs, OUTPUTS, RX_PDO, RW | Access.RX_MAPPABLE)
+    _add_side(dictionary, spec.inputs, INPUTS, TX_PDO, RO | Access.TX_MAPPABLE)
     dictionary.add(array(0x1C00, "Sync manager type", "USINT", _SM_TYPES))
     return dictionary
+
+
+def _add_side(
+    dictionary: ObjectDictionary,
+    channels: Sequence[ChannelSpec],
+    base: int,
+    first_pdo: int,
+    access: Access,
+) -> None:
+    """Add the entries of one direction, the PDOs that map them, and which of these count."""
+    pdos: dict[int, list[tuple[int, int, int]]] = {}
+    assigned: dict[int, bool] = {}
+    for channel, (index, subindex) in zip(channels, places(channels, base), strict=True):
+        if index:
+            bits = _add_entry(dictionary, index, subindex, channel, access).kind.bit_length
+        else:
+            bits = datatypes.parse(channel.type).bit_length
+        pdo = channel.pdo or first_pdo
+        if not 0 <= pdo - first_pdo < PDOS:
+            raise ValueError(f"{channel.name}: 0x{pdo:04X} is no PDO of its direction")
+        pdos.setdefault(pdo, []).append((index, subindex, bits))
+        assigned[pdo] = assigned.get(pdo, False) or channel.assigned
+    for pdo, mapped in pdos.items():
+        dictionary.add(mapping(pdo, mapped, dictionary))
+    assign = RX_ASSIGN if first_pdo == RX_PDO else TX_ASSIGN
+    dictionary.add(assignment(assign, [pdo for pdo in pdos if assigned[pdo]], dictionary))
 
 
 def _identity(spec: SlaveSpec, device_type: int) -> Iterable[OdObject]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
+from devicebus.mailbox.ads_server import AdsServer
+from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.eoe_server import EoeServer
 from devicebus.mailbox.foe_server import FoeServer
@@ -14,8 +16,10 @@ from devicebus.mailbox.soe_parameter import SoeParameter
 from devicebus.mailbox.soe_server import SoeServer
 from devicebus.mailbox.voe_server import VoeServer
 from devicebus.sim.device import Device
+from devicebus.sim.devices.pdoobjects import RX_PDO, TX_PDO
 from devicebus.sim.spec import FileSpec, MailboxSpec
 from devicebus.wire.alstatus import AlState
+from eap.codec.coe import CoeService
 from eap.codec.mailbox import MailboxType
 
 
@@ -23,23 +27,42 @@ def build_mailbox(
     spec: MailboxSpec,
     files: Iterable[FileSpec],
     device: Device,
-    parameters: Iterable[SoeParameter] = (),
+    drives: Mapping[int, Iterable[SoeParameter]] | None = None,
 ) -> MailboxServer:
-    """Make the servers of *device*; SoE has *parameters*, VoE echoes."""
+    """Make the servers of *device*; SoE has the IDNs of *drives*, VoE echoes."""
     sizes = MailboxSizes(spec.size, spec.size)
     servers: dict[MailboxType, ProtocolServer] = {}
     if spec.coe:
-        servers[MailboxType.COE] = CoeServer(device.dictionary, device.od_state, sizes)
+        servers[MailboxType.COE] = _coe(device, sizes)
     if spec.foe:
         store = MemoryStore(map(_file, files), is_boot=lambda: device.al_state is AlState.BOOT)
         servers[MailboxType.FOE] = FoeServer(store, sizes)
     if spec.soe:
-        servers[MailboxType.SOE] = SoeServer({0: parameters}, device.od_state, sizes)
+        servers[MailboxType.SOE] = SoeServer(drives or {0: ()}, device.od_state, sizes)
     if spec.eoe:
         servers[MailboxType.EOE] = EoeServer(sizes)
     if spec.voe:
         servers[MailboxType.VOE] = VoeServer()
+    if spec.aoe:
+        ads = AdsServer(device.dictionary, device.od_state, device.name)
+        servers[MailboxType.AOE] = AoeServer(ads, sizes, forget=ads.forget)
     return MailboxServer(servers, sizes)
+
+
+def _coe(device: Device, sizes: MailboxSizes) -> CoeServer:
+    """Its PDOs go through the mailbox as well, by the number behind 0x1600 or 0x1A00."""
+    process_data = device.process_data
+
+    def read_pdo(service: CoeService, number: int) -> bytes | None:
+        base = TX_PDO if service is CoeService.TX_PDO else RX_PDO
+        return process_data.read_pdo(base + number)
+
+    def write_pdo(number: int, data: bytes) -> bool:
+        return process_data.write_pdo(RX_PDO + number, data)
+
+    return CoeServer(
+        device.dictionary, device.od_state, sizes, read_pdo=read_pdo, write_pdo=write_pdo
+    )
 
 
 def _file(spec: FileSpec) -> MemoryFile:

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
-from devicebus.sim.devices.objects import RX_PDO, TX_PDO
-from devicebus.sim.spec import MailboxSpec, SlaveSpec
+import msgspec
+
+from devicebus.sim.devices.pdoobjects import (
+    MIN_ROOM,
+    PDOS,
+    RX_ASSIGN,
+    RX_PDO,
+    TX_ASSIGN,
+    TX_PDO,
+)
+from devicebus.sim.spec import DeviceKind, MailboxSpec, SlaveSpec
 from devicebus.wire import sii
 from devicebus.wire.sii import Sii, SiiPdo, SiiProtocol
 from devicebus.wire.siirecord import (
@@ -23,8 +33,34 @@ PDI_DIGITAL = 0x0004
 DEVICE_EMULATION = 0x0100
 """In word 0 the high octet is the ESC configuration."""
 IMAGE_SIZE = 2048
+RAM = 8192
 _FIRST = 0x1000
 _NAME, _GROUP = 1, 2
+_NOT_ASSIGNED = 0xFF
+_MAX_STRINGS = 255
+_MAX_STRING = 255
+_KIBIT = 128
+_MII = 1
+
+
+class _Strings:
+    """The texts of an image, each once, by the number that other categories use."""
+
+    def __init__(self, *texts: str) -> None:
+        self.texts = list(texts)
+
+    def number(self, text: str) -> int:
+        """Return the number of *text*, 0 if it cannot be told."""
+        if text in self.texts:
+            return self.texts.index(text) + 1
+        try:
+            size = len(text.encode("latin-1"))
+        except UnicodeEncodeError:
+            return 0
+        if not 0 < size <= _MAX_STRING or len(self.texts) >= _MAX_STRINGS:
+            return 0
+        self.texts.append(text)
+        return len(self.texts)
 
 
 class Layout(NamedTuple):
@@ -36,7 +72,13 @@ class Layout(NamedTuple):
 
 
 def plan_channels(mailbox: MailboxSpec | None, output_size: int, input_size: int) -> Layout:
-    """Place mailboxes and process data; each buffered area has room for its three buffers."""
+    """Place mailboxes and process data; each buffered area has room for its three buffers.
+
+    There is room as well for what a master may map beside.
+
+    Raises:
+        ValueError: the memory of a controller is too small.
+    """
     channels = []
     at = _FIRST
     if mailbox is not None:
@@ -46,19 +88,41 @@ def plan_channels(mailbox: MailboxSpec | None, output_size: int, input_size: int
     first = len(channels)
     at = (at + 7) // 8 * 8
     channels.append(SiiSyncManager(at, output_size, 0x64, enable=int(output_size > 0), type=3))
-    at = (at + 3 * output_size + 7) // 8 * 8
+    at = (at + 3 * max(output_size, MIN_ROOM) + 7) // 8 * 8
     channels.append(SiiSyncManager(at, input_size, 0x20, enable=int(input_size > 0), type=4))
+    end = at + 3 * max(input_size, MIN_ROOM)
+    if end > _FIRST + RAM:
+        raise ValueError(
+            f"mailboxes and process data, three times each, take {end - _FIRST} octets,"
+            f" expected at most {RAM}"
+        )
     return Layout(tuple(channels), first, first + 1)
 
 
 def build_image(
-    spec: SlaveSpec, dictionary: ObjectDictionary, layout: Layout, *, emulates: bool
+    spec: SlaveSpec,
+    dictionary: ObjectDictionary,
+    layout: Layout,
+    *,
+    emulates: bool,
+    ports: Iterable[int] = (0, 1),
 ) -> bytes:
-    """Return the image of 2 KiB."""
+    """Return the image: 2 KiB, or as many as it takes.
+
+    Args:
+        spec: What the slave is.
+        dictionary: Its objects, for the PDOs.
+        layout: Its sync managers.
+        emulates: Whether its controller needs no application.
+        ports: Those that it has.
+    """
     mailbox = spec.mailbox
     size = mailbox.size if mailbox else 0
     boot = size if spec.boot else 0
     second = _FIRST + size
+    strings = _Strings(spec.name, spec.kind.value)
+    rx_pdos = _pdos(dictionary, RX_PDO, layout.output_channel, strings)
+    tx_pdos = _pdos(dictionary, TX_PDO, layout.input_channel, strings)
     fixed = SiiFixed(
         pdi_control=PDI_DIGITAL | DEVICE_EMULATION if emulates else PDI_SPI,
         alias=spec.alias,
@@ -75,24 +139,32 @@ def build_image(
         send_offset=second if size else 0,
         send_size=size,
         protocols=_protocols(mailbox),
-        size=IMAGE_SIZE // 128 - 1,
     )
-    image = sii.encode(
+    return _fill(
         Sii(
             fixed=fixed,
-            strings=(spec.name, spec.kind.value),
-            general=_general(spec),
+            strings=tuple(strings.texts),
+            general=_general(spec, ports),
             fmmus=(1, 2, 3) if mailbox else (1, 2),
             sync_managers=layout.channels,
-            rx_pdos=_pdos(dictionary, RX_PDO, layout.output_channel),
-            tx_pdos=_pdos(dictionary, TX_PDO, layout.input_channel),
+            rx_pdos=rx_pdos,
+            tx_pdos=tx_pdos,
             dc=(SiiDc(assign_activate=0x0300, sync0_factor=1),) if spec.clock else (),
         )
     )
-    return image.ljust(IMAGE_SIZE, b"\xff")
 
 
-def _general(spec: SlaveSpec) -> SiiGeneral:
+def _fill(image: Sii) -> bytes:
+    """Return the octets of an EEPROM that is large enough, which says how large it is."""
+    octets = sii.encode(image)
+    size = IMAGE_SIZE
+    while size < len(octets):
+        size *= 2
+    fixed = msgspec.structs.replace(image.fixed, size=size // _KIBIT - 1)
+    return sii.encode(msgspec.structs.replace(image, fixed=fixed)).ljust(size, b"\xff")
+
+
+def _general(spec: SlaveSpec, ports: Iterable[int]) -> SiiGeneral:
     mailbox = spec.mailbox
     coe = int(mailbox is not None and mailbox.coe)
     return SiiGeneral(
@@ -102,11 +174,13 @@ def _general(spec: SlaveSpec) -> SiiGeneral:
         coe_sdo=coe,
         coe_info=coe,
         coe_pdo_assign=coe,
+        coe_pdo_configuration=coe,
         coe_complete_access=coe,
         foe=int(mailbox is not None and mailbox.foe),
         eoe=int(mailbox is not None and mailbox.eoe),
-        soe_channels=int(mailbox is not None and mailbox.soe),
-        port_physics=0x1111,
+        soe_channels=spec.axes if mailbox is not None and mailbox.soe else 0,
+        ds402_channels=spec.axes if spec.kind is DeviceKind.DRIVE else 0,
+        port_physics=sum(_MII << 4 * port for port in ports),
     )
 
 
@@ -119,18 +193,50 @@ def _protocols(mailbox: MailboxSpec | None) -> int:
         (mailbox.soe, SiiProtocol.SOE),
         (mailbox.eoe, SiiProtocol.EOE),
         (mailbox.voe, SiiProtocol.VOE),
+        (mailbox.aoe, SiiProtocol.AOE),
     )
     return sum(bit for wanted, bit in chosen if wanted)
 
 
-def _pdos(dictionary: ObjectDictionary, index: int, channel: int) -> tuple[SiiPdo, ...]:
-    if index not in dictionary:
-        return ()
-    item = dictionary[index]
-    entries = []
-    for sub in range(1, item.max_subindex + 1):
-        mapped = int.from_bytes(item.entries[sub].octets, "little")
-        place = mapped >> 16, mapped >> 8 & 0xFF
-        code = dictionary.entry(*place).kind.code if place[0] else 0
-        entries.append(SiiPdoEntry(*place, data_type=code & 0xFF, bit_length=mapped & 0xFF))
-    return (SiiPdo(SiiPdoHeader(index, len(entries), channel), tuple(entries)),)
+def _pdos(
+    dictionary: ObjectDictionary, base: int, channel: int, strings: _Strings
+) -> tuple[SiiPdo, ...]:
+    found = [item for item in dictionary if 0 <= item.index - base < PDOS]
+    assign = dictionary[RX_ASSIGN if base == RX_PDO else TX_ASSIGN]
+    assigned = [assign.entries[sub].value for sub in range(1, assign.max_subindex + 1)]
+    found.sort(key=lambda item: _rank(assigned, item.index))
+    title = "Outputs" if base == RX_PDO else "Inputs"
+    return tuple(
+        SiiPdo(
+            SiiPdoHeader(
+                item.index,
+                item.max_subindex,
+                channel if item.index in assigned else _NOT_ASSIGNED,
+                name=strings.number(title if len(found) == 1 else f"{title} {item.index - base}"),
+            ),
+            tuple(
+                _pdo_entry(dictionary, item.entries[sub].value, strings)
+                for sub in range(1, item.max_subindex + 1)
+            ),
+        )
+        for item in found
+    )
+
+
+def _rank(assigned: list[int], index: int) -> int:
+    """PDOs that are assigned come first, in the order in which they lie in the data."""
+    return assigned.index(index) if index in assigned else len(assigned)
+
+
+def _pdo_entry(dictionary: ObjectDictionary, number: int, strings: _Strings) -> SiiPdoEntry:
+    index, subindex, bits = number >> 16, number >> 8 & 0xFF, number & 0xFF
+    if not index:
+        return SiiPdoEntry(0, 0, bit_length=bits)
+    entry = dictionary.entry(index, subindex)
+    return SiiPdoEntry(
+        index,
+        subindex,
+        name=strings.number(entry.name),
+        data_type=entry.kind.code & 0xFF,
+        bit_length=bits,
+    )

@@ -6,8 +6,9 @@ import pytest
 
 from devicebus.sim.device import Device
 from devicebus.wire.alstatus import AlState
+from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
-from eap.od.model import OdState
+from eap.od.model import RO, OdState, variable
 
 
 @pytest.mark.parametrize(
@@ -32,3 +33,48 @@ def test_behaviour_gets_state_and_time():
     device.step(7)
     Device("still", ObjectDictionary()).step(8)
     assert seen == [(AlState.INIT, 7)]
+
+
+class Counter:
+    """Counts up what it finds in an entry."""
+
+    def __init__(self, dictionary):
+        self.seen = []
+        self._entry = dictionary.entry(0x6000, 0)
+
+    def step(self, state, now_ns):
+        self.seen.append(self._entry.value)
+        self._entry.value += 1
+
+
+def test_override_stays_until_it_is_released():
+    dictionary = ObjectDictionary([variable(0x6000, "count", "UINT", RO, 5)])
+    counter = Counter(dictionary)
+    device = Device("d", dictionary, behaviour=counter)
+    device.step(0)
+    for value in (100, 200):
+        device.override(0x6000, 0, value)
+        assert dictionary.entry(0x6000, 0).value == value
+        device.step(1)
+        assert (counter.seen[-1], dictionary.entry(0x6000, 0).value) == (value, value)
+    assert device.release(0x6000, 0)
+    assert dictionary.entry(0x6000, 0).value == 6
+    device.step(2)
+    assert dictionary.entry(0x6000, 0).value == 7
+    assert not device.release(0x6000, 0)
+
+
+def test_override_with_what_is_no_value():
+    device = Device("d", ObjectDictionary([variable(0x6000, "count", "UINT", RO, 5)]))
+    with pytest.raises(ValueError, match="70000 is not a value of UINT"):
+        device.override(0x6000, 0, 70000)
+    assert not device.release(0x6000, 0)
+    with pytest.raises(SdoAbortError):
+        device.override(0x6001, 0, 1)
+
+
+def test_error_of_a_device_without_mailbox_shows_in_its_register():
+    device = Device("d", ObjectDictionary([variable(0x1001, "Error", "USINT", RO)]))
+    device.report_error(0x1000)
+    assert device.dictionary.entry(0x1001, 0).value == 1
+    Device("bare", ObjectDictionary()).report_error(0x1000)

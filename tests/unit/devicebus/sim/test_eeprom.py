@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.sim.eeprom import Eeprom
+from devicebus.sim.eeprom import READ_NS, RELOAD_NS, WRITE_NS, Eeprom
 from devicebus.wire import sii
 from devicebus.wire.register import EepromCommand, EepromControl, Register
 from devicebus.wire.sii import Sii
@@ -22,7 +22,7 @@ def memory():
 
 @pytest.fixture
 def eeprom(memory):
-    return Eeprom(memory, IMAGE)
+    return Eeprom(memory, bytearray(IMAGE))
 
 
 def command(eeprom, memory, what, word=0, *, write_enable=0, data=b""):
@@ -30,7 +30,8 @@ def command(eeprom, memory, what, word=0, *, write_enable=0, data=b""):
     memory[Register.EEPROM_ADDRESS : Register.EEPROM_ADDRESS + 4] = word.to_bytes(4, "little")
     control = EepromControl(write_enable=write_enable, command=what)
     memory[Register.EEPROM_CONTROL : Register.EEPROM_CONTROL + 2] = control.encode()
-    eeprom.control_written()
+    eeprom.control_written(0)
+    eeprom.settle(WRITE_NS)
     return EepromControl.decode(memory, Register.EEPROM_CONTROL)
 
 
@@ -44,6 +45,33 @@ def test_read_gives_eight_octets(eeprom, memory):
     status = command(eeprom, memory, EepromCommand.READ, 8)
     assert memory[0x0508:0x0510] == bytes.fromhex("01efcdab 07000000")
     assert (status.read_eight, status.busy, status.command_error) == (1, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("what", "took_ns"),
+    [(EepromCommand.READ, READ_NS), (EepromCommand.WRITE, WRITE_NS),
+     (EepromCommand.RELOAD, RELOAD_NS)],
+)  # fmt: skip
+def test_command_takes_its_time(eeprom, memory, what, took_ns):
+    control = EepromControl(write_enable=1, command=what)
+    memory[0x0502:0x0504] = control.encode()
+    memory[0x0508:0x050A] = b"\x55\xaa"
+    eeprom.control_written(1000)
+    eeprom.settle(1000 + took_ns - 1)
+    status = EepromControl.decode(memory, Register.EEPROM_CONTROL)
+    assert (status.busy, status.command) == (1, what)
+    assert eeprom.busy_until_ns == 1000 + took_ns
+    eeprom.settle(1000 + took_ns)
+    status = EepromControl.decode(memory, Register.EEPROM_CONTROL)
+    assert (status.busy, status.command, eeprom.busy_until_ns) == (0, 0, None)
+    assert (eeprom.image[:2] == b"\x55\xaa") is (what is EepromCommand.WRITE)
+
+
+def test_broken_eeprom_acknowledges_nothing(eeprom, memory):
+    eeprom.is_broken = True
+    status = command(eeprom, memory, EepromCommand.WRITE, 4, write_enable=1, data=b"\x78\x56")
+    assert (status.command_error, status.busy) == (1, 0)
+    assert eeprom.image == IMAGE
 
 
 def test_read_behind_the_end_is_erased(eeprom, memory):
@@ -76,7 +104,7 @@ def test_reload_judges_the_check_sum_and_leaves_the_alias(eeprom, memory):
 
 
 def test_image_with_a_wrong_check_sum_loads_nothing(memory):
-    Eeprom(memory, bytes(256))
+    Eeprom(memory, bytearray(256))
     assert EepromControl.decode(memory, Register.EEPROM_CONTROL).crc_error
     assert memory[0x0012:0x0014] == bytes(2)
 

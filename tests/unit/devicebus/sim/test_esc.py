@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from devicebus.sim.eeprom import READ_NS, WRITE_NS
 from devicebus.sim.esc import Esc, EscSettings
 from devicebus.wire import sii
 from devicebus.wire.register import AlEvent, Fmmu, Register, SyncManager
@@ -91,8 +92,10 @@ def test_any_write_clears_a_counter(esc, group):
 
 def test_eeprom_through_one_write(esc):
     assert esc.write(0x0502, bytes.fromhex("000108000000"), 0)
-    assert esc.read(0x0502, 2, 0) == b"\xc0\x00"
-    assert esc.read(0x0508, 4, 0) == b"\3\0\0\0"
+    assert esc.read(0x0502, 2, READ_NS - 1) == b"\xc0\x81"
+    assert not esc.write(0x0502, bytes.fromhex("000100000000"), READ_NS - 1)
+    assert esc.read(0x0502, 2, READ_NS) == b"\xc0\x00"
+    assert esc.read(0x0508, 4, READ_NS) == b"\3\0\0\0"
 
 
 def test_eeprom_of_the_slave_is_out_of_reach(esc):
@@ -105,7 +108,10 @@ def test_eeprom_of_the_slave_is_out_of_reach(esc):
 def test_eeprom_outlives_the_power(esc):
     esc.write(0x0508, b"\x99\x00", 0)
     esc.write(0x0502, bytes.fromhex("010208000000"), 0)
-    esc.write(0x0010, b"\x05\x00", 0)
+    assert esc.read(0x0502, 2, WRITE_NS) == b"\xc0\x00"
+    esc.write(0x0508, b"\x77\x00", WRITE_NS)
+    esc.write(0x0502, bytes.fromhex("010208000000"), WRITE_NS)  # the power goes before it is done
+    esc.write(0x0010, b"\x05\x00", WRITE_NS)
     esc.power_on()
     assert esc.station == 0
     assert esc.image[16:18] == b"\x99\x00"

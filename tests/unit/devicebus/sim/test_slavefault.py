@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from devicebus.sim.slavefault import SLAVE_FAULTS
-from devicebus.sim.spec import FaultKind, FaultSpec
+from devicebus.sim.spec import DeviceKind, FaultKind, FaultSpec, SlaveSpec
 from devicebus.wire.alstatus import ERROR, AlState, AlStatusCode
+from devicebus.wire.register import EepromControl
 from eap.codec.mailbox import MailboxType
 from tests.support.bus import Bench
 
@@ -98,3 +99,44 @@ def test_drift(bench):
     bench.now_ns = 10**9
     switch(bench, "drift", on=False)
     assert clock.local_time(2 * 10**9) == 2 * 10**9 + 10**5
+
+
+def test_emergency_of_an_axis_is_a_fault_of_it():
+    bench = Bench(SlaveSpec(name="slave", kind=DeviceKind.DRIVE, axes=2))
+    switch(bench, "emergency", code=0x7500, axis=1)
+    dictionary = bench.slaves[0].device.dictionary
+    assert [dictionary.entry(index, 0).value for index in (0x603F, 0x683F)] == [0, 0x7500]
+    switch(bench, "emergency", code=0x7500, axis=1, on=False)
+    assert dictionary.entry(0x6841, 0).value & 0x6F == 8
+
+
+def test_pdo_that_nobody_asked_for(bench):
+    bench.slaves[0].device.dictionary.entry(0x6000, 1).value = 0x1234
+    switch(bench, "tx-pdo", object="0x1A00")
+    bench.now_ns += 2_000_000
+    bench.status()
+    assert bench.fetch().data[6:11] == bytes.fromhex("0040 3412 00")
+    for object_, on in (("0x1A07", True), ("0x1A00", False)):
+        switch(bench, "tx-pdo", object=object_, on=on)
+        bench.now_ns += 2_000_000
+        bench.status()
+        assert bench.fetch().wkc == 0
+
+
+def test_slow_and_broken_eeprom(bench):
+    def take_ns():
+        bench.write(0x0502, bytes.fromhex("0001 08000000"))
+        for wait_us in range(0, 5000, 50):
+            bench.now_ns += 50_000
+            status = EepromControl.decode(bench.read(0x0502, 2).data)
+            if not status.busy:
+                return wait_us, status.command_error
+        return None
+
+    assert take_ns() == (0, 0)
+    switch(bench, "eeprom", delay_us=1000)
+    assert take_ns() == (1000, 0)
+    switch(bench, "eeprom")
+    assert take_ns() == (0, 1)
+    switch(bench, "eeprom", on=False)
+    assert take_ns() == (0, 0)

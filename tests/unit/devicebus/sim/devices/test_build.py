@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 
 from devicebus.sim.devices.build import build_segment, build_slave
-from devicebus.sim.spec import BusSpec, ClockSpec
+from devicebus.sim.spec import BusSpec, ChannelSpec, ClockSpec, DeviceKind, MailboxSpec, SlaveSpec
 from devicebus.sim.wiring import Side
 from devicebus.wire.datagram import Command, encode_frame
+from eap.codec.mailbox import MailboxType
 from tests.support.bus import datagram, generic, send
 
 
@@ -48,6 +49,36 @@ def test_clock_as_described():
     assert slave.esc.clock.local_time(10**9) == 5 + 10**9 + 10_000
     assert slave.device.needs_sync0
     assert build_slave(generic(clock=None)).esc.read(0x0910, 8, 0) is None
+
+
+def test_ports_follow_the_wiring():
+    segment = build_segment(bus(generic("a"), generic("b", after="a", port=3), generic("c")))
+    assert [slave.esc.peek(7, 1)[0] for slave in segment.slaves] == [0xCF, 0x0F, 0x0F]
+
+
+def test_axis_that_fails_reports_it():
+    slave = build_slave(SlaveSpec(name="d", kind=DeviceKind.DRIVE, axes=2,
+                                  mailbox=MailboxSpec(soe=True)))  # fmt: skip
+    slave.device.behaviour.drives[1].fail(0x7500)
+    servers = slave.device.mailbox.protocols
+    assert servers[MailboxType.COE].messages_to_send(0) == [
+        bytes.fromhex("0010 0075 01") + bytes(5)
+    ]
+    (message,) = servers[MailboxType.SOE].messages_to_send(0)
+    assert message[0] == 6 | 1 << 5
+    assert message[4:7] == bytes.fromhex("0075 01")
+    assert slave.device.dictionary.entry(0x1001, 0).value == 1
+    slave.device.behaviour.drives[1].reset()
+    assert servers[MailboxType.COE].messages_to_send(0) == [
+        bytes.fromhex("0010 0000 00") + bytes(5)
+    ]
+    assert slave.device.dictionary.entry(0x1001, 0).value == 0
+
+
+def test_channels_have_names():
+    slave = build_slave(generic(inputs=(ChannelSpec(name="gap", type="BIT7", object="0"),
+                                        ChannelSpec(name="a"))))  # fmt: skip
+    assert slave.device.channels == {"a": (0x6000, 1), "speed": (0x7000, 1), "valve": (0x7000, 2)}
 
 
 def test_boot_needs_a_mailbox():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.sim.devices.drive import Drive, complete
+from devicebus.sim.devices.drive import FOLLOWING_ERROR, Axes, Drive, complete
 from devicebus.sim.devices.objects import build_dictionary
 from devicebus.sim.spec import ChannelSpec, DeviceKind, ObjectSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
@@ -109,3 +109,44 @@ def test_fault_has_a_code_and_is_reset(drive):
     assert (status(drive), drive.entry(0x603F).value) == (0x08, 0x7500)
     drive.command(0x80)
     assert (status(drive), drive.entry(0x6040).value) == (0x40, 0x80)
+    assert drive.entry(0x603F).value == 0
+
+
+def test_fault_and_its_end_are_reported(drive):
+    reported = []
+    drive.report = reported.append
+    enable(drive)
+    drive.fail(0x7500)
+    drive.step(AlState.OP, 10)
+    drive.entry(0x6040).value = 0x80
+    drive.step(AlState.OP, 11)
+    drive.reset()
+    assert reported == [0x7500, 0]
+
+
+def test_axis_that_cannot_follow_fails(drive):
+    drive.entry(0x6065).value = 100
+    enable(drive)
+    drive.entry(0x607A).value = 100
+    drive.step(AlState.OP, 10)
+    assert drive.entry(0x6064).value == 100
+    drive.entry(0x607A).value = -1
+    drive.step(AlState.OP, 11)
+    assert (status(drive), drive.entry(0x603F).value) == (0x08, FOLLOWING_ERROR)
+    assert drive.entry(0x6064).value == 100
+
+
+def test_axes_have_objects_and_pdos_of_their_own():
+    spec = complete(SlaveSpec(name="d", kind=DeviceKind.DRIVE, axes=2))
+    assert [each.name for each in spec.outputs] == [
+        "controlword", "target_position", "controlword_1", "target_position_1",
+    ]  # fmt: skip
+    dictionary = build_dictionary(spec, 0x20192)
+    assert [dictionary.entry(0x1C12, sub).value for sub in (0, 1, 2)] == [2, 0x1600, 0x1610]
+    assert dictionary.entry(0x1A10, 1).value == 0x6841_0010
+    axes = Axes(Drive(dictionary, axis) for axis in range(2))
+    for number, word in enumerate((6, 7, 15)):
+        axes.drives[1].entry(0x6040).value = word
+        axes.step(AlState.OP, number)
+    assert [status(drive) for drive in axes.drives] == [0x40, 0x27]
+    assert dictionary.entry(0x6841, 0).value & 0x6F == 0x27

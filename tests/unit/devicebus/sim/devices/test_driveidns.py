@@ -73,3 +73,22 @@ def test_fault_is_reset_by_a_procedure(drive, idns):
     assert idns["S-0-0099"].read(Element.DATA_STATE, 1000) == b"\7\0"
     assert idns["S-0-0099"].read(Element.DATA_STATE, 10_000_000) == b"\3\0"
     assert read(idns, "S-0-0135") == b"\0\0"
+
+
+def test_homing_takes_its_time_and_an_axis_that_is_on(drive, idns):
+    with pytest.raises(SoeError) as caught:
+        write(idns, "S-0-0148", b"\3\0")
+    assert caught.value.code == 0x7012
+    write(idns, "S-0-0134", b"\0\xe0")
+    drive.entry(0x6064).value = drive.entry(0x607A).value = 900
+    write(idns, "S-0-0148", b"\3\0")
+    assert idns["S-0-0148"].read(Element.DATA_STATE, 49_999_999) == b"\7\0"
+    assert idns["S-0-0148"].read(Element.DATA_STATE, 50_000_000) == b"\3\0"
+    assert read(idns, "S-0-0051") == bytes(4)
+
+
+def test_homing_of_an_axis_that_is_switched_off_fails(drive, idns):
+    write(idns, "S-0-0134", b"\0\xe0")
+    write(idns, "S-0-0148", b"\3\0")
+    write(idns, "S-0-0134", b"\0\0")
+    assert idns["S-0-0148"].read(Element.DATA_STATE, 50_000_000) == b"\x0f\0"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.sim.devices.build import build_slave
-from devicebus.sim.devices.drive import Drive
+from devicebus.sim.devices.drive import Axes
 from devicebus.sim.devices.kinds import complete, device_type
 from devicebus.sim.devices.signal import Signals
 from devicebus.sim.spec import ChannelSpec, DeviceKind, SlaveSpec
@@ -26,7 +26,7 @@ def test_profile_of_a_drive():
 
 
 def test_behaviour():
-    assert isinstance(build_slave(spec("drive")).device.behaviour, Drive)
+    assert isinstance(build_slave(spec("drive")).device.behaviour, Axes)
     assert build_slave(spec("digital")).device.behaviour is None
     noisy = spec("analogue", inputs=(ChannelSpec(name="a", type="INT", noise=1),))
     assert isinstance(build_slave(noisy).device.behaviour, Signals)

@@ -45,12 +45,31 @@ def test_identity_and_names():
 
 def test_pdos_map_the_channels():
     dictionary = build_dictionary(generic(), 5001)
-    assert [entry.value for entry in dictionary[0x1A00].entries.values()] == [
-        3, 0x6000_0110, 0x6000_0201, 7,
-    ]  # fmt: skip
+    assert dictionary[0x1A00].max_subindex == 3
+    mapped = [dictionary.entry(0x1A00, sub).value for sub in (1, 2, 3)]
+    assert mapped == [0x6000_0110, 0x6000_0201, 7]
     assert dictionary[0x6000].name == "Inputs"
     assert dictionary[0x7000].entries[2].name == "valve"
     assert dictionary.entry(0x1C12, 1).value == 0x1600
+
+
+def test_channels_in_several_pdos_with_padding():
+    inputs = (
+        ChannelSpec(name="a", pdo=0x1A03),
+        ChannelSpec(name="gap", type="BIT7", object="0", pdo=0x1A03),
+        ChannelSpec(name="b", type="UINT", pdo=0x1A01),
+        ChannelSpec(name="c", pdo=0x1A05, assigned=False),
+    )
+    dictionary = build_dictionary(generic(inputs=inputs), 5001)
+    assert [dictionary.entry(0x1A03, sub).value for sub in (0, 1, 2)] == [2, 0x6000_0101, 7]
+    assert [dictionary.entry(0x1C13, sub).value for sub in (0, 1, 2)] == [2, 0x1A03, 0x1A01]
+    assert dictionary.entry(0x1A05, 1).value == 0x6000_0301
+
+
+@pytest.mark.parametrize("pdo", [0x1600, 0x1C00, 5])
+def test_pdo_of_the_other_direction(pdo):
+    with pytest.raises(ValueError, match="no PDO of its direction"):
+        build_dictionary(generic(inputs=(ChannelSpec(name="a", pdo=pdo),)), 5001)
 
 
 def test_device_without_outputs_assigns_nothing():

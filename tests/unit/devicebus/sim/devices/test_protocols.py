@@ -9,9 +9,13 @@ from devicebus.sim.devices.build import build_slave
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.spec import DeviceKind, FileSpec, MailboxSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
+from eap.codec.ads import AdsRange
+from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_message, encode_message
+from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
+from tests.support.bus import generic
 
 
 def make(spec, files=()):
@@ -61,6 +65,51 @@ def test_voe_echoes_and_eoe_answers():
     message = bytes.fromhex("34120000 0500 aabb")
     assert ask(mailbox, MailboxType.VOE, message) == (MailboxType.VOE, message)
     assert ask(mailbox, MailboxType.EOE, bytes.fromhex("06000000"))[0] is MailboxType.EOE
+
+
+def test_pdos_go_through_the_mailbox():
+    slave = build_slave(generic())
+    mailbox, dictionary = slave.device.mailbox, slave.device.dictionary
+    mailbox.start(256, 256)
+    write = bytes.fromhex("0050 3412 01")  # RxPDO 0
+    mailbox.receive_message(encode_message(MailboxHeader(0, type=MailboxType.COE), write), 0)
+    assert mailbox.next_message(0) is None
+    assert (dictionary.entry(0x7000, 1).value, dictionary.entry(0x7000, 2).value) == (0x1234, True)
+    assert ask(mailbox, MailboxType.COE, bytes.fromhex("0070")) == (MailboxType.COE, write)
+    dictionary.entry(0x6000, 1).value = 0x5678
+    assert ask(mailbox, MailboxType.COE, bytes.fromhex("0060")) == (
+        MailboxType.COE, bytes.fromhex("0040 7856 00"),
+    )  # fmt: skip
+    for refused in ("0050 3412", "0150 3412 01", "0160", "0170"):
+        assert ask(mailbox, MailboxType.COE, bytes.fromhex(refused))[0] is MailboxType.ERR
+
+
+def test_dictionary_answers_by_aoe():
+    slave = build_slave(generic(mailbox=MailboxSpec(aoe=True)))
+    mailbox = slave.device.mailbox
+    mailbox.start(256, 256)
+    header = AmsHeader(NetId(b"target"), 1001, NetId(b"source"), 33000, AmsCommand.READ)
+    request = encode_packet(header, AdsRange(0xF302, 0x1018_0001, 4).encode())
+    kind, data = ask(mailbox, MailboxType.AOE, request)
+    assert (kind, data[32:]) == (MailboxType.AOE, bytes.fromhex("00000000 04000000 5a0e0000"))
+    server = mailbox.protocols[MailboxType.AOE]._handler
+    assert server.address is not None
+    mailbox.start(256, 256)
+    assert server.address is None
+
+
+def test_every_axis_of_a_drive_has_idns():
+    spec = SlaveSpec(name="d", kind=DeviceKind.DRIVE, axes=2, mailbox=MailboxSpec(soe=True))
+    slave = build_slave(spec)
+    mailbox = slave.device.mailbox
+    mailbox.start(256, 256)
+    position = (77).to_bytes(4, "little")
+    assert ask(mailbox, MailboxType.SOE, bytes.fromhex("23 40 2f00") + position) == (
+        MailboxType.SOE, bytes.fromhex("24 40 2f00"),
+    )  # fmt: skip
+    assert slave.device.dictionary.entry(0x687A, 0).value == 77
+    assert slave.device.dictionary.entry(0x607A, 0).value == 0
+    assert ask(mailbox, MailboxType.SOE, bytes.fromhex("41 40 2f00"))[1][-2:] == b"\x0a\x80"
 
 
 def test_idns_of_a_drive():
