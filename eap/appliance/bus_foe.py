@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from devicebus.errors import MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
 from devicebus.mailbox.conversation import Progress
-from eap.appliance.bus_session import BusSession
+from eap.appliance.bus_slave import SlaveBus
 from eap.errors import ConfigError, EnvironmentalError
 
 Report: TypeAlias = Callable[[int, int | None], None]
@@ -20,7 +20,7 @@ Report: TypeAlias = Callable[[int, int | None], None]
 
 
 def get_file(
-    bus: BusSession, slave: str, name: str, target: Path, *, password: int, report: Report
+    bus: SlaveBus, slave: str, name: str, target: Path, *, password: int, report: Report
 ) -> dict[str, Any]:
     """Read the file *name* of a slave into *target*, which appears once it is complete.
 
@@ -66,7 +66,7 @@ def get_file(
 
 
 def put_file(
-    bus: BusSession, slave: str, source: Path, name: str, *, password: int, report: Report
+    bus: SlaveBus, slave: str, source: Path, name: str, *, password: int, report: Report
 ) -> dict[str, Any]:
     """Write *source* to a slave as the file *name*.
 
@@ -107,7 +107,7 @@ def put_file(
 
 
 def exchange(
-    bus: BusSession, slave: str, vendor_id: int, vendor_type: int, data: bytes
+    bus: SlaveBus, slave: str, vendor_id: int, vendor_type: int, data: bytes
 ) -> dict[str, Any]:
     """Send a VoE message to a slave and return its answer.
 

@@ -11,14 +11,13 @@ from devicebus.errors import SoeError
 from devicebus.mailbox import soe_browse, soe_client
 from devicebus.mailbox.conversation import Conversation, reading
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.master.bus import Unit
-from eap.appliance.bus_session import BusSession
+from eap.appliance.bus_slave import Slave, SlaveBus
 from eap.codec.soe import Display, Element, Idn, SoeAttribute, decode_list
 from eap.codec.soevalue import SoeScalar, SoeValue, encode_value
 from eap.errors import ConfigError
 
 
-def read_idn(bus: BusSession, slave: str, idn: Idn, *, drive: int) -> dict[str, Any]:
+def read_idn(bus: SlaveBus, slave: str, idn: Idn, *, drive: int) -> dict[str, Any]:
     """Return an IDN with all elements that it has.
 
     Raises:
@@ -43,7 +42,7 @@ def read_idn(bus: BusSession, slave: str, idn: Idn, *, drive: int) -> dict[str, 
     }
 
 
-def write_idn(bus: BusSession, slave: str, idn: Idn, text: str, *, drive: int) -> dict[str, Any]:
+def write_idn(bus: SlaveBus, slave: str, idn: Idn, text: str, *, drive: int) -> dict[str, Any]:
     """Write the value of an IDN; lists are separated by commas.
 
     Raises:
@@ -65,14 +64,14 @@ def write_idn(bus: BusSession, slave: str, idn: Idn, text: str, *, drive: int) -
     return {"slave": unit.station, "drive": drive, "idn": str(idn), "value": value}
 
 
-def list_idns(bus: BusSession, slave: str, *, drive: int) -> Iterator[dict[str, Any]]:
+def list_idns(bus: SlaveBus, slave: str, *, drive: int) -> Iterator[dict[str, Any]]:
     """Yield every IDN of a drive with its name; raises as read_idn() does."""
     unit = bus.find(slave)
     for idn in bus.converse(unit, lambda _: soe_browse.idn_list(drive=drive), "list of IDNs"):
         yield {"idn": str(idn), "number": idn.number, "name": _name(bus, unit, idn, drive)}
 
 
-def _name(bus: BusSession, unit: Unit, idn: Idn, drive: int) -> str:
+def _name(bus: SlaveBus, unit: Slave, idn: Idn, drive: int) -> str:
     return bus.converse(unit, lambda _: _read_name(idn, drive), str(idn))
 
 

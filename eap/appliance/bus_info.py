@@ -2,51 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
 from devicebus.errors import SiiError
 from devicebus.master import eeprom
-from devicebus.master.bus import Unit
 from devicebus.master.diagnosis import diagnose
 from devicebus.master.esm import read_status
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from devicebus.wire.sii import SiiProtocol
-from eap.appliance.bus_session import BusSession
+from eap.appliance.bus_slave import Slave, SlaveBus
 
 STATES = tuple(state.name for state in AlState)
 
 
-def scan_rows(bus: BusSession) -> list[dict[str, Any]]:
+def scan_rows(bus: SlaveBus) -> list[dict[str, Any]]:
     """Return who is there, in the order of the line; raises as a scan does."""
-    return [_slave(unit) for unit in bus.scan()]
+    return [_slave(slave) for slave in bus.scan()]
 
 
-def state_rows(bus: BusSession, slave: str | None, target: str | None) -> list[dict[str, Any]]:
+def state_rows(bus: SlaveBus, slave: str | None, target: str | None) -> list[dict[str, Any]]:
     """Return the states of one slave or of all, after bringing them to *target* if it is given.
 
     Raises:
         BusError: there is no such slave, or one refuses the state.
     """
-    units = [bus.find(slave)] if slave is not None else bus.scan()
+    units: Sequence[Slave] = [bus.find(slave)] if slave is not None else bus.scan()
     if target is not None:
         bus.bring(units, AlState[target])
     return [_state(bus, unit) for unit in units]
 
 
-def diagnosis(bus: BusSession, slave: str | None) -> dict[str, Any]:
+def diagnosis(bus: SlaveBus, slave: str | None) -> dict[str, Any]:
     """Return states and error counters of one slave or of all, and where on the line errors start.
 
     Raises:
         BusError: there is no such slave.
     """
-    names = {unit.station: unit.name for unit in bus.scan()}
+    names = {each.station: each.name for each in bus.scan()}
     wanted = {bus.find(slave).station} if slave is not None else {*names}
     found = bus.run(diagnose(list(names)), "diagnosis")
     fault = found.first_fault
-    frames = bus.link_stats()
+    frames = bus.frame_counts()
     return {
         "frames": {"sent": frames.sent, "received": frames.received, "lost": frames.lost},
         "starts_at": None
@@ -73,7 +73,7 @@ def diagnosis(bus: BusSession, slave: str | None) -> dict[str, Any]:
     }
 
 
-def read_eeprom(bus: BusSession, slave: str) -> tuple[dict[str, Any], bytes]:
+def read_eeprom(bus: SlaveBus, slave: str) -> tuple[dict[str, Any], bytes]:
     """Return what an EEPROM says in short, and all its octets.
 
     Raises:
@@ -99,7 +99,7 @@ def read_eeprom(bus: BusSession, slave: str) -> tuple[dict[str, Any], bytes]:
     }, image
 
 
-def write_eeprom(bus: BusSession, slave: str, image: bytes) -> dict[str, Any]:
+def write_eeprom(bus: SlaveBus, slave: str, image: bytes) -> dict[str, Any]:
     """Write a whole EEPROM, read it back, and let the slave load it.
 
     Raises:
@@ -118,32 +118,31 @@ def write_eeprom(bus: BusSession, slave: str, image: bytes) -> dict[str, Any]:
     return {"address": unit.station, "name": unit.name, "octets": len(image)}
 
 
-def _slave(unit: Unit) -> dict[str, Any]:
-    found = unit.found
-    status = found.al_status
-    protocols = SiiProtocol(found.sii.fixed.protocols & sum(SiiProtocol))
+def _slave(slave: Slave) -> dict[str, Any]:
+    status = slave.status
+    protocols = SiiProtocol(slave.protocols & sum(SiiProtocol))
     return {
-        "address": unit.station,
-        "name": unit.name,
-        "vendor": found.identity.vendor,
-        "product": found.identity.product,
-        "revision": found.identity.revision,
-        "serial": found.identity.serial,
-        "alias": found.alias,
+        "address": slave.station,
+        "name": slave.name,
+        "vendor": slave.vendor,
+        "product": slave.product,
+        "revision": slave.revision,
+        "serial": slave.serial,
+        "alias": slave.alias,
         "state": state_name(status.state | status.error << 4),
         "code": status.code,
         "mailbox": [f"{str(each.name)[0]}oE" for each in protocols],
-        "parent": None if found.joint.parent is None else found.joint.parent,
-        "ports": list(found.joint.ports),
-        "fault": found.fault,
+        "parent": slave.parent,
+        "ports": list(slave.ports),
+        "fault": slave.fault,
     }
 
 
-def _state(bus: BusSession, unit: Unit) -> dict[str, Any]:
-    status = bus.run(read_status(unit.station), f"slave {unit.station}: its state")
+def _state(bus: SlaveBus, slave: Slave) -> dict[str, Any]:
+    status = bus.run(read_status(slave.station), f"slave {slave.station}: its state")
     return {
-        "address": unit.station,
-        "name": unit.name,
+        "address": slave.station,
+        "name": slave.name,
         "state": state_name(status.state | status.error << 4),
         "code": status.code,
         "reason": name_of(status.code) if status.code else "",

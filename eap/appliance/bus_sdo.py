@@ -11,8 +11,7 @@ from devicebus.errors import MailboxProtocolError, MailboxRefusedError
 from devicebus.mailbox import coe_client, coeinfo_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.master.bus import Unit
-from eap.appliance.bus_session import BusSession
+from eap.appliance.bus_slave import Slave, SlaveBus
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.sdoinfo import EntryDescription
@@ -30,7 +29,7 @@ _PLAIN_SIZES = (1, 2, 4, 8)
 
 
 def read_entry(
-    bus: BusSession, slave: str, index: int, subindex: int, *, kind: DataType | None, complete: bool
+    bus: SlaveBus, slave: str, index: int, subindex: int, *, kind: DataType | None, complete: bool
 ) -> dict[str, Any]:
     """Return an entry, or with *complete* the octets of an object.
 
@@ -53,7 +52,7 @@ def read_entry(
 
 
 def write_entry(
-    bus: BusSession,
+    bus: SlaveBus,
     slave: str,
     index: int,
     subindex: int,
@@ -89,7 +88,7 @@ def write_entry(
     }
 
 
-def list_objects(bus: BusSession, slave: str) -> Iterator[dict[str, Any]]:
+def list_objects(bus: SlaveBus, slave: str) -> Iterator[dict[str, Any]]:
     """Yield what a slave says of each of its objects; raises as read_entry() does."""
     unit = bus.find(slave)
     indexes = bus.converse(unit, lambda _: coeinfo_client.object_list(), "object list")
@@ -97,7 +96,7 @@ def list_objects(bus: BusSession, slave: str) -> Iterator[dict[str, Any]]:
         yield _described(bus, unit, index)
 
 
-def dump_entries(bus: BusSession, slave: str) -> Iterator[dict[str, Any]]:
+def dump_entries(bus: SlaveBus, slave: str) -> Iterator[dict[str, Any]]:
     """Yield every entry of every object with its value; refusals are in *error* of the entry."""
     unit = bus.find(slave)
     for found in list_objects(bus, slave):
@@ -108,7 +107,7 @@ def dump_entries(bus: BusSession, slave: str) -> Iterator[dict[str, Any]]:
                 yield {"index": index, "subindex": subindex, "object": found["name"]} | row
 
 
-def _described(bus: BusSession, unit: Unit, index: int) -> dict[str, Any]:
+def _described(bus: SlaveBus, unit: Slave, index: int) -> dict[str, Any]:
     found = bus.converse(unit, lambda _: coeinfo_client.object_description(index), _name(index))
     codes = ObjectCode._value2member_map_
     return {
@@ -120,7 +119,7 @@ def _described(bus: BusSession, unit: Unit, index: int) -> dict[str, Any]:
     }
 
 
-def _dumped(bus: BusSession, unit: Unit, index: int, subindex: int) -> dict[str, Any] | None:
+def _dumped(bus: SlaveBus, unit: Slave, index: int, subindex: int) -> dict[str, Any] | None:
     """Return one entry, None for a gap."""
     name = _name(index, subindex)
     try:

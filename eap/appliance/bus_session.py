@@ -14,26 +14,23 @@ import select
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Conversation
-from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.attach import attach
 from devicebus.master.bring import bring, read_process_data
 from devicebus.master.bus import Bus, MasterSettings, Unit
-from devicebus.master.link import LinkStats
 from devicebus.master.procedure import Procedure, together
-from devicebus.master.scan import scan
+from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import set_up_cycle
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
+from eap.appliance.bus_slave import Begin, FrameCounts, Slave, choose
 from eap.errors import EapError
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
 
 T = TypeVar("T")
-Begin: TypeAlias = Callable[[MailboxSizes], Conversation[T]]
 
 FRAME_TIMEOUT_NS = 20_000_000
 """Longer than a master's with a cycle: nobody waits for these frames but a person."""
@@ -58,37 +55,32 @@ class BusSession:
         self._clock = clock
         self._bus = Bus(MasterSettings(frame_timeout_ns=FRAME_TIMEOUT_NS))
         self._cycle_ns = 0
+        self._slaves: Sequence[Slave] = ()
 
-    def scan(self) -> Sequence[Unit]:
+    def scan(self) -> Sequence[Slave]:
         """Find all slaves and give them their station addresses; raises as the scan does."""
         found = self.run(scan(), "scanning the bus")
         self._bus.units = {each.station: Unit(each, each.name) for each in found}
         for unit in self._bus.units.values():
             status = unit.found.al_status
             unit.state = AlState(status.state) if status.state in set(AlState) else AlState.INIT
-        return list(self._bus.units.values())
+        self._slaves = [_slave(each) for each in found]
+        return self._slaves
 
-    def find(self, name: str) -> Unit:
+    def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name, after a scan if there was none.
 
         Raises:
             BusError: there is none, or several have that name.
         """
-        units = list(self._bus.units.values()) or self.scan()
-        if name.isdecimal() or name.lower().startswith("0x"):
-            fitting = [unit for unit in units if unit.station == int(name, 0)]
-        else:
-            fitting = [unit for unit in units if unit.name == name]
-        if len(fitting) == 1:
-            return fitting[0]
-        if fitting:
-            stations = ", ".join(str(unit.station) for unit in fitting)
-            raise BusError(f"{len(fitting)} slaves are called {name!r}: say which of {stations}")
-        known = ", ".join(f"{unit.station} ({unit.name})" for unit in units) or "none"
-        raise BusError(f"there is no slave {name!r}; there are {known}")
+        return choose(self._slaves or self.scan(), name)
 
     def converse(
-        self, unit: Unit, begin: Begin[T], name: str, meanwhile: Callable[[], None] | None = None
+        self,
+        slave: Slave,
+        begin: Begin[T],
+        name: str,
+        meanwhile: Callable[[], None] | None = None,
     ) -> T:
         """Talk to a slave's mailbox until the conversation ends; return its result.
 
@@ -96,11 +88,12 @@ class BusSession:
             BusError: the slave has no mailbox, or does not answer.
             SdoAbortError, SoeError, FoeError: it refuses.
         """
+        unit = self._bus.units[slave.station]
         mailbox = unit.mailbox or self.run(attach(self._bus, unit), f"slave {unit.station}")
         task = mailbox.converse(begin(mailbox.sizes), self._clock(), name=name)
         return self._finish(task, meanwhile)
 
-    def bring(self, units: Sequence[Unit], target: AlState) -> None:
+    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
         """Bring slaves to a state together; cycles run until they are there.
 
         Process data of those that are to get some is laid out anew, so that they begin in PREOP.
@@ -109,6 +102,7 @@ class BusSession:
             AlStatusError, StateTimeoutError: one refuses, or takes too long.
             BusError: several do; the message has a line for each.
         """
+        units = [self._bus.units[slave.station] for slave in slaves]
         if target in _WITH_PROCESS_DATA:
             for unit in units:
                 if unit.state in _WITH_MAILBOX and unit.found.sii.fixed.protocols:
@@ -126,9 +120,10 @@ class BusSession:
         """Run a procedure to its end and return its result, or raise what went wrong."""
         return self._finish(self._bus.runner.start(procedure, self._clock(), name))
 
-    def link_stats(self) -> LinkStats:
+    def frame_counts(self) -> FrameCounts:
         """Return the counters of the frames of this session."""
-        return self._bus.link.stats()
+        stats = self._bus.link.stats()
+        return FrameCounts(stats.sent, stats.received, stats.lost)
 
     def _bring_all(self, units: Sequence[Unit], target: AlState) -> None:
         self._run_all(units, [bring(self._bus, unit, target) for unit in units])
@@ -176,6 +171,24 @@ class BusSession:
         bus.link.handle_timeout(now_ns)
         bus.runner.handle_timeout(now_ns)
         return now_ns
+
+
+def _slave(found: FoundSlave) -> Slave:
+    identity = found.identity
+    return Slave(
+        station=found.station,
+        name=found.name,
+        vendor=identity.vendor,
+        product=identity.product,
+        revision=identity.revision,
+        serial=identity.serial,
+        alias=found.alias,
+        status=found.al_status,
+        protocols=found.sii.fixed.protocols,
+        parent=found.joint.parent,
+        ports=found.joint.ports,
+        fault=found.fault,
+    )
 
 
 @contextmanager

@@ -8,12 +8,15 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
+from eap.appliance.bus_failure import to_error
+from eap.appliance.bus_request import Failure
 from eap.appliance.control import (
     MAX_LINE,
     ErrorCode,
     Reply,
     decode_reply,
     encode_request,
+    near,
 )
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_running, runtime_root
 from eap.errors import ControlError
@@ -32,13 +35,23 @@ class Client:
         self._reader = connection.makefile("rb")
         self._last_id = 0
 
-    def request(self, method: str, **params: Any) -> Any:
+    def request(self, method: str, /, **params: Any) -> Any:
         """Return the result of *method*.
 
         Raises:
             ControlError: the appliance refused, or does not answer.
         """
+        return self.request_within(TIMEOUT_S, method, **params)
+
+    def request_within(self, patience_s: float, method: str, /, **params: Any) -> Any:
+        """Return the result of *method*, which may take *patience_s*.
+
+        Raises:
+            ControlError: the appliance refused, or does not answer.
+            BusError: a bus or a slave did not do it; as its class says.
+        """
         self._last_id += 1
+        self._socket.settimeout(patience_s)
         try:
             self._socket.sendall(encode_request(self._last_id, method, params))
         except OSError as exc:
@@ -92,9 +105,12 @@ class Client:
         if not line:
             raise self._gone(None)
         reply = decode_reply(line)
-        if reply.error is not None:
-            raise ControlError(reply.error.message, code=reply.error.code)
-        return reply
+        error = reply.error
+        if error is None:
+            return reply
+        if error.kind:
+            raise to_error(Failure(error.kind, error.message, error.detail))
+        raise ControlError(error.message, code=error.code)
 
     def _gone(self, cause: OSError | None) -> ControlError:
         why = str(cause) if cause else "it closed the connection"
@@ -127,6 +143,21 @@ def connect(plant: str | None = None, station: str | None = None) -> list[Client
             client.close()
         raise
     return clients
+
+
+def connect_station(station: str, plant: str | None) -> Client:
+    """Connect to the one running appliance that has *station*.
+
+    Raises:
+        ControlError: none has it, or several do and *plant* does not choose among them.
+    """
+    first, *others = connect(plant, station)
+    if others:
+        for client in (first, *others):
+            client.close()
+        plants = ", ".join(client.info.plant for client in (first, *others))
+        raise ControlError(f"station {station} runs in {plants}: choose one with --plant")
+    return first
 
 
 def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -170,6 +201,9 @@ def _none_runs(
     plant: str | None, station: str | None, running: Sequence[ApplianceInfo]
 ) -> ControlError:
     wanted = f"station {station}" if station else f"plant {plant}" if plant else "appliance"
+    if station:
+        names = [name for info in running for name in info.stations]
+        wanted += near(station, names)
     if running:
         others = ", ".join(f"{info.plant} ({', '.join(info.stations)})" for info in running)
         hint = f"running are {others}"

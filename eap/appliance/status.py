@@ -89,17 +89,19 @@ def appliance_status(
         stations.append(station)
     engine = _process(info.engine, meter, now_ns)
     engine["realtime"] = info.engine.report.get("realtime", {})
+    processes = {
+        "supervisor": {"pid": info.supervisor, **meter.measure(info.supervisor, now_ns)},
+        "engine": engine,
+        "services": _process(info.services, meter, now_ns),
+    }
+    if info.segments:
+        processes["segments"] = {
+            name: _process(process, meter, now_ns) for name, process in info.segments.items()
+        }
     return {
         "version": VERSION,
         "plant": info.plant,
-        "processes": {
-            "supervisor": {"pid": info.supervisor, **meter.measure(info.supervisor, now_ns)},
-            "engine": engine,
-            "services": _process(info.services, meter, now_ns),
-            "segments": {
-                name: _process(process, meter, now_ns) for name, process in info.segments.items()
-            },
-        },
+        "processes": processes,
         "stations": stations,
     }
 

@@ -7,17 +7,14 @@ from pathlib import Path
 import click
 
 from eap.cli.bus_params import (
-    BusCommand,
-    interface_option,
     number_up_to,
-    open_session,
     parse_octets,
     slave_argument,
 )
+from eap.cli.bus_place import BusCommand, Place, bus_options, open_session
 from eap.cli.group import LazyGroup
 from eap.cli.output import write_json, write_tables, write_text
 from eap.cli.params import json_option
-from eap.ids import InterfaceUri
 
 STATES = ("INIT", "PREOP", "BOOT", "SAFEOP", "OP")
 _U32 = 0xFFFFFFFF
@@ -46,13 +43,13 @@ def bus() -> None:
 
 
 @click.command(cls=BusCommand)
-@interface_option
+@bus_options
 @json_option("Print one object.")
-def scan(interface: InterfaceUri, as_json: bool) -> None:
+def scan(bus: Place, as_json: bool) -> None:
     """Find all slaves: identity, state, alias, mailbox protocols."""
     from eap.appliance.bus_info import scan_rows
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         rows = scan_rows(session)
     if as_json:
         write_json({"slaves": rows})
@@ -63,10 +60,10 @@ def scan(interface: InterfaceUri, as_json: bool) -> None:
 
 
 @click.command(cls=BusCommand)
+@bus_options
 @click.argument("words", nargs=-1, metavar="[SLAVE] [INIT|PREOP|SAFEOP|OP|BOOT]")
-@interface_option
 @json_option("Print one object.")
-def state(words: tuple[str, ...], interface: InterfaceUri, as_json: bool) -> None:
+def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
     """Show states, or bring one slave or all of them to a state.
 
     A slave with outputs does not stay in OP when nobody sends it process data: this command does so
@@ -78,7 +75,7 @@ def state(words: tuple[str, ...], interface: InterfaceUri, as_json: bool) -> Non
     rest = words[:-1] if target else words
     if len(rest) > 1:
         raise click.UsageError(f"{rest[-1]!r} is not a state, expected one of {', '.join(STATES)}")
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         rows = state_rows(session, rest[0] if rest else None, target)
     if as_json:
         write_json({"slaves": rows})
@@ -89,14 +86,14 @@ def state(words: tuple[str, ...], interface: InterfaceUri, as_json: bool) -> Non
 
 
 @click.command(cls=BusCommand)
+@bus_options
 @click.argument("slave", required=False, metavar="[SLAVE]")
-@interface_option
 @json_option("Print one object.")
-def diag(slave: str | None, interface: InterfaceUri, as_json: bool) -> None:
+def diag(slave: str | None, bus: Place, as_json: bool) -> None:
     """Show states, error counters of every port, and where frames get damaged."""
     from eap.appliance.bus_info import diagnosis
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         found = diagnosis(session, slave)
     if as_json:
         write_json(found)
@@ -112,15 +109,15 @@ def sii() -> None:
 
 
 @sii.command("dump", cls=BusCommand)
+@bus_options
 @slave_argument
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
-@interface_option
 @json_option("Print one object, with all octets in hexadecimal digits.")
-def sii_dump(slave: str, file: Path | None, interface: InterfaceUri, as_json: bool) -> None:
+def sii_dump(slave: str, file: Path | None, bus: Place, as_json: bool) -> None:
     """Read the EEPROM; with FILE, store its octets there."""
     from eap.appliance.bus_info import read_eeprom
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         content, image = read_eeprom(session, slave)
     if file is not None:
         file.write_bytes(image)
@@ -133,15 +130,15 @@ def sii_dump(slave: str, file: Path | None, interface: InterfaceUri, as_json: bo
 
 
 @sii.command("write", cls=BusCommand)
+@bus_options
 @slave_argument
 @click.argument("file", type=click.Path(exists=True, path_type=Path, dir_okay=False))
-@interface_option
 @json_option("Print one object.")
-def sii_write(slave: str, file: Path, interface: InterfaceUri, as_json: bool) -> None:
+def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
     """Write FILE into the EEPROM and compare what is there then."""
     from eap.appliance.bus_info import write_eeprom
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         done = write_eeprom(session, slave, file.read_bytes())
     if as_json:
         write_json(done)
@@ -150,6 +147,7 @@ def sii_write(slave: str, file: Path, interface: InterfaceUri, as_json: bool) ->
 
 
 @click.command(cls=BusCommand)
+@bus_options
 @slave_argument
 @click.argument("data", type=parse_octets, metavar="HEX")
 @click.option("--vendor", type=number_up_to(_U32), required=True, metavar="ID", help="Vendor ID.")
@@ -160,15 +158,12 @@ def sii_write(slave: str, file: Path, interface: InterfaceUri, as_json: bool) ->
     metavar="TYPE",
     help="What the vendor makes of it.",
 )
-@interface_option
 @json_option("Print one object.")
-def voe(
-    slave: str, data: bytes, vendor: int, vendor_type: int, interface: InterfaceUri, as_json: bool
-) -> None:
+def voe(slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, as_json: bool) -> None:
     """Send a message of a vendor's own protocol and print the answer."""
     from eap.appliance.bus_foe import exchange
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         answer = exchange(session, slave, vendor, vendor_type, data)
     if as_json:
         write_json(answer)

@@ -10,16 +10,12 @@ from typing import Any
 import click
 
 from eap.cli.bus_params import (
-    BusCommand,
-    CommandT,
-    interface_option,
     number_up_to,
-    open_session,
     slave_argument,
 )
+from eap.cli.bus_place import BusCommand, Place, bus_options, open_session
 from eap.cli.output import write_json, write_text
-from eap.cli.params import json_option
-from eap.ids import InterfaceUri
+from eap.cli.params import CommandT, json_option
 
 
 def _password_option(command: CommandT) -> CommandT:
@@ -38,49 +34,49 @@ def foe() -> None:
 
 
 @foe.command(cls=BusCommand)
+@bus_options
 @slave_argument
 @click.argument("name")
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @_password_option
-@interface_option
 @json_option("Print one object; without it a progress bar is on stderr.")
 def get(
     slave: str,
     name: str,
     file: Path | None,
     password: int,
-    interface: InterfaceUri,
+    bus: Place,
     as_json: bool,
 ) -> None:
     """Read the file NAME of a slave into FILE, by default NAME in this folder."""
     from eap.appliance.bus_foe import get_file
 
     target = file or Path(Path(name).name)
-    with open_session(interface) as session, _progress(name, hidden=as_json) as report:
+    with open_session(bus) as session, _progress(name, hidden=as_json) as report:
         row = get_file(session, slave, name, target, password=password, report=report)
     _show(row, f"{row['name']} → {row['file']}", as_json=as_json)
 
 
 @foe.command(cls=BusCommand)
+@bus_options
 @slave_argument
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
 @click.argument("name", required=False)
 @_password_option
-@interface_option
 @json_option("Print one object; without it a progress bar is on stderr.")
 def put(
     slave: str,
     file: Path,
     name: str | None,
     password: int,
-    interface: InterfaceUri,
+    bus: Place,
     as_json: bool,
 ) -> None:
     """Write FILE to a slave, as NAME if that is given."""
     from eap.appliance.bus_foe import put_file
 
     target = name or file.name
-    with open_session(interface) as session, _progress(target, hidden=as_json) as report:
+    with open_session(bus) as session, _progress(target, hidden=as_json) as report:
         row = put_file(session, slave, file, target, password=password, report=report)
     _show(row, f"{row['file']} → {row['name']}", as_json=as_json)
 

@@ -7,15 +7,11 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.bus_params import (
-    BusCommand,
-    CommandT,
-    interface_option,
-    open_session,
     slave_argument,
 )
+from eap.cli.bus_place import BusCommand, Place, bus_options, open_session
 from eap.cli.output import write_json, write_tables, write_text
-from eap.cli.params import json_option
-from eap.ids import InterfaceUri
+from eap.cli.params import CommandT, json_option
 
 if TYPE_CHECKING:
     from eap.codec.soe import Idn
@@ -52,16 +48,16 @@ def idn() -> None:
 
 
 @idn.command(cls=BusCommand)
+@bus_options
 @slave_argument
 @click.argument("number", type=parse_idn, metavar="IDN")
 @_drive_option
-@interface_option
 @json_option("Print one object.")
-def read(slave: str, number: Idn, drive: int, interface: InterfaceUri, as_json: bool) -> None:
+def read(slave: str, number: Idn, drive: int, bus: Place, as_json: bool) -> None:
     """Read an IDN with its name, unit and limits."""
     from eap.appliance.bus_idn import read_idn
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         row = read_idn(session, slave, number, drive=drive)
     if as_json:
         write_json(row)
@@ -72,19 +68,17 @@ def read(slave: str, number: Idn, drive: int, interface: InterfaceUri, as_json: 
 
 
 @idn.command(cls=BusCommand, context_settings={"ignore_unknown_options": True})
+@bus_options
 @slave_argument
 @click.argument("number", type=parse_idn, metavar="IDN")
 @click.argument("value")
 @_drive_option
-@interface_option
 @json_option("Print one object: what was written.")
-def write(
-    slave: str, number: Idn, value: str, drive: int, interface: InterfaceUri, as_json: bool
-) -> None:
+def write(slave: str, number: Idn, value: str, drive: int, bus: Place, as_json: bool) -> None:
     """Write the value of an IDN; the numbers of a list have commas between them."""
     from eap.appliance.bus_idn import write_idn
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         row = write_idn(session, slave, number, value, drive=drive)
     if as_json:
         write_json(row)
@@ -93,15 +87,15 @@ def write(
 
 
 @idn.command("list", cls=BusCommand)
+@bus_options
 @slave_argument
 @_drive_option
-@interface_option
 @json_option("Print one object a line.")
-def list_idns(slave: str, drive: int, interface: InterfaceUri, as_json: bool) -> None:
+def list_idns(slave: str, drive: int, bus: Place, as_json: bool) -> None:
     """List all IDNs of a drive."""
     from eap.appliance.bus_idn import list_idns as rows_of
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         if as_json:
             for row in rows_of(session, slave, drive=drive):
                 write_json(row)

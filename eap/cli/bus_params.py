@@ -1,53 +1,19 @@
-"""What the commands of ``eapctl bus`` have in common: the bus, and how things on it are written."""
+"""How things on a bus are written on a command line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias
 
 import click
 
-from eap.ids import InterfaceUri
+from eap.cli.params import CommandT
 
 if TYPE_CHECKING:
-    from eap.appliance.bus_session import BusSession
     from eap.codec.datatypes import DataType
-
-CommandT = TypeVar("CommandT", bound=Callable[..., Any])
-
 
 Entry: TypeAlias = tuple[int, int]
 """Index and subindex."""
-
-
-class BusCommand(click.Command):
-    """A command on a bus; says so where a bus is given as a port of a running station."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the command line; raise UsageError for STATION/PORT."""
-        asks = {*ctx.help_option_names, "--help"} & {*args}
-        given = any(word.partition("=")[0] == "--interface" for word in args)
-        if not given and not asks and args and "/" in args[0]:
-            raise click.UsageError(
-                f"{args[0]!r}: ports of running stations have no bus yet; expected"
-                " --interface ethernet://IFACE or udp://ADDRESS",
-                ctx,
-            )
-        return super().parse_args(ctx, args)
-
-
-def parse_uri(text: str) -> InterfaceUri:
-    """Read where a bus is; raise BadParameter with the reason otherwise."""
-    try:
-        uri = InterfaceUri.parse(text)
-    except ValueError as exc:
-        raise click.BadParameter(str(exc)) from None
-    if uri.scheme not in {"ethernet", "udp"}:
-        raise click.BadParameter(
-            f"a bus is reached by ethernet://IFACE or udp://ADDRESS, not by {uri}"
-        )
-    return uri
 
 
 def number_up_to(limit: int) -> Callable[[str | int], int]:
@@ -95,24 +61,6 @@ def parse_octets(text: str) -> bytes:
         raise click.BadParameter(f"{text!r} is not pairs of hexadecimal digits") from None
 
 
-def interface_option(command: CommandT) -> CommandT:
-    """Add ``--interface``, which says where the bus is."""
-    return click.option(
-        "--interface",
-        required=True,
-        type=parse_uri,
-        metavar="URI",
-        help="Where the bus is: ethernet://IFACE (needs CAP_NET_RAW) or udp://ADDRESS[:PORT].",
-    )(command)
-
-
 def slave_argument(command: CommandT) -> CommandT:
     """Add the argument SLAVE."""
     return click.argument("slave", metavar="SLAVE")(command)
-
-
-def open_session(interface: InterfaceUri) -> AbstractContextManager[BusSession]:
-    """Open the bus; imported here, so that ``--help`` need not wait for a master."""
-    from eap.appliance.bus_session import open_bus
-
-    return open_bus(interface)

@@ -7,18 +7,14 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.bus_params import (
-    BusCommand,
-    CommandT,
     Entry,
-    interface_option,
-    open_session,
     parse_entry,
     parse_type,
     slave_argument,
 )
+from eap.cli.bus_place import BusCommand, Place, bus_options, open_session
 from eap.cli.output import write_json, write_tables, write_text
-from eap.cli.params import json_option
-from eap.ids import InterfaceUri
+from eap.cli.params import CommandT, json_option
 
 if TYPE_CHECKING:
     from eap.codec.datatypes import DataType
@@ -44,23 +40,23 @@ def sdo() -> None:
 
 
 @sdo.command(cls=BusCommand)
+@bus_options
 @slave_argument
 @click.argument("entry", type=parse_entry, metavar="INDEX[:SUB]")
 @_value_options
-@interface_option
 @json_option("Print one object.")
 def read(
     slave: str,
     entry: Entry,
     kind: DataType | None,
     complete: bool,
-    interface: InterfaceUri,
+    bus: Place,
     as_json: bool,
 ) -> None:
     """Read an entry."""
     from eap.appliance.bus_sdo import read_entry
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         row = read_entry(session, slave, *entry, kind=kind, complete=complete)
     if as_json:
         write_json(row)
@@ -71,11 +67,11 @@ def read(
 
 
 @sdo.command(cls=BusCommand, context_settings={"ignore_unknown_options": True})
+@bus_options
 @slave_argument
 @click.argument("entry", type=parse_entry, metavar="INDEX[:SUB]")
 @click.argument("value")
 @_value_options
-@interface_option
 @json_option("Print one object: what was written.")
 def write(
     slave: str,
@@ -83,7 +79,7 @@ def write(
     value: str,
     kind: DataType | None,
     complete: bool,
-    interface: InterfaceUri,
+    bus: Place,
     as_json: bool,
 ) -> None:
     """Write an entry.
@@ -93,7 +89,7 @@ def write(
     """
     from eap.appliance.bus_sdo import write_entry
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         row = write_entry(session, slave, *entry, value, kind=kind, complete=complete)
     if as_json:
         write_json(row)
@@ -104,14 +100,14 @@ def write(
 
 
 @sdo.command("list", cls=BusCommand)
+@bus_options
 @slave_argument
-@interface_option
 @json_option("Print one object a line.")
-def list_objects(slave: str, interface: InterfaceUri, as_json: bool) -> None:
+def list_objects(slave: str, bus: Place, as_json: bool) -> None:
     """List the objects that the slave describes."""
     from eap.appliance.bus_sdo import list_objects as rows_of
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         if as_json:
             for row in rows_of(session, slave):
                 write_json(row)
@@ -122,14 +118,14 @@ def list_objects(slave: str, interface: InterfaceUri, as_json: bool) -> None:
 
 
 @sdo.command(cls=BusCommand)
+@bus_options
 @slave_argument
-@interface_option
 @json_option("Print one object a line.")
-def dump(slave: str, interface: InterfaceUri, as_json: bool) -> None:
+def dump(slave: str, bus: Place, as_json: bool) -> None:
     """Read every entry of every object that the slave describes."""
     from eap.appliance.bus_sdo import dump_entries
 
-    with open_session(interface) as session:
+    with open_session(bus) as session:
         if as_json:
             for row in dump_entries(session, slave):
                 write_json(row)

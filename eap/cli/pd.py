@@ -99,7 +99,7 @@ def set_value(words: tuple[str, ...], plant: str | None, as_json: bool) -> None:
     VALUE as the variable's type has it: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
     hexadecimal digits for a raw block.
     """
-    from eap.cli.watching import connect_station
+    from eap.appliance.client import connect_station
     from eap.codec import datatypes
 
     target, text = parse_assignment(words)

@@ -13,23 +13,8 @@ from datetime import datetime
 from queue import SimpleQueue
 from typing import Any
 
-from eap.appliance.client import Client, connect
-from eap.errors import ControlError, EapError
-
-
-def connect_station(station: str, plant: str | None) -> Client:
-    """Connect to the one running appliance that has *station*.
-
-    Raises:
-        ControlError: none has it, or several do and *plant* does not choose among them.
-    """
-    first, *others = connect(plant, station)
-    if others:
-        for client in (first, *others):
-            client.close()
-        plants = ", ".join(client.info.plant for client in (first, *others))
-        raise ControlError(f"station {station} runs in {plants}: choose one with --plant")
-    return first
+from eap.appliance.client import connect_station
+from eap.errors import EapError
 
 
 def changes(

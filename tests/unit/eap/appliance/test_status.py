@@ -65,7 +65,7 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     document = appliance_status(info, images, discarded, ProcessMeter(), {})
     assert (document["version"], document["plant"]) == (1, "demo")
     processes = document["processes"]
-    assert set(processes) == {"supervisor", "engine", "services", "segments"}
+    assert set(processes) == {"supervisor", "engine", "services"}
     assert processes["supervisor"]["pid"] == os.getpid()
     assert processes["engine"]["restarts"] == 2
     assert processes["engine"]["realtime"] == {"scheduler": "fifo 50"}
