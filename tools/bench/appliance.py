@@ -86,12 +86,12 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
     """Run *plant* for *seconds* and return what it did."""
     with running(plant, link) as environment:
         wait(_WARM_UP_S)
-        first = _status(link, environment)
+        first = status(link, environment)
         pids = {name: int(first["processes"][name]["pid"]) for name in PROCESSES}
         before = {name: ProcessSample(pid) for name, pid in pids.items()}
         wait(seconds)
         after = {name: ProcessSample(pid) for name, pid in pids.items()}
-        last = _status(link, environment)
+        last = status(link, environment)
     return Observation(
         seconds=seconds,
         cpu={
@@ -109,7 +109,8 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
     )
 
 
-def _status(link: Cable | None, environment: dict[str, str]) -> dict[str, Any]:
+def status(link: Cable | None, environment: dict[str, str]) -> dict[str, Any]:
+    """Return what ``eapctl status`` says of the appliance that runs in *environment*."""
     done = subprocess.run(
         _command(link, "status", "--json"),
         capture_output=True,
