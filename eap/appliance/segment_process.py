@@ -1,8 +1,8 @@
 """A simulated segment as a process: it answers a master until it is asked to end.
 
 ``eapctl sim run`` runs one in its own process; the supervisor starts one for each simulated bus
-with one argument, the descriptor of its handover.  Commands come as JSON, one fault each, as lines
-or as messages; each is answered.
+with one argument, the descriptor of its handover.  Commands come as JSON (:mod:`command`), as lines
+or as messages; each is answered, with its *id* if it has one.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Any, Protocol
 
 import msgspec
 
+from devicebus.sim.command import obey
 from devicebus.sim.fault import FaultySegment
-from devicebus.sim.spec import FaultSpec
 from devicebus.sim.wiring import Side
 from eap.appliance.busfile import Bus, load_or_raise
 from eap.appliance.handover import SegmentHandover, tell_ready
@@ -37,14 +37,6 @@ NICE = 5
 _BATCH = 64
 _MS = 1_000_000
 _MAX_COMMAND = 65536
-
-
-class FaultCommand(FaultSpec, frozen=True):
-    """A fault as a command; with *end* the fault that it describes is over."""
-
-    end: bool = False
-    id: int | None = None
-    """The answer repeats it."""
 
 
 class Commands(Protocol):
@@ -213,13 +205,12 @@ class _Loop:
         return taken is not None
 
     def _obey(self, text: bytes) -> dict[str, Any]:
-        now_ns = time.monotonic_ns()
         outcome: dict[str, Any] = {"ok": True}
         try:
-            command = msgspec.json.decode(text, type=FaultCommand)
-            outcome |= {} if command.id is None else {"id": command.id}
-            fault = msgspec.convert(msgspec.structs.asdict(command), FaultSpec)
-            (self._segment.end if command.end else self._segment.begin)(fault, now_ns)
+            command = msgspec.json.decode(text)
+            if isinstance(command, dict) and "id" in command:
+                outcome["id"] = command.pop("id")
+            obey(self._segment, msgspec.json.encode(command), time.monotonic_ns())
         except (msgspec.MsgspecError, ValueError) as exc:
             outcome |= {"ok": False, "error": str(exc)}
         return outcome
