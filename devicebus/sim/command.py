@@ -41,16 +41,15 @@ class FaultCommand(FaultSpec, frozen=True, forbid_unknown_fields=True):
     end: bool = False
 
 
-def obey(segment: FaultySegment, octets: bytes, now_ns: int) -> None:
-    """Do what the JSON object *octets* says.
+def obey(segment: FaultySegment, command: object, now_ns: int) -> None:
+    """Do what *command* says, a JSON object that is decoded.
 
     Raises:
         ValueError: it says nothing that can be done; the text says why.
     """
+    if not isinstance(command, dict):
+        raise ValueError("a command is a JSON object")  # noqa: TRY004  the person's, not ours
     try:
-        command = msgspec.json.decode(octets)
-        if not isinstance(command, dict):
-            raise ValueError("a command is a JSON object")  # noqa: TRY004  the person's, not ours
         if "set" in command:
             entry = msgspec.convert(command, _SetCommand).set
             segment.set_value(entry.slave, entry.entry, entry.value, now_ns)
