@@ -210,7 +210,7 @@ class _Loop:
             command = msgspec.json.decode(text)
             if isinstance(command, dict) and "id" in command:
                 outcome["id"] = command.pop("id")
-            obey(self._segment, msgspec.json.encode(command), time.monotonic_ns())
+            obey(self._segment, command, time.monotonic_ns())
         except (msgspec.MsgspecError, ValueError) as exc:
             outcome |= {"ok": False, "error": str(exc)}
         return outcome

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devicebus.sim.command import obey
+from devicebus.sim import command as commands
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.spec import ChannelSpec, FaultKind
 from devicebus.wire.alstatus import AlState
@@ -18,6 +18,10 @@ from tests.support.bus import Bench, datagram, generic
 
 SET = b'{"set": {"slave": "slave", "entry": "limit", "value": true}}'
 RELEASE = b'{"release": {"slave": "slave", "entry": "limit"}}'
+
+
+def obey(faulty, octets, now_ns):
+    commands.obey(faulty, json.loads(octets), now_ns)
 
 
 @pytest.fixture
@@ -67,8 +71,7 @@ def test_faults_begin_and_end(bench):
     ("command", "reason"),
     [
         (b"[]", "a JSON object"),
-        (b"{", "JSON|truncated"),
-        (b"\xff", "JSON"),
+        (b"3", "a JSON object"),
         (b"{}", "kind"),
         (b'{"kind": "loss", "evry": 2}', "evry"),
         (b'{"kind": "power", "slave": "x"}', "no slave 'x'"),

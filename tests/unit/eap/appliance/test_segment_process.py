@@ -100,6 +100,18 @@ def test_command_that_cannot_be(master):
     assert "no slave 'x'" in run_with(script)[-1]["error"]
 
 
+def test_values_by_command_and_answers_with_the_number_of_the_command(master):
+    def script(command):
+        told = {"id": 7, "set": {"slave": "b", "entry": "level", "value": 9}}
+        assert command(json.dumps(told)) == {"ok": True, "id": 7}
+        told = {"id": 8, "release": {"slave": "b", "entry": "limit"}}
+        answer = command(json.dumps(told))
+        assert (answer["ok"], answer["id"]) == (False, 8)
+        assert command("[]") == {"ok": False, "error": "a command is a JSON object"}
+
+    assert len(run_with(script)) == 4
+
+
 def test_commands_may_come_in_pieces_and_end(master):
     bus = Bus(BusSpec(bus="b", slaves=(generic("a"),)), {})
     read_end, write_end = os.pipe()
