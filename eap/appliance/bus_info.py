@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from devicebus.errors import SiiError
+from devicebus.errors import SiiError, WorkingCounterError
 from devicebus.master import eeprom
 from devicebus.master.diagnosis import diagnose
 from devicebus.master.esm import read_status
@@ -26,6 +26,8 @@ def scan_rows(bus: SlaveBus) -> list[dict[str, Any]]:
 
 def state_rows(bus: SlaveBus, slave: str | None, target: str | None) -> list[dict[str, Any]]:
     """Return the states of one slave or of all, after bringing them to *target* if it is given.
+
+    The state of one that does not answer is None.
 
     Raises:
         BusError: there is no such slave, or one refuses the state.
@@ -129,7 +131,7 @@ def _slave(slave: Slave) -> dict[str, Any]:
         "revision": slave.revision,
         "serial": slave.serial,
         "alias": slave.alias,
-        "state": state_name(status.state | status.error << 4),
+        "state": state_name(status.state | status.error << 4) if status.state else None,
         "code": status.code,
         "mailbox": [f"{str(each.name)[0]}oE" for each in protocols],
         "parent": slave.parent,
@@ -139,10 +141,12 @@ def _slave(slave: Slave) -> dict[str, Any]:
 
 
 def _state(bus: SlaveBus, slave: Slave) -> dict[str, Any]:
-    status = bus.run(read_status(slave.station), f"slave {slave.station}: its state")
-    return {
-        "address": slave.station,
-        "name": slave.name,
+    row: dict[str, Any] = {"address": slave.station, "name": slave.name}
+    try:
+        status = bus.run(read_status(slave.station), f"slave {slave.station}: its state")
+    except WorkingCounterError:
+        return row | {"state": None, "code": 0, "reason": "it does not answer"}
+    return row | {
         "state": state_name(status.state | status.error << 4),
         "code": status.code,
         "reason": name_of(status.code) if status.code else "",

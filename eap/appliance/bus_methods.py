@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from devicebus.sim.spec import FaultKind
 from devicebus.wire.alstatus import AlState
 from eap.appliance import control_bus
 from eap.appliance.bus_client import BusClient
@@ -73,8 +74,8 @@ class Buses:
         known = f"its bus ports are {', '.join(buses)}" if buses else "it has no bus ports"
         if any(port.name == wanted.port for port in station.ports):
             raise _unknown(f"port {wanted.port} of station {station.name} is no bus; {known}")
-        hint = near(wanted.port, buses) or f": {known}"
-        raise _unknown(f"station {station.name} has no port {wanted.port!r}{hint}")
+        hint = near(wanted.port, buses)
+        raise _unknown(f"station {station.name} has no port {wanted.port!r}; {known}{hint}")
 
     def segment(self, port: PortName) -> SegmentLink:
         """Return who takes commands for a bus; raise ControlError if it is not simulated."""
@@ -184,6 +185,7 @@ class BusConnection:
         wanted = parameters(params, control_bus.BusFaultParameters)
         _, port = self._buses.find(wanted)
         segment = self._buses.segment(port)
+        _check_kind(wanted.command)
         try:
             await segment.command(wanted.command)
         except ValueError as exc:
@@ -214,6 +216,15 @@ class BusConnection:
         held = self._held.pop(number)
         self._end_idle(held)
         return held
+
+
+def _check_kind(command: Mapping[str, Any]) -> None:
+    """Raise ControlError for a kind of fault that there is not."""
+    kinds = [kind.value for kind in FaultKind]
+    kind = command.get("kind", kinds[0])
+    if kind not in kinds:
+        reason = f"no fault {kind!r}{near(str(kind), kinds)} (one of {', '.join(kinds)})"
+        raise ControlError(reason, code=ErrorCode.VALUE)
 
 
 def _unknown(reason: str) -> ControlError:

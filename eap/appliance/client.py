@@ -201,12 +201,10 @@ def _none_runs(
     plant: str | None, station: str | None, running: Sequence[ApplianceInfo]
 ) -> ControlError:
     wanted = f"station {station}" if station else f"plant {plant}" if plant else "appliance"
-    if station:
-        names = [name for info in running for name in info.stations]
-        wanted += near(station, names)
     if running:
         others = ", ".join(f"{info.plant} ({', '.join(info.stations)})" for info in running)
-        hint = f"running are {others}"
+        names = [name for info in running for name in info.stations]
+        hint = f"running are {others}{near(station, names) if station else ''}"
     else:
         hint = f"start one with 'eapctl run PLANT' (looked in {runtime_root()})"
     return ControlError(f"no {wanted} runs: {hint}", code=ErrorCode.UNAVAILABLE)

@@ -11,7 +11,7 @@ from eap.cli.bus_params import (
     parse_octets,
     slave_argument,
 )
-from eap.cli.bus_place import BusCommand, Place, bus_options, open_session
+from eap.cli.bus_place import BusCommand, BusPort, Place, bus_options, open_session
 from eap.cli.group import LazyGroup
 from eap.cli.output import write_json, write_tables, write_text
 from eap.cli.params import json_option
@@ -37,8 +37,10 @@ _U16 = 0xFFFF
 def bus() -> None:
     """Look at a bus of slaves and talk to them.
 
-    SLAVE is a station address (1001 is the first slave) or the slave's name.  Slaves stay in their
-    states, except that one in INIT is brought to PREOP when its mailbox is needed.
+    The bus is a port of a running station (STATION/PORT), whose master is asked, or is behind an
+    interface (--interface URI), where the command is the master.  SLAVE is a station address (1001
+    is the first slave) or the slave's name.  Slaves stay in their states, except that behind an
+    interface one in INIT is brought to PREOP when its mailbox is needed.
     """
 
 
@@ -46,7 +48,7 @@ def bus() -> None:
 @bus_options
 @json_option("Print one object.")
 def scan(bus: Place, as_json: bool) -> None:
-    """Find all slaves: identity, state, alias, mailbox protocols."""
+    """Show all slaves: identity, state, alias, mailbox protocols."""
     from eap.appliance.bus_info import scan_rows
 
     with open_session(bus) as session:
@@ -54,9 +56,9 @@ def scan(bus: Place, as_json: bool) -> None:
     if as_json:
         write_json({"slaves": rows})
         return
-    from eap.cli.bus_view import scan_table
+    from eap.cli.bus_view import scan_tables
 
-    write_tables([scan_table(rows)])
+    write_tables(scan_tables(rows))
 
 
 @click.command(cls=BusCommand)
@@ -66,8 +68,8 @@ def scan(bus: Place, as_json: bool) -> None:
 def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
     """Show states, or bring one slave or all of them to a state.
 
-    A slave with outputs does not stay in OP when nobody sends it process data: this command does so
-    only until all slaves are there.
+    The master of a running station keeps them there.  Behind an interface nobody does: a slave with
+    outputs leaves OP when nobody sends it process data.
     """
     from eap.appliance.bus_info import state_rows
 
@@ -83,6 +85,8 @@ def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
     from eap.cli.bus_view import state_table
 
     write_tables([state_table(rows)])
+    if target is not None and isinstance(bus, BusPort):
+        write_text(f"The master of {bus} keeps {'it' if rest else 'them'} there.")
 
 
 @click.command(cls=BusCommand)
@@ -135,7 +139,10 @@ def sii_dump(slave: str, file: Path | None, bus: Place, as_json: bool) -> None:
 @click.argument("file", type=click.Path(exists=True, path_type=Path, dir_okay=False))
 @json_option("Print one object.")
 def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
-    """Write FILE into the EEPROM and compare what is there then."""
+    """Write FILE into the EEPROM and compare what is there then.
+
+    The master of a running station takes note of it when it brings its bus up anew.
+    """
     from eap.appliance.bus_info import write_eeprom
 
     with open_session(bus) as session:
@@ -144,6 +151,8 @@ def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
         write_json(done)
     else:
         write_text(f"slave {done['address']}: {done['octets']} octets written and compared")
+        if isinstance(bus, BusPort):
+            write_text(f"The master of {bus} goes by the old content until its plant starts again.")
 
 
 @click.command(cls=BusCommand)

@@ -17,22 +17,26 @@ _SHOWN_OCTETS = 32
 _COUNTERS = ("invalid_frames", "physical", "forwarded", "lost_links")
 
 
-def scan_table(rows: Iterable[Row]) -> Table:
-    """Return the table of a scan."""
+def scan_tables(rows: Iterable[Row]) -> Iterator[Table | Text]:
+    """Yield the table of a scan, and in words what is wrong with slaves."""
     table = _table("Slave", "Name", "Vendor", "Product", "Revision", "Serial", "Alias", "State",
                    "Mailbox")  # fmt: skip
+    faults = []
     for row in rows:
         numbers = (f"0x{row[key]:X}" for key in ("vendor", "product", "revision"))
         table.add_row(
             str(row["address"]),
-            row["fault"] or row["name"],
+            row["name"],
             *numbers,
             str(row["serial"]),
             str(row["alias"] or ""),
             _state(row["state"]),
             " ".join(row["mailbox"]),
         )
-    return table
+        if row["fault"]:
+            faults.append(f"{row['name']} ({row['address']}): {row['fault']}")
+    yield table
+    yield from map(Text, faults)
 
 
 def state_table(rows: Iterable[Row]) -> Table:
@@ -47,7 +51,7 @@ def diagnosis_tables(found: Row) -> Iterator[Table | Text]:
     """Yield the table of all ports, and in words where trouble starts."""
     table = _table("Slave", "Name", "State", "Port", "Open", "CRC", "RX", "Forwarded", "Lost link")
     for row in found["slaves"]:
-        state = row["state"] if row["answers"] else "no answer"
+        state = row["state"] if row["answers"] else None
         first = (str(row["address"]), row["name"], _state(state))
         for port in row["ports"] or [{}]:
             errors = [port.get(key, 0) for key in _COUNTERS]
@@ -147,12 +151,14 @@ def _table(*columns: str) -> Table:
     return table
 
 
-def _state(name: str) -> Text:
+def _state(name: str | None) -> Text:
+    if name is None:
+        return Text("no answer", style="red")
     return Text(name, style="red" if name.endswith("ERROR") else "")
 
 
 def _reason(row: Row) -> str:
-    return f"{row['reason']} (0x{row['code']:04X})" if row["reason"] else ""
+    return f"{row['reason']} (0x{row['code']:04X})" if row["code"] else str(row["reason"])
 
 
 def _plain(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""``eapctl sim``: simulated slaves that answer a master."""
+"""``eapctl sim run``: simulated slaves that answer a master."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from eap.cli.group import LazyGroup
 from eap.cli.output import write_json
 from eap.ids import InterfaceUri
 
@@ -20,12 +21,19 @@ def _parse_interface(
         raise click.BadParameter(str(exc), ctx, param) from None
 
 
-@click.group()
+@click.group(
+    cls=LazyGroup,
+    commands_at={
+        "fault": "eap.cli.sim_fault:fault",
+        "run": "eap.cli.sim:run",
+        "set": "eap.cli.sim_fault:set_value",
+    },
+)
 def sim() -> None:
     """Simulated slaves for masters that speak the EtherCAT device protocol."""
 
 
-@sim.command()
+@click.command()
 @click.argument("bus", type=click.Path(dir_okay=False, path_type=Path))
 @click.option(
     "--interface",

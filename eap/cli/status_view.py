@@ -6,6 +6,7 @@ has; what is rare, and worth a look because it is, follows below them in words.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -39,6 +40,8 @@ def status_tables(document: Row) -> Iterator[RenderableType]:
     for appliance in document["appliances"]:
         yield _processes(appliance)
     yield _stations(stations)
+    if any("bus" in port for station in stations for port in station["ports"]):
+        yield _buses(stations)
     yield _process_data(stations)
     remarks = [remark for appliance in document["appliances"] for remark in _denied(appliance)]
     remarks += [remark for station in stations for remark in _remarks(station)]
@@ -52,7 +55,10 @@ def _processes(appliance: Row) -> RenderableType:
     table.box, table.show_header, table.pad_edge = None, False, True
     for _ in range(5):
         table.add_column()
-    for name, process in appliance["processes"].items():
+    processes = dict(appliance["processes"])
+    segments = processes.pop("segments", {})
+    processes |= {f"segment {name}": process for name, process in segments.items()}
+    for name, process in processes.items():
         if not process["pid"]:
             table.add_row(name, Text("restarting", style=_BAD))
             continue
@@ -84,10 +90,51 @@ def _stations(stations: Sequence[Row]) -> RenderableType:
             words.duration(station["cycle_us"]) if "cycle_us" in station else "",
         )
         for port in station["ports"] or [{}]:
-            ports = (port.get(key) or "" for key in ("name", "interface", "net_id"))
-            table.add_row(*own, *ports, _state(port.get("link") or ""))
+            where, net_id = _interface(port.get("interface", "")), port.get("net_id", "")
+            link = _state(port.get("link") or "")
+            table.add_row(*own, port.get("name", ""), where, net_id, link)
             own = ("", Text(), "")
     return table
+
+
+def _interface(uri: str) -> str:
+    """Return where a port is; of a simulated bus only the name of its file."""
+    scheme, _, path = uri.partition("://")
+    return f"{scheme}://{path.rpartition('/')[2]}" if scheme == "sim" else uri
+
+
+def _buses(stations: Sequence[Row]) -> RenderableType:
+    table = _table("Bus", "Slaves", "State", "Cycles", "Lost", "Counters", "Trip")
+    for column in table.columns[3:]:
+        column.justify, column.no_wrap = "right", True
+    for station in stations:
+        for port in station["ports"]:
+            if (bus := port.get("bus")) is None:
+                continue
+            states = Counter(slave["state"] or "no answer" for slave in bus["slaves"])
+            shown = ", ".join(
+                state if len(states) == 1 else f"{count} {state}" for state, count in states.items()
+            )
+            table.add_row(
+                f"{station['name']}/{port['name']}",
+                str(len(bus["slaves"])),
+                _state(shown if bus["is_up"] else "down"),
+                str(bus["cycles"]),
+                str(bus["lost"]),
+                f"{bus['received_wkc']} of {bus['expected_wkc']}",
+                words.duration(bus["trip_us"]),
+            )
+    return table
+
+
+def _bus_remarks(name: str, bus: Row) -> Iterator[str]:
+    if bus["fault"]:
+        yield f"{name}: {'; '.join(bus['fault'].splitlines())}"
+    if bus["wkc_errors"]:
+        yield f"{name}: {words.count(bus['wkc_errors'], 'cycle')} with a wrong working counter"
+    for slave in bus["slaves"]:
+        if slave["fault"]:
+            yield f"{name} {slave['name']} ({slave['address']}): {slave['fault']}"
 
 
 def _process_data(stations: Sequence[Row]) -> RenderableType:
@@ -124,24 +171,29 @@ def _received(row: Row) -> tuple[RenderableType, ...]:
 
 def _remarks(station: Row) -> Iterator[str]:
     name = station["name"]
-    own = []
-    silent_us = station.get("cycle_age_us") or 0
-    if silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * station.get("cycle_us", 0)):
-        own.append(f"has not run a cycle for {words.duration(silent_us)}")
-    if overruns := station.get("overruns"):
-        own.append(f"left out {words.count(overruns, 'cycle')}")
-    if torn := station.get("torn"):
-        own.append(f"found {words.count(torn, 'torn write')}")
-    if discarded := _counts(station["discarded"]):
-        own.append(f"turned away: {discarded}")
-    if own:
-        yield f"{name}: {'; '.join(own)}"
+    if own := "; ".join(_own_remarks(station)):
+        yield f"{name}: {own}"
+    for port in station["ports"]:
+        if (bus := port.get("bus")) is not None:
+            yield from _bus_remarks(f"{name}/{port['name']}", bus)
     for row in station["pd"]["tx"]:
         if remark := "; ".join(_sent_remarks(row)):
             yield f"{name} → {row['name']}: {remark}"
     for row in station["pd"]["rx"]:
         if remark := "; ".join(_received_remarks(row)):
             yield f"{name} ← {row['name']}: {remark}"
+
+
+def _own_remarks(station: Row) -> Iterator[str]:
+    silent_us = station.get("cycle_age_us") or 0
+    if silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * station.get("cycle_us", 0)):
+        yield f"has not run a cycle for {words.duration(silent_us)}"
+    if overruns := station.get("overruns"):
+        yield f"left out {words.count(overruns, 'cycle')}"
+    if torn := station.get("torn"):
+        yield f"found {words.count(torn, 'torn write')}"
+    if discarded := _counts(station["discarded"]):
+        yield f"turned away: {discarded}"
 
 
 def _sent_remarks(row: Row) -> Iterator[str]:

@@ -1,0 +1,121 @@
+"""``eapctl sim fault`` and ``sim set``: what happens to a simulated bus of a running station."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from eap.cli.bus_place import BusPort, parse_port
+from eap.cli.output import write_json, write_text
+from eap.cli.params import CommandT, json_option, plant_option
+
+_EXAMPLE = "such as power slave=drive for_ms=500"
+
+
+def parse_fault(words: tuple[str, ...]) -> dict[str, Any]:
+    """Read a JSON object, or a kind and ``key=value``; raise UsageError for anything else."""
+    if len(words) == 1 and words[0].lstrip().startswith("{"):
+        import msgspec
+
+        try:
+            return msgspec.json.decode(words[0], type=dict[str, Any])
+        except msgspec.DecodeError as exc:
+            raise click.UsageError(f"not a fault in JSON: {exc}") from None
+    kind, *rest = words
+    fault: dict[str, Any] = {"kind": kind}
+    for word in rest:
+        key, equals, text = word.partition("=")
+        if not key or not equals:
+            raise click.UsageError(f"{word!r} is not key=value: a fault is written {_EXAMPLE}")
+        fault[key.replace("-", "_")] = parse_value(text)
+    return fault
+
+
+def parse_value(text: str) -> bool | int | float | str:
+    """Read a truth value or a number, in hexadecimal too; what is neither stays text."""
+    if text in {"true", "false"}:
+        return text == "true"
+    try:
+        return int(text, 0)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _place_argument(command: CommandT) -> CommandT:
+    return click.argument("bus", callback=_to_port, metavar="STATION/PORT")(command)
+
+
+def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> BusPort:
+    port = parse_port(text)
+    if port is None:
+        raise click.BadParameter(f"{text!r} is no STATION/PORT, such as press/bus0", ctx, param)
+    return port
+
+
+@click.command()
+@_place_argument
+@click.argument("words", nargs=-1, required=True, metavar="JSON|KIND [KEY=VALUE]...")
+@click.option("--end", is_flag=True, help="End the fault that is described, instead of beginning.")
+@plant_option
+@json_option("Print one object: what was sent.")
+def fault(
+    bus: BusPort, words: tuple[str, ...], end: bool, plant: str | None, as_json: bool
+) -> None:
+    """Let a fault happen on a simulated bus of a running station.
+
+    docs/simulator.md lists the kinds and their keys, such as: power slave=drive for_ms=500
+    """
+    command = parse_fault(words) | ({"end": True} if end else {})
+    _send(bus, command, plant)
+    if as_json:
+        write_json(command)
+    else:
+        write_text(f"{bus}: fault {command.get('kind')} {'ends' if end else 'begins'}")
+
+
+@click.command("set", context_settings={"ignore_unknown_options": True})
+@_place_argument
+@click.argument("slave")
+@click.argument("entry")
+@click.argument("value", required=False, metavar="[VALUE]")
+@click.option("--release", is_flag=True, help="Let the entry change again; without VALUE.")
+@plant_option
+@json_option("Print one object: what was sent.")
+def set_value(
+    bus: BusPort,
+    slave: str,
+    entry: str,
+    value: str | None,
+    release: bool,
+    plant: str | None,
+    as_json: bool,
+) -> None:
+    """Let an entry of a simulated slave keep a value, whatever it would be otherwise.
+
+    SLAVE is its name in the bus file, ENTRY the name of an input or another entry, or such as
+    0x6000:1.
+    """
+    if release == (value is not None):
+        raise click.UsageError("expected either VALUE or --release")
+    where: dict[str, Any] = {"slave": slave, "entry": entry}
+    if value is None:
+        command = {"release": where}
+    else:
+        command = {"set": where | {"value": parse_value(value)}}
+    _send(bus, command, plant)
+    if as_json:
+        write_json(command)
+    else:
+        write_text(f"{bus}: {slave} {entry} " + ("changes again" if release else f"= {value}"))
+
+
+def _send(bus: BusPort, command: dict[str, Any], plant: str | None) -> None:
+    from eap.appliance.client import connect_station
+
+    with connect_station(bus.station, plant) as client:
+        client.request("bus_fault", station=bus.station, port=bus.port, command=command)
