@@ -17,6 +17,7 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import (
     EXPEDITED_SIZE,
     INITIATE_OVERHEAD,
+    SEGMENT_MINIMUM,
     SEGMENT_OVERHEAD,
     SdoHeader,
     SdoRequest,
@@ -33,6 +34,8 @@ from eap.od.abort import AbortCode, SdoAbortError
 
 MAX_SIZE = 1 << 24
 """Octets of the largest object that an upload takes unless told otherwise."""
+MAX_SHORT = 1_000
+"""Segments of less than seven octets that a slave may send before it only keeps us busy."""
 
 
 def upload(
@@ -60,7 +63,7 @@ def upload(
     content = bytearray(rest[:size])
     progress = progress or Progress()
     progress.done, progress.total = len(content), size
-    toggle = 0
+    toggle = short = 0
     while len(content) < size:
         asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
         body = yield from sdo.ask_segment(asked)
@@ -71,8 +74,10 @@ def upload(
             yield from sdo.give_up(AbortCode.TOO_LONG, f"more than the {size} octets announced")
         if segment.last and len(content) < size:
             raise MailboxProtocolError(f"{sdo}: {len(content)} octets of {size} announced")
-        if not data:
-            yield from sdo.give_up(AbortCode.GENERAL, "a segment without data")
+        short += len(data) < SEGMENT_MINIMUM
+        if not data or short > MAX_SHORT:
+            reason = f"{short} short segments" if data else "a segment without data"
+            yield from sdo.give_up(AbortCode.GENERAL, reason)
         progress.done = len(content)
         toggle ^= 1
     return bytes(content)

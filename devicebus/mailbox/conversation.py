@@ -12,6 +12,7 @@ mailbox error, and closes it to cancel.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, TypeAlias, TypeVar
@@ -46,9 +47,15 @@ class Message(NamedTuple):
 
     type: MailboxType
     data: bytes
+    at_ns: int = 0
+    """When it came; 0 where nobody has a clock, and a number of messages is the only limit."""
 
 
 Conversation: TypeAlias = Generator[Ask, Message, T]
+
+
+RATE_WINDOW_NS = 2_000_000_000
+"""What a rate is the mean of, at most."""
 
 
 class Progress:
@@ -59,11 +66,24 @@ class Progress:
         total: Octets in all, None where the protocol does not tell.
     """
 
-    __slots__ = ("done", "total")
+    __slots__ = ("_seen", "done", "total")
 
     def __init__(self, total: int | None = None) -> None:
         self.done = 0
         self.total = total
+        self._seen: deque[tuple[int, int]] = deque()
+
+    def rate(self, now_ns: int) -> float:
+        """Return octets a second over the last two seconds, 0 when asked for the first time.
+
+        To be asked a few times a second by one user.
+        """
+        seen = self._seen
+        while len(seen) > 1 and seen[1][0] <= now_ns - RATE_WINDOW_NS:
+            seen.popleft()
+        seen.append((now_ns, self.done))
+        first_ns, first = seen[0]
+        return (self.done - first) * 1e9 / (now_ns - first_ns) if now_ns > first_ns else 0.0
 
 
 @contextmanager

@@ -28,6 +28,8 @@ STEP_TIMEOUT_NS = 3_000_000_000
 BUSY_DELAY_NS = 10_000_000
 BUSY_LIMIT = 6_000
 """Times in a row that a slave may be busy: a minute, at least."""
+BUSY_TIMEOUT_NS = 120_000_000_000
+"""How long it may be busy, however long it takes to say so."""
 MAX_SIZE = 1 << 28
 """Octets of the largest file that is read unless told otherwise."""
 
@@ -155,7 +157,9 @@ class _Transfer:
     def ask(self, sent: bytes) -> Conversation[tuple[FoeHeader, bytes]]:
         """Send a message, again while the slave is busy; return header and body of the answer."""
         ask = Ask(MailboxType.FOE, sent, timeout_ns=STEP_TIMEOUT_NS)
-        for _ in range(BUSY_LIMIT):
+        since_ns: int | None = None
+        times = 0
+        while times < BUSY_LIMIT:
             message = yield ask
             with reading(self.what):
                 header, body = decode_message(message.data)
@@ -163,9 +167,13 @@ class _Transfer:
                 raise self._refusal(header.number, text_of(body))
             if header.opcode is not FoeOpcode.BUSY:
                 return header, bytes(body)
+            times += 1
+            since_ns = message.at_ns if since_ns is None else since_ns
+            if message.at_ns - since_ns > BUSY_TIMEOUT_NS:
+                break
             ask = ask._replace(delay_ns=BUSY_DELAY_NS)
         yield from self.tell(FoeErrorCode.NOT_DEFINED)
-        raise MailboxTimeoutError(f"{self.what}: still busy after {BUSY_LIMIT} answers")
+        raise MailboxTimeoutError(f"{self.what}: still busy after {times} answers")
 
     def tell(self, code: FoeErrorCode) -> Conversation[None]:
         """Tell the slave that the transfer is over."""

@@ -7,7 +7,7 @@ that end in another IDN were late, and are dropped.
 from __future__ import annotations
 
 from devicebus.errors import MailboxProtocolError, MailboxTimeoutError, SoeError
-from devicebus.mailbox.conversation import Ask, Conversation, Progress, reading
+from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_procedure import CLEAR, START
 from eap.codec.mailbox import MailboxType
@@ -49,6 +49,14 @@ def read(
         SoeError: the drive refuses.
         MailboxProtocolError: its answer is no answer.
     """
+    _, content = yield from _read(idn, elements, drive, progress, delay_ns)
+    return content
+
+
+def _read(
+    idn: Idn, elements: int, drive: int, progress: Progress | None, delay_ns: int
+) -> Conversation[tuple[Message, bytes]]:
+    """As read(); return the last message as well."""
     what = f"SoE read of {idn} at drive {drive}"
     progress = progress or Progress()
     number = idn.number
@@ -83,7 +91,7 @@ def read(
         if len(content) > MAX_SIZE:
             raise MailboxProtocolError(f"{what}: more than {MAX_SIZE} octets")
         if not header.incomplete:
-            return bytes(content)
+            return message, bytes(content)
         left = now_left
 
 
@@ -132,18 +140,22 @@ def execute(
 
     Raises:
         SoeError: the drive refuses, or the command failed.
-        MailboxTimeoutError: it is not done after *timeout_ns*, not counting the answers' time.
+        MailboxTimeoutError: it is not done after *timeout_ns*.
         MailboxProtocolError: an answer is no answer.
     """
     what = f"procedure command {idn} at drive {drive}"
     yield from write(idn, START.to_bytes(2, "little"), sizes, drive=drive)
     state = DataState.BUSY
+    since_ns: int | None = None
     for _ in range(max(1, timeout_ns // POLL_DELAY_NS)):
-        octets = yield from read(idn, Element.DATA_STATE, drive=drive, delay_ns=POLL_DELAY_NS)
+        message, octets = yield from _read(idn, Element.DATA_STATE, drive, None, POLL_DELAY_NS)
         if len(octets) < 2:
             raise MailboxProtocolError(f"{what}: a data state of {len(octets)} octets")
         state = DataState(int.from_bytes(octets[:2], "little") & DataState.FAILED)
         if state & DataState.ERROR or not state & DataState.EXECUTING:
+            break
+        since_ns = message.at_ns if since_ns is None else since_ns
+        if message.at_ns - since_ns > timeout_ns:
             break
     yield from write(idn, CLEAR.to_bytes(2, "little"), sizes, drive=drive)
     if state & DataState.ERROR:

@@ -188,7 +188,8 @@ class Mailbox:
         _, now_ns = yield Sleep(0)
         if error is None:
             self._tally.answer(now_ns - start_ns)
-            _resume(job, lambda: job.conversation.send(message), now_ns)
+            answer = message._replace(at_ns=now_ns)
+            _resume(job, lambda: job.conversation.send(answer), now_ns)
         else:
             reason = error
             _resume(job, lambda: job.conversation.throw(reason), now_ns)

@@ -17,7 +17,8 @@ INITIATE_OVERHEAD = 16
 """Octets of a mailbox that the first message of a normal SDO takes before its data."""
 SEGMENT_OVERHEAD = 9
 """Octets of a mailbox that a segment takes before its data."""
-_SEGMENT_MINIMUM = 7
+SEGMENT_MINIMUM = 7
+"""Octets of a segment at least; in one with fewer the rest is padding."""
 
 
 class SdoRequest(IntEnum):
@@ -105,22 +106,22 @@ def encode_segment(
     specifier: SdoRequest | SdoResponse, data: Buffer = b"", *, toggle: int, last: bool = False
 ) -> bytes:
     """Return a segment that carries *data*."""
-    unused = max(0, _SEGMENT_MINIMUM - len(data))
+    unused = max(0, SEGMENT_MINIMUM - len(data))
     head = SdoSegmentHeader(last, unused, toggle, specifier)
     return head.encode() + bytes(data) + bytes(unused)
 
 
 def encode_segment_answer(specifier: SdoRequest | SdoResponse, *, toggle: int) -> bytes:
     """Return what asks for a segment, or confirms one."""
-    return SdoSegmentHeader(toggle=toggle, specifier=specifier).encode() + bytes(_SEGMENT_MINIMUM)
+    return SdoSegmentHeader(toggle=toggle, specifier=specifier).encode() + bytes(SEGMENT_MINIMUM)
 
 
 def decode_segment(body: Buffer) -> tuple[SdoSegmentHeader, bytes]:
     """Return header and data of a segment; raise TruncatedError if it is empty."""
     head = SdoSegmentHeader.decode(body)
     data = bytes(body[SdoSegmentHeader.SIZE :])
-    if len(data) <= _SEGMENT_MINIMUM:
-        data = data[: _SEGMENT_MINIMUM - head.unused]
+    if len(data) <= SEGMENT_MINIMUM:
+        data = data[: SEGMENT_MINIMUM - head.unused]
     return head, data
 
 

@@ -103,7 +103,7 @@ class Line:
         if not ask.listen:
             self.now_ns += ask.delay_ns
             self._send(ask)
-        return self._receive(ask) if ask.expects_reply else Message(ask.type, b"")
+        return self._receive(ask) if ask.expects_reply else Message(ask.type, b"", self.now_ns)
 
     def _send(self, ask: Ask) -> None:
         if ask.listen:
@@ -152,7 +152,7 @@ class Line:
             self.server.handle_read()
             assert again == octets
             assert not self._watch.is_new(decode_message(again)[0].counter)
-        return Message(header.type, bytes(data))
+        return Message(header.type, bytes(data), self.now_ns)
 
 
 def open_line(

@@ -131,6 +131,18 @@ def test_answer_that_breaks_the_protocol(
         assert not asked[-1].expects_reply
 
 
+def test_endless_short_segments_end_with_the_limit() -> None:
+    answers = (f"0030 {(n % 2) << 4 | 0x0A:02x} 01020000000000" for n in itertools.count())
+    first = "0030 41 1810 01 00000001 01"
+    with pytest.raises(MailboxProtocolError, match="1001 short segments"):
+        talk_to(
+            COE,
+            coe_client.upload(0x1018, 1, max_size=1 << 30),
+            first,
+            *itertools.islice(answers, 1100),
+        )
+
+
 def test_slave_that_says_nothing_ends_in_a_timeout() -> None:
     with pytest.raises(MailboxTimeoutError):
         talk_to(COE, coe_client.upload(0x1018, 1))

@@ -28,6 +28,20 @@ def test_progress_starts_at_nothing() -> None:
     assert (Progress().done, Progress().total, Progress(5).total) == (0, None, 5)
 
 
+def test_rate_is_that_of_the_last_seconds() -> None:
+    progress = Progress(4000)
+    second = 1_000_000_000
+    assert progress.rate(second) == 0
+    progress.done = 100
+    assert progress.rate(2 * second) == 100
+    progress.done = 500
+    assert progress.rate(3 * second) == 250
+    assert progress.rate(3 * second) == 250
+    progress.done = 600
+    assert progress.rate(5 * second) == 50
+    assert progress.rate(9 * second) == 0
+
+
 def test_what_a_decoder_says_becomes_a_protocol_error() -> None:
     broken = pytest.raises(MailboxProtocolError, match="answer of S1: MailboxHeader at offset 0")
     with broken, reading("answer of S1"):

@@ -105,6 +105,14 @@ def test_endless_busy_ends_in_a_timeout() -> None:
         read(itertools.repeat(BUSY))
 
 
+def test_slave_that_takes_its_time_to_be_busy_ends_in_a_timeout_too() -> None:
+    talk = foe_client.write(NAME, io.BytesIO(b"ab").read, SIZES)
+    next(talk)
+    slow = (Message(FOE, bytes.fromhex(BUSY), n * 2_900_000_000) for n in itertools.count())
+    with pytest.raises(MailboxTimeoutError, match="still busy after 43 answers"):
+        list(map(talk.send, slow))
+
+
 def test_late_messages_are_not_taken() -> None:
     content, _ = read(
         [

@@ -55,7 +55,7 @@ def test_boot_mailbox(line):
     for _ in range(2):
         with line.session() as bus:
             unit = bus.find("foe")
-            if unit.state is not AlState.BOOT:
+            if unit.status.state != AlState.BOOT:
                 bus.bring([unit], AlState.BOOT)
             assert bus.converse(unit, read_file, "file") == 3
 
@@ -64,6 +64,6 @@ def test_slave_without_a_mailbox(line):
     for state in ("INIT", "PREOP"):
         with line.session() as bus:
             unit = bus.find("none")
-            assert unit.state.name == state
+            assert AlState(unit.status.state).name == state
             with pytest.raises(BusError, match="no mailbox in PREOP"):
                 bus.converse(unit, REQUESTS["coe"], "request")
