@@ -1,7 +1,8 @@
 """The engine process: the cycles of all stations of an appliance, and nothing beside them.
 
 It is started by the supervisor with one argument, the descriptor of its handover.  Once it runs it
-makes nothing that the garbage collector would look for, does not log and waits for nobody.
+does not log and waits for nobody.  Its cycles make nothing that the garbage collector would look
+for; what requests to buses leave behind when they fail is collected between them.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from eap.net.ticker import Ticker
 
 LOOK_PERIOD_NS = 20_000_000
 """How often the engine looks beyond its cycles, and takes at most one connection from services."""
+
+GARBAGE = 5000
+"""Objects that may be made and not given back before the collector looks at them."""
 
 
 class StopFlag:
@@ -52,6 +56,8 @@ def run_cycles(plant: EnginePlant, link: socket.socket, stop: StopFlag) -> None:
             if now_ns >= look_ns:
                 look_ns = now_ns + LOOK_PERIOD_NS
                 plant.publish_discards()
+                if gc.get_count()[0] > GARBAGE:
+                    gc.collect()
                 if passed := take_connection(link):
                     plant.add_connection(*passed)
     finally:

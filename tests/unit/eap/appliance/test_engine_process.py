@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import socket
 import subprocess
 import sys
+import weakref
 from time import monotonic_ns
 
 import msgspec
 import pytest
 
+from eap.appliance import engine_process
 from eap.appliance.build import EnginePlant
 from eap.appliance.engine_process import StopFlag, run_cycles
 from eap.appliance.handover import EngineOptions, Handover
@@ -108,3 +111,37 @@ def test_an_orphan_does_not_start(tmp_path):
         engine.process.communicate(timeout=10)
         assert engine.process.returncode == -signal.SIGKILL
     assert list(tmp_path.iterdir()) == []
+
+
+class Circle:
+    """What only the garbage collector finds."""
+
+    def __init__(self):
+        self.me = self
+
+
+def test_garbage_does_not_pile_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(engine_process, "GARBAGE", 50)
+    handler = signal.getsignal(signal.SIGTERM)
+    engine, services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    plant = EnginePlant(handover(tmp_path))
+    stop = StopFlag()
+    circles = []
+    receive = plant.engine.handle_timeout
+
+    def make_circles(now_ns):
+        receive(now_ns)
+        circles.extend(weakref.ref(Circle()) for _ in range(100))
+        stop.is_set = len(circles) > 5 and circles[0]() is None
+
+    monkeypatch.setattr(plant.engine, "handle_timeout", make_circles)
+    gc.disable()
+    try:
+        plant.start(monotonic_ns())
+        with engine, services:
+            run_cycles(plant, engine, stop)
+    finally:
+        gc.enable()
+        plant.close()
+        signal.signal(signal.SIGTERM, handler)
+    assert circles[0]() is None

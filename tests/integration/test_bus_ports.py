@@ -1,0 +1,174 @@
+"""Buses of a running plant: their slaves get to OP, and back there whatever dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import EAPCTL, wait_until
+from tests.support.simulator import simulator
+
+pytestmark = pytest.mark.net
+
+BUSES = Path(__file__).parents[2] / "config" / "buses"
+OP = 8
+PLANT = """
+plant: buses
+stations:
+  - name: one
+    net_id: 5.1.1.1.1.1
+    cycle_us: 5000
+    ports:
+      - {name: eap0, kind: eap, interface: "udp://127.0.41.1", net_id: 5.1.1.1.2.1}
+      - {name: bus0, kind: bus, interface: "sim://coe.yaml", net_id: 5.1.1.1.3.1}
+      - {name: bus1, kind: bus, interface: "sim://io.yaml", net_id: 5.1.1.1.3.2}
+    links:
+      - {from: bus1.inputs.in1, to: bus0.buttons.lamp}
+"""
+REMOTE = """
+plant: remote
+stations:
+  - name: one
+    net_id: 5.1.1.1.1.1
+    cycle_us: 5000
+    ports:
+      - {name: eap0, kind: eap, interface: "udp://127.0.41.1", net_id: 5.1.1.1.2.1}
+      - name: bus0
+        kind: bus
+        interface: udp://127.0.41.9
+        bus: coe.yaml
+        net_id: 5.1.1.1.3.1
+"""
+
+
+@pytest.fixture
+def folder(farm):
+    for file in BUSES.iterdir():
+        shutil.copy(file, farm.folder)
+    return farm.folder
+
+
+def is_op(appliance, *ports):
+    values = appliance.values("one")
+    return all(values[f"{port}.state"] == OP and values[f"{port}.wkc_ok"] for port in ports)
+
+
+def segments(appliance):
+    """Process ids by port."""
+    (info,) = appliance.runtime.glob("*/appliance.json")
+    return {
+        name.partition("/")[2]: process["pid"]
+        for name, process in json.loads(info.read_text())["segments"].items()
+    }
+
+
+@pytest.fixture
+def running(farm, folder):
+    appliance = farm.run(farm.write(PLANT))
+    wait_until(lambda: is_op(appliance, "bus0", "bus1"))
+    return appliance
+
+
+def states(interface):
+    """Where slaves stand, seen by another master."""
+    command = [*EAPCTL, "bus", "scan", "--interface", interface, "--json"]
+    found = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    return [slave["state"] for slave in found["slaves"]]
+
+
+def set_output(appliance, name, value):
+    appliance.request("write", station="one", values={name: value})
+
+
+def test_two_buses_of_one_station(running):
+    values = running.values("one")
+    assert values["bus0.sensor.state"] == values["bus1.level.state"] == OP
+    assert values["bus0.sensor.pressure"] in range(1011, 1016)
+    assert values["bus0.buttons.echo"] is False
+    set_output(running, "bus0.buttons.valve", True)
+    wait_until(lambda: running.values("one")["bus0.buttons.echo"] is True)
+    wait_until(lambda: running.values("one")["bus0.buttons.lamp"] is True)
+    wait_until(lambda: running.values("one")["bus0.buttons.lamp"] is False)
+
+
+def test_engine_that_is_killed(running):
+    set_output(running, "bus0.buttons.valve", True)
+    wait_until(lambda: running.values("one")["bus0.buttons.echo"] is True)
+    for restarts in (1, 2):
+        os.kill(running.pid("engine"), signal.SIGKILL)
+        wait_until(lambda count=restarts: running.station("one")["restarts"] == count)
+        took_s = wait_until(lambda: is_op(running, "bus0", "bus1"))
+        assert took_s < 2.0
+        assert running.values("one")["bus0.buttons.echo"] is True
+    assert running.stop()[0] == 0
+
+
+def test_segment_that_is_killed(running):
+    before = segments(running)
+    os.kill(before["bus0"], signal.SIGKILL)
+    wait_until(lambda: running.values("one")["bus0.state"] == 0)
+    values = running.values("one")
+    assert (values["bus0.wkc_ok"], values["bus0.sensor.state"]) == (False, 0)
+    assert (values["bus1.state"], values["bus1.wkc_ok"]) == (OP, True)
+    wait_until(lambda: is_op(running, "bus0"))
+    assert segments(running)["bus0"] != before["bus0"]
+    assert segments(running)["bus1"] == before["bus1"]
+    assert running.station("one")["restarts"] == 0
+
+
+def test_services_that_are_killed_disturb_no_bus(running):
+    before = running.request("bus_describe", station="one", port="bus0")
+    os.kill(running.pid("services"), signal.SIGKILL)
+    wait_until(lambda: running.status()["processes"]["services"]["restarts"] == 1)
+    after = running.request("bus_describe", station="one", port="bus0")
+    assert after["cycles_good"] > before["cycles_good"]
+    assert after["wkc_errors"] == before["wkc_errors"]
+    assert is_op(running, "bus0", "bus1")
+
+
+def test_nothing_is_left_in_time(running):
+    pids = [*segments(running).values(), running.pid("engine"), running.pid("services")]
+    took_s = wait_until(lambda: running.stop()[0] == 0)
+    assert took_s < 2.0
+    assert not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+
+
+def test_supervisor_that_is_killed_takes_all_with_it(running):
+    pids = [*segments(running).values(), running.pid("engine"), running.pid("services")]
+    running.process.kill()
+    running.process.communicate()
+    wait_until(lambda: not [pid for pid in pids if Path(f"/proc/{pid}").exists()])
+
+
+def test_bus_that_comes_late_and_goes(farm, folder):
+    appliance = farm.run(farm.write(REMOTE))
+    assert appliance.values("one")["bus0.state"] == 0
+    for _ in range(2):
+        with simulator(folder / "coe.yaml", "udp://127.0.41.9"):
+            wait_until(lambda: is_op(appliance, "bus0"))
+            assert appliance.values("one")["bus0.sensor.pressure"] in range(1011, 1016)
+        wait_until(lambda: appliance.values("one")["bus0.state"] == 0)
+    assert appliance.stop()[0] == 0
+
+
+def test_slaves_rest_when_the_plant_ends(farm, folder):
+    plant = farm.write(REMOTE)
+    with simulator(folder / "coe.yaml", "udp://127.0.41.9"):
+        appliance = farm.run(plant)
+        wait_until(lambda: is_op(appliance, "bus0"))
+        assert appliance.stop()[0] == 0
+        assert states("udp://127.0.41.9") == ["INIT"] * 3
+
+
+def test_wrong_bus_file_ends_the_start(farm, folder):
+    plant = farm.write(PLANT)
+    (folder / "coe.yaml").write_text("bus: x\nslaves: []\n")
+    code, _, err = farm.start(plant).finish()
+    assert code == 2
+    assert "coe.yaml" in err
