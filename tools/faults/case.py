@@ -44,8 +44,8 @@ class Case(NamedTuple):
 
     @property
     def kind(self) -> FaultKind:
-        """By which it is called."""
-        return self.faults[0].kind
+        """By which it is called: the last one's, the others lead to it."""
+        return self.faults[-1].kind
 
     @property
     def duration_ms(self) -> int:
@@ -112,14 +112,25 @@ CASES = (
         _one(FaultKind.EMERGENCY, 100, slave="drive", code=0x8611),
     ),
     Case(
+        "`drive` sends a TxPDO that nobody asked for",
+        _one(FaultKind.TX_PDO, 100, slave="drive", object="0x1A00"),
+    ),
+    Case(
+        "`island` has no power, and then an EEPROM that does not answer for 3 s",
+        (
+            FaultSpec(kind=FaultKind.POWER, for_ms=200, slave="island"),
+            FaultSpec(kind=FaultKind.EEPROM, at_ms=200, for_ms=3000, slave="island"),
+        ),
+    ),
+    Case(
         "`drive` reports an error and leaves OP",
         _one(FaultKind.AL_ERROR, 1, slave="drive", code=0x001A),
     ),
     Case(
         "`island` reports an error and refuses OP for 1.5 s",
         (
-            FaultSpec(kind=FaultKind.REFUSE, for_ms=1500, slave="island", state="OP", code=0x0052),
             FaultSpec(kind=FaultKind.AL_ERROR, for_ms=1, slave="island", code=0x0052),
+            FaultSpec(kind=FaultKind.REFUSE, for_ms=1500, slave="island", state="OP", code=0x0052),
         ),
     ),
     Case(

@@ -18,7 +18,9 @@ from devicebus.master.event import (
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import MasterStats
 from devicebus.wire.alstatus import name_of, state_name
-from eap.codec.coe import CoeHeader, Emergency
+from eap.codec.coe import CoeHeader, CoeService, Emergency
+from eap.codec.mailbox import MailboxType
+from eap.codec.soe import SoeHeader, SoeOpcode
 
 _MS = 1_000_000
 Names = Mapping[int, str]
@@ -110,6 +112,17 @@ def _describe(event: Event, names: Names) -> str:
         case SlaveFailed():
             return f"`SlaveFailed` {names[event.station]}: {event.reason}"
         case Unsolicited():
-            emergency = Emergency.decode(event.data, CoeHeader.SIZE)
-            code = f"emergency 0x{emergency.error_code:04X}"
-            return f"`Unsolicited` {names[event.station]}: {code}"
+            return f"`Unsolicited` {names[event.station]}: {_message(event.type, event.data)}"
+
+
+def _message(kind: MailboxType, data: bytes) -> str:
+    if kind is MailboxType.COE:
+        header = CoeHeader.decode(data)
+        if header.service is CoeService.EMERGENCY:
+            code = Emergency.decode(data, CoeHeader.SIZE).error_code
+            return f"emergency 0x{code:04X} by CoE"
+        return f"{header.service.name} {header.number} with {data[CoeHeader.SIZE :].hex(' ')}"
+    if kind is MailboxType.SOE and SoeHeader.decode(data).opcode is SoeOpcode.EMERGENCY:
+        code = Emergency.decode(data, SoeHeader.SIZE).error_code
+        return f"emergency 0x{code:04X} by SoE"
+    return f"{kind.name} {data.hex(' ')}"
