@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -40,6 +41,12 @@ def test_the_demo_is_the_ring_that_the_contract_describes():
     ]
     assert "setpoint" in {v.name for v in plant.stations[0].variables if v.writer == "application"}
     assert plant.stations[0].ports[0].join == ("239.88.164.1",)
+    for station in plant.stations:
+        eap0, bus0 = station.ports
+        assert (eap0.name, eap0.kind, bus0.name, bus0.kind) == ("eap0", "eap", "bus0", "bus")
+        assert bus0.interface.startswith("sim:///")
+    drive = plant.stations[0].ports[1].bus.slaves[0]
+    assert (drive.name, drive.station) == ("drive", 1001)
 
 
 def test_the_solar_line_has_the_sizes_of_the_contract():
@@ -110,7 +117,10 @@ def test_no_content_is_a_traceback(tmp_path_factory, changes):
     words = WORDS.copy()
     for position, word in changes:
         words[position] = word
-    path = tmp_path_factory.getbasetemp() / "odd.yaml"
+    folder = tmp_path_factory.getbasetemp()
+    if not (folder / "buses").exists():
+        shutil.copytree(PLANTS / "buses", folder / "buses")
+    path = folder / "odd.yaml"
     path.write_text(" ".join(words))
     result = load_shipped(path)
     assert (result.plant is None) == bool(result.findings)
