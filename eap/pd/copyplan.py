@@ -137,16 +137,16 @@ def _bridge(runs: Iterable[Move], used: _Used) -> list[Move]:
     wide: list[Move] = []
     for run in runs:
         begin, end = run.target_bit, run.target_bit + run.bits
-        if not _delta(run) % 8:
+        delta = _delta(run)
+        if not delta % 8:  # what lies otherwise in its octets would become more steps, not fewer
             floor, ceiling = begin // 8 * 8, -(-end // 8) * 8
             begin = floor if used.is_free(floor, begin) else begin
             end = ceiling if used.is_free(end, ceiling) else end
-        delta = _delta(run)
-        if wide and _delta(wide[-1]) == delta:
-            last = wide[-1]
-            if used.is_free(last.target_bit + last.bits, begin):
-                begin = last.target_bit
-                wide.pop()
+            if wide and _delta(wide[-1]) == delta:
+                last = wide[-1]
+                if used.is_free(last.target_bit + last.bits, begin):
+                    begin = last.target_bit
+                    wide.pop()
         wide.append(Move(begin - delta, begin, end - begin))
     return wide
 

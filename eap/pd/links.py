@@ -80,6 +80,11 @@ class Links:
         ways = [_way(link, end(link.source), end(link.target)) for link in links]
         self._steps = [step for stage in _stages(ways) for step in _steps(image, stage)]
 
+    @property
+    def steps(self) -> int:
+        """How many calls a run makes."""
+        return len(self._steps)
+
     def run(self) -> None:
         """Give every target its value; the engine's region is marked as changing."""
         for step in self._steps:

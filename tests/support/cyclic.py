@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import NetId
+from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image, format_image
-from eap.pd.layout import RxPlace, plan_layout
+from eap.pd.layout import RxPlace, VariablePlace, plan_layout
 from eap.pd.link import OutFrame, Taker
-from eap.pd.spec import PortKind, PortSpec, RxPdSpec, StationSpec, VariableSpec, Writer
+from eap.pd.spec import (
+    BusEntrySpec,
+    BusPortSpec,
+    BusSlaveSpec,
+    PortKind,
+    PortSpec,
+    RxPdSpec,
+    StationSpec,
+    VariableSpec,
+    Writer,
+)
+from eap.pd.station import Station
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import DISCARDS, RxWord, StationWord
 
@@ -138,3 +150,91 @@ class Wire:
             return list(frames)
         self.sent += [bytes(frame.buffer) for frame in frames]
         return ()
+
+
+def entries(*variables: str) -> tuple[BusEntrySpec, ...]:
+    """Process data of a slave, written as ``name:bits``; without a name it is padding."""
+    rows = (variable.rsplit(":", 1) for variable in variables)
+    return tuple(BusEntrySpec(name, 0x6000, 1, int(bits)) for name, bits in rows)
+
+
+def bus_port(*slaves: BusSlaveSpec, name: str = "bus0") -> PortSpec:
+    bus = BusPortSpec(slaves=slaves)
+    return PortSpec(name, PortKind.BUS, "sim://bus.yaml", OWN, bus=bus)
+
+
+def slave(
+    inputs: Sequence[BusEntrySpec] = (), outputs: Sequence[BusEntrySpec] = (), station: int = 1001
+) -> BusSlaveSpec:
+    return BusSlaveSpec(f"slave{station}", station, 2, 3, outputs=outputs, inputs=inputs)
+
+
+class FakeBus:
+    """The bus of one station (or *only* its n-th), whose slaves the test holds.
+
+    An exchange samples the inputs and brings the outputs; what it brought is taken when it is
+    *received*.
+
+    Attributes:
+        inputs: What the slaves measure.
+        outputs: What they have been told.
+        due_ns: What :meth:`next_timeout` returns.
+        log: Calls, with the time if they are told one.
+    """
+
+    def __init__(self, made: Station, *, only: int = 0, log: list[str] | None = None) -> None:
+        places = made.image.places
+        slaves = [port.bus for port in made.spec.ports if port.bus][only].slaves
+        self._image = made.image
+        self._inputs, input_size = _plan([each.inputs for each in slaves], places)
+        self._outputs, output_size = _plan([each.outputs for each in slaves], places)
+        self._memory_of = made.memory_of
+        self.inputs = bytearray(input_size)
+        self.outputs = bytearray(output_size)
+        self._on_the_way: bytes | None = None
+        self._arrived = bytes(input_size)
+        self.due_ns: int | None = None
+        self.log: list[str] = [] if log is None else log
+
+    def take_inputs(self) -> None:
+        changing = self._image.words[StationWord.ENGINE_SEQUENCE] % 2
+        self.log.append("take changing" if changing else "take calm")
+        for moves in self._inputs.values():
+            CopyPlan(moves).run(self._arrived, self._image.memory)
+
+    def exchange(self, now_ns: int) -> None:
+        self.log.append(f"exchange {now_ns}")
+        for writer, moves in self._outputs.items():
+            back = [(move.target_bit, move.source_bit, move.bits) for move in moves]
+            CopyPlan(back).run(self._memory_of(writer), memoryview(self.outputs))
+        self._on_the_way = bytes(self.inputs)
+
+    def next_timeout(self) -> int | None:
+        return self.due_ns
+
+    def handle_timeout(self, now_ns: int) -> None:
+        self.log.append(f"timeout {now_ns}")
+        self.due_ns = None
+
+    def receive(self, now_ns: int) -> None:
+        self.log.append(f"receive {now_ns}")
+        if self._on_the_way is not None:
+            self._arrived, self._on_the_way = self._on_the_way, None
+
+
+def _plan(
+    sides: Iterable[Sequence[BusEntrySpec]], places: Mapping[str, VariablePlace]
+) -> tuple[dict[Writer, list[Move]], int]:
+    """Moves to the image by writer, and the octets of all sides one behind the other."""
+    moves: dict[Writer, list[Move]] = {}
+    start = 0
+    for side in sides:
+        bit = 8 * start
+        for entry in side:
+            if entry.variable:
+                place = places[entry.variable]
+                move = Move(bit, place.bit_offset, entry.bit_length)
+                moves.setdefault(place.writer, []).append(move)
+            bit += entry.bit_length
+        start = -(-bit // 8)
+    return moves, start

@@ -4,7 +4,20 @@ from eap.pd.engine import Engine
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
 from eap.pd.station import Station
 from eap.pd.words import StationWord
-from tests.support.cyclic import MS, PEER, Wire, image_of, octets, received, station, written
+from tests.support.cyclic import (
+    MS,
+    PEER,
+    FakeBus,
+    Wire,
+    bus_port,
+    entries,
+    image_of,
+    octets,
+    received,
+    slave,
+    station,
+    written,
+)
 
 
 def make(name: str = "a", **options: object) -> tuple[Station, Wire]:
@@ -72,6 +85,53 @@ def test_the_stop_ends_sending_and_receiving():
     engine.stop()
     assert made.image.words[StationWord.STATE] == 2
     assert len(wire.sent) == 3
+
+
+def with_bus() -> tuple[Station, FakeBus]:
+    spec = station(
+        ports=(bus_port(slave(entries("i:8"))),), variables=received("i:USINT"), cycle_us=4000
+    )
+    made = Station(spec, image_of(spec), lambda: None)
+    bus = FakeBus(made)
+    made.connect_bus(bus)
+    return made, bus
+
+
+def test_a_bus_that_is_due_between_two_cycles_has_its_turn():
+    (made, bus), (other, late) = with_bus(), with_bus()
+    engine = Engine([made, other])
+    engine.start(0)
+    bus.due_ns, late.due_ns = MS + 5, MS + 3
+    assert engine.next_timeout() == MS + 3
+    engine.handle_timeout(MS + 2)
+    assert bus.log == late.log == []
+    engine.handle_timeout(MS + 7)
+    assert (bus.log, late.log) == ([], [f"timeout {MS + 7}"])
+    assert engine.next_timeout() == MS + 5
+    engine.handle_timeout(MS + 8)
+    assert bus.log == [f"timeout {MS + 8}"]
+    assert engine.next_timeout() == 4 * MS
+
+
+def test_stations_come_before_buses():
+    made, bus = with_bus()
+    other, late = with_bus()
+    engine = Engine([made, other])
+    engine.start(0)
+    bus.due_ns = late.due_ns = 3 * MS
+    for _ in range(3):
+        engine.handle_timeout(4 * MS)
+    assert made.image.words[StationWord.CYCLE] == other.image.words[StationWord.CYCLE] == 1
+    # Each station ran the timer of its own bus.
+    assert bus.log.count(f"timeout {4 * MS}") == late.log.count(f"timeout {4 * MS}") == 1
+
+
+def test_buses_are_asked_for_frames_as_these_arrive():
+    made, bus = with_bus()
+    engine = Engine([made])
+    engine.start(0)
+    engine.receive(MS)
+    assert bus.log == [f"receive {MS}"]
 
 
 def test_frames_are_taken_as_they_arrive_where_that_is_wanted():

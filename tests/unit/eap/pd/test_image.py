@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eap.codec.datatypes import parse
 from eap.errors import ImageError, TornReadError
 from eap.pd.image import READ_ATTEMPTS, Image, default_value, format_image, read_header
 from eap.pd.layout import HEADER, plan_layout
@@ -47,6 +48,22 @@ def test_what_is_written_is_read_and_nothing_else_changes(data):
         expected[f"v{i}"] = value
     assert image.read_all() == expected
     assert {name: image.read(name) for name in names} == expected
+
+
+@given(st.data())
+def test_a_storer_writes_what_write_writes(data):
+    kinds = ("BOOL", "BIT3", "SINT", "USINT", "INT", "UINT24", "UDINT", "LINT", "REAL", "LREAL")
+    names = tuple(f"v{i}" for i in range(len(kinds)))
+    variables = received(*(f"v{i}:{kind}" for i, kind in enumerate(kinds)))
+    spec = station(variables=variables, subscriptions=(RxPdSpec("r", "eap0", 1, names),))
+    image, other = image_of(spec), image_of(spec)
+    for name, kind in zip(names, kinds, strict=True):
+        low, high = parse(kind).scalar_range
+        number = st.integers(low, high) if isinstance(low, int) else st.floats(low, high)
+        value = data.draw(number)
+        image.storer(name)(value)
+        other.write(name, value)
+    assert bytes(image.memory) == bytes(other.memory)
 
 
 def test_bits_are_read_from_where_they_were_packed():

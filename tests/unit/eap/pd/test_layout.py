@@ -8,7 +8,7 @@ from eap.codec import datatypes
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, WORDS_OFFSET, ImageLayout, plan_layout
 from eap.pd.spec import RxPdSpec, TriggerSpec, TxFrameSpec, TxPdSpec, Writer
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
-from tests.support.cyclic import received, station, written
+from tests.support.cyclic import bus_port, eap_port, entries, received, slave, station, written
 
 TYPES = st.sampled_from(["BOOL", "BIT3", "USINT", "UINT24", "LREAL", "STRING(5)", "INT[3]"])
 
@@ -121,3 +121,48 @@ def test_the_directory_is_the_layout():
     )
     assert msgspec.json.decode(layout.encode(), type=ImageLayout) == layout
     assert layout.size == layout.directory_offset + len(layout.encode())
+
+
+def test_slaves_lie_in_the_image_as_in_their_process_data():
+    inputs = [entries("a:1", "b:1", ":6", "c:16"), entries("d:4", ":4"), entries("e:8")]
+    layout = plan_layout(
+        station(
+            ports=(
+                eap_port(),
+                bus_port(slave(inputs[0]), slave(station=1002), slave(inputs[1], station=1003)),
+                bus_port(slave(inputs[2]), name="bus1"),
+            ),
+            variables=received(
+                "r:UINT", "state:BYTE", "e:USINT", "d:BIT4", "c:INT", "b:BOOL", "a:BOOL"
+            ),
+            subscriptions=(RxPdSpec("r", "eap0", 1, ("r",)),),
+        )
+    )
+    bits = {place.name: place.bit_offset for place in layout.variables}
+    first = bits["r"] + 16
+    assert bits["state"] == first + 40
+    assert {name: bits[name] - first for name in "abcde"} == {
+        "a": 0, "b": 1, "c": 8, "d": 24, "e": 32,
+    }  # fmt: skip
+    assert layout.regions[Writer.ENGINE].size == 8 + 2 + 5 + 1
+
+
+def test_each_writer_of_a_slaves_outputs_has_a_mirror_of_them():
+    outputs = entries("a:1", "b:1", ":6", "c:16")
+    layout = plan_layout(
+        station(
+            ports=(eap_port(), bus_port(slave(outputs=outputs), slave(entries("i:8"), outputs=()))),
+            variables=(*written("x:UINT", "b:BOOL"), *received("a:BOOL", "c:INT", "i:USINT")),
+        )
+    )
+    bits = {place.name: place.bit_offset for place in layout.variables}
+    engine, application = (
+        layout.regions[w].offset * 8 for w in (Writer.ENGINE, Writer.APPLICATION)
+    )
+    # Inputs first, then what the engine writes of the outputs.
+    assert [bits[name] - engine for name in "iac"] == [0, 8, 16]
+    assert [bits[name] - application for name in "bx"] == [1, 24]
+
+
+def test_a_bus_without_a_description_has_no_variables():
+    assert plan_layout(station(ports=(bus_port(),))).variables == ()
