@@ -212,6 +212,91 @@ def test_clocks_and_sync0(master):
     assert exchange(master) == master.expected_wkc
 
 
+def difference_ns(slave):
+    """How far a clock is from the reference, as the slave says."""
+    value = int.from_bytes(slave._fprd(0x092C, 4), "little")
+    return value & 0x7FFF_FFFF
+
+
+def test_clocks_follow_the_reference(master):
+    master.config_map()
+    assert master.config_dc()
+    operate(master)
+    for _ in range(CYCLES):
+        exchange(master)
+    assert all(difference_ns(each) < 200 for each in master.slaves[1:])
+
+
+def test_mapping_by_sdo(master):
+    island = master.slaves[0]
+    try:
+        for sub, octets in ((0, "00"), (1, "10010060"), (2, "10010060"), (0, "02")):
+            island.sdo_write(0x1A00, sub, bytes.fromhex(octets))
+        master.config_map()
+        assert len(island.input) == 4
+        operate(master)
+        island.output = b"\x34\x12\0"
+        for _ in range(3):
+            exchange(master)
+        assert island.input == bytes.fromhex("3412 3412")
+    finally:
+        lead(master, pysoem.PREOP_STATE)
+        island.sdo_write(0x1A00, 0, b"\0")
+        for sub, octets in ((1, "10010060"), (2, "01020060"), (3, "07000000"), (0, "03")):
+            island.sdo_write(0x1A00, sub, bytes.fromhex(octets))
+
+
+def test_entry_that_cannot_be_mapped(master):
+    island = master.slaves[0]
+    island.sdo_write(0x1A00, 0, b"\0")
+    island.sdo_write(0x1A00, 1, bytes.fromhex("20010080"))
+    with pytest.raises(pysoem.SdoError) as caught:
+        island.sdo_write(0x1A00, 0, b"\1")
+    assert caught.value.abort_code == 0x06040041
+    island.sdo_write(0x1A00, 1, bytes.fromhex("10010060"))
+    island.sdo_write(0x1A00, 0, b"\3")
+
+
+def test_value_by_command(bus, master):
+    operate(master)
+    island = master.slaves[0]
+    where = {"slave": "island", "entry": "level"}
+    assert bus.fault(set={**where, "value": 0x4321}) == {"ok": True}
+    island.output = b"\x34\x12\0"
+    for _ in range(3):
+        exchange(master)
+    assert island.input[:2] == b"\x21\x43"
+    assert bus.fault(release=where) == {"ok": True}
+    for _ in range(2):
+        exchange(master)
+    assert island.input[:2] == b"\x34\x12"
+
+
+def test_emergency(bus, master):
+    island = master.slaves[0]
+    heard = []
+    island.add_emergency_callback(heard.append)
+    assert bus.fault(kind="emergency", slave="island", code=0x5010) == {"ok": True}
+    for _ in range(10):
+        island.mbx_receive()
+        if heard:
+            break
+    assert [(each.error_code, each.error_reg) for each in heard] == [(0x5010, 1)]
+    assert bus.fault(kind="emergency", slave="island", code=0x5010, end=True) == {"ok": True}
+    island.mbx_receive()
+
+
+def test_slow_eeprom_is_waited_for(bus, master):
+    drive = master.slaves[1]
+    drive.eeprom_write(0x20, b"\x12\x34")
+    assert drive.eeprom_read(0x20)[:2] == b"\x12\x34"
+    assert bus.fault(kind="eeprom", slave="drive", delay_us=5000) == {"ok": True}
+    try:
+        assert drive.eeprom_read(0x20)[:2] == b"\x12\x34"
+    finally:
+        bus.fault(kind="eeprom", slave="drive", end=True)
+
+
 def test_eeprom(master):
     island = master.slaves[0]
     assert island.eeprom_read(8) == (0x1234).to_bytes(4, "little")
