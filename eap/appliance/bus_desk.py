@@ -15,13 +15,9 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask, Conversation
-from devicebus.master.access import Access, Reply
-from devicebus.master.link import MAX_DATA
-from devicebus.master.procedure import Procedure
+from devicebus.master.access import Reply
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command
 from eap.appliance.bus_failure import to_failure
 from eap.appliance.bus_report import report_bus
 from eap.appliance.bus_request import (
@@ -35,9 +31,9 @@ from eap.appliance.bus_request import (
     Request,
     Transfer,
 )
+from eap.appliance.bus_step import one_ask, one_step, to_accesses, to_ask
 from eap.appliance.bus_target import bring_all, bring_one
 from eap.appliance.engine_bus import EngineBus
-from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
 
 T = TypeVar("T")
@@ -45,18 +41,7 @@ T = TypeVar("T")
 PER_WAKE_UP = 16
 MAX_OUTSTANDING = 1024
 MAX_PER_SLAVE = 64
-MAX_DATAGRAMS = 256
-"""Of one transfer."""
-MAX_TRIES = 8
 _MAX_MESSAGE = 1 << 18
-_ALLOWED = frozenset(
-    (
-        *(Command.NOP, Command.APRD, Command.APWR, Command.APRW, Command.FPRD),
-        *(Command.FPWR, Command.FPRW, Command.BRD),
-    )
-)
-"""What does not disturb the slaves that others talk to: no logical ones, none that write to all."""
-
 _Place = tuple[int, int]
 
 
@@ -137,32 +122,15 @@ class BusDesk:
 
     def _ask(self, bus: EngineBus, request: AskMailbox, now_ns: int) -> None:
         self._check_room((request.bus, request.station))
-        try:
-            kind = MailboxType(request.type)
-        except ValueError:
-            raise BusError(f"there is no mailbox protocol {request.type}") from None
-        ask = Ask(
-            kind,
-            request.request,
-            listen=request.listen,
-            timeout_ns=request.timeout_ns,
-            delay_ns=request.delay_ns,
-            expects_reply=request.expects_reply,
-        )
+        ask = to_ask(request)
         task = bus.master.converse(
-            request.station, _one_ask(ask), now_ns, name=f"{kind.name} request", requester=self
+            request.station, one_ask(ask), now_ns, name=f"{ask.type.name} request", requester=self
         )
         self._watch(bus, request, request.station, task, _data_answer, now_ns)
 
     def _transfer(self, bus: EngineBus, request: Transfer, now_ns: int) -> None:
         self._check_room((request.bus, 0))
-        accesses = [
-            _access(each.command, each.adp, each.ado, each.data, each.tries)
-            for each in request.datagrams
-        ]
-        if not 1 <= len(accesses) <= MAX_DATAGRAMS:
-            raise BusError(f"{len(accesses)} datagrams, expected 1 to {MAX_DATAGRAMS}")
-        task = bus.master.run(_one_step(accesses), now_ns, "a transfer")
+        task = bus.master.run(one_step(to_accesses(request)), now_ns, "a transfer")
         self._watch(bus, request, 0, task, _outcomes_answer, now_ns)
 
     def _bring(self, bus: EngineBus, request: Bring, now_ns: int) -> None:
@@ -234,31 +202,6 @@ class BusDesk:
             self._sock.send(msgspec.msgpack.encode(message))
         except OSError:
             self.dropped += 1
-
-
-def _one_ask(ask: Ask) -> Conversation[bytes]:
-    message = yield ask
-    return message.data
-
-
-def _one_step(accesses: Sequence[Access]) -> Procedure[list[Reply]]:
-    replies, _ = yield accesses
-    return list(replies)
-
-
-def _access(command: int, adp: int, ado: int, data: bytes, tries: int) -> Access:
-    if command not in _ALLOWED:
-        names = ", ".join(sorted(each.name for each in _ALLOWED))
-        raise BusError(
-            f"datagram with command {command}: it would disturb the slaves while they exchange"
-            f" process data; expected one of {names}"
-        )
-    if not (0 <= adp <= 0xFFFF and 0 <= ado <= 0xFFFF and 1 <= len(data) <= MAX_DATA):
-        raise BusError(
-            f"datagram to 0x{adp:X}:0x{ado:X} with {len(data)} octets, expected addresses of 16"
-            f" bits and 1 to {MAX_DATA} octets"
-        )
-    return Access(Command(command), adp, ado, data, min(max(tries, 1), MAX_TRIES))
 
 
 def _data_answer(number: int, data: bytes) -> Answer:

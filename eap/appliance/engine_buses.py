@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable, Mapping
 
 from eap.appliance.bus_desk import BusDesk
-from eap.appliance.engine_bus import EngineBus, master_settings
+from eap.appliance.bus_settings import master_settings
+from eap.appliance.engine_bus import EngineBus
 from eap.appliance.handover import NO_DESCRIPTOR, BusSocket, Handover
 from eap.net.busport import BusPort
 from eap.pd.spec import BusPortSpec

@@ -7,8 +7,8 @@ import pytest
 
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import AlState
-from eap.appliance.engine_bus import RETRY_NS, SILENT_RETRY_NS, master_settings
-from eap.pd.spec import BusPortSpec, BusTarget
+from eap.appliance.engine_bus import RETRY_NS, SILENT_RETRY_NS
+from eap.pd.spec import BusTarget
 from tests.support.cyclic import MS
 from tests.support.enginebus import BUS, BusRig
 
@@ -215,15 +215,3 @@ def test_what_an_earlier_engine_waited_for_is_thrown_away(tmp_path):
     rig.start()
     assert rig.bus.master.stats().link.late == 0
     rig.wait_op()
-
-
-@pytest.mark.parametrize(
-    ("cycle_us", "octets", "patience_ms"),
-    [(1000, 3000, 5), (250, 1536, 5), (10_000, 30_000, 20), (1_000_000, 3_000_000, 50)],
-)
-def test_settings_follow_the_cycle(cycle_us, octets, patience_ms):
-    settings = master_settings(BusPortSpec(clocks=True), cycle_us, 7)
-    assert settings.acyclic_octets == octets
-    assert settings.frame_timeout_ns == patience_ms * MS
-    assert (settings.clocks, settings.epoch_offset_ns) == (True, 7)
-    assert settings.expected == []
