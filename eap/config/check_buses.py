@@ -48,8 +48,7 @@ def describe_buses(
         path, file = bus_file(port, folder)
         if file is None:
             description: BusDescription | None = BusDescription()
-        elif not file.is_file():
-            reason = "is a directory" if file.is_dir() else "does not exist"
+        elif reason := _unusable(file):
             report.add(path, f"bus file {file} {reason}", _FILE)
             description = None
         else:
@@ -71,6 +70,16 @@ def bus_file(port: Port, folder: Path) -> tuple[str, Path | None]:
     if uri is not None and uri.scheme == "sim":
         return f"{port.at}.interface", folder / uri.host
     return f"{port.at}.bus", folder / port.bus if port.bus else None
+
+
+def _unusable(file: Path) -> str:
+    """Return why there is nothing to read at *file*; empty if there is."""
+    try:
+        if file.is_file():
+            return ""
+        return "is no regular file" if file.exists() else "does not exist"
+    except OSError as exc:
+        return f"cannot be read: {exc.strerror}"
 
 
 def _bus_ports(plant: PlantFile) -> Iterator[tuple[Station, Port]]:
