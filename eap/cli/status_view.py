@@ -192,6 +192,8 @@ def _own_remarks(station: Row) -> Iterator[str]:
         yield f"left out {words.count(overruns, 'cycle')}"
     if torn := station.get("torn"):
         yield f"found {words.count(torn, 'torn write')}"
+    if held := station.get("links_held"):
+        yield f"held {words.count(held, 'linked value')} back: no number"
     if discarded := _counts(station["discarded"]):
         yield f"turned away: {discarded}"
 

@@ -49,6 +49,7 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
         "overruns": words[StationWord.OVERRUNS],
         "restarts": words[StationWord.RESTARTS],
         "torn": words[StationWord.TORN],
+        "links_held": words[StationWord.LINKS_HELD],
         "lateness_us": _spread(lateness, words[StationWord.LATENESS_MAX_NS] // 1000),
         "ports": [
             {"name": p.name, "kind": p.kind, "net_id": p.net_id, "interface": p.interface}

@@ -142,6 +142,11 @@ def test_station_whose_engine_hangs(cycle_us: int, hangs: bool) -> None:
     assert ("mixer: has not run a cycle for 3.1 s" in text) is hangs
 
 
+def test_values_that_no_link_passes_on_are_worth_a_look() -> None:
+    assert "mixer: held 3 linked values back: no number" in show(document(links_held=3))
+    assert "held" not in show(document(links_held=0))
+
+
 def test_remarks_name_all_that_is_rare() -> None:
     left = rx(
         "left", timeouts=1, duplicated=2, reordered=3, late=4, discarded={"version": 5, "length": 6}

@@ -182,3 +182,9 @@ def test_the_list_names_every_pd_with_its_variables():
     }
     assert (taken["direction"], taken["publisher"], taken["length"]) == ("rx", None, 4)
     assert msgspec.json.encode([sent, taken])
+
+
+def test_values_that_links_held_back_are_counted():
+    image = image_of(station())
+    image.words[StationWord.LINKS_HELD] = 3
+    assert station_status(image, 0)["links_held"] == 3
