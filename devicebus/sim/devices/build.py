@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from functools import partial
 
@@ -86,12 +87,14 @@ def build_segment(bus: BusSpec, resources: Mapping[str, bytes] = _NONE) -> Segme
 
 
 def _channels(spec: SlaveSpec) -> dict[str, tuple[int, int]]:
-    sides = ((spec.inputs, INPUTS), (spec.outputs, OUTPUTS))
+    """Return the entries of inputs and outputs by those names that only one of them has."""
+    channels = (*spec.inputs, *spec.outputs)
+    found = (*places(spec.inputs, INPUTS), *places(spec.outputs, OUTPUTS))
+    counts = Counter(channel.name for channel in channels)
     return {
         channel.name: place
-        for channels, base in sides
-        for channel, place in zip(channels, places(channels, base), strict=True)
-        if place[0]
+        for channel, place in zip(channels, found, strict=True)
+        if place[0] and counts[channel.name] == 1
     }
 
 

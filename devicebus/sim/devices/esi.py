@@ -1,7 +1,7 @@
 """A device from its vendor's description: an ESI file (ETG.2000).
 
-Read are identity, name, mailbox, PDO entries and the variables of the dictionary.  All RxPDOs and
-all TxPDOs that are on by default become one PDO each.
+Read are identity, mailbox, PDOs and the object dictionary.  Addresses of sync managers are not: the
+simulated controller has its own.
 """
 
 from __future__ import annotations
@@ -12,18 +12,14 @@ from typing import TYPE_CHECKING
 import msgspec
 from defusedxml import ElementTree
 
-from devicebus.sim.spec import AccessKind, ChannelSpec, MailboxSpec, ObjectSpec, SlaveSpec
-from eap.codec import datatypes
+from devicebus.sim.devices.esidictionary import number, objects, text_at, type_of
+from devicebus.sim.spec import ChannelSpec, MailboxSpec, SlaveSpec
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-_BY_BITS = {1: "BOOL", 8: "USINT", 16: "UINT", 32: "UDINT", 64: "ULINT"}
-_ACCESS = {"ro": AccessKind.READ, "wo": AccessKind.WRITE, "rw": AccessKind.READ_WRITE}
-_STANDARD = frozenset(
-    (0x1000, 0x1001, 0x1008, 0x1009, 0x100A, 0x1018, 0x1C00, *range(0x1600, 0x1700),
-     *range(0x1A00, 0x1B00), *range(0x1C10, 0x1C20))
-)  # fmt: skip
+_PADDING = (64, 32, 16, 8, 4, 2, 1)
+_BY_BITS = {64: "ULINT", 32: "UDINT", 16: "UINT"}
 _MINIMUM_MAILBOX = 32
 
 
@@ -40,21 +36,14 @@ def complete(spec: SlaveSpec, xml: bytes) -> SlaveSpec:
     own = {each.index for each in spec.objects}
     return msgspec.structs.replace(
         spec,
-        vendor=number(_text(root, "Vendor/Id", "0")),
+        vendor=number(text_at(root, "Vendor/Id", "0")),
         product=number(attributes.get("ProductCode", "0")),
         revision=number(attributes.get("RevisionNo", "0")),
         mailbox=_mailbox(device),
         inputs=spec.inputs or tuple(_channels(device.iterfind("TxPdo"))),
         outputs=spec.outputs or tuple(_channels(device.iterfind("RxPdo"))),
-        objects=(*spec.objects, *(each for each in _objects(device) if each.index not in own)),
+        objects=(*spec.objects, *(each for each in objects(device) if each.index not in own)),
     )
-
-
-def number(text: str) -> int:
-    """Read ``#x1A00`` or ``6656``, as ESI files write numbers; raise ValueError otherwise."""
-    stripped = text.strip().lower()
-    digits = stripped.removeprefix("#x")
-    return int(digits, 10 if digits == stripped else 16)
 
 
 def _parse(xml: bytes, name: str) -> Element:
@@ -96,51 +85,29 @@ def _mailbox(device: Element) -> MailboxSpec | None:
 
 
 def _channels(pdos: Iterable[Element]) -> Iterator[ChannelSpec]:
+    """Yield what the PDOs map; those without a sync manager are there to be assigned."""
     for pdo in pdos:
-        if "Sm" not in pdo.attrib:
-            continue
+        index = number(text_at(pdo, "Index", "0"))
+        assigned = "Sm" in pdo.attrib
         for entry in pdo.iterfind("Entry"):
-            index = number(_text(entry, "Index", "0"))
-            bits = number(_text(entry, "BitLen", "0"))
-            if index and bits:
-                place = f"{index:#06x}:{number(_text(entry, 'SubIndex', '0'))}"
+            bits = number(text_at(entry, "BitLen", "0"))
+            place = number(text_at(entry, "Index", "0"))
+            if not place:
+                yield from _padding(bits, index, assigned=assigned)
+            elif bits:
+                name = f"{place:#06x}:{number(text_at(entry, 'SubIndex', '0'))}"
                 yield ChannelSpec(
-                    name=_text(entry, "Name", place),
-                    type=_type(_text(entry, "DataType", ""), bits),
-                    object=place,
+                    name=text_at(entry, "Name", name),
+                    type=type_of(text_at(entry, "DataType", ""), bits),
+                    object=name,
+                    pdo=index,
+                    assigned=assigned,
                 )
 
 
-def _objects(device: Element) -> Iterator[ObjectSpec]:
-    for item in device.iterfind("Profile/Dictionary/Objects/Object"):
-        index = number(_text(item, "Index", "0"))
-        name, bits = _text(item, "Type", ""), number(_text(item, "BitSize", "0"))
-        if index in _STANDARD or not bits or not _is_simple(name):
-            continue
-        yield ObjectSpec(
-            index=index,
-            name=_text(item, "Name", f"0x{index:04X}"),
-            type=_type(name, bits),
-            access=_ACCESS.get(_text(item, "Flags/Access", "rw"), AccessKind.READ_WRITE),
-        )
-
-
-def _is_simple(name: str) -> bool:
-    # DT… are the records that the file itself defines.
-    return bool(name) and not name.startswith("DT")
-
-
-def _type(name: str, bits: int) -> str:
-    try:
-        kind = datatypes.parse(name)
-    except ValueError:
-        kind = None
-    if kind is not None and kind.bit_length == bits:
-        return name
-    if bits in _BY_BITS:
-        return _BY_BITS[bits]
-    return f"BIT{bits}" if bits < 8 else f"BLOCK({(bits + 7) // 8})"
-
-
-def _text(element: Element, path: str, default: str) -> str:
-    return (element.findtext(path) or default).strip()
+def _padding(bits: int, pdo: int, *, assigned: bool) -> Iterator[ChannelSpec]:
+    for size in _PADDING:
+        while bits >= size:
+            kind = _BY_BITS.get(size, f"BIT{size}")
+            yield ChannelSpec(name="", type=kind, object="0", pdo=pdo, assigned=assigned)
+            bits -= size

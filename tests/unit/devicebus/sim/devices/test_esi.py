@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.sim.devices.build import build_slave
-from devicebus.sim.devices.esi import complete, number
+from devicebus.sim.devices.esi import complete
 from devicebus.sim.spec import DeviceKind, SlaveSpec
 from devicebus.wire import sii
 
@@ -54,9 +54,20 @@ def test_device_is_what_its_file_says():
     spec = complete(SPEC, XML)
     assert (spec.vendor, spec.product, spec.revision) == (0x123, 2, 0x20000)
     assert (spec.mailbox.size, spec.mailbox.foe, spec.mailbox.soe) == (160, True, False)
-    assert [(c.name, c.type, c.object) for c in spec.outputs] == [("Nibble", "BIT4", "0x7000:1")]
+    assert [(c.name, c.type, c.object, c.pdo, c.assigned) for c in spec.outputs] == [
+        ("Nibble", "BIT4", "0x7000:1", 0x1600, True),
+        ("", "BIT4", "0", 0x1600, True),
+        ("0x7010:1", "USINT", "0x7010:1", 0x1601, False),
+    ]
     assert [(c.name, c.type) for c in spec.inputs] == [("Level", "INT"), ("Odd", "BLOCK(3)")]
     assert [(o.index, o.name, o.type) for o in spec.objects] == [(0x8001, "Gain", "UINT")]
+
+
+def test_wide_padding_is_cut():
+    xml = XML.replace(
+        b"<Index>0</Index><BitLen>4</BitLen>", b"<Index>#x0</Index><BitLen>28</BitLen>"
+    )
+    assert [c.type for c in complete(SPEC, xml).outputs[1:4]] == ["UINT", "BIT8", "BIT4"]
 
 
 def test_first_device_without_a_product_code():
@@ -69,6 +80,9 @@ def test_slave_is_built_from_it():
     image = sii.decode(slave.esc.image)
     assert (image.fixed.vendor, image.fixed.receive_size) == (0x123, 160)
     assert slave.device.process_data.inputs.size == 5
+    assert slave.device.process_data.outputs.size == 1
+    assert [pdo.header.sync_manager for pdo in image.rx_pdos] == [2, 0xFF]
+    assert [entry.bit_length for entry in image.rx_pdos[0].entries] == [4, 4]
     assert slave.device.dictionary[0x8001].name == "Gain"
 
 
@@ -84,8 +98,3 @@ def test_slave_is_built_from_it():
 def test_file_that_cannot_be_used(xml, message):
     with pytest.raises(ValueError, match=message):
         complete(SPEC, xml)
-
-
-@pytest.mark.parametrize(("text", "value"), [("#x1A00", 0x1A00), (" 12 ", 12), ("#X0f", 15)])
-def test_numbers(text, value):
-    assert number(text) == value
