@@ -10,7 +10,6 @@ that a reader sees inputs and what follows from them in one cycle.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeAlias
@@ -29,9 +28,6 @@ from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
 
 _CYCLE = int(StationWord.CYCLE)
 _CYCLE_AT_NS = int(StationWord.CYCLE_AT_NS)
-_put_cycle = struct.Struct("2q").pack_into
-"""Writes CYCLE and CYCLE_AT_NS, which lie side by side."""
-_CYCLE_OFFSET = 8 * _CYCLE
 _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
 _FUTEX = int(StationWord.FUTEX)
 _WAITERS = int(StationWord.WAITERS)
@@ -189,7 +185,8 @@ class Station:
         """Run one cycle that was due at *due_ns*."""
         words = self._words
         cycle = words[_CYCLE] + 1
-        _put_cycle(words, _CYCLE_OFFSET, cycle, due_ns)
+        words[_CYCLE] = cycle  # one by one: pack_into would show readers a 0 in between
+        words[_CYCLE_AT_NS] = due_ns
         if self._has_own_variables or not cycle % self._rarely_every:
             changed = self._write_own_variables(cycle, now_ns)
         else:
