@@ -10,6 +10,7 @@ from eap.appliance.handover import (
     EngineOptions,
     Handover,
     PortName,
+    SegmentHandover,
     SharedSocket,
     SocketKind,
     decode_report,
@@ -39,6 +40,11 @@ def test_crosses_in_a_file_without_a_name():
     assert Handover.from_descriptor(fd) == handover()
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(fd)
+
+
+def test_a_segment_gets_its_own():
+    given = SegmentHandover(7, "/plants/io.yaml", 5, 6)
+    assert SegmentHandover.from_descriptor(given.to_descriptor()) == given
 
 
 def test_finds_a_port_by_name():

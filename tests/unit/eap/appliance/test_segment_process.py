@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import os
 import queue
+import select
 import signal
 import socket
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -15,6 +18,7 @@ from devicebus.sim.spec import BusSpec
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
 from eap.appliance import segment_process
 from eap.appliance.busfile import Bus
+from eap.appliance.handover import SegmentHandover
 from eap.ids import InterfaceUri
 from tests.support.bus import datagram, generic
 
@@ -141,3 +145,101 @@ def test_late_frame_comes_when_its_time_has_come(master):
             assert scan(master) == 2
 
     assert run_with(script)[1] == {"ok": True}
+
+
+class Child:
+    """The process that the supervisor starts for a simulated bus."""
+
+    def __init__(self, file, *, supervisor=None, stale=()):
+        self.frames, frames = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        for frame in stale:
+            self.frames.send(frame)
+        self.ready, ready = os.pipe()
+        given = SegmentHandover(
+            supervisor or os.getpid(), str(file), frames.fileno(), commands.fileno(), ready
+        )
+        fd = given.to_descriptor()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "eap.appliance.segment_process", str(fd)],
+            pass_fds=(fd, frames.fileno(), commands.fileno(), ready),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        os.close(fd)
+        os.close(ready)
+        frames.close()
+        commands.close()
+        for end in (self.frames, self.commands):
+            end.settimeout(5)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.communicate()
+        self.frames.close()
+        self.commands.close()
+        os.close(self.ready)
+
+    def scan(self):
+        self.frames.send(SCAN)
+        return next(iter_datagrams(self.frames.recv(2048))).wkc
+
+    def command(self, **spec):
+        self.commands.send(json.dumps(spec).encode())
+        return json.loads(self.commands.recv(65536))
+
+
+@pytest.fixture
+def bus_file(tmp_path):
+    file = tmp_path / "bus.yaml"
+    file.write_text("bus: b\nslaves: [{name: a, kind: coupler}, {name: b, kind: coupler}]\n")
+    return file
+
+
+def test_child_answers_what_came_after_its_start_and_ends_when_asked(bus_file):
+    with Child(bus_file, stale=[SCAN] * 20) as child:
+        assert json.loads(os.read(child.ready, 4096)) == {"slaves": 2}
+        assert child.scan() == 2
+        assert not select.select([child.frames], [], [], 0.1)[0]
+        assert os.getpriority(os.PRIO_PROCESS, child.process.pid) > os.getpriority(
+            os.PRIO_PROCESS, 0
+        )
+        child.process.terminate()
+        assert child.process.communicate(timeout=5)[1] == ""
+        assert child.process.returncode == 0
+
+
+def test_child_takes_commands_one_a_message(bus_file):
+    with Child(bus_file) as child:
+        os.read(child.ready, 4096)
+        assert child.command(kind="power", slave="b", id=3) == {"ok": True, "id": 3}
+        assert child.scan() == 1
+        assert child.command(kind="power", slave="b", end=True) == {"ok": True}
+        assert child.scan() == 2
+
+
+def test_child_that_nobody_listens_to_goes_on(bus_file):
+    with Child(bus_file) as child:
+        os.read(child.ready, 4096)
+        for _ in range(2000):
+            child.commands.send(b"{}")
+        assert child.scan() == 2
+
+
+def test_child_without_a_bus_file_says_so_in_its_exit_code(bus_file):
+    bus_file.write_text("bus: b\nslaves: []\n")
+    with Child(bus_file) as child:
+        error = child.process.communicate(timeout=10)[1]
+        assert child.process.returncode == 2
+        assert os.read(child.ready, 1) == b""
+    assert error.startswith("segment: ")
+    assert "the bus has no slaves" in error
+
+
+def test_child_of_a_supervisor_that_has_gone_does_not_start(bus_file):
+    with Child(bus_file, supervisor=1) as child:
+        child.process.communicate(timeout=10)
+        assert child.process.returncode == -signal.SIGKILL

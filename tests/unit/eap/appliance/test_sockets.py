@@ -7,11 +7,13 @@ import os
 import socket
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from eap.appliance.handover import NO_DESCRIPTOR, PortName, SocketKind
 from eap.appliance.sockets import SharedSockets, plan_sockets
 from eap.errors import EnvironmentalError
+from eap.pd.spec import BusPortSpec, PortKind, PortSpec
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
 LEFT, RIGHT = PortName("left", "eap0"), PortName("right", "eap0")
@@ -67,11 +69,29 @@ def test_all_are_opened_and_described(tmp_path):
         for described in shared.descriptions:
             assert (described.engine_fd == NO_DESCRIPTOR) == (described.kind is SocketKind.TCP)
             assert described.services_fd != NO_DESCRIPTOR
+        assert (shared.engine_bus, shared.services_bus) == (NO_DESCRIPTOR, NO_DESCRIPTOR)
         inherited = {*shared.engine_descriptors(), *shared.services_descriptors()}
         assert len(inherited) == open_descriptors() - before
         assert not any(os.get_inheritable(fd) for fd in inherited)
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(tmp_path / "control"))
+    assert open_descriptors() == before
+
+
+@pytest.mark.net
+def test_buses_add_theirs(tmp_path):
+    before = open_descriptors()
+    bus = PortSpec("bus0", PortKind.BUS, "sim:///x.yaml", "1.1.1.1.1.9", bus=BusPortSpec("/x.yaml"))
+    station = left()
+    station = msgspec.structs.replace(station, ports=(*station.ports, bus))
+    with SharedSockets([station], tmp_path / "control") as shared:
+        (described,) = shared.buses
+        engine, services = shared.engine_descriptors(), shared.services_descriptors()
+        assert {described.engine_fd, shared.engine_bus} < set(engine)
+        assert {described.command_fd, shared.services_bus} < set(services)
+        assert not set(engine) & set(services)
+        segment = {described.segment_fd, described.segment_command_fd}
+        assert len({*engine, *services, *segment}) == open_descriptors() - before
     assert open_descriptors() == before
 
 

@@ -6,12 +6,14 @@ import os
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from eap.appliance.handover import EngineOptions
 from eap.appliance.runtime import ApplianceFolder, find_appliances
 from eap.appliance.sockets import SharedSockets
 from eap.appliance.supervisor import Supervisor, make_info, run
 from eap.errors import ConfigError
+from eap.pd.spec import BusPortSpec, PortKind, PortSpec
 
 DEMO = Path(__file__).parents[4] / "config" / "demo.yaml"
 
@@ -62,3 +64,23 @@ def test_a_child_that_cannot_start_ends_all_with_its_exit_code(stations, capfd):
     assert not Path(f"/proc/{engine}").exists()
     assert not Path(f"/proc/{services}").exists()
     assert find_appliances() == []
+
+
+@pytest.mark.net
+def test_a_segment_that_cannot_start_ends_all_with_its_exit_code(tmp_path, stations, capfd):
+    bus_file = tmp_path / "bus.yaml"
+    bus_file.write_text("bus: b\nslaves: []\n")
+    bus = PortSpec(
+        "bus0", PortKind.BUS, f"sim://{bus_file}", "1.1.1.1.1.9", bus=BusPortSpec(str(bus_file))
+    )
+    station = replace(stations[0], ports=(*stations[0].ports, bus))
+    options = EngineOptions(realtime=False)
+    with ApplianceFolder.claim("demo") as folder:
+        with SharedSockets([station], folder.control_socket) as sockets:
+            info = make_info("demo", "demo.yaml", [station])
+            assert Supervisor(info, (station,), folder, sockets, options=options).run() == 2
+        assert list(folder.read_info().segments) == ["left/bus0"]
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "segment: " in err
+    assert "the bus has no slaves" in err
