@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import EAPCTL, wait_until
-from tests.support.simulator import simulator
+from tests.support.simulator import NEAR, simulator, veth_pair
 
 pytestmark = pytest.mark.net
 
@@ -172,3 +172,24 @@ def test_wrong_bus_file_ends_the_start(farm, folder):
     code, _, err = farm.start(plant).finish()
     assert code == 2
     assert "coe.yaml" in err
+
+
+def describe(appliance):
+    return appliance.request("bus_describe", station="one", port="bus0")
+
+
+@pytest.mark.root
+def test_interface_that_goes_and_comes_back(farm, folder):
+    plant = farm.write(REMOTE.replace("udp://127.0.41.9", f"ethernet://{NEAR}"))
+    with veth_pair(), simulator(folder / "coe.yaml"):
+        appliance = farm.run(plant)
+        wait_until(lambda: is_op(appliance, "bus0"))
+        for _ in range(2):
+            subprocess.run(["ip", "link", "set", NEAR, "down"], check=True)
+            wait_until(lambda: appliance.values("one")["bus0.state"] == 0)
+            assert "Network is down" in describe(appliance)["fault"]
+            subprocess.run(["ip", "link", "set", NEAR, "up"], check=True)
+            wait_until(lambda: is_op(appliance, "bus0"))
+            assert describe(appliance)["fault"] == ""
+        assert appliance.station("one")["restarts"] == 0
+        assert appliance.stop()[0] == 0
