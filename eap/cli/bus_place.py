@@ -53,8 +53,6 @@ class BusCommand(click.Command):
             ctx.params["bus"] = interface
         elif place is not None:
             ctx.params["bus"] = place._replace(plant=plant)
-        elif not ctx.resilient_parsing:
-            raise _neither(ctx)
         return rest
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
@@ -140,19 +138,14 @@ def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
 
 def _to_port(ctx: click.Context, param: click.Parameter, text: str | None) -> BusPort | None:
     del param
-    if text is None:
-        return None
-    port = parse_port(text)
-    if port is None:
-        raise _neither(ctx, f"{text!r} is no STATION/PORT: ")
+    port = parse_port(text or "")
+    if port is None and not ctx.resilient_parsing:
+        problem = f"{text!r} is no STATION/PORT: " if text else ""
+        command = ctx.command
+        forms = " or ".join(
+            f"{ctx.command_path} {command.usage_of(ctx, form)}"
+            for form in _FORMS
+            if isinstance(command, BusCommand)
+        )
+        raise click.UsageError(f"{problem}say which bus: {forms}", ctx)
     return port
-
-
-def _neither(ctx: click.Context, problem: str = "") -> click.UsageError:
-    command = ctx.command
-    forms = (
-        [f"{ctx.command_path} {command.usage_of(ctx, form)}" for form in _FORMS]
-        if isinstance(command, BusCommand)
-        else []
-    )
-    return click.UsageError(f"{problem}say which bus: {' or '.join(forms)}", ctx)

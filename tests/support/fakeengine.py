@@ -17,6 +17,7 @@ from devicebus.master.access import Access
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master
 from devicebus.master.procedure import Procedure
+from devicebus.sim.command import obey
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command
 from eap.appliance.bus_failure import to_failure
@@ -34,6 +35,7 @@ from eap.appliance.bus_request import (
     SlaveReport,
     Transfer,
 )
+from eap.appliance.bus_target import bring_all, bring_one
 from eap.appliance.handover import PortName
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
@@ -90,9 +92,12 @@ class FakeBus:
             replies = self.finish(master.run(_transfer(accesses), now_ns))
             return {"outcomes": tuple(Outcome(r.wkc, r.data, r.tries) for r in replies)}
         assert isinstance(request, Bring)
-        stations = [request.station] if request.station else list(master.units)
-        for station in stations:
-            self.finish(master.request_state(station, AlState(request.target), now_ns))
+        target = AlState(request.target)
+        self.finish(
+            bring_one(master, request.station, target, now_ns)
+            if request.station
+            else bring_all(master, target, now_ns)
+        )
         return {}
 
     def report(self) -> BusReport:
@@ -185,8 +190,10 @@ class FakeEngine:
 
     async def wait_for(self, count: int) -> None:
         """Wait until so many requests have come."""
-        self._awaited = count
-        await self._enough.wait()
+        if len(self.requests) < count:
+            self._awaited = count
+            self._enough.clear()
+            await self._enough.wait()
 
     def of(self, kind: type) -> list[Any]:
         """Return the requests of one kind."""
@@ -216,3 +223,36 @@ class FakeEngine:
 
     def _send(self, message: Any) -> None:
         self._sock.send(msgspec.msgpack.encode(message))
+
+
+class FakeSegment:
+    """Takes commands for slaves in memory, inside the running loop.
+
+    Attributes:
+        is_silent: Nothing is answered.
+    """
+
+    def __init__(self, line: LoopBus) -> None:
+        self.is_silent = False
+        self._line = line
+        self._sock, self.services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        asyncio.get_running_loop().add_reader(self._sock, self._receive)
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._sock)
+        self._sock.close()
+
+    def say(self, message: Any) -> None:
+        """Send anything."""
+        self._sock.send(msgspec.json.encode(message))
+
+    def _receive(self) -> None:
+        command = msgspec.json.decode(self._sock.recv(1 << 16))
+        if self.is_silent:
+            return
+        answer = {"id": command.pop("id"), "ok": True}
+        try:
+            obey(self._line.segment, command, self._line.now_ns)
+        except ValueError as exc:
+            answer |= {"ok": False, "error": str(exc)}
+        self.say(answer)

@@ -36,6 +36,16 @@ class LoopBus:
         self.segment.begin(msgspec.convert(spec, FaultSpec), self.now_ns)
 
     @contextmanager
+    def lost(self, slave: str) -> Iterator[None]:
+        """Switch a slave off for the length of a block."""
+        spec = msgspec.convert({"kind": "power", "slave": slave}, FaultSpec)
+        self.segment.begin(spec, self.now_ns)
+        try:
+            yield
+        finally:
+            self.segment.end(spec, self.now_ns)
+
+    @contextmanager
     def session(self, interface: object = None) -> Iterator[BusSession]:
         """Be a master for the length of a block."""
         port = LoopPort(self)

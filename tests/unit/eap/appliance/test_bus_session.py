@@ -25,7 +25,7 @@ def vendor_of(bus, name):
 
 def states(line):
     with line.session() as bus:
-        return [unit.state for unit in bus.scan()]
+        return [slave.status.state for slave in bus.scan()]
 
 
 def test_scan_changes_nothing(line):
@@ -47,18 +47,6 @@ def test_slave_by_address_and_by_name(line, name):
 def test_slave_that_is_not_there(line):
     with line.session() as bus, pytest.raises(BusError, match=r"no slave 'x'.*1001 \(coupler\)"):
         bus.find("x")
-
-
-def test_name_of_several(tmp_path):
-    text = "bus: b\nslaves: [{name: a, kind: coupler}, {name: b, kind: coupler}]\n"
-    (tmp_path / "twins.yaml").write_text(text)
-    with LoopBus("twins", tmp_path).session() as bus:
-        for unit in bus.scan():
-            unit.name = "coupler"
-        with pytest.raises(
-            BusError, match="2 slaves are called 'coupler': say which of 1001, 1002"
-        ):
-            bus.find("coupler")
 
 
 def test_slave_in_init_is_brought_to_preop(line):
@@ -102,7 +90,7 @@ def test_meanwhile_is_called(line):
 def test_frames_are_counted(line):
     with line.session() as bus:
         bus.scan()
-        stats = bus.link_stats()
+        stats = bus.frame_counts()
     assert stats.sent == stats.received > 0
 
 

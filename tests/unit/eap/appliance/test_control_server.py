@@ -9,11 +9,16 @@ import socket
 import pytest
 
 from eap.appliance import control_server
+from eap.appliance.bus_client import BusClient
 from eap.appliance.bus_methods import Buses
 from eap.appliance.control import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.appliance.control_server import ControlServer
+from eap.appliance.engine_link import EngineLink
 from eap.appliance.methods import Methods
 from eap.errors import TornReadError
+from eap.pd.spec import PortKind, PortSpec, StationSpec
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.loopbus import LoopBus
 
 pytestmark = pytest.mark.net
 
@@ -163,5 +168,95 @@ def test_a_listener_serves_many(methods, tmp_path):
                 await writer.wait_closed()
             serving.cancel()
             await asyncio.wait([serving])
+
+    asyncio.run(talk())
+
+
+class Slow:
+    """Methods that wait, and what became of those who waited."""
+
+    def __init__(self) -> None:
+        self.outcomes = []
+        self.begun = asyncio.Event()
+
+    async def wait(self):
+        self.begun.set()
+        try:
+            await asyncio.sleep(0.2)
+        except asyncio.CancelledError:
+            self.outcomes.append("cancelled")
+            raise
+        self.outcomes.append("answered")
+        return {}
+
+
+STATUS = b'{"v":1,"id":1,"method":"status"}\n'
+
+
+@pytest.mark.parametrize("rest", [b"", STATUS * 3, b'{"v":1'])
+def test_who_leaves_is_not_waited_for(files, rest):
+    async def talk():
+        slow = Slow()
+        methods = Methods({}, files, status=slow.wait, stop=lambda: None)
+        server = ControlServer(methods, NO_BUSES)
+        ours, theirs = socket.socketpair()
+        with ours:
+            serving = asyncio.ensure_future(server.serve_client(theirs))
+            ours.sendall(STATUS + rest)
+            await slow.begun.wait()
+        await asyncio.wait_for(serving, 0.1)
+        assert slow.outcomes == ["cancelled"]
+
+    asyncio.run(talk())
+
+
+def test_who_only_stops_sending_gets_answers(files):
+    async def talk():
+        slow = Slow()
+        methods = Methods({}, files, status=slow.wait, stop=lambda: None)
+        ours, theirs = socket.socketpair()
+        with ours:
+            ours.sendall(STATUS)
+            ours.shutdown(socket.SHUT_WR)
+            await asyncio.wait_for(ControlServer(methods, NO_BUSES).serve_client(theirs), 5)
+            assert ours.recv(100) == b'{"v":1,"id":1,"result":{}}\n'
+        assert slow.outcomes == ["answered"]
+
+    asyncio.run(talk())
+
+
+def test_what_was_sent_before_leaving_is_done(files):
+    async def talk():
+        stopped = []
+        methods = Methods({}, files, status=torn, stop=lambda: stopped.append(True))
+        ours, theirs = socket.socketpair()
+        with ours:
+            ours.sendall(b'{"v":1,"id":1,"method":"stop"}\n')
+        await asyncio.wait_for(ControlServer(methods, NO_BUSES).serve_client(theirs), 5)
+        assert stopped == [True]
+
+    asyncio.run(talk())
+
+
+def test_errors_of_a_bus_keep_kind_and_detail(methods):
+    async def talk():
+        engine = FakeEngine(FakeBus(LoopBus("drive")))
+        link = EngineLink(engine.services)
+        port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1")
+        station = StationSpec("left", "1.1.1.1.1.1", 10_000, (port,))
+        buses = Buses((station,), BusClient(link, [PORT]), {})
+        where = {"station": "left", "port": "bus0"}
+        async with Talk(ControlServer(methods, buses)) as client:
+            answer = await client.ask("bus_open", **where, slave=1009, protocol="coe")
+            assert answer["result"] == {"conversation": 1}
+            answer = await client.ask("bus_ask", conversation=1, request="00")
+            assert answer["error"]["code"] == "bus"
+            assert answer["error"]["kind"] == "BusError"
+            assert "no slave 1009" in answer["error"]["message"]
+            engine.buses[0].line.fault(kind="refuse", slave="drive", state="SAFEOP", code=0x1B)
+            error = (await client.ask("bus_bring", **where, state="SAFEOP"))["error"]
+            assert (error["kind"], error["detail"]) == ("AlStatusError", 2 << 16 | 0x1B)
+        link.close()
+        engine.close()
 
     asyncio.run(talk())

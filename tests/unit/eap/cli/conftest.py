@@ -1,21 +1,29 @@
-"""An appliance to talk to: a real control server on real images, without an engine."""
+"""An appliance to talk to: a real control server on real images, its engine's buses in memory."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic_ns
+from typing import Any
 
+import msgspec
 import pytest
 
+from devicebus.wire.alstatus import AlState
+from eap.appliance.bus_client import BusClient
+from eap.appliance.bus_methods import Buses
 from eap.appliance.control import encode_request
 from eap.appliance.control_server import ControlServer
+from eap.appliance.engine_link import EngineLink
+from eap.appliance.handover import PortName
 from eap.appliance.methods import Methods
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
+from eap.appliance.segment_link import SegmentLink
 from eap.appliance.status import ProcessMeter, appliance_status
 from eap.net.image_file import ImageFile, create_image
 from eap.pd.layout import plan_layout
@@ -30,6 +38,8 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.words import RxWord, StationWord
+from tests.support.fakeengine import FakeBus, FakeEngine, FakeSegment
+from tests.support.loopbus import LoopBus
 
 
 def station(name: str) -> StationSpec:
@@ -57,10 +67,31 @@ def station(name: str) -> StationSpec:
     )
 
 
-class Appliance:
-    """A plant's folder, images and control server; the server runs in a thread."""
+def with_buses(spec: StationSpec, names: list[str]) -> StationSpec:
+    """Return a station that has bus ports too."""
+    ports = [PortSpec(name, PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1") for name in names]
+    return msgspec.structs.replace(spec, ports=(*spec.ports, *ports))
 
-    def __init__(self, plant: str, names: list[str], stack: ExitStack) -> None:
+
+class Appliance:
+    """A plant's folder, images and control server; the server runs in a thread.
+
+    Args:
+        plant: Its name.
+        names: Of its stations.
+        stack: Ends it.
+        buses: Names of bus files; the first station has a port for each, bus0 and so on.
+    """
+
+    def __init__(
+        self, plant: str, names: list[str], stack: ExitStack, buses: Sequence[str] = ()
+    ) -> None:
+        self.lines = [LoopBus(name) for name in buses]
+        ports = [f"bus{number}" for number in range(len(buses))]
+        self._specs = {
+            name: with_buses(station(name), ports if name == names[0] else []) for name in names
+        }
+        self._ports = [PortName(names[0], port) for port in ports]
         folder = stack.enter_context(ApplianceFolder.claim(plant))
         self.info = ApplianceInfo(
             plant=plant,
@@ -72,7 +103,9 @@ class Appliance:
         )
         folder.write_info(self.info)
         self.files = {
-            name: stack.enter_context(create_image(folder.image(name), plan_layout(station(name))))
+            name: stack.enter_context(
+                create_image(folder.image(name), plan_layout(self._specs[name]))
+            )
             for name in names
         }
         for file in self.files.values():
@@ -94,27 +127,19 @@ class Appliance:
     def stop(self) -> None:
         """End the server; clients see their connection close."""
         if self._thread.is_alive():
-            self._wait_for_others()
+            self.wait_served()
             self._loop.call_soon_threadsafe(self._task.cancel)
             self._thread.join()
 
-    def _wait_for_others(self) -> None:
-        """Be served once: by then, whoever connected before has a task that closes its socket."""
+    def wait_served(self) -> None:
+        """Be served once: its buses are up, and whoever connected before has a task of its own."""
         with socket.socket(socket.AF_UNIX) as connection:
             connection.connect(self._listener.getsockname())
             connection.sendall(encode_request(1, "hello", {}))
             connection.recv(1)
 
     def _run(self) -> None:
-        meter = ProcessMeter()
-        images = [file.image for file in self.files.values()]
-        methods = Methods(
-            {"plant": self.info.plant},
-            self.files,
-            status=lambda: appliance_status(self.info, images, {}, meter),
-            stop=lambda: None,
-        )
-        self._task = self._loop.create_task(ControlServer(methods).serve(self._listener))
+        self._task = self._loop.create_task(self._serve())
         try:
             self._loop.run_until_complete(self._task)
         except asyncio.CancelledError:
@@ -122,6 +147,28 @@ class Appliance:
         finally:
             self._loop.run_until_complete(self._loop.shutdown_asyncgens())
             self._loop.close()
+
+    async def _serve(self) -> None:
+        engine = FakeEngine(*(FakeBus(line, AlState.OP) for line in self.lines))
+        segments = {
+            port: FakeSegment(line) for port, line in zip(self._ports, self.lines, strict=True)
+        }
+        link = EngineLink(engine.services)
+        links = {port: SegmentLink(segment.services) for port, segment in segments.items()}
+        buses = Buses(tuple(self._specs.values()), BusClient(link, self._ports), links)
+        meter = ProcessMeter()
+        images = [file.image for file in self.files.values()]
+
+        async def status() -> dict[str, Any]:
+            reports = await buses.reports(1)
+            return appliance_status(self.info, images, {}, meter, reports)
+
+        methods = Methods({"plant": self.info.plant}, self.files, status=status, stop=lambda: None)
+        try:
+            await ControlServer(methods, buses).serve(self._listener)
+        finally:
+            for each in (link, engine, *links.values(), *segments.values()):
+                each.close()
 
 
 def _receive(file: ImageFile) -> None:
@@ -150,6 +197,15 @@ def appliance(runtime: Path) -> Iterator[Appliance]:
     """Plant ``line`` with the stations mixer and filler."""
     with ExitStack() as stack:
         yield Appliance("line", ["mixer", "filler"], stack)
+
+
+@pytest.fixture
+def bus_appliance(runtime: Path) -> Iterator[Appliance]:
+    """Plant ``works``: station press has bus0 (coe) and bus1 (drive), station saw has none."""
+    with ExitStack() as stack:
+        running = Appliance("works", ["press", "saw"], stack, ["coe", "drive"])
+        running.wait_served()
+        yield running
 
 
 @pytest.fixture

@@ -98,8 +98,95 @@ def test_slave_that_is_not_there(line, command):
     assert "there is no slave 'nobody'" in err
 
 
-def test_port_of_a_station(command):
-    code, _, err = command("scan", "island-01/bus0")
-    assert code == 2
+BOTH = [
+    (("scan",), "coe"),
+    (("diag",), "coe"),
+    (("diag", "sensor"), "coe"),
+    (("state",), "coe"),
+    (("state", "1003"), "coe"),
+    (("state", "sensor", "SAFEOP"), "coe"),
+    (("state", "OP"), "coe"),
+    (("sdo", "read", "sensor", "0x8000:1"), "coe"),
+    (("sdo", "read", "1003", "0x8000", "--complete"), "coe"),
+    (("sdo", "write", "sensor", "0x8000:2", "-7"), "coe"),
+    (("sdo", "list", "sensor"), "coe"),
+    (("sdo", "dump", "sensor"), "coe"),
+    (("sii", "dump", "buttons"), "coe"),
+    (("idn", "read", "drive", "S-0-0032"), "drive"),
+    (("idn", "write", "drive", "S-0-0032", "7"), "drive"),
+    (("idn", "list", "drive"), "drive"),
+    (("voe", "drive", "c0ffee", "--vendor", "1"), "drive"),
+]
+
+
+@pytest.mark.net
+@pytest.mark.parametrize(("words", "name"), BOTH)
+def test_port_of_a_station_is_as_good_as_an_interface(
+    bus_appliance, monkeypatch, command, words, name
+):
+    LoopBus(name).replace(monkeypatch)
+    verbs = 2 if words[0] in {"sdo", "sii", "idn"} else 1
+    port = f"press/bus{['coe', 'drive'].index(name)}"
+    for where in ((port, "PREOP"), ("PREOP", *WHERE)):
+        assert command("state", *where)[0] == 0
+    asked = command(*words[:verbs], port, *words[verbs:], "--json")
+    own = command(*words, *WHERE, "--json")
+    assert (asked[0], asked[2]) == (own[0], own[2]) == (0, "")
+    lines, expected = (
+        [json.loads(line) for line in out.splitlines()] for out in (asked[1], own[1])
+    )
+    if words[0] == "diag":
+        for found in (lines[0], expected[0]):
+            assert found.pop("frames")["sent"] > 0
+    if words[1:2] == ("dump",) and words[0] == "sdo":
+        for row in (*lines, *expected):  # inputs go up and down
+            if row["index"] == 0x6000 and row["subindex"]:
+                del row["value"], row["data"]
+    assert lines == expected
+
+
+@pytest.mark.net
+def test_what_the_running_master_makes_of_it(bus_appliance, command, tmp_path):
+    assert "keeps it there" in command("state", "press/bus0", "sensor", "INIT")[1]
+    assert "keeps them there" in command("state", "press/bus0", "PREOP")[1]
+    file = tmp_path / "image.bin"
+    assert command("sii", "dump", "press/bus0", "sensor", str(file))[0] == 0
+    out = command("sii", "write", "press/bus0", "sensor", str(file))[1]
+    assert "goes by the old content" in out
+
+
+@pytest.mark.net
+@pytest.mark.parametrize(
+    ("words", "code", "reason"),
+    [
+        (("scan", "press/eap0"), 1, "port eap0 of station press is no bus; its bus ports are bus0"),
+        (("scan", "press/bus2"), 1, "no port 'bus2'; its bus ports are bus0, bus1, did you mean"),
+        (("scan", "saw/bus0"), 1, "station saw has no port 'bus0'; it has no bus ports"),
+        (("scan", "pres/bus0"), 1, "no station pres runs: running are works (press, saw), did you"),
+        (("scan", "press/bus0", "--plant", "work"), 1, "no station press runs"),
+        (("scan", "press/bus0/x"), 2, "'press/bus0/x' is no STATION/PORT"),
+        (("state", "press/bus0", "nobody"), 1, "there is no slave 'nobody'"),
+        (("voe", "press/bus0", "1001", "00", "--vendor", "1"), 1, "mailbox error"),
+        (("sdo", "read", "press/bus0", "sensor", "0x8000:9"), 1, "subindex does not exist"),
+    ],
+)
+def test_refusals(bus_appliance, command, words, code, reason):
+    got, out, err = command(*words)
+    assert (got, out) == (code, "")
     assert err.count("\n") == 1
-    assert "ports of running stations have no bus yet" in err
+    assert reason in err
+
+
+@pytest.mark.net
+def test_slave_that_does_not_answer(bus_appliance, command):
+    with bus_appliance.lines[0].lost("sensor"):
+        (row,) = document_of(command, "state", "press/bus0", "sensor")["slaves"]
+        assert (row["state"], row["reason"]) == (None, "it does not answer")
+        rows = document_of(command, "scan", "press/bus0")["slaves"]
+        assert [row["state"] for row in rows] == ["OP", "OP", None]
+
+
+def document_of(command, *words):
+    code, out, err = command(*words, "--json")
+    assert (code, err) == (0, "")
+    return json.loads(out)

@@ -15,7 +15,7 @@ from eap.cli.bus_view import (
     idn_lines,
     idn_table,
     object_table,
-    scan_table,
+    scan_tables,
     state_table,
     value_line,
 )
@@ -36,14 +36,21 @@ def port(number, **counters):
 def test_slave_whose_eeprom_is_unreadable():
     row = {"address": 1001, "name": "", "vendor": 0, "product": 0, "revision": 0, "serial": 0,
            "alias": 7, "state": "INIT+ERROR", "mailbox": [], "fault": "no end"}  # fmt: skip
-    text = shown(scan_table([row]))
+    gone = row | {"address": 1002, "name": "b", "state": None, "fault": "it does not answer"}
+    text = shown(*scan_tables([row, gone]))
     assert "no end" in text
+    assert "b (1002): it does not answer" in text
+    assert "no answer" in text
     assert "INIT+ERROR" in text
 
 
 def test_state_with_its_reason():
     row = {"address": 1001, "name": "a", "state": "INIT+ERROR", "code": 0x51, "reason": "bad"}
-    assert "bad (0x0051)" in shown(state_table([row]))
+    gone = row | {"state": None, "code": 0, "reason": "it does not answer"}
+    text = shown(state_table([row, gone]))
+    assert "bad (0x0051)" in text
+    assert "no answer" in text
+    assert "it does not answer (" not in text
 
 
 def test_diagnosis():

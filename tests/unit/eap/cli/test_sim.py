@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from eap.appliance import segment_process
 from eap.cli.group import exit_code_of
-from eap.cli.sim import sim
+from eap.cli.sim import run
 
 COE = Path(__file__).parents[4] / "config" / "buses" / "coe.yaml"
 
@@ -19,16 +19,16 @@ def runs(monkeypatch):
     """What would run, instead of running it."""
     found = []
 
-    def run(bus, interface, say, *, second, command_fd):
+    def pretend(bus, interface, say, *, second, command_fd):
         found.append((bus.spec.bus, str(interface), second and str(second), command_fd))
         say({"ready": True, "slaves": len(bus.spec.slaves)})
 
-    monkeypatch.setattr(segment_process, "run", run)
+    monkeypatch.setattr(segment_process, "run", pretend)
     return found
 
 
 def invoke(*words):
-    return CliRunner().invoke(sim, ["run", *map(str, words)])
+    return CliRunner().invoke(run, [*map(str, words)])
 
 
 def test_ready_line(runs):

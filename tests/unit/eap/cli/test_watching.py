@@ -4,7 +4,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.cli.watching import changes, connect_station
+from eap.appliance.client import connect_station
+from eap.cli.watching import changes
 from eap.errors import ControlError
 from tests.unit.eap.cli.conftest import Appliance
 

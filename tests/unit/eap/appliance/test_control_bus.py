@@ -1,0 +1,68 @@
+"""Steps and datagrams as words of the control protocol, there and back."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import BusError
+from devicebus.mailbox.conversation import Ask
+from devicebus.master.access import TRIES, Access, Reply, fprd
+from devicebus.wire.datagram import Command
+from eap.appliance.control import parameters
+from eap.appliance.control_bus import (
+    BusAskParameters,
+    ask_parameters,
+    datagram_row,
+    kind_of,
+    protocol_of,
+    reply_row,
+    to_access,
+    to_ask,
+    to_octets,
+    to_replies,
+)
+from eap.codec.mailbox import MailboxType
+from eap.errors import ControlError
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        Ask(MailboxType.COE, b"\x01\xff"),
+        Ask(MailboxType.FOE, b"", listen=True, timeout_ns=3_000_000_000, delay_ns=10_000_000),
+        Ask(MailboxType.VOE, b"x", expects_reply=False),
+    ],
+)
+def test_step(ask):
+    wanted = parameters({"conversation": 1} | ask_parameters(ask), BusAskParameters)
+    assert to_ask(ask.type, wanted) == ask
+
+
+def test_times_are_rounded_up():
+    assert ask_parameters(Ask(MailboxType.COE, b"", timeout_ns=1))["timeout_ms"] == 1
+
+
+def test_protocols():
+    for kind in set(MailboxType) - {MailboxType.ERR}:
+        assert kind_of(protocol_of(kind)) is kind
+
+
+def test_datagrams_and_replies():
+    access = fprd(1001, 0x130, 6)
+    assert to_access(datagram_row(access)) == access
+    row = (Command.FPWR, 1, 2, "ff", 0)
+    assert to_access(row) == Access(Command.FPWR, 1, 2, b"\xff", TRIES)
+    replies = [Reply(b"\1\2", 1, 2), Reply(b"", 0)]
+    assert to_replies([reply_row(each) for each in replies]) == replies
+
+
+def test_what_is_none():
+    with pytest.raises(ControlError, match="99 is no command"):
+        to_access((99, 0, 0, "", 1))
+    with pytest.raises(ControlError, match="'xy' is not pairs"):
+        to_octets("xy")
+    for rows in ([(1, "xy", 1)], [1]):
+        with pytest.raises(BusError, match="no reply"):
+            to_replies(rows)
+    with pytest.raises(ControlError, match="timeout_ms"):
+        parameters({"conversation": 1, "request": "", "timeout_ms": 10**9}, BusAskParameters)
