@@ -3,7 +3,8 @@
 Two appliances run config/valve.yaml, a station each.  This program moves the switch at the
 simulated slave, watches in the process images how that gets to the valve and back through EAP, and
 asks the valve's slave itself.  Then it kills the engine of the station with the switch: the valve
-has to close by its substitute, and to open again when that engine is back.
+has to close by its substitute, and to open again when that engine is back.  At last the valve's
+slave loses its power for half a second.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -24,7 +25,9 @@ from time import monotonic_ns
 from typing import NamedTuple
 
 import eap
+from devicebus.mailbox.coe_client import upload
 from eap.appliance.attach import AttachedStation
+from eap.appliance.bus_running import open_running
 from eap.appliance.runtime import VARIABLE
 from eap.errors import EapError
 from eap.net.ticker import Ticker
@@ -32,11 +35,13 @@ from eap.net.ticker import Ticker
 PLANT = Path(__file__).resolve().parent.parent / "config" / "valve.yaml"
 EAPCTL = Path(sys.executable).with_name("eapctl")
 LEFT, RIGHT = "left", "right"
-SWITCH = ("left/bus0", "buttons", "limit_switch")
-VALVE = ("right/bus0", "valves", "0x7000:1")
+BUS = "bus0"
+SWITCH = (f"{LEFT}/{BUS}", "buttons", "limit_switch")
+VALVE, VALVE_ENTRY = "valves", (0x7000, 1)
 TIMEOUT_MS = 50
 """After so long without news the valve closes; the plant file says so."""
 OP = 8
+_POWER_MS = 500
 _LOOK_NS = 100_000
 _UP_WITHIN_S = 15.0
 _MOVES_WITHIN_S = 2.0
@@ -75,6 +80,7 @@ class Plant:
             if not _line(appliance):
                 raise DemoError(f"eapctl run --station {name} did not start: see above")
         self._stations = {name: stack.enter_context(eap.attach(name)) for name in self._appliances}
+        self._bus = stack.enter_context(open_running(RIGHT, BUS))
         self._ticker = Ticker()
         stack.callback(self._ticker.close)
         self.cycle_ms = self._stations[LEFT].cycle_s * 1000
@@ -93,6 +99,10 @@ class Plant:
             self._ticker.wait(now_ns + _LOOK_NS)
         return monotonic_ns()
 
+    def times(self, duration_ns: int) -> str:
+        """Write a duration in milliseconds and cycles."""
+        return f"{_ms(duration_ns)}, {duration_ns / _MS / self.cycle_ms:.1f} cycles"
+
     def wait_operational(self) -> None:
         """Wait until all slaves of both buses are in OP."""
         for name, station in self._stations.items():
@@ -101,19 +111,35 @@ class Plant:
 
     def move_switch(self, *, on: bool) -> list[int]:
         """Move the switch at its slave; return when that was seen at each point of the chain."""
-        mover = subprocess.Popen(_command("sim", "set", *SWITCH, str(on).lower()))
-        try:
+        with _doing("sim", "set", *SWITCH, str(on).lower()):
             return [self._wait_for(point, on=on) for point in CHAIN]
-        finally:
-            if mover.wait(_MOVES_WITHIN_S):
-                raise DemoError("eapctl sim set was refused: see above")
+
+    def ask_valve(self, *, is_open: bool) -> None:
+        """Ask the slave of the valve itself, as ``eapctl bus sdo read`` does, and print that.
+
+        Raises DemoError if it says something else.
+        """
+        slave = self._bus.find(VALVE)
+        octets = self._bus.converse(slave, lambda sizes: upload(*VALVE_ENTRY), "the valve")
+        index, subindex = VALVE_ENTRY
+        text = f"its slave says 0x{index:04X}:{subindex:02X} = {octets[0]}"
+        if bool(octets[0]) is not is_open:
+            raise DemoError(f"the valve should be {_open(is_open)}, but {text}")
+        _tell(f"    {text}")
+
+    def cut_power(self, for_ms: int) -> tuple[int, int]:
+        """Take the power from the slave of the valve; return when it was missed, and was back."""
+        fault = ("power", f"slave={VALVE}", f"for_ms={for_ms}")
+        with _doing("sim", "fault", f"{RIGHT}/{BUS}", *fault):
+            lost_ns = self._wait_for_state(0)
+        return lost_ns, self._wait_for_state(OP)
 
     def _wait_for(self, point: Point, *, on: bool) -> int:
         return self.wait(lambda: self.read(point) is on, _MOVES_WITHIN_S, point.what)
 
-    def ask_valve(self) -> str:
-        """Ask the valve's slave by SDO; return what ``eapctl`` prints."""
-        return _say("bus", "sdo", "read", *VALVE)
+    def _wait_for_state(self, state: int) -> int:
+        right, name = self._stations[RIGHT], f"{BUS}.{VALVE}.state"
+        return self.wait(lambda: right[name] == state, _BACK_WITHIN_S, f"{name} = {state}")
 
     def kill_engine(self, name: str) -> int:
         """Kill the engine of a station as a crash would; return when."""
@@ -131,7 +157,7 @@ class Plant:
 def main(arguments: Sequence[str]) -> int:
     """Show it; return 0 if everything happened as it should."""
     parser = argparse.ArgumentParser(description="A limit switch opens a valve, through EAP.")
-    parser.add_argument("--moves", type=int, default=6, help="how often the switch moves")
+    parser.add_argument("--moves", type=int, default=4, help="how often the switch moves")
     moves = parser.parse_args(arguments).moves
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with ExitStack() as stack:
@@ -141,6 +167,7 @@ def main(arguments: Sequence[str]) -> int:
             plant = Plant(stack)
             show_moves(plant, moves)
             show_substitute(plant)
+            show_power(plant)
         except (DemoError, EapError) as exc:
             print(f"make valve: {exc}", file=sys.stderr)
             return 1
@@ -153,37 +180,60 @@ def show_moves(plant: Plant, moves: int) -> None:
     """Move the switch to and fro, and say how long it took to each point."""
     begin_ns = monotonic_ns()
     plant.wait_operational()
-    _tell(f"all slaves of both buses are in OP, after {_ms(monotonic_ns() - begin_ns)}")
-    _tell(f"cycle {plant.cycle_ms:g} ms; times count from {CHAIN[0].what}")
-    took_ns = []
+    _tell(
+        f"all slaves of both buses are in OP, {_ms(monotonic_ns() - begin_ns)} after the ready line"
+    )
+    _tell(f"cycle {plant.cycle_ms:g} ms; times count from the switch in the process image of left")
+    took = []
     for number in range(moves):
         is_on = not number % 2
-        at_ns = plant.move_switch(on=is_on)
-        took_ns.append(at_ns[2] - at_ns[0])
-        cycles = (at_ns[2] - at_ns[0]) / _MS / plant.cycle_ms
-        _tell(
-            f"switch {_on(is_on)}: valve {_open(is_on)}"
-            f" after {_ms(at_ns[2] - at_ns[0])} ({cycles:.1f} cycles;"
-            f" output {_ms(at_ns[1] - at_ns[0])}), lamp at left {_ms(at_ns[3] - at_ns[0])}"
-        )
-        _tell(f"  the slave of the valve says {plant.ask_valve()}")
-    middle_ns = int(median(took_ns))
-    _tell(f"from switch to valve: median {_ms(middle_ns)}, longest {_ms(max(took_ns))}")
+        switch_ns, *others_ns = plant.move_switch(on=is_on)
+        after_ns = [each_ns - switch_ns for each_ns in others_ns]
+        took.append(after_ns)
+        _tell(f"    output to the valve {_on(is_on)}: {plant.times(after_ns[0])}")
+        _tell(f"    its contact says {_open(is_on)}: {plant.times(after_ns[1])}")
+        _tell(f"    lamp at left {_on(is_on)}: {plant.times(after_ns[2])}")
+        plant.ask_valve(is_open=is_on)
+    output, contact, _ = (plant.times(int(median(column))) for column in zip(*took, strict=True))
+    _tell(f"from the switch to the valve: {output}; until its contact is known at right: {contact}")
 
 
 def show_substitute(plant: Plant) -> None:
     """Kill the engine at the switch; the valve has to close, and to open when it is back."""
     plant.move_switch(on=True)
+    plant.ask_valve(is_open=True)
     killed_ns = plant.kill_engine(LEFT)
-    _tell("switch on: valve open; the engine of left is killed")
+    _tell(f"the engine of left is killed; right waits {TIMEOUT_MS} ms for news")
     closed_ns = plant.wait(lambda: not plant.read(FEEDBACK), _MOVES_WITHIN_S, "the valve closed")
-    _tell(f"valve closed by the substitute, {_ms(closed_ns - killed_ns)} later")
-    _tell(f"  time-out {TIMEOUT_MS} ms; the slave of the valve says {plant.ask_valve()}")
+    _tell(f"    valve closed by the substitute: {_ms(closed_ns - killed_ns)}")
+    plant.ask_valve(is_open=False)
     open_ns = plant.wait(lambda: plant.read(FEEDBACK), _BACK_WITHIN_S, "the valve open again")
-    _tell(f"the engine of left is back: valve open, {_ms(open_ns - killed_ns)} after the kill")
+    _tell(f"    the engine is back, valve open: {_ms(open_ns - killed_ns)}")
     plant.wait(lambda: plant.read(LAMP), _BACK_WITHIN_S, LAMP.what)
+    plant.ask_valve(is_open=True)
+
+
+def show_power(plant: Plant) -> None:
+    """Take the power from the valve's slave; it has to come back, and to open the valve again."""
+    lost_ns, back_ns = plant.cut_power(_POWER_MS)
+    _tell(f"    its slave is missed, and in OP again {_ms(back_ns - lost_ns)} later")
+    plant.wait(lambda: plant.read(FEEDBACK), _MOVES_WITHIN_S, FEEDBACK.what)
+    plant.ask_valve(is_open=True)
     plant.move_switch(on=False)
-    _tell("switch off: valve closed")
+    plant.ask_valve(is_open=False)
+
+
+@contextmanager
+def _doing(*words: str) -> Iterator[None]:
+    """Run a command while the block watches what it does; raise DemoError if it is refused."""
+    _tell(f"$ eapctl {' '.join(words)}")
+    with subprocess.Popen(
+        _command(*words), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        yield
+        _, refusal = process.communicate(timeout=_MOVES_WITHIN_S)
+    if process.returncode:
+        raise DemoError(refusal.strip())
 
 
 def _is_up(station: AttachedStation) -> bool:
