@@ -4,8 +4,9 @@ Every datagram of a frame carries the frame's index; a frame that comes back is 
 index is awaited and each datagram is the one that was sent, so that late, foreign and damaged
 frames never answer anything.
 
-Cyclic accesses go first.  Once cycles run, acyclic ones share a budget that each cycle refills: a
-cycle sends at most the budget and one frame of them, however much is waiting.
+Cyclic accesses go first; a few short acyclic ones may ride along, which spares a frame.  Once
+cycles run, acyclic ones share a budget that each cycle refills: a cycle sends at most the budget
+and one frame of them, however much is waiting.
 """
 
 from __future__ import annotations
@@ -31,12 +32,15 @@ MAX_DATA = MAX_BODY - OVERHEAD
 """Octets of one access."""
 MIN_COST = 64
 """What a datagram takes of the budget at least: a short one costs as much time as this many."""
+MAX_RIDE = 256
+"""Octets of acyclic datagrams in a cyclic frame: 20 µs of it at 100 Mbit/s."""
 MAX_ACYCLIC_FRAMES = 8
 """Acyclic frames under way at once; more would only wait in somebody's buffer."""
 
 Done: TypeAlias = Callable[[list[Reply] | FrameLostError, int], None]
 
 _LAYOUT = DatagramHeader.LAYOUT
+_TYPE_WORD = FrameType.DATAGRAM << 12
 _MORE = 0x8000
 _LENGTH = 0x07FF
 _BY_STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW))
@@ -217,10 +221,18 @@ class Link:
 
     def _take(self, queue: deque[_Item], *, cyclic: bool) -> list[_Item]:
         items: list[_Item] = []
+        self._fill(items, queue, MAX_BODY, cyclic=cyclic)
+        if cyclic and not queue and self._credit is not None and self._credit > 0:
+            room = MAX_BODY - sum(OVERHEAD + len(item.access.data) for item in items)
+            self._fill(items, self._acyclic, min(room, MAX_RIDE), cyclic=False)
+        return items
+
+    def _fill(self, items: list[_Item], queue: deque[_Item], room: int, *, cyclic: bool) -> None:
+        """Add what *room* octets hold."""
         size = 0
         while queue and len(items) < MAX_DATAGRAMS:
             octets = OVERHEAD + len(queue[0].access.data)
-            if size + octets > MAX_BODY:
+            if size + octets > room:
                 break
             item = queue.popleft()
             if item.exchange.cancelled:
@@ -232,7 +244,6 @@ class Link:
                 self._credit -= max(octets, MIN_COST)
                 if self._credit <= 0:
                     break
-        return items
 
     def _land(self, index: int) -> _Flight:
         flight = self._flights.pop(index)
@@ -249,7 +260,7 @@ def _encode(items: list[_Item], index: int) -> bytes:
         word = len(data) | (_MORE if number < last else 0)
         parts += (_LAYOUT.pack(command, index, adp, ado, word, 0), data, b"\0\0")
         length += OVERHEAD + len(data)
-    parts[0] = EtherCatHeader(length, type=FrameType.DATAGRAM).encode()
+    parts[0] = (length | _TYPE_WORD).to_bytes(2, "little")
     return b"".join(parts)
 
 
@@ -258,7 +269,7 @@ def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, in
     results = []
     offset = EtherCatHeader.SIZE
     need = offset + sum(OVERHEAD + len(item.access.data) for item in items)
-    if len(data) < need or EtherCatHeader.decode(data).type != FrameType.DATAGRAM:
+    if len(data) < need or data[1] >> 4 != FrameType.DATAGRAM:
         return None
     for item in items:
         command, adp, ado, sent, _ = item.access

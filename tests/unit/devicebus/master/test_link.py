@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from devicebus.errors import FrameLostError
 from devicebus.master.access import Reply, fprd, fpwr, logical
-from devicebus.master.link import MAX_BODY, MAX_DATA, MAX_DATAGRAMS, Link
+from devicebus.master.link import MAX_BODY, MAX_DATA, MAX_DATAGRAMS, MAX_RIDE, Link
 from devicebus.wire.datagram import Command
 from tests.support.busline import MS, accesses_of, answer
 
@@ -193,15 +193,43 @@ def test_indexes_go_round_and_pass_by_those_that_are_awaited(link):
     assert (seen[254], seen[255], 0 in seen) == (255, 1, False)
 
 
-def test_cyclic_frames_go_first_and_alone():
-    link = Link(acyclic_octets=100)
+def test_cyclic_frames_go_first_and_take_a_little_along():
+    link = Link(acyclic_octets=3000)
+    client = Client(link)
+    long = fprd(1001, 0x1000, MAX_RIDE)
+    client.ask(READ, READ, long, READ)
+    link.start_cycle()
+    cyclic = logical(Command.LRW, 0x10000, bytes(20))._replace(tries=1)
+    client.ask(cyclic, cyclic=True)
+    first, second = link.frames_to_send(0)
+    assert accesses_of(first) == [cyclic._replace(tries=3), READ, READ]
+    assert accesses_of(second) == [long, READ]
+
+
+def test_nobody_rides_along_without_budget_or_room():
+    link = Link(acyclic_octets=64)
+    client = Client(link)
+    client.ask(READ, READ)
+    link.start_cycle()
+    client.ask(logical(Command.LRW, 0x10000, bytes(MAX_DATA)), cyclic=True)
+    first, second = link.frames_to_send(0)
+    assert (len(accesses_of(first)), accesses_of(second)) == (1, [READ])
+    client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
+    (third,) = link.frames_to_send(1)
+    assert len(accesses_of(third)) == 1
+
+
+def test_who_rode_along_with_a_lost_frame_is_sent_again():
+    link = Link(acyclic_octets=3000)
     client = Client(link)
     client.ask(READ)
     link.start_cycle()
     client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
-    first, second = link.frames_to_send(0)
-    assert accesses_of(first)[0].command is Command.LRW
-    assert accesses_of(second) == [READ]
+    link.frames_to_send(0)
+    link.handle_timeout(2 * MS)
+    assert [type(outcome) for outcome, _ in client.outcomes] == [FrameLostError]
+    (again,) = link.frames_to_send(2 * MS)
+    assert accesses_of(again) == [READ]
 
 
 def test_a_cycle_sends_no_more_acyclic_octets_than_its_budget_and_one_datagram():
