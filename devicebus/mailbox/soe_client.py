@@ -6,7 +6,7 @@ that end in another IDN were late, and are dropped.
 
 from __future__ import annotations
 
-from devicebus.errors import MailboxProtocolError, MailboxTimeoutError, SoeError
+from devicebus.errors import BusError, MailboxProtocolError, MailboxTimeoutError, SoeError
 from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_procedure import CLEAR, START
@@ -157,7 +157,11 @@ def execute(
         since_ns = message.at_ns if since_ns is None else since_ns
         if message.at_ns - since_ns > timeout_ns:
             break
-    yield from write(idn, CLEAR.to_bytes(2, "little"), sizes, drive=drive)
+    try:
+        yield from write(idn, CLEAR.to_bytes(2, "little"), sizes, drive=drive)
+    except BusError:
+        if not state & DataState.EXECUTING:
+            raise  # else that it was not done says more
     if state & DataState.ERROR:
         raise SoeError(f"{what}: failed", code=SoeErrorCode.GENERAL)
     if state & DataState.EXECUTING:

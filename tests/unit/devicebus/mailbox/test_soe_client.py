@@ -178,6 +178,14 @@ def test_procedure_command_that_takes_its_time_to_be_busy_ends_too() -> None:
     assert ask.request == bytes.fromhex("03 40 6300 0000")
 
 
+def test_procedure_command_that_is_neither_done_nor_cleared() -> None:
+    busy = ["04 40 6300", *["02 01 6300 0700"] * 3]
+    with pytest.raises(MailboxTimeoutError, match=r"not done after 0\.03 s"):
+        talk_to(SOE, soe_client.execute(RESET, SIZES, timeout_ns=30_000_000), *busy)
+    with pytest.raises(MailboxTimeoutError, match="no answer"):
+        talk_to(SOE, soe_client.execute(RESET, SIZES), busy[0], "02 01 6300 0300")
+
+
 def test_data_state_that_is_cut_breaks_the_protocol() -> None:
     with pytest.raises(MailboxProtocolError, match="a data state of 1 octets"):
         talk_to(SOE, soe_client.execute(RESET, SIZES), "04 40 6300", "02 01 6300 07")
