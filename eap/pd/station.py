@@ -10,16 +10,15 @@ that a reader sees inputs and what follows from them in one cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias
 
 from eap.ids import NetId
 from eap.pd.device import Device, DeviceState, Request
 from eap.pd.generator import Generators
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
-from eap.pd.link import Channel, CyclicBus, OutFrame, Taker
+from eap.pd.link import Channel, CyclicBus, Taker
 from eap.pd.links import Links
 from eap.pd.publisher import Publisher
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
@@ -37,10 +36,6 @@ _LATENESS_MAX_NS = int(StationWord.LATENESS_MAX_NS)
 
 WAKE_FOR_CYCLES = 100
 """Cycles after the last announcement of a waiting program in which waiters are woken."""
-
-_Choose: TypeAlias = Callable[[int, int], list[OutFrame]]
-_Send: TypeAlias = Callable[[Sequence[OutFrame], int], Sequence[OutFrame]]
-_Sent: TypeAlias = Callable[[Sequence[OutFrame], int], None]
 
 _UNREAD_FOR_US = 10_000
 """How long frames may wait at a port without subscriptions: they will only be counted."""
@@ -71,14 +66,13 @@ class Station:
         self._wake = wake
         self._inputs = Inputs(image)
         generated = [s for s in spec.sources if isinstance(s, EngineSource)]
-        self._generators = Generators(image, generated)
+        self._generate = Generators(image, generated).run
         self._run_links = Links(image, self.memory_of, spec.links).run if spec.links else None
         self._computes = bool(generated or spec.links)
-        """Whether more is to be written than what is received from other stations."""
+        """Whether anything follows from what was received."""
         self._has_own_variables = self._computes
         self.buses: list[CyclicBus] = []
-        self._publishers: list[Publisher] = []
-        self._senders: list[tuple[_Choose, _Send, _Sent]] = []
+        self._publishers: list[tuple[Publisher, Channel]] = []
         self._channels: list[Channel] = []
         self._drains: list[Callable[[int], object]] = []
         self._rarely: list[Callable[[int], int]] = []
@@ -124,9 +118,7 @@ class Station:
         if frames:
             net_id = next(p.net_id for p in self.spec.ports if p.name == port)
             publisher = Publisher(self.image, self._inputs, NetId.parse(net_id), channel, frames)
-            self._publishers.append(publisher)
-            # Bound once: a publisher's cycle is so short that three lookups show.
-            self._senders.append((publisher.frames_to_send, channel.send, publisher.sent))
+            self._publishers.append((publisher, channel))
 
     def drain_also(self, channel: Channel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""
@@ -139,8 +131,8 @@ class Station:
         """Exchange process data with *bus* in each cycle."""
         self.buses.append(bus)
         self._drains.append(bus.receive)
-        self._supervisors.append(partial(_run_due, bus))
-        self._has_own_variables = self._computes = True
+        self._supervisors.append(partial(_supervise, bus))
+        self._has_own_variables = True
 
     def memory_of(self, writer: Writer) -> memoryview:
         """Return where the cycle reads the variables of *writer*, as long as the image.
@@ -192,14 +184,15 @@ class Station:
         else:
             changed = self._inputs.refresh()
         if changed:
-            for publisher in self._publishers:
+            for publisher, _ in self._publishers:
                 publisher.read_controls()
-        for frames_to_send, send, sent in self._senders:
-            frames = frames_to_send(cycle, now_ns)
+        for publisher, channel in self._publishers:
+            frames = publisher.frames_to_send(cycle, now_ns)
             if frames:
-                sent(send(frames, now_ns), now_ns)
-        for bus in self.buses:
-            bus.exchange(now_ns)
+                publisher.sent(channel.send(frames, now_ns), now_ns)
+        if self.buses:
+            for bus in self.buses:
+                bus.exchange(now_ns)
         late_ns = now_ns - due_ns
         late_us = late_ns // 1000
         bin_ = BIN_OF_US[late_us] if 0 <= late_us < _BINS_KNOWN else histogram_bin(late_us)
@@ -218,15 +211,13 @@ class Station:
         words[_SEQUENCE] = sequence + 1
         for drain in self._drains:
             drain(now_ns)
-        if not cycle % self._rarely_every:
+        if self._rarely and not cycle % self._rarely_every:
             for drain in self._rarely:
                 drain(now_ns)
-        for apply_timeouts in self._supervisors:
-            apply_timeouts(now_ns)
+        for supervise in self._supervisors:
+            supervise(now_ns)
         if self._computes:
-            for bus in self.buses:
-                bus.take_inputs()
-            self._generators.run(cycle)
+            self._generate(cycle)
             changed = self._inputs.refresh()
             if self._run_links is not None:
                 self._run_links()
@@ -236,8 +227,9 @@ class Station:
         return changed
 
 
-def _run_due(bus: CyclicBus, now_ns: int) -> None:
-    """Run the timers of *bus* if the cycle has kept them waiting."""
+def _supervise(bus: CyclicBus, now_ns: int) -> None:
+    """Run the timers of *bus* if the cycle has kept them waiting, then take its inputs."""
     due_ns = bus.next_timeout()
     if due_ns is not None and due_ns <= now_ns:
         bus.handle_timeout(now_ns)
+    bus.take_inputs()
