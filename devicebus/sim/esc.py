@@ -32,7 +32,7 @@ class EscSettings(msgspec.Struct, frozen=True, kw_only=True):
     revision: int = 0
     build: int = 2
     fmmus: int = 8
-    sync_managers: int = 8
+    sync_managers: int = 16
     ram: int = 8192
     """Octets of process data memory."""
     port_descriptor: int = 0x0F

@@ -21,7 +21,6 @@ from devicebus.sim.spec import FaultKind, FaultSpec
 from devicebus.sim.wiring import Side
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import OVERHEAD, DatagramHeader
-from devicebus.wire.register import Register
 from eap.codec.ethercat import EtherCatHeader
 
 _MS = 1_000_000
@@ -127,7 +126,7 @@ class FaultySegment:
             if spec.kind is FaultKind.LOSS:
                 return
             if spec.kind is FaultKind.CORRUPT:
-                self._corrupt(self._numbers[spec.slave])
+                self.segment.break_frame(frame, now_ns, side, self._numbers[spec.slave])
                 return
             if spec.kind is FaultKind.DELAY:
                 delay_ns += 1000 * spec.delay_us
@@ -172,12 +171,6 @@ class FaultySegment:
     def _hits(self, spec: FaultSpec) -> bool:
         self._on_frames[spec] += 1
         return self._on_frames[spec] % spec.every == 0
-
-    def _corrupt(self, number: int) -> None:
-        """The frame breaks on the cable in front of a slave, which counts it first."""
-        self.segment.slaves[number].esc.count_error(Register.RX_ERROR)
-        for slave in self.segment.slaves[number + 1 :]:
-            slave.esc.count_error(Register.FORWARDED_RX_ERROR)
 
     def _switch(self, spec: FaultSpec, now_ns: int, *, on: bool) -> None:
         if spec.kind in _ON_FRAMES:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from devicebus.sim.processing import Chain
 from devicebus.sim.slave import Slave
 from devicebus.sim.wiring import CABLE_NS, PortAt, Side, Way, dl_status, find_way
+from devicebus.wire.register import Register
 
 POLL_NS = 1_000_000
 """How often slaves look at the time on their own."""
@@ -81,16 +82,27 @@ class Segment:
         if chain is None:
             return None
         survives = chain.process(frame, now_ns)
-        rewire = False
-        for slave in self._reached[side]:
-            esc = slave.esc
-            if esc.al_event:
-                slave.run(now_ns)
-            rewire |= esc.loops_changed
-        if rewire:
-            self._rewire()
+        self._let_run(side, now_ns)
         way = self._ways[side]
         return way.comes_out if survives and way is not None else None
+
+    def break_frame(self, frame: bytearray, now_ns: int, side: Side, number: int) -> None:
+        """Let a frame break on the cable in front of slave *number*, as the others see it.
+
+        Those in front have taken it as it was; the slave counts an error, those behind a forwarded
+        one, and none of these takes it.
+        """
+        self.handle_timeout(now_ns)
+        way = self._ways[side]
+        if way is None or number not in way.order:
+            return
+        place = way.order.index(number)
+        reached = self._reached[side]
+        Chain([slave.esc for slave in reached[:place]]).process(frame, now_ns)
+        self._let_run(side, now_ns)
+        reached[place].esc.count_error(Register.RX_ERROR)
+        for slave in reached[place + 1 :]:
+            slave.esc.count_error(Register.FORWARDED_RX_ERROR)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
@@ -107,6 +119,16 @@ class Segment:
         self._poll_at_ns = now_ns + POLL_NS
         for slave in self.slaves:
             slave.handle_timeout(now_ns)
+
+    def _let_run(self, side: Side, now_ns: int) -> None:
+        rewire = False
+        for slave in self._reached[side]:
+            esc = slave.esc
+            if esc.al_event:
+                slave.run(now_ns)
+            rewire |= esc.loops_changed
+        if rewire:
+            self._rewire()
 
     def _rewire(self) -> None:
         links = self._links()

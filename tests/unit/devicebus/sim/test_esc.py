@@ -190,3 +190,24 @@ def test_controller_without_clock():
     esc = Esc(IMAGE, EscSettings(has_dc=False))
     assert esc.read(0x0910, 8, 0) is None
     assert esc.read(0x0008, 2, 0) == bytes(2)
+
+
+def test_sixteen_sync_managers():
+    esc = Esc(IMAGE)
+    assert esc.read(0x0005, 1, 0) == b"\x10"
+    assert esc.write(0x0878, SyncManager(0x1800, 4, 2, 1, enable=1).encode(), 0)
+    assert esc.write(0x1800, b"abcd", 0)
+    assert not esc.write(0x1800, b"abcd", 0)
+    assert esc.al_event & 1 << 23
+    assert esc.read(0x087D, 1, 0) == b"\x09"
+    assert esc.channels[15].take() == b"abcd"
+    assert esc.read(0x0880, 1, 0) is None
+
+
+def test_overlapping_sync_managers_are_asked_in_their_order():
+    esc = Esc(IMAGE)
+    for number, direction in enumerate((0, 1)):
+        esc.write(0x0800 + 8 * number, SyncManager(0x1800, 4, 0, direction, enable=1).encode(), 0)
+    assert not esc.write(0x1800, b"abcd", 0)
+    esc.write(0x0806, b"\0", 0)
+    assert esc.write(0x1800, b"abcd", 0)

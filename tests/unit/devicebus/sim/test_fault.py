@@ -88,6 +88,22 @@ def test_damaged_frames_are_counted_where_they_start():
     assert counters == [0, 0, 2, 0, 0, 2]
 
 
+def test_damaged_frame_is_taken_in_front_of_the_damage_only():
+    faulty = make(fault("corrupt", slave="b", for_ms=1))
+    assert exchange(faulty, 0, Command.BWR, Register.STATION_ADDRESS, 2) == []
+    frame = bytearray(encode_frame([datagram(Command.BWR, 0, 0x1F00, b"\x55")]))
+    faulty.receive_frame(frame, 0)
+    memory = [slave.esc.peek(0x1F00, 1) for slave in faulty.segment.slaves]
+    assert memory == [b"\x55", b"\0", b"\0"]
+
+
+def test_damage_where_no_frame_comes_hurts_nobody():
+    faulty = make(fault("corrupt", slave="c", for_ms=1), fault("cut", slave="b", for_ms=1))
+    faulty.handle_timeout(0)
+    assert wkcs(faulty) == []
+    assert faulty.segment.slaves[2].esc.peek(Register.RX_ERROR, 1) == b"\0"
+
+
 def test_cut_by_script_is_mended_in_time():
     faulty = make(fault("cut", slave="b", at_ms=10, for_ms=5))
     assert wkcs(faulty, 7) == [3]

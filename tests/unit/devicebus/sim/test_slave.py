@@ -160,6 +160,19 @@ def test_channel_switched_off_under_data_is_an_error(bench):
     assert bench.status() == (AlState.PREOP | ERROR, AlStatusCode.OUTPUT_CONFIGURATION)
 
 
+@pytest.mark.parametrize(
+    ("state", "code"),
+    [(AlState.PREOP, AlStatusCode.MAILBOX_PREOP), (AlState.OP, AlStatusCode.MAILBOX_PREOP),
+     (AlState.BOOT, AlStatusCode.MAILBOX_BOOT)],
+)  # fmt: skip
+def test_mailbox_switched_off_while_it_is_used_is_an_error(bench, state, code):
+    bench.bring(state)
+    bench.write(Register.SYNC_MANAGER + 6, b"\x00")
+    assert bench.status() == (AlState.INIT | ERROR, code)
+    bench.ask(AlState.INIT)
+    assert bench.status() == (AlState.INIT, 0)
+
+
 def test_sync0_where_it_is_needed():
     bench = Bench(generic(clock=ClockSpec(needs_sync0=True)))
     bench.bring(AlState.SAFEOP)

@@ -46,6 +46,8 @@ def test_mailbox(first, second, fits):
         (2, SyncManager(0x1200, 2, 0, 1, enable=1), AlStatusCode.OUTPUT_CONFIGURATION),
         (2, SyncManager(0x1200, 3, 0, 1), AlStatusCode.OUTPUT_CONFIGURATION),
         (3, SyncManager(0x1300, 4, 0, 0, enable=1), AlStatusCode.INPUT_CONFIGURATION),
+        (2, SyncManager(0x1258, 3, 0, 1, enable=1), AlStatusCode.SYNC_MANAGER),
+        (2, SyncManager(0x11FE, 3, 0, 1, enable=1), AlStatusCode.SYNC_MANAGER),
     ],
 )
 def test_process_data(channel, setting, code):
