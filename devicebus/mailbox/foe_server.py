@@ -17,10 +17,13 @@ from eap.codec.foe import (
     FoeHeader,
     FoeOpcode,
     encode_message,
+    name_of,
     text_of,
 )
 from eap.codec.mailbox import MailboxError
 from eap.errors import MalformedError, TruncatedError
+
+_REQUESTS = frozenset((FoeOpcode.READ, FoeOpcode.WRITE))
 
 
 class FileReader(Protocol):
@@ -66,12 +69,14 @@ class FoeServer:
     Attributes:
         packet_time_ns: How long storing the data of one message takes; until then the slave says
             that it is busy.
+        refuses: Error code with which every request is refused; 0 refuses none.
     """
 
     def __init__(self, store: FileStore, sizes: MailboxSizes, *, packet_time_ns: int = 0) -> None:
         self._store = store
         self._sizes = sizes
         self.packet_time_ns = packet_time_ns
+        self.refuses = 0
         self._reader: FileReader | None = None
         self._writer: FileWriter | None = None
         self._number = 0
@@ -110,6 +115,9 @@ class FoeServer:
 
     def _answer(self, header: FoeHeader, body: bytes, now_ns: int) -> list[bytes]:
         opcode = header.opcode
+        if self.refuses and opcode in _REQUESTS:
+            text = name_of(self.refuses)
+            raise FoeError(text, code=self.refuses, text=text)
         if opcode is FoeOpcode.READ:
             self.reset()
             self._reader = self._store.open_read(text_of(body), header.number)

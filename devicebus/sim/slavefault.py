@@ -23,11 +23,13 @@ def _mailbox(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
 
 
 def _foe(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
+    """Be busy with every message, or refuse every request with a code."""
     del now_ns
     mailbox = slave.device.mailbox
     server = mailbox.protocols.get(MailboxType.FOE) if mailbox else None
     if isinstance(server, FoeServer):
         server.packet_time_ns = 1000 * spec.delay_us if on else 0
+        server.refuses = spec.code if on else 0
 
 
 def _sdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:

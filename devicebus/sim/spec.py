@@ -97,7 +97,11 @@ class FileSpec(msgspec.Struct, frozen=True, kw_only=True):
     max_size: Size = 4 << 20
     content: str = ""
     password: U32 = 0
+    access: AccessKind = AccessKind.READ_WRITE
     boot_only: bool = False
+    not_in_boot: bool = False
+    checksum: bool = False
+    """Whether what is written must end with the CRC-32 of what is in front of it."""
 
 
 class MailboxSpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -180,7 +184,7 @@ class FaultSpec(msgspec.Struct, frozen=True, kw_only=True):
     delay_us: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
     object: str = ""
     code: U32 = 0
-    """SDO abort code, AL status code, or error code of an emergency."""
+    """SDO abort code, AL status code, FoE error code, or error code of an emergency."""
     axis: Annotated[int, Meta(ge=0, le=7)] = 0
     """Of a drive, for its emergency."""
     state: str = ""

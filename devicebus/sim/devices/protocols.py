@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
+from zlib import crc32
 
 from devicebus.mailbox.ads_server import AdsServer
 from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.eoe_server import EoeServer
 from devicebus.mailbox.foe_server import FoeServer
-from devicebus.mailbox.foe_store import AllowedIn, MemoryFile, MemoryStore
+from devicebus.mailbox.foe_store import AllowedIn, MemoryFile, MemoryStore, refusal
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.soe_parameter import SoeParameter
@@ -17,10 +19,14 @@ from devicebus.mailbox.soe_server import SoeServer
 from devicebus.mailbox.voe_server import VoeServer
 from devicebus.sim.device import Device
 from devicebus.sim.devices.pdoobjects import RX_PDO, TX_PDO
-from devicebus.sim.spec import FileSpec, MailboxSpec
+from devicebus.sim.spec import AccessKind, FileSpec, MailboxSpec
 from devicebus.wire.alstatus import AlState
 from eap.codec.coe import CoeService
+from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxType
+
+_WRITABLE = frozenset((AccessKind.WRITE, AccessKind.READ_WRITE))
+_CRC_SIZE = 4
 
 
 def build_mailbox(
@@ -66,10 +72,21 @@ def _coe(device: Device, sizes: MailboxSizes) -> CoeServer:
 
 
 def _file(spec: FileSpec) -> MemoryFile:
+    if spec.boot_only and spec.not_in_boot:
+        raise ValueError(f"file {spec.name} is in no state: boot_only and not_in_boot")
+    allowed = AllowedIn.OTHERS if spec.not_in_boot else AllowedIn.ANY_STATE
     return MemoryFile(
         spec.name,
         spec.content.encode(),
         password=spec.password,
-        allowed_in=AllowedIn.BOOT if spec.boot_only else AllowedIn.ANY_STATE,
+        readable=spec.access is not AccessKind.WRITE,
+        writable=spec.access in _WRITABLE,
+        allowed_in=AllowedIn.BOOT if spec.boot_only else allowed,
         max_size=spec.max_size,
+        check=partial(_check_sum, spec.name) if spec.checksum else None,
     )
+
+
+def _check_sum(name: str, content: bytes) -> None:
+    if crc32(content[:-_CRC_SIZE]).to_bytes(_CRC_SIZE, "little") != content[-_CRC_SIZE:]:
+        raise refusal(FoeErrorCode.CHECKSUM, name)

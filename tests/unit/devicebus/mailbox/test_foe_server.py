@@ -182,3 +182,16 @@ def test_any_request_gets_one_answer_at_most(requests: list[bytes]) -> None:
         answers = slave.server.receive_message(request, 0)
         assert len(answers) <= 1
         assert all(len(answer) <= 10 for answer in answers)
+
+
+@pytest.mark.parametrize("code", FoeErrorCode)
+@pytest.mark.parametrize("request_", [READ, WRITE])
+def test_every_request_is_refused_with_a_code_and_its_text(code, request_) -> None:
+    slave = Slave(b"ab")
+    slave.server.refuses = code
+    assert slave.error(request_) is code
+    assert len(bytes.fromhex(slave.ask(request_))) > 6
+    slave.server.refuses = 0
+    assert slave.ask(READ) == "03 00 01 00 00 00 61 62"
+    slave.server.refuses = code
+    assert slave.ask("04 00 01000000") == ""

@@ -53,6 +53,16 @@ def test_slow_files(bench):
     assert server.packet_time_ns == 0
 
 
+def test_refused_files(bench):
+    server = bench.slaves[0].device.mailbox.protocols[MailboxType.FOE]
+    switch(bench, "foe", code=0x8007)
+    (answer,) = server.receive_message(b"\1\0\0\0\0\0firmware.bin", 0)
+    assert answer[:6] == bytes.fromhex("0500 07800000")
+    switch(bench, "foe", on=False)
+    (answer,) = server.receive_message(b"\1\0\0\0\0\0firmware.bin", 0)
+    assert answer[0] == 3
+
+
 def test_files_of_a_slave_without_mailbox_are_not_slow():
     bench = Bench()
     bench.slaves[0].device.mailbox = None

@@ -7,7 +7,7 @@ import pytest
 from devicebus.sim.device import Device
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.devices.protocols import build_mailbox
-from devicebus.sim.spec import DeviceKind, FileSpec, MailboxSpec, SlaveSpec
+from devicebus.sim.spec import AccessKind, DeviceKind, FileSpec, MailboxSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
 from eap.codec.ads import AdsRange
 from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
@@ -49,6 +49,47 @@ def test_file_for_boot_only_and_with_a_password():
     assert ask(mailbox, MailboxType.FOE, request) == (MailboxType.FOE, b"\3\0\1\0\0\0abc")
     kind, data = ask(mailbox, MailboxType.FOE, b"\1\0\0\0\0\0fw")
     assert int.from_bytes(data[2:6], "little") == FoeErrorCode.NO_RIGHTS
+
+
+def foe(mailbox, octets):
+    kind, data = ask(mailbox, MailboxType.FOE, octets)
+    assert kind is MailboxType.FOE
+    return int.from_bytes(data[2:6], "little") if data[0] == 5 else 0
+
+
+@pytest.mark.parametrize(
+    ("rules", "read", "write"),
+    [
+        ({}, 0, 0),
+        ({"access": AccessKind.READ}, 0, FoeErrorCode.ACCESS_DENIED),
+        ({"access": AccessKind.WRITE}, FoeErrorCode.ACCESS_DENIED, 0),
+        ({"boot_only": True}, FoeErrorCode.BOOTSTRAP_ONLY, FoeErrorCode.BOOTSTRAP_ONLY),
+        ({"not_in_boot": True}, 0, 0),
+    ],
+)
+def test_rules_of_files(rules, read, write):
+    _, mailbox = make(MailboxSpec(foe=True), (FileSpec(name="f", **rules),))
+    assert foe(mailbox, b"\1\0\0\0\0\0f") == read
+    assert foe(mailbox, b"\2\0\0\0\0\0f") == write
+
+
+def test_file_that_is_not_there_in_boot():
+    device, mailbox = make(MailboxSpec(foe=True), (FileSpec(name="f", not_in_boot=True),))
+    device.al_state = AlState.BOOT
+    assert foe(mailbox, b"\1\0\0\0\0\0f") == FoeErrorCode.NOT_IN_BOOTSTRAP
+    with pytest.raises(ValueError, match="file f is in no state"):
+        make(MailboxSpec(foe=True), (FileSpec(name="f", not_in_boot=True, boot_only=True),))
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [(b"123456789\x26\x39\xf4\xcb", 0), (b"123456789\0\0\0\0", FoeErrorCode.CHECKSUM),
+     (b"12", FoeErrorCode.CHECKSUM)],
+)  # fmt: skip
+def test_file_with_a_check_sum(content, code):
+    _, mailbox = make(MailboxSpec(foe=True), (FileSpec(name="f", checksum=True),))
+    foe(mailbox, b"\2\0\0\0\0\0f")
+    assert foe(mailbox, b"\3\0\1\0\0\0" + content) == code
 
 
 def test_dictionary_answers_by_coe():
