@@ -30,7 +30,7 @@ from tools.bench.settings import Settings, quick
 
 NAMES = (
     "throughput", "latency", "lateness", "solar", "limits", "receive", "startup",
-    "acyclic", "cycle", "plantbus", "segment",
+    "acyclic", "cycle", "plantbus", "recovery", "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
 BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"

@@ -1,4 +1,4 @@
-"""Bus files of any size: slaves alike, which share a number of octets of process data."""
+"""Bus files of any size, slaves alike that share process data, and a plant with such a bus."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+STATION, PORT = "master", "bus0"
 FILE = "firmware.bin"
 FILE_SIZE = 1 << 20
 FILE_MAILBOX = 1024
@@ -38,6 +39,18 @@ def bus(slaves: int, octets: int) -> dict[str, Any]:
             for number in range(1, slaves + 1)
         ],
     }
+
+
+def plant(interface: str, cycle_us: int, **more: str) -> dict[str, Any]:
+    """Return a plant file of one station, STATION, with one bus port, PORT, at *interface*."""
+    port = {"name": PORT, "kind": "bus", "interface": interface, "net_id": "10.134.164.1.3.1"}
+    station = {
+        "name": STATION,
+        "net_id": "10.134.164.1.1.1",
+        "cycle_us": cycle_us,
+        "ports": [port | more],
+    }
+    return {"plant": "bench-bus", "stations": [station]}
 
 
 def encode(content: dict[str, Any]) -> bytes:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Any
 
+from eap.appliance.runtime import VARIABLE
 from tools.bench import buses, machine
 from tools.bench.appliance import running, status
+from tools.bench.buses import PORT, STATION
 from tools.bench.cycle import CYCLE_US, OCTETS, PRIORITY, SLAVES
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.machine import ProcessSample
@@ -16,7 +18,6 @@ from tools.bench.settings import Settings
 from tools.bench.simulator import simulator
 
 TITLE = "The same in a running plant: requests come from other processes, by way of services"
-STATION, PORT = "master", "bus0"
 _UP_WITHIN_S = 20
 _SETTLE_S = 1.0
 
@@ -29,7 +30,8 @@ def run(settings: Settings) -> list[Figure]:
         link = stack.enter_context(cable())
         bus, plant = link.folder / "bus.yaml", link.folder / "plant.yaml"
         bus.write_bytes(buses.encode(buses.bus(SLAVES, OCTETS)))
-        plant.write_bytes(buses.encode(_plant(link)))
+        interface = f"ethernet://{link.interface(0)}"
+        plant.write_bytes(buses.encode(buses.plant(interface, CYCLE_US, bus=bus.name)))
         segment = stack.enter_context(simulator(link, bus))
         segment.pin(machine.cores()[1], PRIORITY)
         environment = stack.enter_context(running(plant, link))
@@ -63,23 +65,6 @@ def figures(quiet: dict[str, Any], busy: dict[str, Any]) -> list[Figure]:
     ]
 
 
-def _plant(link: Cable) -> dict[str, Any]:
-    port = {
-        "name": PORT,
-        "kind": "bus",
-        "interface": f"ethernet://{link.interface(0)}",
-        "net_id": "10.134.164.1.3.1",
-        "bus": "bus.yaml",
-    }
-    station = {
-        "name": STATION,
-        "net_id": "10.134.164.1.1.1",
-        "cycle_us": CYCLE_US,
-        "ports": [port],
-    }
-    return {"plant": "bench-bus", "stations": [station]}
-
-
 def _wait_up(link: Cable, environment: dict[str, str]) -> None:
     """Wait until all slaves are in OP; raise RuntimeError if they do not get there."""
     for _ in range(_UP_WITHIN_S):
@@ -94,7 +79,7 @@ def _observe_busy(link: Cable, environment: dict[str, str], seconds: float) -> d
     page = Page(link.folder / "page")
     job = {
         "page": str(link.folder / "page"),
-        "runtime": environment["EAP_RUNTIME_DIR"],
+        "runtime": environment[VARIABLE],
         "station": STATION,
         "port": PORT,
         "size": buses.FILE_SIZE,
