@@ -1,0 +1,82 @@
+"""EEPROM images: decoded, written again, read through a controller, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+
+from devicebus.errors import BusError
+from devicebus.master import eeprom
+from devicebus.master.access import Access, Reply
+from devicebus.master.layout import SlaveShape, lay_out
+from devicebus.master.pdo import channels_from_sii
+from devicebus.master.procedure import Answer, Procedure, Sleep
+from devicebus.wire import sii
+from devicebus.wire.register import Register
+from devicebus.wire.sii import CategoryHeader, SiiCategory
+from devicebus.wire.siirecord import SiiFixed
+from eap.errors import CodecError
+from tools.fuzz.messages import cut
+
+_FIXED = SiiFixed(size=7).encode()
+
+
+def fuzz_one(data: bytes) -> None:
+    """Only CodecError and errors of the bus may pass."""
+    for image in (data, _FIXED + data, _FIXED + b"".join(_categories(data)) + b"\xff\xff"):
+        _decode(image)
+        with suppress(BusError):
+            there = _read(image)
+            if image.ljust(len(there), b"\xff")[: len(there)] != there:
+                raise AssertionError("other octets were read than are there")
+            _decode(there)
+
+
+def _categories(data: bytes) -> Iterator[bytes]:
+    """Cut *data* into categories of known types, whose lengths are true but for every fourth."""
+    kinds = list(SiiCategory)
+    for number, body in enumerate(cut(data)):
+        octets = body + bytes(len(body) % 2)
+        length = len(octets) // 2 + (number % 4 == 3)
+        yield CategoryHeader(kinds[len(body) % len(kinds)], length).encode() + octets
+
+
+def _decode(image: bytes) -> None:
+    try:
+        content = sii.decode(image)
+    except CodecError:
+        return
+    again = sii.decode(sii.encode(content))
+    if [item for item in content.other if item[1]] != list(again.other):
+        raise AssertionError("the image encodes to other categories")
+    if (content.strings, content.tx_pdos, content.rx_pdos, content.sync_managers) != (
+        again.strings, again.tx_pdos, again.rx_pdos, again.sync_managers,
+    ):  # fmt: skip
+        raise AssertionError("the image encodes to another device")
+    with suppress(BusError, CodecError):
+        lay_out([SlaveShape(1001, channels_from_sii(content))])
+
+
+def _read(image: bytes) -> bytes:
+    """Read *image* as a master does, from a controller that gives four octets at a time."""
+    reading: Procedure[bytes] = eeprom.read_image(1001)
+    step = next(reading)
+    word = 0
+    while True:
+        replies = []
+        if not isinstance(step, Sleep):
+            for access in step:
+                if access.ado == Register.EEPROM_CONTROL and len(access.data) == 6:
+                    word = int.from_bytes(access.data[2:6], "little")
+                replies.append(_reply(access, image, word))
+        try:
+            step = reading.send(Answer(replies, 0))
+        except StopIteration as end:
+            octets: bytes = end.value
+            return octets
+
+
+def _reply(access: Access, image: bytes, word: int) -> Reply:
+    here = image[2 * word : 2 * word + 4].ljust(4, b"\xff")
+    octets = bytes(2) + word.to_bytes(4, "little") + here
+    return Reply(octets[: len(access.data)].ljust(len(access.data), b"\0"), 1)
