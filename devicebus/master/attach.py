@@ -2,6 +2,9 @@
 
 A slave drops a message with the counter of the one before (ETG.1000.4), and nobody can ask it which
 that was.  So the first message is one that needs no answer: dropped or not, the next one is new.
+
+With CoE it is a request that every slave knows.  An abort would ask for no answer at all, but
+slaves are in use that take one for a request which they never finish, and are deaf from then on.
 """
 
 from __future__ import annotations
@@ -17,14 +20,15 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register, SyncManager
 from devicebus.wire.sii import SiiProtocol
 from eap.codec import foe, soe
+from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxType
-from eap.codec.sdo import encode_abort
+from eap.codec.sdo import SdoRequest, encode_plain
 from eap.codec.voe import VoeHeader
-from eap.od.abort import AbortCode
 
 SETTLE_NS = 2_000_000
 """How long an answer to the first message is waited for, to be thrown away."""
 _MAILBOX_MODE = 2
+_DEVICE_TYPE = 0x1000
 
 
 def attach(bus: Bus, unit: Unit) -> Procedure[Mailbox]:
@@ -72,9 +76,11 @@ def _settle(bus: Bus, unit: Unit) -> Procedure[None]:
 
 
 def _greet(protocols: SiiProtocol, state: AlState) -> Conversation[None]:
-    """Send what a slave may ignore, in a protocol that it knows."""
+    """Send what changes nothing, in a protocol that the slave knows; an answer is thrown away."""
     if protocols & SiiProtocol.COE and state is not AlState.BOOT:
-        yield Ask(MailboxType.COE, encode_abort(0, 0, AbortCode.GENERAL), expects_reply=False)
+        body = encode_plain(SdoRequest.UPLOAD, _DEVICE_TYPE, 0)
+        request = encode_message(CoeService.SDO_REQUEST, body)
+        yield Ask(MailboxType.COE, request, expects_reply=False)
     elif protocols & SiiProtocol.FOE:
         over = foe.encode_message(foe.FoeOpcode.ERROR, foe.FoeErrorCode.NOT_DEFINED)
         yield Ask(MailboxType.FOE, over, expects_reply=False)

@@ -6,7 +6,9 @@ import pytest
 
 from devicebus.errors import BusError
 from devicebus.mailbox import coe_client, foe_client, soe_client, voe_client
+from devicebus.mailbox.sdo_server import SdoServer
 from devicebus.wire.alstatus import AlState
+from eap.codec.sdo import SdoRequest
 from eap.codec.soe import Idn
 from tests.support.loopbus import LoopBus
 
@@ -49,6 +51,23 @@ def test_every_session_is_answered(line, name):
             requests = range(1 + number % 2)
             answers += [bus.converse(unit, REQUESTS[name], "request") for _ in requests]
     assert len(set(answers)) == 1
+
+
+def test_slave_that_an_abort_makes_deaf(line, monkeypatch):
+    """SOES begins a transfer with any SDO request, and never ends one that is an abort."""
+    plain = SdoServer.receive_request
+    aborted = []
+
+    def receive_request(server, body):
+        if body[0] >> 5 == SdoRequest.ABORT:
+            aborted.append(body)
+        return [] if aborted else plain(server, body)
+
+    monkeypatch.setattr(SdoServer, "receive_request", receive_request)
+    for _ in range(2):
+        with line.session() as bus:
+            unit = bus.find("coe")
+            assert bus.converse(unit, REQUESTS["coe"], "request") == (0xE5A).to_bytes(4, "little")
 
 
 def test_boot_mailbox(line):
