@@ -28,9 +28,10 @@ RETRY_NS = 2_000_000_000
 """Between two attempts to bring a bus up."""
 SILENT_RETRY_NS = 100_000_000
 """The same while nothing comes back at all: nobody is disturbed then."""
-BATCH = 64
+BATCH = 8
 """Frames taken in one go; the rest waits until the cycles have had their turn."""
 _LONG_CYCLE_NS = 20_000_000
+_MOST_STALE = 4096
 
 
 class EngineBus:
@@ -97,7 +98,7 @@ class EngineBus:
 
     def start(self, now_ns: int) -> None:
         """Begin to bring the bus up."""
-        for _ in range(BATCH * BATCH):
+        for _ in range(_MOST_STALE):
             if self._take_frame() is None:
                 break  # the rest was for an engine that has died
         self._guarded(self._start, now_ns)

@@ -13,6 +13,7 @@ import socket
 import sys
 from time import monotonic_ns
 
+from eap.appliance.arrivals import Arrivals
 from eap.appliance.build import EnginePlant
 from eap.appliance.handover import EngineOptions, Handover, tell_ready
 from eap.appliance.passing import take_connection
@@ -44,12 +45,9 @@ def run_cycles(plant: EnginePlant, link: socket.socket, stop: StopFlag) -> None:
     look_ns = 0
     ticker = Ticker()
     try:
-        for fd in plant.arrivals:
-            ticker.register(fd)
+        arrivals = Arrivals(ticker, plant.arrivals)
         while not stop.is_set:
-            if not ticker.wait(engine.next_timeout()):
-                for fd in ticker.arrivals():
-                    plant.arrivals[fd](monotonic_ns())
+            if not arrivals.wait(engine.next_timeout()):
                 continue
             now_ns = monotonic_ns()
             engine.handle_timeout(now_ns)
