@@ -20,6 +20,7 @@ class ExpectedSlave(msgspec.Struct, frozen=True, kw_only=True):
     revision: int | None = None
     serial: int | None = None
     alias: int | None = None
+    """With one, other than 0, it may be anywhere in the line (:func:`arrange`)."""
 
 
 def fits(expected: ExpectedSlave, identity: Identity) -> bool:
@@ -40,6 +41,30 @@ def check_bus(expected: Sequence[ExpectedSlave], found: Sequence[FoundSlave]) ->
             f"the bus is not as configured ({len(expected)} slaves expected, {len(found)} found):"
             f"\n  {text}"
         )
+
+
+def arrange(expected: Sequence[ExpectedSlave], aliases: Sequence[int]) -> tuple[int, ...]:
+    """Return which of the expected slaves is to stand at each position, by their numbers.
+
+    A slave that is expected with an alias is looked for wherever in the line it is, and those
+    behind it up to the next with an alias stay behind it.  If an alias is missing or there twice,
+    the order is the expected one.
+
+    Args:
+        expected: In the order of the configuration.
+        aliases: Of the slaves that are there, in the order of the line.
+    """
+    blocks: dict[int, list[int]] = {0: []}
+    for number, each in enumerate(expected):
+        if each.alias and each.alias in blocks:
+            return tuple(range(len(expected)))
+        if each.alias:
+            blocks[each.alias] = []
+        blocks[next(reversed(blocks))].append(number)
+    order = [alias for alias in aliases if alias and alias in blocks]
+    if sorted([0, *order]) != sorted(blocks):
+        return tuple(range(len(expected)))
+    return tuple(number for alias in (0, *order) for number in blocks[alias])
 
 
 def iter_differences(

@@ -10,11 +10,11 @@ from devicebus.master.bring import bring, read_process_data, set_clocks
 from devicebus.master.bus import Bus, Unit
 from devicebus.master.cycle import Cycle
 from devicebus.master.esm import POLL_NS, TIMEOUT_NS
-from devicebus.master.expected import check_bus
+from devicebus.master.expected import arrange, check_bus
 from devicebus.master.image import BusImage
 from devicebus.master.layout import SlaveShape, lay_out
 from devicebus.master.procedure import Procedure, Sleep, together
-from devicebus.master.scan import FoundSlave, scan
+from devicebus.master.scan import FoundSlave, assign_stations, scan
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlControl, AlStatus, Register
 from eap.errors import EapError
@@ -32,10 +32,8 @@ def start_up(bus: Bus, target: AlState) -> Procedure[None]:
     bus.forget()
     yield [bwr(Register.AL_CONTROL, AlControl(AlState.INIT).encode())]
     found = yield from scan(bus.settings.first_station)
-    if bus.settings.expected:
-        check_bus(bus.settings.expected, found)
-    bus.units = {unit.station: unit for unit in _units(bus, found)}
-    units = list(bus.units.values())
+    units = yield from _identify(bus, found)
+    bus.units = {unit.station: unit for unit in units}
     for unit in units:
         unit.target = target
     yield from _bring_all(bus, units, AlState.INIT)
@@ -89,10 +87,25 @@ def set_up_cycle(bus: Bus) -> None:
     bus.follow(bus.reference)
 
 
-def _units(bus: Bus, found: Sequence[FoundSlave]) -> list[Unit]:
+def _identify(bus: Bus, found: Sequence[FoundSlave]) -> Procedure[list[Unit]]:
+    """Return the slaves in the order of the line, with the names and stations they are to have."""
     expected = bus.settings.expected
-    names = [each.name for each in expected] or [each.name for each in found]
-    return [Unit(each, name) for each, name in zip(found, names, strict=True)]
+    if not expected:
+        return [Unit(slave, slave.name) for slave in found]
+    order = arrange(expected, [slave.alias for slave in found])
+    check_bus([expected[number] for number in order], found)
+    stations = [bus.settings.first_station + number for number in order]
+    moved = [
+        (slave.position, station)
+        for slave, station in zip(found, stations, strict=True)
+        if slave.station != station
+    ]
+    if moved:
+        yield from assign_stations(moved)
+    return [
+        Unit(slave._replace(station=station), expected[number].name)
+        for slave, station, number in zip(found, stations, order, strict=True)
+    ]
 
 
 def _bring_all(bus: Bus, units: Sequence[Unit], target: AlState) -> Procedure[None]:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import IdentityError
-from devicebus.master.expected import ExpectedSlave, check_bus, fits, iter_differences
+from devicebus.master.expected import ExpectedSlave, arrange, check_bus, fits, iter_differences
 from devicebus.master.scan import Identity, scan
 from tests.support.busline import Bench, Line, run, segment, slave
 
@@ -90,3 +90,22 @@ def test_all_differences_are_told_at_once():
 def test_whether_a_slave_fits():
     assert fits(VALVE, Identity(0xE5A, 2, 1, 1))
     assert not fits(VALVE, Identity(0xE5B, 2, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("expected", "there", "order"),
+    [
+        ((None, None), (0, 0), (0, 1)),
+        ((0, 5, None, 6, None), (0, 5, 0, 6, 0), (0, 1, 2, 3, 4)),
+        ((0, 5, None, 6, None), (0, 6, 0, 5, 0), (0, 3, 4, 1, 2)),
+        ((5, 6, 7), (7, 5, 6), (2, 0, 1)),
+        ((5, 6), (6, 9), (0, 1)),
+        ((5, 6), (6, 5, 5), (0, 1)),
+        ((5, 5), (5, 5), (0, 1)),
+        ((5, 6), (6,), (0, 1)),
+        ((None, 6), (6, 3), (0, 1)),
+    ],
+)
+def test_slaves_with_an_alias_are_found_wherever_they_are(expected, there, order):
+    slaves = [ExpectedSlave(name="s", vendor=1, product=1, alias=alias) for alias in expected]
+    assert arrange(slaves, there) == order

@@ -50,6 +50,30 @@ def test_sixteen_slaves_are_in_op_in_less_than_a_tenth_of_a_second():
     assert line.now_ns - begun < 100 * MS
 
 
+def test_slaves_with_an_alias_keep_name_and_station_wherever_they_are_wired():
+    there = [slave("right", product=2, alias=6), slave("x"), slave("left", product=2, alias=5)]
+    expected = [
+        ExpectedSlave(name=name, vendor=0xE5A, product=product, alias=alias)
+        for name, product, alias in (("left", 2, 5), ("right", 2, 6), ("behind", 7, None))
+    ]
+    line = line_of(*there, expected=expected)
+    line.wait(line.core.bring_up(line.now_ns))
+    units = line.core.units
+    assert [(at, unit.name) for at, unit in units.items()] == [
+        (1002, "right"), (1003, "behind"), (1001, "left")
+    ]  # fmt: skip
+    line.core.image.write(1001, "out", True)
+    line.elapse(5 * MS)
+    written = [each.device.dictionary.entry(0x7000, 1).value for each in line.segment.slaves]
+    assert list(map(bool, written)) == [False, False, True]
+    line.segment.switch(1, on=False)
+    line.elapse(200 * MS)
+    line.segment.switch(1, on=True)
+    line.elapse(500 * MS)
+    assert states(line) == [AlState.OP] * 3
+    assert not any(unit.is_lost for unit in units.values())
+
+
 def test_a_bus_that_runs_is_taken_over():
     line = line_of(*SLAVES)
     line.wait(line.core.bring_up(line.now_ns))
