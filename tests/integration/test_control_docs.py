@@ -20,13 +20,13 @@ from eap.appliance.client import connect
 pytestmark = pytest.mark.net
 
 PAGE = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
-PLANT = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0]
+PLANT, OVEN = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 LINES = [
     line
     for block in re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
     for line in block.splitlines()
 ]
-OF_THIS_MACHINE = {"realtime", "release"}
+OF_THIS_MACHINE = {"realtime", "release", "interface"}
 
 
 def outline(value: Any) -> Any:
@@ -47,6 +47,7 @@ def control(monkeypatch):
     folder = Path(tempfile.mkdtemp(prefix="eap-"))  # short enough for a socket's path
     monkeypatch.setenv("EAP_RUNTIME_DIR", str(folder))
     (folder / "kiln.yaml").write_text(PLANT)
+    (folder / "oven.yaml").write_text(OVEN)
     process = subprocess.Popen(
         [sys.executable, "-m", "eap", "run", str(folder / "kiln.yaml")], stdout=subprocess.PIPE
     )
@@ -65,6 +66,7 @@ def wait_for_data() -> None:
     (client,) = connect()
     deadline = monotonic() + 5
     with client:
+        client.request("bus_describe", station="burner", port="bus0", wait=True)
         while client.request("read", station="panel")["values"]["flame"] < 10:
             assert monotonic() < deadline
             sleep(0.01)
