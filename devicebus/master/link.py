@@ -60,6 +60,8 @@ class LinkStats(msgspec.Struct, frozen=True):
     """Frames that nobody waited for any more, or that nobody sent."""
     malformed: int
     """Frames that came back as something else."""
+    max_acyclic_octets: int = 0
+    """Most octets of acyclic datagrams that one cycle has sent, headers included."""
 
 
 class Exchange:
@@ -118,6 +120,7 @@ class Link:
         self._flights: dict[int, _Flight] = {}  # in the order of sending, so of deadlines
         self._acyclic_flights = 0
         self._index = 0
+        self._spent = self._max_spent = 0
         self._sent = self._received = self._lost = self._late = self._malformed = 0
 
     def submit(self, accesses: Sequence[Access], done: Done, *, cyclic: bool = False) -> Exchange:
@@ -137,12 +140,15 @@ class Link:
 
     def start_cycle(self) -> None:
         """A new cycle begins: refill the budget; what was overdrawn is taken off."""
+        self._max_spent = max(self._max_spent, self._spent)
+        self._spent = 0
         credit = self._credit or 0
         self._credit = min(credit, 0) + self._budget
 
     def stop_cycles(self) -> None:
         """No cycles run any more: acyclic accesses go out as they come."""
         self._credit = None
+        self._spent = 0
 
     def frames_to_send(self, now_ns: int) -> list[bytes]:
         """Take the frames that are ready to go out."""
@@ -196,7 +202,10 @@ class Link:
 
     def stats(self) -> LinkStats:
         """Return a snapshot of the counters."""
-        return LinkStats(self._sent, self._received, self._lost, self._late, self._malformed)
+        return LinkStats(
+            self._sent, self._received, self._lost, self._late, self._malformed,
+            max(self._max_spent, self._spent),
+        )  # fmt: skip
 
     def _may_send_acyclic(self) -> bool:
         return (
@@ -241,6 +250,7 @@ class Link:
             items.append(item)
             size += octets
             if not cyclic and self._credit is not None:
+                self._spent += octets
                 self._credit -= max(octets, MIN_COST)
                 if self._credit <= 0:
                     break

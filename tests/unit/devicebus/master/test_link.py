@@ -246,6 +246,7 @@ def test_a_cycle_sends_no_more_acyclic_octets_than_its_budget_and_one_datagram()
             link.receive_frame(answer(frame), cycle)
     assert len(client.outcomes) == 10
     assert sent[:6] == [500, 500, 500, 500, 0, 500]
+    assert link.stats().max_acyclic_octets == 512
     link.stop_cycles()
     for _ in range(3):
         client.ask(fprd(1001, 0x1000, 500))
