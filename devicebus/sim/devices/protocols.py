@@ -18,6 +18,7 @@ from devicebus.mailbox.soe_parameter import SoeParameter
 from devicebus.mailbox.soe_server import SoeServer
 from devicebus.mailbox.voe_server import VoeServer
 from devicebus.sim.device import Device
+from devicebus.sim.devices.ethernethost import EthernetHost
 from devicebus.sim.devices.pdoobjects import RX_PDO, TX_PDO
 from devicebus.sim.spec import AccessKind, FileSpec, MailboxSpec
 from devicebus.wire.alstatus import AlState
@@ -46,7 +47,7 @@ def build_mailbox(
     if spec.soe:
         servers[MailboxType.SOE] = SoeServer(drives or {0: ()}, device.od_state, sizes)
     if spec.eoe:
-        servers[MailboxType.EOE] = EoeServer(sizes)
+        servers[MailboxType.EOE] = _eoe(sizes)
     if spec.voe:
         servers[MailboxType.VOE] = VoeServer()
     if spec.aoe:
@@ -69,6 +70,13 @@ def _coe(device: Device, sizes: MailboxSizes) -> CoeServer:
     return CoeServer(
         device.dictionary, device.od_state, sizes, read_pdo=read_pdo, write_pdo=write_pdo
     )
+
+
+def _eoe(sizes: MailboxSizes) -> EoeServer:
+    server: EoeServer
+    host = EthernetHost(lambda: server.settings)
+    server = EoeServer(sizes, receive_frame=host.receive_frame)
+    return server
 
 
 def _file(spec: FileSpec) -> MemoryFile:

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import pytest
+from ipaddress import IPv4Address
 
+import pytest
+from scapy.layers.inet import ICMP, IP
+from scapy.layers.l2 import Ether
+
+from devicebus.mailbox.eoe_fragment import Assembler, iter_fragments
 from devicebus.sim.device import Device
 from devicebus.sim.devices.build import build_slave
+from devicebus.sim.devices.ethernethost import DEFAULT_MAC
 from devicebus.sim.devices.protocols import build_mailbox
 from devicebus.sim.spec import AccessKind, DeviceKind, FileSpec, MailboxSpec, SlaveSpec
 from devicebus.wire.alstatus import AlState
 from eap.codec.ads import AdsRange
 from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
+from eap.codec.eoe import EoeType, IpSettings
+from eap.codec.eoe import encode_message as encode_eoe
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_message, encode_message
-from eap.ids import NetId
+from eap.ids import MacAddr, NetId
 from eap.od.dictionary import ObjectDictionary
 from tests.support.bus import generic
 
@@ -151,6 +159,25 @@ def test_every_axis_of_a_drive_has_idns():
     assert slave.device.dictionary.entry(0x687A, 0).value == 77
     assert slave.device.dictionary.entry(0x607A, 0).value == 0
     assert ask(mailbox, MailboxType.SOE, bytes.fromhex("41 40 2f00"))[1][-2:] == b"\x0a\x80"
+
+
+def test_device_with_eoe_answers_a_ping_in_fragments():
+    _, mailbox = make(MailboxSpec(eoe=True, size=128))
+    settings = IpSettings(ip=IPv4Address("10.0.0.2"))
+    set_ip = encode_eoe(EoeType.SET_IP_REQUEST, settings.encode())
+    assert ask(mailbox, MailboxType.EOE, set_ip)[1][2:4] == b"\0\0"
+    ping = IP(src="10.0.0.1", dst="10.0.0.2") / ICMP(type=8) / bytes(400)
+    frame = bytes(Ether(src="02:00:00:00:00:01", dst=str(MacAddr(DEFAULT_MAC))) / ping)
+    for piece in iter_fragments(frame, 0, 96):
+        message = encode_message(MailboxHeader(0, type=MailboxType.EOE), piece)
+        mailbox.receive_message(message, 0)
+    assembler = Assembler()
+    answers = []
+    while (message := mailbox.next_message(0)) is not None:
+        answers.append(assembler.receive(bytes(decode_message(message)[1])))
+    assert len(answers) == 5
+    assert answers[:-1] == [None] * 4
+    assert Ether(answers[-1])[ICMP].type == 0
 
 
 def test_idns_of_a_drive():
