@@ -117,6 +117,7 @@ HELP = [
     ["bus"],
     ["bus", "foe", "put"],
     ["bus", "idn", "read"],
+    ["bus", "scan"],
     ["bus", "sdo", "read"],
     ["check"],
     ["decode"],
@@ -124,6 +125,7 @@ HELP = [
     ["pd", "watch"],
     ["pd", "set"],
     ["run"],
+    ["sim", "fault"],
     ["status"],
 ]
 
