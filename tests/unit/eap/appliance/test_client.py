@@ -9,6 +9,7 @@ import threading
 
 import pytest
 
+from devicebus.errors import AlStatusError
 from eap.appliance.client import Client, connect, merge_status
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
 from eap.errors import ControlError
@@ -51,6 +52,16 @@ def test_a_request_and_its_result():
     assert script.requests == [
         {"v": 1, "id": 1, "method": "write", "params": {"station": "a", "values": {"x": 1}}}
     ]
+
+
+def test_an_error_of_a_bus_is_what_it_was():
+    error = {"code": "bus", "message": "refuses OP", "kind": "AlStatusError", "detail": 0x4001B}
+    with (
+        Script([{"v": 1, "id": 1, "error": error}]) as script,
+        pytest.raises(AlStatusError, match="refuses OP") as caught,
+    ):
+        script.client.request_within(20, "bus_bring", state="OP")
+    assert (caught.value.code, caught.value.state) == (0x1B, 4)
 
 
 def test_a_refusal_keeps_its_code():

@@ -5,12 +5,19 @@ from __future__ import annotations
 import os
 from time import CLOCK_BOOTTIME, clock_gettime_ns
 
+import msgspec
 import pytest
 
 from eap.appliance import status
+from eap.appliance.bus_request import BusReport
+from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.appliance.status import ProcessMeter, appliance_status, link_state
+from eap.net.image_file import create_image
+from eap.pd.layout import plan_layout
+from eap.pd.spec import PortKind, PortSpec
 from eap.pd.words import StationWord
+from tests.unit.eap.appliance.conftest import left
 
 
 def now_ns() -> int:
@@ -77,3 +84,23 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     assert right["discarded"] == {}
     assert left["pd"]["tx"][0]["name"] == "state"
     assert right["pd"]["rx"][0]["lost"] == 0
+
+
+def test_buses_and_segments(tmp_path):
+    bus = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
+    station = msgspec.structs.replace(left(), ports=(*left().ports, bus))
+    info = ApplianceInfo("demo", "demo.yaml", ["left"], "now", os.getpid())
+    info.segments = {"left/bus0": ProcessInfo(os.getpid(), 3)}
+    report = BusReport(is_up=True, cycles=5)
+    with create_image(tmp_path / "left.image", plan_layout(station)) as file:
+        documents = [
+            appliance_status(info, [file.image], (), ProcessMeter(), buses)
+            for buses in ({PortName("left", "bus0"): report}, {})
+        ]
+    told, silent = (document["stations"][0]["ports"] for document in documents)
+    assert "bus" not in told[0]
+    assert (told[1]["link"], told[1]["bus"]["cycles"]) == ("up", 5)
+    assert silent[1]["link"] == "down"
+    assert "bus" not in silent[1]
+    segment = documents[0]["processes"]["segments"]["left/bus0"]
+    assert (segment["pid"], segment["restarts"]) == (os.getpid(), 3)

@@ -188,3 +188,35 @@ def test_state_has_a_colour_on_a_terminal_only() -> None:
     status = document(rx=[rx("left", state="stale")])
     assert "\x1b[1;31mstale" in show(status, color=True)
     assert "\x1b" not in show(status)
+
+
+def bus_port(name: str = "bus0", **more: Any) -> dict[str, Any]:
+    slaves = [
+        {"address": 1001, "name": "drive", "state": "OP", "target": "OP", "fault": ""},
+        {"address": 1002, "name": "press", "state": None, "target": "OP", "fault": "is lost"},
+    ]
+    bus = {"is_up": True, "fault": "", "slaves": slaves, "cycles": 12, "lost": 3, "wkc_errors": 0,
+           "expected_wkc": 3, "received_wkc": 2, "trip_us": 480, "max_trip_us": 999}  # fmt: skip
+    where = "sim:///home/you/buses/line.yaml"
+    port = {"name": name, "kind": "bus", "net_id": "5.1.1.1.3.1", "interface": where, "link": "up"}
+    return port | {"bus": bus | more}
+
+
+def test_buses() -> None:
+    down = bus_port("bus1", is_up=False, fault="no frame comes back\nso far", slaves=[])
+    status = document(ports=[bus_port(wkc_errors=4), down])
+    status["appliances"][0]["processes"]["segments"] = {"mixer/bus0": {"pid": 7, "restarts": 2}}
+    text = show(status)
+    assert row_of(text, "mixer/bus0  2") == "mixer/bus0 2 1 OP, 1 no answer 12 3 2 of 3 480 µs"
+    assert row_of(text, "mixer/bus1").split()[:3] == ["mixer/bus1", "0", "down"]
+    assert "segment mixer/bus0  process 7" in text
+    assert "sim://line.yaml" in text
+    assert "/home/you" not in text
+    assert "mixer/bus0: 4 cycles with a wrong working counter" in text
+    assert "mixer/bus0 press (1002): is lost" in text
+    assert "mixer/bus1: no frame comes back; so far" in text
+
+
+def test_no_table_of_buses_where_nothing_is_known_of_them() -> None:
+    silent = {key: value for key, value in bus_port().items() if key != "bus"}
+    assert "Counters" not in show(document(ports=[silent | {"link": "down"}]))
