@@ -35,6 +35,8 @@ T = TypeVar("T")
 FRAME_TIMEOUT_NS = 20_000_000
 """Longer than a master's with a cycle: nobody waits for these frames but a person."""
 CYCLE_NS = 2_000_000
+SPIN_NS = 200_000
+"""How long the answer to a frame is looked for before sleeping."""
 LOOK_NS = 100_000_000
 """How often *meanwhile* is called while something runs."""
 
@@ -158,19 +160,31 @@ class BusSession:
         if bus.cycle is not None and now_ns >= self._cycle_ns:
             self._cycle_ns = now_ns + CYCLE_NS
             bus.cycle.start(now_ns)
-        for frame in bus.link.frames_to_send(now_ns):
+        frames = bus.link.frames_to_send(now_ns)
+        for frame in frames:
             port.send(frame)
         times = [bus.link.next_timeout(), bus.runner.next_timeout(), now_ns + LOOK_NS]
         if bus.cycle is not None:
             times.append(self._cycle_ns)
         due_ns = min(at_ns for at_ns in times if at_ns is not None)
-        select.select([port], [], [], max(0, due_ns - now_ns) / 1e9)
+        data = self._spin(now_ns) if frames else None
+        if data is None:
+            select.select([port], [], [], max(0, due_ns - now_ns) / 1e9)
+            data = port.receive()
         now_ns = self._clock()
-        while (data := port.receive()) is not None:
+        while data is not None:
             bus.link.receive_frame(data, now_ns)
+            data = port.receive()
         bus.link.handle_timeout(now_ns)
         bus.runner.handle_timeout(now_ns)
         return now_ns
+
+    def _spin(self, now_ns: int) -> bytes | None:
+        """Return a frame if one comes soon: waking up would take longer than its whole way."""
+        end_ns = now_ns + SPIN_NS
+        while (data := self._port.receive()) is None and self._clock() < end_ns:
+            pass
+        return data
 
 
 def _slave(found: FoundSlave) -> Slave:

@@ -55,6 +55,15 @@ def test_slave_in_init_is_brought_to_preop(line):
     assert states(line) == [AlState.INIT, AlState.INIT, AlState.PREOP]
 
 
+@pytest.mark.parametrize("delay_us", [0, 100, 1000])
+def test_answers_are_taken_however_soon_they_come(line, delay_us):
+    line.fault(kind="delay", delay_us=delay_us)
+    with line.session() as bus:
+        assert vendor_of(bus, "sensor") == VENDOR
+        counts = bus.frame_counts()
+    assert (counts.received, counts.lost) == (counts.sent, 0)
+
+
 def test_states_of_all(line):
     with line.session() as bus:
         bus.bring(bus.scan(), AlState.OP)
