@@ -265,7 +265,8 @@ class LinkSpec(Record, frozen=True):
     """In each cycle *target* gets the value of *source*, both variables of one station.
 
     Without scale, offset and swap bits are copied: *bits* of them (0: all of the source) from bit
-    *source_bit* of the source to bit *target_bit* of the target.
+    *source_bit* of the source to bit *target_bit* of the target.  Between numbers of different
+    types, and with 0 bits, the value is converted.
     """
 
     source: str
