@@ -7,15 +7,20 @@ import signal
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
 import pytest
 
+from eap.appliance.bus_request import Answer, BusReport, Request
 from eap.appliance.client import Client
 from eap.appliance.handover import Handover
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
 from eap.appliance.sockets import SharedSockets
 from eap.codec.ethercat import EtherCatHeader
+from eap.net.image_file import create_image
+from eap.pd.layout import plan_layout
+from eap.pd.spec import PortKind, PortSpec
 
 pytestmark = pytest.mark.net
 
@@ -41,6 +46,8 @@ class Services:
             ready_fd=ready_end,
             link_fd=self.sockets.services_link,
             control_fd=self.sockets.control,
+            buses=self.sockets.buses,
+            bus_fd=self.sockets.services_bus,
         ).to_descriptor()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "eap.appliance.services_process", str(fd)],
@@ -80,6 +87,49 @@ def test_it_answers_counts_and_ends_when_asked(tmp_path, stations):
                     break
             assert left["discarded"] == {"mailbox": 1}
             assert right["discarded"] == {}
+        services.process.terminate()
+        assert services.process.communicate(timeout=5)[1] == ""
+        assert services.process.returncode == 0
+
+
+def answer_one(fd: int, make) -> None:
+    """Be the process at the other end of a pair for one request."""
+    with socket.socket(fileno=os.dup(fd)) as pair:
+        pair.setblocking(True)
+        pair.send(make(pair.recv(1 << 16)))
+
+
+def say_up(octets: bytes) -> bytes:
+    request = msgspec.msgpack.decode(octets, type=Request)
+    return msgspec.msgpack.encode(Answer(id=request.id, report=BusReport(is_up=True, cycles=7)))
+
+
+def say_ok(octets: bytes) -> bytes:
+    return msgspec.json.encode({"id": msgspec.json.decode(octets)["id"], "ok": True})
+
+
+def test_it_asks_engine_and_segment(tmp_path, stations):
+    port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
+    station = msgspec.structs.replace(stations[0], ports=(*stations[0].ports, port))
+    where = {"station": "left", "port": "bus0"}
+    with (
+        create_image(tmp_path / "left.image", plan_layout(station)),
+        Services(tmp_path, (station,), os.getpid()) as services,
+        services.connect() as client,
+        ThreadPoolExecutor(1) as other,
+    ):
+        silent = client.request("status")["stations"][0]["ports"][1]
+        assert silent["link"] == "down"
+        engine_fd = services.sockets.engine_bus
+        with socket.socket(fileno=os.dup(engine_fd)) as pair:
+            pair.recv(1 << 16)  # what status has asked for
+            pair.recv(1 << 16)
+        said = other.submit(answer_one, engine_fd, say_up)
+        assert client.request("bus_describe", **where)["cycles"] == 7
+        said.result(5)
+        said = other.submit(answer_one, services.sockets.buses[0].segment_command_fd, say_ok)
+        assert client.request("bus_fault", **where, command={"kind": "loss"}) == {"ok": True}
+        said.result(5)
         services.process.terminate()
         assert services.process.communicate(timeout=5)[1] == ""
         assert services.process.returncode == 0
