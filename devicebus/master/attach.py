@@ -35,7 +35,7 @@ def attach(bus: Bus, unit: Unit) -> Procedure[Mailbox]:
     """Return the open mailbox of a slave, which is brought to PREOP if it is in INIT.
 
     Raises:
-        BusError: it has none.
+        BusError: it has none that can be.
         AlStatusError: it refuses PREOP.
         WorkingCounterError: it does not answer.
     """
@@ -49,6 +49,7 @@ def attach(bus: Bus, unit: Unit) -> Procedure[Mailbox]:
     if out.mode == back.mode == _MAILBOX_MODE and out.enable and back.enable:
         area = MailboxArea(out.start, out.length, back.start, back.length)
         if area.is_there:
+            area.check(unit.station)
             bus.open_mailbox(unit, area)
             yield from _settle(bus, unit)
     return _opened(unit)

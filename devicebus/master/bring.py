@@ -100,6 +100,7 @@ def _prepare_mailbox(bus: Bus, unit: Unit, step: AlState) -> Procedure[None]:
     yield from clear(unit.station, fmmus=esc.fmmus, sync_managers=esc.sync_managers)
     area = boot_mailbox(fixed) if step is AlState.BOOT else standard_mailbox(fixed)
     if area.is_there:
+        area.check(unit.station)
         yield from configure(unit.station, area)
     elif step is AlState.BOOT:
         raise BusError(f"slave {unit.station}: its EEPROM names no mailbox for BOOT")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from devicebus.master.layout import Place
+from devicebus.master.layout import MAX_FMMUS, Place
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.procedure import Procedure, write
 from devicebus.wire.register import Fmmu, Register, SyncManager
 from devicebus.wire.siirecord import SiiFixed
 
+MAX_SYNC_MANAGERS = 16
 WATCHDOG_DIVIDER = 2498
 """Gives steps of 100 µs."""
 _STEPS_PER_MS = 10
@@ -35,10 +36,10 @@ def clear(station: int, *, fmmus: int, sync_managers: int) -> Procedure[None]:
     Raises WorkingCounterError if it does not answer.
     """
     if sync_managers:
-        octets = bytes(SyncManager.SIZE * sync_managers)
+        octets = bytes(SyncManager.SIZE * min(sync_managers, MAX_SYNC_MANAGERS))
         yield from write(station, Register.SYNC_MANAGER, octets, "sync managers")
     if fmmus:
-        yield from write(station, Register.FMMU, bytes(Fmmu.SIZE * fmmus), "FMMUs")
+        yield from write(station, Register.FMMU, bytes(Fmmu.SIZE * min(fmmus, MAX_FMMUS)), "FMMUs")
 
 
 def set_process_data(place: Place) -> Procedure[None]:

@@ -86,5 +86,5 @@ def kind_of(variable: Variable) -> DataType | None:
     if kind is not None and kind.bit_length == variable.bit_length:
         return kind
     bits = variable.bit_length
-    name = "BOOL" if bits == 1 else f"BIT{bits}" if bits < 8 else _UNTYPED.get(bits)
+    name = "BOOL" if bits == 1 else f"BIT{bits}" if 0 < bits < 8 else _UNTYPED.get(bits)
     return datatypes.parse(name) if name else None

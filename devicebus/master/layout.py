@@ -19,6 +19,8 @@ from devicebus.wire.register import FMMU_READ, FMMU_WRITE, Fmmu, SyncManager
 
 BASE = 0x0001_0000
 """First logical address."""
+MAX_FMMUS = 16
+"""Of a controller, whatever it says of itself."""
 _STRIDE = 0x0800
 """Between the addresses of two datagrams; more than the octets of one."""
 
@@ -156,10 +158,10 @@ def _place(slave: SlaveShape, group: int, start: tuple[int, int], shift: tuple[i
             )
         )
         ends[side] += channel.size
-    if len(fmmus) > slave.fmmus:
+    if len(fmmus) > min(slave.fmmus, MAX_FMMUS):
         raise BusError(
             f"slave {slave.station}: {len(fmmus)} sync managers with process data, but"
-            f" {slave.fmmus} FMMUs"
+            f" {min(slave.fmmus, MAX_FMMUS)} FMMUs"
         )
     sizes = [end - begin for begin, end in zip(start, ends, strict=True)]
     return Place(

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from devicebus.errors import FrameLostError
+from devicebus.errors import BusError, FrameLostError
 from devicebus.mailbox.protocol import MINIMUM_SIZE
 from devicebus.master.access import fprd, fpwr
+from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure, Sleep, read, write
 from devicebus.wire.register import Register, SmStatus, SyncManager
 
@@ -20,6 +21,8 @@ POLL_NS = 200_000
 TRIES = 8
 """How often a frame is sent at most: a message that is half done is worth some patience."""
 
+FIRST_MEMORY = 0x1000
+"""Where registers end and memory begins."""
 _IN = Register.SYNC_MANAGER + SyncManager.SIZE
 STATUS = _IN + 5
 _ACTIVATE = _IN + 6
@@ -38,6 +41,15 @@ class MailboxArea(NamedTuple):
     def is_there(self) -> bool:
         """Whether the slave has a mailbox at all."""
         return min(self.to_slave_size, self.to_master_size) >= MINIMUM_SIZE
+
+    def check(self, station: int) -> None:
+        """Raise BusError if no frame can reach it, or if it lies over the registers."""
+        for start, size in (self[:2], self[2:]):
+            if size > MAX_DATA or not FIRST_MEMORY <= start <= 0x1_0000 - size:
+                raise BusError(
+                    f"slave {station}: its mailbox of {size} octets at 0x{start:04X} cannot be,"
+                    f" expected at most {MAX_DATA} octets from 0x{FIRST_MEMORY:04X} on"
+                )
 
     def sync_managers(self) -> tuple[SyncManager, SyncManager]:
         """Return the registers of sync managers 0 and 1."""

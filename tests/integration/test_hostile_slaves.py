@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ from devicebus.mailbox import (
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
+from devicebus.master.event import SlaveBack, SlaveFailed
 from devicebus.master.master import Master
 from devicebus.sim.spec import MailboxSpec
 from eap.codec.ams import AmsHeader, encode_packet
@@ -331,3 +333,64 @@ def test_lies_end_in_named_errors_in_time_and_the_bus_runs_on(
     assert after.good - before.good >= after.cycles - before.cycles - 1
     assert (after.wkc_errors, after.lost) == (before.wkc_errors, before.lost)
     assert isinstance(task.error, BusError | SdoAbortError)
+
+
+EEPROMS = {
+    "category without end": ("0a00 ff0f", "EEPROM category 10 ends at octet"),
+    "more strings than there are": ("0a00 0200 ff 01 61 00 ffff", "string|StringCount"),
+    "string longer than its category": ("0a00 0200 01 c8 6161 ffff", "a string of 200 octets"),
+    "PDO without its entries": ("3200 0400 001a ff 03 0000 0000 ffff", "SiiPdoEntry"),
+    "cut general category": ("1e00 0100 0000 ffff", "SiiGeneral"),
+}
+"""What stands in the place of the categories, and what is said of it."""
+
+
+def tamper(line: Paced, text: str) -> bytes:
+    """Put octets in the place of the second slave's categories; return what there was."""
+    image = line.segment.slaves[1].esc.eeprom.image
+    before = bytes(image)
+    image[128:] = bytes.fromhex(text).ljust(len(image) - 128, b"\0")
+    return before
+
+
+@pytest.mark.parametrize("name", EEPROMS)
+def test_an_eeprom_that_lies_is_named_and_the_others_are_found(line: Paced, name: str) -> None:
+    text, reason = EEPROMS[name]
+    before = tamper(line, text)
+    found = line.wait(line.core.scan(line.now_ns))
+    assert [bool(each.fault) for each in found] == [False, True, False]
+    assert re.search(f"slave 1002: its EEPROM cannot be used: .*({reason})", found[1].fault)
+    with pytest.raises(BusError, match=f"slave 1002: .*({reason})"):
+        line.wait(line.core.bring_up(line.now_ns))
+    line.segment.slaves[1].esc.eeprom.image[:] = before
+    line.wait(line.core.bring_up(line.now_ns))
+    assert line.core.cycle.is_good
+
+
+def test_a_mailbox_that_lies_over_the_registers_is_no_mailbox(line: Paced) -> None:
+    """Sizes and places from the EEPROM are not believed blindly."""
+    image = line.segment.slaves[1].esc.eeprom.image
+    image[0x30:0x38] = bytes.fromhex("0000 ffff 0008 ffff")
+    with pytest.raises(BusError, match="slave 1002: its mailbox of 65535 octets at 0x0000 cannot"):
+        line.wait(line.core.bring_up(line.now_ns))
+
+
+def test_a_slave_that_returns_with_an_eeprom_that_lies_disturbs_nobody(line: Paced) -> None:
+    line.segment.switch(1, on=False)
+    line.elapse(300 * MS)
+    line.events()
+    image = line.segment.slaves[1].esc.eeprom.image
+    identity = bytes(image[16:32])
+    image[16:32] = b"\xff" * 16
+    line.segment.switch(1, on=True)
+    line.elapse(3 * SECOND)
+    failed = [each for each in line.events() if isinstance(each, SlaveFailed)]
+    assert 2 <= len(failed) <= 4
+    assert "in place of evil (station 1002) there is vendor 0xFFFFFFFF" in failed[0].reason
+    before = line.core.cycle.stats()
+    line.elapse(100 * MS)
+    after = line.core.cycle.stats()
+    assert after.good - before.good >= after.cycles - before.cycles - 1
+    image[16:32] = identity
+    line.elapse(3 * SECOND)
+    assert [each.station for each in line.events() if isinstance(each, SlaveBack)] == [EVIL]

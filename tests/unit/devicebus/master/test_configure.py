@@ -53,6 +53,7 @@ def test_process_data_is_set_up_and_cleared(line):
     assert not any(memory[Register.FMMU : Register.FMMU + 128])
     assert not SyncManager.decode(memory, Register.SYNC_MANAGER + 16).enable
     run(line, clear(1001, fmmus=0, sync_managers=0))
+    run(line, clear(1001, fmmus=255, sync_managers=255))
 
 
 def test_the_watchdog_is_set_in_milliseconds(line):

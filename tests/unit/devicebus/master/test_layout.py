@@ -84,3 +84,7 @@ def test_what_cannot_be_laid_out_is_refused():
         lay_out([shape(5, (8,) * 1500)])
     with pytest.raises(BusError, match="slave 5: 2 sync managers with process data, but 1 FMMUs"):
         lay_out([shape(5, (8,), (8,), fmmus=1)])
+    one = Pdo(0x1A00, (PdoEntry(0x6000, 1, 8, "a"),))
+    channels = tuple(Channel(n, 0x1100, 0x20, False, (one,)) for n in range(17))
+    with pytest.raises(BusError, match="slave 5: 17 sync managers with process data, but 16"):
+        lay_out([SlaveShape(5, channels, 255)])

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.errors import FrameLostError, WorkingCounterError
+from devicebus.errors import BusError, FrameLostError, WorkingCounterError
 from devicebus.master.access import Reply
 from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted, configure
 from devicebus.master.scan import assign_stations
@@ -28,6 +28,20 @@ def test_configuring_writes_both():
     assert tuple(there) == AREA.sync_managers()
     with pytest.raises(WorkingCounterError, match="slave 1009: writing sync managers"):
         run(line, configure(1009, AREA))
+
+
+@pytest.mark.parametrize(
+    ("area", "reason"),
+    [
+        ((0x1000, 1487, 0x1800, 32), "its mailbox of 1487 octets at 0x1000 cannot be"),
+        ((0x1000, 32, 0x0800, 32), "32 octets at 0x0800 cannot be, .* from 0x1000 on"),
+        ((0x1000, 32, 0xFFF0, 32), "32 octets at 0xFFF0 cannot be"),
+    ],
+)
+def test_mailboxes_that_cannot_be(area, reason):
+    with pytest.raises(BusError, match=f"slave 7: .*{reason}"):
+        MailboxArea(*area).check(7)
+    MailboxArea(0x1000, 1486, 0xFFE0, 32).check(7)
 
 
 class Wire:
