@@ -163,7 +163,7 @@ class RunningBus:
             number = self._open(slave, ask)
             while True:
                 try:
-                    message = Message(ask.type, self._ask(number, ask))
+                    message = Message(ask.type, self._ask(number, ask), monotonic_ns())
                 except BusError as exc:
                     ask = conversation.throw(exc)
                 else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from time import monotonic_ns
 from typing import TypeVar
 
 from devicebus.errors import BusError
@@ -52,7 +53,7 @@ class Talk:
             lambda number: self._request(ask, number),
             (ask.delay_ns + ask.timeout_ns) / _S + MARGIN_S,
         )
-        return Message(self._kind, answer.data)
+        return Message(self._kind, answer.data, monotonic_ns())
 
     def abandon(self) -> None:
         """Close it in the middle: the slave is told that what it has begun will not go on."""
