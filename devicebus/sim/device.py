@@ -74,10 +74,12 @@ class Device:
 
     def step(self, now_ns: int) -> None:
         """Let the device act once; what is overridden stays as it is."""
-        self._keep()
+        if self._overrides:
+            self._keep()
         if self.behaviour is not None:
             self.behaviour.step(self.al_state, now_ns)
-        self._keep()
+            if self._overrides:
+                self._keep()
 
     def override(self, index: int, subindex: int, value: object) -> None:
         """Let an entry keep *value*, whatever the device or the master puts there.

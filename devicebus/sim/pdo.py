@@ -14,6 +14,7 @@ from eap.od.model import Entry
 
 OUTPUTS = 0x1C12
 INPUTS = 0x1C13
+_OCTETS = tuple(bytes((value,)) for value in range(0x100))
 
 
 class Mapped(NamedTuple):
@@ -38,6 +39,8 @@ class _Bits(NamedTuple):
     places: tuple[tuple[Entry, int, int], ...]
     first: int
     end: int
+    is_small: bool
+    """Whether every entry is one octet, as those of digital inputs and outputs are."""
 
 
 class Side:
@@ -60,6 +63,10 @@ class Side:
                 run.entry.octets = data[run.first : run.end]
                 continue
             word = int.from_bytes(data[run.first : run.end], "little")
+            if run.is_small:
+                for entry, shift, mask in run.places:
+                    entry.octets = _OCTETS[word >> shift & mask]
+                continue
             for entry, shift, mask in run.places:
                 entry.octets = (word >> shift & mask).to_bytes(entry.kind.size, "little")
 
@@ -73,8 +80,12 @@ class Side:
                 pieces.append(octets if len(octets) == size else octets[:size].ljust(size, b"\0"))
                 continue
             word = 0
-            for entry, shift, mask in run.places:
-                word |= (int.from_bytes(entry.octets, "little") & mask) << shift
+            if run.is_small:
+                for entry, shift, mask in run.places:
+                    word |= (entry.octets[0] & mask) << shift
+            else:
+                for entry, shift, mask in run.places:
+                    word |= (int.from_bytes(entry.octets, "little") & mask) << shift
             pieces.append(word.to_bytes(size, "little"))
         return b"".join(pieces)
 
@@ -149,7 +160,12 @@ def _runs(parts: Iterable[Mapped]) -> Iterator[_Whole | _Bits]:
             mask = min((1 << part.bits) - 1, (1 << 8 * part.entry.kind.size) - 1)
             places.append((part.entry, part.start - 8 * first, mask))
         if not end % 8:
-            yield _Bits(tuple(places), first, end // 8)
+            yield _bits(places, first, end // 8)
             places, first = [], end // 8
     if end > 8 * first:
-        yield _Bits(tuple(places), first, (end + 7) // 8)
+        yield _bits(places, first, (end + 7) // 8)
+
+
+def _bits(places: list[tuple[Entry, int, int]], first: int, end: int) -> _Bits:
+    is_small = all(entry.kind.size == 1 and not entry.is_text for entry, _, _ in places)
+    return _Bits(tuple(places), first, end, is_small)
