@@ -16,6 +16,8 @@ OCTETS = 512
 CYCLE_US = 1000
 ACYCLIC_OCTETS = 3000
 """What a plant gives a bus of 1 ms: three octets for each microsecond."""
+TIMEOUT_MS = 5
+"""How long a plant waits for a frame."""
 PRIORITY = 50
 
 
@@ -26,6 +28,7 @@ def run(settings: Settings) -> list[Figure]:
     job = {
         "cycle_us": CYCLE_US,
         "acyclic_octets": ACYCLIC_OCTETS,
+        "timeout_ms": TIMEOUT_MS,
         "priority": PRIORITY,
         "seconds": settings.cycle_s,
         "size": buses.FILE_SIZE,
@@ -51,13 +54,14 @@ def figures(answer: dict[str, Any]) -> list[Figure]:
     return [
         at_most("cycles skipped by mailbox work", busy["skipped_by_work"], 0, " ", cycles),
         at_most("cycles with a wrong working counter", busy["wkc_errors"], 0, " ", cycles),
+        at_most("requests that failed", len(answer["errors"]), 0, " ", _first(answer["errors"])),
         report("mailbox traffic meanwhile", moved),
         report(
             "cycles skipped while others had the processor, with and without mailbox traffic",
             f"{busy['skipped'] - busy['skipped_by_work']} and"
             f" {quiet['skipped'] - quiet['skipped_by_work']}",
         ),
-        report("cycles without an answer within 2 ms, with and without",
+        report(f"cycles without an answer within {TIMEOUT_MS} ms, with and without",
                f"{busy['lost']} and {quiet['lost']}"),
         report("answers that came after the next cycle, with and without",
                f"{busy['unanswered']} and {quiet['unanswered']}"),
@@ -68,6 +72,10 @@ def figures(answer: dict[str, Any]) -> list[Figure]:
         report("master, share of one core, with and without",
                f"{busy['cpu']:.0%} and {quiet['cpu']:.0%}"),
     ]  # fmt: skip
+
+
+def _first(errors: list[str]) -> str:
+    return errors[0] if errors else ""
 
 
 def _times(summary: dict[str, int]) -> str:

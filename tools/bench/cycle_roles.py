@@ -29,7 +29,11 @@ _SETTLE_NS = 500_000_000
 def run(job: dict[str, Any]) -> None:
     """Bring all slaves to OP; run for a while without mailbox traffic, then with it."""
     cycle_ns = job["cycle_us"] * 1000
-    settings = MasterSettings(acyclic_octets=job["acyclic_octets"], watchdog_ms=100)
+    settings = MasterSettings(
+        acyclic_octets=job["acyclic_octets"],
+        frame_timeout_ns=job["timeout_ms"] * 1_000_000,
+        watchdog_ms=100,
+    )
     with (
         closing(open_bus_port(InterfaceUri.parse(f"ethernet://{job['interface']}"))) as port,
         closing(Ticker()) as ticker,
@@ -48,6 +52,7 @@ def run(job: dict[str, Any]) -> None:
             "slaves": len(loop.master.units),
             "reads": traffic.reads,
             "octets": traffic.octets,
+            "errors": traffic.errors,
         }
         answer({"quiet": quiet, "busy": busy, **counts})
 
@@ -57,8 +62,9 @@ class Traffic:
 
     def __init__(self, master: Master, content: bytes) -> None:
         self.reads = 0
+        self.errors: list[str] = []
         self.progress = Progress()
-        self._files = 0
+        self._octets = 0
         self._master = master
         self._content = content
         for station in master.units:
@@ -68,13 +74,13 @@ class Traffic:
     @property
     def octets(self) -> int:
         """How many octets of files the slave has taken."""
-        return self._files * len(self._content) + self.progress.done
+        return self._octets + self.progress.done
 
     def _read(self, station: int) -> None:
         def done(task: Task[bytes]) -> None:
-            task.result()
-            self.reads += 1
-            self._read(station)
+            if self._is_well(task):
+                self.reads += 1
+                self._read(station)
 
         self._start(station, upload(0x1018, 1)).watch(done)
 
@@ -83,14 +89,20 @@ class Traffic:
         assert mailbox is not None  # noqa: S101  all slaves are in OP
 
         def done(task: Task[int]) -> None:
-            task.result()
-            self._files += 1
-            self._write()
+            self._octets += self.progress.done
+            if self._is_well(task):
+                self._write()
 
         self.progress = Progress(len(self._content))
         source = BytesIO(self._content).read
         writing = foe_client.write(FILE, source, mailbox.sizes, progress=self.progress)
         self._start(_FIRST_STATION, writing).watch(done)
+
+    def _is_well(self, task: Task[Any]) -> bool:
+        """Note what went wrong; the slave is asked for nothing more then."""
+        if task.error is not None:
+            self.errors.append(str(task.error))
+        return task.error is None
 
     def _start(self, station: int, conversation: Conversation[Any]) -> Task[Any]:
         return self._master.converse(station, conversation, monotonic_ns())

@@ -18,7 +18,7 @@ def shown(**busy: int) -> dict[str, Figure]:
         "unanswered": 0, "cpu": 0.25, "late_ns": TIMES, "trip_ns": TIMES,
     }  # fmt: skip
     answer = {
-        "slaves": SLAVES, "reads": 100, "octets": 1_500_000, "quiet": noted, "busy": noted | busy,
+        "slaves": SLAVES, "reads": 100, "octets": 1_500_000, "errors": ["no"], "quiet": noted, "busy": noted | busy,
     }  # fmt: skip
     return {figure.name: figure for figure in figures(answer)}
 
@@ -33,6 +33,11 @@ def test_cycles_skipped_by_the_master_itself_are_told_from_others() -> None:
 
 def test_times_are_in_microseconds() -> None:
     assert shown()["lateness without"].measured == "p50 20 µs, p99 50 µs, max 200 µs"
+
+
+def test_a_request_that_failed_is_told() -> None:
+    found = shown()["requests that failed"]
+    assert (found.verdict, found.measured) == (Verdict.MISSED, "1  (no)")
 
 
 def test_a_missing_slave_is_no_measurement() -> None:
