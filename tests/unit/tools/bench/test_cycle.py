@@ -18,7 +18,8 @@ def shown(**busy: int) -> dict[str, Figure]:
         "unanswered": 0, "cpu": 0.25, "late_ns": TIMES, "trip_ns": TIMES,
     }  # fmt: skip
     answer = {
-        "slaves": SLAVES, "reads": 100, "octets": 1_500_000, "errors": ["no"], "quiet": noted, "busy": noted | busy,
+        "slaves": SLAVES, "reads": 100, "octets": 1_500_000, "errors": ["no"],
+        "quiet": noted, "busy": noted | busy,
     }  # fmt: skip
     return {figure.name: figure for figure in figures(answer)}
 
