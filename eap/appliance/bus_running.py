@@ -174,6 +174,9 @@ class RunningBus:
         except StopIteration as end:
             value: T = end.value
             return value
+        except KeyboardInterrupt:
+            number = None  # an answer may be under way: the end of the connection ends it all
+            raise
         finally:
             if number is not None:
                 with suppress(ControlError):

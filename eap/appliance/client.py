@@ -59,7 +59,7 @@ class Client:
         while True:
             reply = self._next_reply()
             if reply.subscription is None:
-                return reply.result
+                return _checked(reply).result
 
     def events(self, **params: Any) -> Iterator[dict[str, Any]]:
         """Subscribe with *params* and yield each event until the appliance goes.
@@ -72,7 +72,7 @@ class Client:
         self.request("subscribe", **params)
         self._socket.settimeout(None)
         while True:
-            event = self._next_reply().event
+            event = _checked(self._next_reply()).event
             if event is None:
                 continue
             if failure := event.get("error"):
@@ -104,13 +104,7 @@ class Client:
             raise self._gone(exc) from None
         if not line:
             raise self._gone(None)
-        reply = decode_reply(line)
-        error = reply.error
-        if error is None:
-            return reply
-        if error.kind:
-            raise to_error(Failure(error.kind, error.message, error.detail))
-        raise ControlError(error.message, code=error.code)
+        return decode_reply(line)
 
     def _gone(self, cause: OSError | None) -> ControlError:
         why = str(cause) if cause else "it closed the connection"
@@ -118,6 +112,16 @@ class Client:
             f"appliance {self.info.plant} (process {self.info.supervisor}) does not answer: {why}",
             code=ErrorCode.UNAVAILABLE,
         )
+
+
+def _checked(reply: Reply) -> Reply:
+    """Return *reply*, or raise the error that it tells of."""
+    error = reply.error
+    if error is None:
+        return reply
+    if error.kind:
+        raise to_error(Failure(error.kind, error.message, error.detail))
+    raise ControlError(error.message, code=error.code)
 
 
 def connect(plant: str | None = None, station: str | None = None) -> list[Client]:

@@ -79,7 +79,12 @@ class Appliance:
         names: Of its stations.
         stack: Ends it.
         buses: Names of bus files; the first station has a port for each, bus0 and so on.
+
+    Attributes:
+        engine: Once it serves.
     """
+
+    engine: FakeEngine
 
     def __init__(
         self, plant: str, names: list[str], stack: ExitStack, buses: Sequence[str] = ()
@@ -147,7 +152,7 @@ class Appliance:
             self._loop.close()
 
     async def _serve(self) -> None:
-        engine = FakeEngine(*(FakeBus(line, AlState.OP) for line in self.lines))
+        engine = self.engine = FakeEngine(*(FakeBus(line, AlState.OP) for line in self.lines))
         segments = {
             port: FakeSegment(line) for port, line in zip(self._ports, self.lines, strict=True)
         }

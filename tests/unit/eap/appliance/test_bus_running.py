@@ -12,6 +12,7 @@ from devicebus.mailbox.conversation import Ask
 from devicebus.master.procedure import Sleep, read
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
+from eap.appliance.bus_request import AskMailbox
 from eap.appliance.bus_running import open_running
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
@@ -117,7 +118,7 @@ def test_frames_are_counted(bus):
     assert counts.sent == counts.received + counts.lost > 0
 
 
-def test_who_leaves_gives_the_turn_back(bus):
+def test_who_leaves_gives_the_turn_back(bus, works):
     bus.find("sensor")
 
     def stuck(sizes):
@@ -130,6 +131,9 @@ def test_who_leaves_gives_the_turn_back(bus):
         open_running("press", "bus0") as other,
     ):
         other.converse(other.find("sensor"), stuck, "stuck")
+    works.wait_served()
+    farewell = works.engine.of(AskMailbox)[-1]
+    assert (farewell.station, farewell.expects_reply) == (1003, False)
     assert bus.converse(bus.find("sensor"), vendor, "vendor") == b"\x5a\x0e\0\0"
 
 

@@ -197,7 +197,7 @@ def bus_port(name: str = "bus0", **more: Any) -> dict[str, Any]:
     ]
     bus = {"is_up": True, "fault": "", "slaves": slaves, "cycles": 12, "lost": 3, "wkc_errors": 0,
            "expected_wkc": 3, "received_wkc": 2, "trip_us": 480, "max_trip_us": 999}  # fmt: skip
-    where = "sim:///home/you/buses/line.yaml"
+    where = "sim:///plants/buses/line.yaml"
     port = {"name": name, "kind": "bus", "net_id": "5.1.1.1.3.1", "interface": where, "link": "up"}
     return port | {"bus": bus | more}
 
@@ -211,7 +211,7 @@ def test_buses() -> None:
     assert row_of(text, "mixer/bus1").split()[:3] == ["mixer/bus1", "0", "down"]
     assert "segment mixer/bus0  process 7" in text
     assert "sim://line.yaml" in text
-    assert "/home/you" not in text
+    assert "/plants" not in text
     assert "mixer/bus0: 4 cycles with a wrong working counter" in text
     assert "mixer/bus0 press (1002): is lost" in text
     assert "mixer/bus1: no frame comes back; so far" in text
