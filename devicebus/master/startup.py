@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from devicebus.errors import BusError, StateTimeoutError
 from devicebus.master.access import brd, bwr
@@ -13,17 +13,21 @@ from devicebus.master.esm import POLL_NS, TIMEOUT_NS
 from devicebus.master.expected import arrange, check_bus
 from devicebus.master.image import BusImage
 from devicebus.master.layout import SlaveShape, lay_out
+from devicebus.master.pdo import Channel, channels_from_sii
 from devicebus.master.procedure import Procedure, Sleep, together
 from devicebus.master.scan import FoundSlave, assign_stations, scan
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlControl, AlStatus, Register
 from eap.errors import EapError
 
+_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
+
 
 def start_up(bus: Bus, target: AlState) -> Procedure[None]:
     """Find all slaves and bring them to *target*, INIT to OP, together.
 
-    For OP cycles have to run as soon as the bus has one.
+    For OP cycles have to run as soon as the bus has one.  Slaves that fail are left behind and the
+    others go on without them.
 
     Raises:
         IdentityError: the bus is not the expected one.
@@ -36,19 +40,15 @@ def start_up(bus: Bus, target: AlState) -> Procedure[None]:
     bus.units = {unit.station: unit for unit in units}
     for unit in units:
         unit.target = target
-    yield from _bring_all(bus, units, AlState.INIT)
-    if target is AlState.INIT:
-        return
-    yield from _bring_all(bus, units, AlState.PREOP)
-    if target is AlState.PREOP:
-        return
-    _check(units, (yield from together([read_process_data(bus, unit) for unit in units])))
-    if bus.settings.clocks:
-        yield from set_clocks(bus)
-    set_up_cycle(bus)
-    yield from _bring_all(bus, units, AlState.SAFEOP)
-    if target is AlState.OP:
-        yield from _bring_all(bus, units, AlState.OP)
+    crew = _Crew(units)
+    yield from crew.do(lambda unit: bring(bus, unit, AlState.INIT))
+    if target is not AlState.INIT:
+        yield from crew.do(lambda unit: bring(bus, unit, AlState.PREOP))
+    if target in _WITH_PROCESS_DATA:
+        yield from crew.do(lambda unit: _plan(bus, unit))
+        if crew.fit:
+            yield from _run_process_data(bus, crew, target)
+    crew.check()
 
 
 def shut_down(bus: Bus) -> Procedure[None]:
@@ -73,9 +73,7 @@ def shut_down(bus: Bus) -> Procedure[None]:
 def set_up_cycle(bus: Bus) -> None:
     """Lay out the process data of all slaves, so that cycles can run."""
     units = bus.units.values()
-    layout = lay_out(
-        [SlaveShape(unit.station, unit.channels, unit.found.esc.fmmus) for unit in units]
-    )
+    layout = lay_out([_shape(unit) for unit in units])
     knows_lrw = bus.settings.allow_lrw and all(unit.found.esc.knows_lrw for unit in units)
 
     def trouble(now_ns: int) -> None:
@@ -108,19 +106,61 @@ def _identify(bus: Bus, found: Sequence[FoundSlave]) -> Procedure[list[Unit]]:
     ]
 
 
-def _bring_all(bus: Bus, units: Sequence[Unit], target: AlState) -> Procedure[None]:
-    _check(units, (yield from together([bring(bus, unit, target) for unit in units])))
+def _run_process_data(bus: Bus, crew: _Crew, target: AlState) -> Procedure[None]:
+    """Lay out process data and bring those that are left to SAFEOP or OP."""
+    for unit, _ in crew.errors:
+        unit.channels = _believed(unit)
+    if bus.settings.clocks:
+        yield from set_clocks(bus)
+    set_up_cycle(bus)
+    yield from crew.do(lambda unit: bring(bus, unit, AlState.SAFEOP))
+    if target is AlState.OP:
+        yield from crew.do(lambda unit: bring(bus, unit, AlState.OP))
 
 
-def _check(units: Sequence[Unit], results: Sequence[EapError | None]) -> None:
-    """Raise what went wrong: one error as it is, several as one that lists them."""
-    errors = [
-        (unit, result)
-        for unit, result in zip(units, results, strict=True)
-        if isinstance(result, EapError)
-    ]
-    if len(errors) == 1:
-        raise errors[0][1]
-    if errors:
-        lines = "\n  ".join(f"{unit.name}: {error}" for unit, error in errors)
-        raise BusError(f"{len(errors)} slaves have failed:\n  {lines}")
+def _plan(bus: Bus, unit: Unit) -> Procedure[None]:
+    """Find out what a slave exchanges, and that it fits the bus."""
+    yield from read_process_data(bus, unit)
+    lay_out([_shape(unit)])
+
+
+def _believed(unit: Unit) -> tuple[Channel, ...]:
+    """Return what a slave that has failed may exchange once it comes back, by its EEPROM."""
+    channels = channels_from_sii(unit.found.sii)
+    try:
+        lay_out([SlaveShape(unit.station, channels, unit.found.esc.fmmus)])
+    except BusError:
+        return ()
+    return channels
+
+
+def _shape(unit: Unit) -> SlaveShape:
+    return SlaveShape(unit.station, unit.channels, unit.found.esc.fmmus)
+
+
+class _Crew:
+    """The slaves that go from step to step together.
+
+    Attributes:
+        fit: Those that are left.
+        errors: What went wrong with the others.
+    """
+
+    def __init__(self, units: Sequence[Unit]) -> None:
+        self.fit = list(units)
+        self.errors: list[tuple[Unit, EapError]] = []
+
+    def do(self, work: Callable[[Unit], Procedure[None]]) -> Procedure[None]:
+        """Let all that are left do something together."""
+        results = yield from together([work(unit) for unit in self.fit])
+        done = list(zip(self.fit, results, strict=True))
+        self.errors += [(unit, error) for unit, error in done if isinstance(error, EapError)]
+        self.fit = [unit for unit, error in done if not isinstance(error, EapError)]
+
+    def check(self) -> None:
+        """Raise what went wrong: one error as it is, several as one that lists them."""
+        if len(self.errors) == 1:
+            raise self.errors[0][1]
+        if self.errors:
+            lines = "\n  ".join(f"{unit.name}: {error}" for unit, error in self.errors)
+            raise BusError(f"{len(self.errors)} slaves have failed:\n  {lines}")

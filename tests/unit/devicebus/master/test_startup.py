@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from devicebus.errors import (
@@ -14,6 +15,7 @@ from devicebus.master.clocks import Sync0
 from devicebus.master.expected import ExpectedSlave
 from devicebus.master.master import Master
 from devicebus.sim.spec import ClockSpec, MailboxSpec
+from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState
 from tests.support.busline import MS, Paced, segment, slave
 
@@ -129,6 +131,45 @@ def test_one_that_refuses_does_not_keep_the_others_from_running():
     line.segment.slaves[1].refuses.clear()
     line.elapse(1500 * MS)
     assert set(states(line)) == {AlState.OP}
+
+
+def test_one_that_does_not_even_reach_preop_leaves_its_place_free():
+    line = line_of(slave("a"), slave("b"), slave("c"))
+    line.segment.slaves[1].refuses[AlState.PREOP] = 0x16
+    with pytest.raises(AlStatusError, match="slave 1002: refuses PREOP"):
+        line.wait(line.core.bring_up(line.now_ns))
+    assert states(line) == [AlState.OP, AlState.INIT, AlState.OP]
+    assert line.core.cycle.is_good
+    line.segment.slaves[1].refuses.clear()
+    line.elapse(1500 * MS)
+    assert set(states(line)) == {AlState.OP}
+    line.core.image.write(1002, "out", True)
+    line.elapse(5 * MS)
+    assert line.segment.slaves[1].device.dictionary.entry(0x7000, 1).value
+    assert line.core.cycle.is_full
+
+
+def test_one_with_more_process_data_than_can_be_is_left_out():
+    line = line_of(slave("a"), slave("b", mailbox=None))
+    image = line.segment.slaves[1].esc.eeprom.image
+    content = sii.decode(image)
+    huge = tuple(msgspec.structs.replace(each, length=1400) for each in content.sync_managers)
+    octets = sii.encode(
+        msgspec.structs.replace(content, sync_managers=huge, rx_pdos=(), tx_pdos=())
+    )
+    image[: len(octets)] = octets
+    with pytest.raises(BusError, match="slave 1002: 2800 octets of process data"):
+        line.wait(line.core.bring_up(line.now_ns))
+    assert line.segment.slaves[0].state is AlState.OP
+    assert line.core.cycle.is_full
+
+
+def test_nobody_left_is_no_bus():
+    line = line_of(slave("a"))
+    line.segment.slaves[0].refuses[AlState.PREOP] = 0x16
+    with pytest.raises(AlStatusError):
+        line.wait(line.core.bring_up(line.now_ns))
+    assert line.core.cycle is None
 
 
 def test_a_bus_that_is_not_there():
