@@ -179,6 +179,11 @@ class Link:
             if not exchange.missing and not exchange.cancelled:
                 exchange.done(exchange.replies, now_ns)
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a frame is under way."""
+        return bool(self._flights)
+
     def next_timeout(self) -> int | None:
         """When the oldest frame under way counts as lost."""
         for flight in self._flights.values():

@@ -67,6 +67,11 @@ class Master:
         """The exchange of process data, None before it is laid out; for reading."""
         return self._bus.cycle
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether frames are under way, so that some may come back."""
+        return self._bus.link.is_waiting
+
     def bring_up(self, now_ns: int, target: AlState = AlState.OP) -> Task[None]:
         """Find the slaves and bring them to *target*; from then on they are kept there.
 

@@ -136,7 +136,12 @@ class EngineBus:
         self._guarded(self._handle_timeout, now_ns)
 
     def receive(self, now_ns: int) -> None:
-        """Take frames that came back, at most a batch."""
+        """Take frames that came back, at most a batch, if any are under way."""
+        if self.master.is_waiting:
+            self._guarded(self._receive, now_ns)
+
+    def drain(self, now_ns: int) -> None:
+        """Take frames that are there, at most a batch, whether anybody waits for them or not."""
         self._guarded(self._receive, now_ns)
 
     def _guarded(self, action: Callable[[int], None], now_ns: int) -> None:

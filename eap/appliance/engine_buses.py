@@ -35,7 +35,7 @@ class EngineBuses:
         self.buses = [self._make(given, stations[given.owner.station]) for given in handover.buses]
         self.desk: BusDesk | None = None
         self.arrivals: dict[int, Callable[[int], None]] = {
-            bus.fileno(): bus.receive for bus in self.buses
+            bus.fileno(): bus.drain for bus in self.buses
         }
         if handover.bus_fd != NO_DESCRIPTOR:
             self.desk = BusDesk(socket.socket(fileno=handover.bus_fd), self.buses)
@@ -60,7 +60,7 @@ class EngineBuses:
             times = [end_ns, *(at for bus in waiting if (at := bus.next_timeout()) is not None)]
             select.select(waiting, [], [], max(0, min(times) - now_ns) / 1e9)
             for bus in waiting:
-                bus.receive(clock())
+                bus.drain(clock())
                 bus.handle_timeout(clock())
 
     def close(self) -> None:

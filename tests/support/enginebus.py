@@ -143,12 +143,13 @@ class BusRig:
         times = [until_ns, self._next_ns, self.bus.next_timeout(), self.wire.settle()]
         self.now_ns = max(self.now_ns, min(at for at in times if at is not None))
         self.wire.now_ns = self.now_ns
-        self.bus.receive(self.now_ns)
+        self.bus.drain(self.now_ns)
         due_ns = self.bus.next_timeout()
         if due_ns is not None and due_ns <= self.now_ns:
             self.bus.handle_timeout(self.now_ns)
         if self.now_ns >= self._next_ns:
             self._next_ns += self.cycle_ns
+            self.bus.receive(self.now_ns)
             with self.image.writing(Writer.ENGINE):
                 self.bus.take_inputs()
             self.bus.exchange(self.now_ns)

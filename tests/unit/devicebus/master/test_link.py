@@ -36,13 +36,16 @@ def test_accesses_of_several_share_a_frame_and_each_gets_its_own_answer(link):
     one, two = Client(link), Client(link)
     one.ask(READ, fpwr(1001, 0x120, b"\2\0"))
     two.ask(READ)
+    assert not link.is_waiting
     (frame,) = link.frames_to_send(0)
+    assert link.is_waiting
     assert accesses_of(frame) == [READ, fpwr(1001, 0x120, b"\2\0"), READ]
     assert link.frames_to_send(1) == []
     link.receive_frame(answer(frame, data=b"abcdef"), 50)
     assert one.outcomes == [([Reply(b"abcdef", 1), Reply(b"ab", 1)], 50)]
     assert two.outcomes == [([Reply(b"abcdef", 1)], 50)]
     assert (link.stats().sent, link.stats().received) == (1, 1)
+    assert not link.is_waiting
 
 
 def test_an_exchange_larger_than_a_frame_is_answered_when_all_of_it_is(link):

@@ -215,3 +215,15 @@ def test_what_an_earlier_engine_waited_for_is_thrown_away(tmp_path):
     rig.start()
     assert rig.bus.master.stats().link.late == 0
     rig.wait_op()
+
+
+def test_frames_that_nobody_waits_for_are_taken_on_arrival_only(rig):
+    rig.wait(lambda: not rig.bus.master.is_waiting)
+    rig.wire.send(bytes.fromhex("0d10 0707 0000 3001 0180 0000 0000 00"))
+    rig.wire.settle()
+    rig.wire.now_ns += 100_000
+    late = rig.bus.master.stats().link.late
+    rig.bus.receive(rig.now_ns)
+    assert rig.bus.master.stats().link.late == late
+    rig.bus.drain(rig.now_ns)
+    assert rig.bus.master.stats().link.late == late + 1
