@@ -68,7 +68,7 @@ def main(arguments: list[str]) -> int:
 def _parse(arguments: list[str]) -> Any:
     parser = argparse.ArgumentParser(prog="python -m tools.bench", description="Measure the speed.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(NAMES)}")
-    parser.add_argument("--quick", action="store_true", help="two minutes, rough figures")
+    parser.add_argument("--quick", action="store_true", help="three minutes, rough figures")
     parser.add_argument("--json", metavar="FILE", help="write all figures to FILE")
     parser.add_argument("--markdown", action="store_true", help=f"put the tables into {PAGE.name}")
     options = parser.parse_args(arguments)
