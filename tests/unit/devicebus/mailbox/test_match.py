@@ -30,6 +30,7 @@ READ, ACK, WRITE, DATA = "01 00 00000000 66", "04 00 03000000", "02 00 05000000 
         (COE, UPLOAD, "0030", True),
         (COE, UPLOAD, "0030 43 18", True),
         (COE, UPLOAD, "", False),
+        (COE, "0020", "0030 43 1810 01 02000000", False),
         (COE, UPLOAD, "0020 80 1810 01 00000206", True),
         (COE, UPLOAD, "0030 80 1810 01 00000206", True),
         (COE, UPLOAD, "0030 80 1810 05 00000206", False),
