@@ -13,6 +13,8 @@ BUSY_TIMEOUT_NS = 20_000_000
 POLL_NS = 100_000
 TRIES = 4
 """How often a command is given that the EEPROM does not acknowledge."""
+RETRY_NS = 4_000_000
+"""How long it is left alone then: it stores a word in up to 10 ms, and is deaf meanwhile."""
 MIN_LIMIT = 4096
 """Octets that an EEPROM may fill whatever size it gives: many give none."""
 MAX_SIZE = 0x20000
@@ -108,7 +110,9 @@ def _extend(station: int, image: bytearray, size: int) -> Procedure[None]:
 
 def _command(station: int, request: bytes, what: str) -> Procedure[bytes]:
     """Give a command, also again when it is not acknowledged; return registers from 0x0502 on."""
-    for _ in range(TRIES):
+    for number in range(TRIES):
+        if number:
+            yield Sleep(RETRY_NS)
         yield from write(station, Register.EEPROM_CONTROL, request, "EEPROM control")
         octets = yield from _wait_idle(station, what)
         if not EepromControl.decode(octets).command_error:

@@ -5,6 +5,7 @@ import pytest
 from devicebus.errors import SiiError, WorkingCounterError
 from devicebus.master import eeprom
 from devicebus.master.access import Reply
+from devicebus.master.procedure import Sleep
 from devicebus.master.scan import assign_stations
 from devicebus.sim.eeprom import Eeprom
 from devicebus.wire import sii
@@ -97,6 +98,25 @@ def test_commands_that_are_not_acknowledged_are_given_again():
     assert len(chip.commands) == 4
     with pytest.raises(SiiError, match="writing word 0x0002: not acknowledged, tried 4 times"):
         drive(eeprom.write_word(1001, 2, b"ab"), Chip(b"", refuse=4))
+
+
+def watched(procedure, pauses):
+    step = next(procedure)
+    while True:
+        if isinstance(step, Sleep):
+            pauses.append(step.duration_ns)
+        outcome = yield step
+        try:
+            step = procedure.send(outcome)
+        except StopIteration as end:
+            return end.value
+
+
+def test_a_chip_that_stores_a_word_is_given_ten_milliseconds():
+    pauses = []
+    chip = Chip(b"abcd", refuse=3)
+    assert drive(watched(eeprom.read_words(1001, 0), pauses), chip) == b"abcd"
+    assert sum(pauses) >= 10_000_000
 
 
 def test_a_slave_that_is_gone_is_named():
