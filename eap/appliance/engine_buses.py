@@ -12,7 +12,6 @@ from eap.appliance.bus_settings import master_settings
 from eap.appliance.engine_bus import EngineBus
 from eap.appliance.handover import NO_DESCRIPTOR, BusSocket, Handover
 from eap.net.busport import BusPort
-from eap.pd.spec import BusPortSpec
 from eap.pd.station import Station
 
 REST_NS = 300_000_000
@@ -75,7 +74,7 @@ class EngineBuses:
         epoch_offset_ns = time.time_ns() - time.monotonic_ns() - _EPOCH_S * 1_000_000_000
         bus = EngineBus(
             port,
-            master_settings(port.bus or BusPortSpec(), station.spec.cycle_us, epoch_offset_ns),
+            master_settings(port, station.spec.cycle_us, epoch_offset_ns),
             station.cycle_ns,
             station.image,
             station.memory_of,

@@ -31,9 +31,6 @@ from eap.ids import InterfaceUri
 from eap.net import realtime
 from eap.net.segmentsocket import SegmentSocket, open_segment
 
-NICE = 5
-"""A busy simulated segment waits for the engine, not the other way round."""
-
 _BATCH = 64
 _MS = 1_000_000
 _MAX_COMMAND = 65536
@@ -220,7 +217,6 @@ def main() -> int:
     """Return the exit code: 2 for a bus file that is none."""
     handover = SegmentHandover.from_descriptor(int(sys.argv[1]))
     realtime.die_with_parent(handover.supervisor)
-    os.nice(NICE)
     try:
         run_for_appliance(handover)
     except ConfigError as exc:

@@ -117,7 +117,7 @@ class BusRig:
         port = self.station.ports[1]
         self.bus = EngineBus(
             port,
-            master_settings(port.bus, self.station.cycle_us),
+            master_settings(port, self.station.cycle_us),
             self.cycle_ns,
             self.image,
             self.memory_of,
