@@ -8,13 +8,15 @@ answers whoever asked it; a simulated segment in another process is at the other
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
+from contextlib import suppress
 
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, MacAddr
-from eap.net.packetsocket import open_type1
+from eap.net.packetsocket import join_type1, open_type1
 
 BUS_MULTICAST_MAC = MacAddr.parse("01:01:05:01:00:00")
 """Where masters send frames of type 1; slaves take them whatever their destination is."""
@@ -36,6 +38,7 @@ class BusPort:
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
+        self._interface = sock.getsockname()[0] if sock.family == socket.AF_PACKET else ""
         self._header = _ethernet_header(sock) if sock.family == socket.AF_PACKET else b""
         sock.setblocking(False)
 
@@ -59,6 +62,8 @@ class BusPort:
         except _LOST:
             return
         except OSError as error:
+            if self._interface and error.errno == errno.ENXIO:
+                self._join_again()
             raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
 
     def receive(self) -> bytes | None:
@@ -78,6 +83,12 @@ class BusPort:
                 return data or None
             if len(data) > _HEADER and _source(data) == _source(self._header):
                 return data[_HEADER:]
+
+    def _join_again(self) -> None:
+        """Find the interface that was taken away, if another of its name has come."""
+        with suppress(OSError, EnvironmentalError):
+            join_type1(self._sock, self._interface, bytes(BUS_MULTICAST_MAC))
+            self._header = _ethernet_header(self._sock)
 
 
 def open_bus_port(interface: InterfaceUri) -> BusPort:

@@ -58,17 +58,27 @@ def open_type1(interface: str, *, group: bytes = b"") -> socket.socket:
     """
     check_interface(interface)
     sock = _deaf_socket(interface)
-    kind = PACKET_MR_MULTICAST if group else PACKET_MR_PROMISC
     try:
         bpf.attach(sock, bpf.type1_filter())
-        _join(sock, interface, ETHERTYPE)
-        index = socket.if_nametoindex(interface)
-        membership = struct.pack("iHH8s", index, kind, len(group), group)
-        sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
+        join_type1(sock, interface, group)
     except (OSError, EnvironmentalError) as error:
         sock.close()
         raise _explain(interface, error) from None
     return sock
+
+
+def join_type1(sock: socket.socket, interface: str, group: bytes) -> None:
+    """Bind a socket of :func:`open_type1`, also anew to an interface that was made again.
+
+    Raises:
+        OSError: the interface is not there.
+        EnvironmentalError: it is no Ethernet.
+    """
+    _join(sock, interface, ETHERTYPE)
+    kind = PACKET_MR_MULTICAST if group else PACKET_MR_PROMISC
+    index = socket.if_nametoindex(interface)
+    membership = struct.pack("iHH8s", index, kind, len(group), group)
+    sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
 
 
 def _open(interface: str, role: bpf.Role) -> socket.socket:

@@ -173,6 +173,31 @@ def test_interface_that_goes_down(cable, call):
         master.close()
 
 
+@pytest.mark.root
+def test_interface_that_is_taken_away_and_made_again(cable):
+    near, distant = cable
+    master = open_bus_port(InterfaceUri.parse(f"ethernet://{near}"))
+    try:
+        ip(f"link del {near}")
+        with pytest.raises(EnvironmentalError, match="cannot be reached"):
+            master.receive()
+        for _ in range(3):
+            with pytest.raises(EnvironmentalError, match="No such device"):
+                master.send(FRAME)
+        ip(f"link add {near} type veth peer name {distant}")
+        for name in (near, distant):
+            ip(f"link set {name} up")
+        far = open_segment(InterfaceUri.parse(f"ethernet://{distant}"))
+        try:
+            with pytest.raises(EnvironmentalError, match="cannot be reached"):
+                master.send(FRAME)
+            assert exchange(master, far)[: len(FRAME)] == FRAME[:2] + b"\x08" + FRAME[3:]
+        finally:
+            far.close()
+    finally:
+        master.close()
+
+
 @pytest.mark.parametrize("text", ["tcp://127.0.0.1", "loop://x", "ethernet://nothere"])
 def test_interface_that_is_no_bus(text):
     with pytest.raises(EnvironmentalError, match=r"a bus is reached by|no interface"):
