@@ -10,8 +10,9 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -47,6 +48,22 @@ def _lacks_program(name: str, *, package: str) -> str | None:
     if shutil.which(name) is None:
         return f"needs {name}; to install: apt-get install {package}"
     return None
+
+
+@pytest.fixture(scope="session", autouse=True)
+def state_dir_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep configurations away from the user's own; for appliances that several tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EAP_STATE_DIR", str(tmp_path_factory.mktemp("state") / "eap"))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def state_dir(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give each test a place for configurations of its own; it is made when it is needed."""
+    path = tmp_path_factory.getbasetemp() / f"state-{uuid4().hex}"
+    monkeypatch.setenv("EAP_STATE_DIR", str(path))
+    return path
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -1,0 +1,97 @@
+"""What is kept of a station that was configured while it ran, and the file it is kept in.
+
+The file is JSON: a version, a digest, and under ``content`` a :class:`Stored`.  The digest tells a
+file that was damaged, or edited by hand, from one that was written whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import msgspec
+
+from eap.errors import ConfigError
+from eap.pd.device import DeviceState
+from eap.pd.spec import Record, StationSpec
+
+VERSION = 1
+
+
+class Configuration(Record, frozen=True, kw_only=True):
+    """One whole configuration of a station."""
+
+    base: str
+    """``digest_of`` the station in the plant file that was in force then."""
+    spec: StationSpec
+    """What the engine runs."""
+    objects: dict[str, Any] = msgspec.field(default_factory=dict)
+    """Content of the dictionary of each EAP port, by its name; a port that is missing here has
+    what follows from *spec*."""
+
+
+class Stored(Configuration, frozen=True, kw_only=True):
+    """The configuration in force and the one before it."""
+
+    state: DeviceState = DeviceState.OP
+    """Asked for last."""
+    previous: Configuration | None = None
+    """For a rollback."""
+
+
+class _File(msgspec.Struct, frozen=True):
+    """The file."""
+
+    version: int
+    digest: str
+    content: msgspec.Raw
+
+
+def digest_of(spec: StationSpec) -> str:
+    """Return what tells *spec* from any other.
+
+    Fields that hold their defaults do not count: a release that adds one does not change it.
+    """
+    return hashlib.sha256(msgspec.json.encode(_lean(spec))).hexdigest()
+
+
+def encode_stored(stored: Stored) -> bytes:
+    """Return the octets of a file."""
+    content = msgspec.json.encode(stored)
+    return msgspec.json.encode(_File(VERSION, _digest(content), msgspec.Raw(content)))
+
+
+def decode_stored(data: bytes) -> Stored:
+    """Read the octets of a file; raise ConfigError that says what is wrong with them."""
+    try:
+        file = msgspec.json.decode(data, type=_File)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as exc:
+        raise ConfigError(f"it is not whole: {exc}") from None
+    if file.version != VERSION:
+        raise ConfigError(f"its version is {file.version}, this release knows {VERSION}")
+    if file.digest != _digest(bytes(file.content)):
+        raise ConfigError("its content is not what was written")
+    try:
+        return msgspec.json.decode(file.content, type=Stored)
+    except msgspec.MsgspecError as exc:
+        raise ConfigError(f"it holds no configuration: {exc}") from None
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _lean(value: Any) -> Any:
+    """Return *value* for JSON, records without the fields that hold their defaults."""
+    if isinstance(value, msgspec.Struct):
+        fields = {}
+        if value.__struct_config__.tag is not None:
+            fields["kind"] = value.__struct_config__.tag
+        for field in msgspec.structs.fields(value):
+            held = getattr(value, field.name)
+            if held != field.default:
+                fields[field.name] = _lean(held)
+        return fields
+    if isinstance(value, tuple):
+        return [_lean(each) for each in value]
+    return value

@@ -1,0 +1,184 @@
+"""Configurations that outlive the appliance: one file per station, replaced in one step.
+
+Rule 1: a station that was never configured while it ran has no file.
+Rule 2: a file is written beside the old one, synced and renamed, so that whatever happens one of
+the two is there, and whole.
+Rule 3: who edits the plant file has the last word: what was stored before that does not run, and
+is kept for a rollback.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from eap.appliance.configuration import (
+    Configuration,
+    Stored,
+    decode_stored,
+    digest_of,
+    encode_stored,
+)
+from eap.appliance.runtime import folder_name
+from eap.errors import ConfigError, EnvironmentalError
+from eap.pd.device import DeviceState
+from eap.pd.spec import StationSpec
+
+VARIABLE = "EAP_STATE_DIR"
+
+logger = logging.getLogger(__name__)
+
+
+class Effective(NamedTuple):
+    """What a station is to run."""
+
+    spec: StationSpec
+    state: DeviceState
+
+
+def state_root() -> Path:
+    """Return where configurations are kept.
+
+    EAP_STATE_DIR, else ``$XDG_STATE_HOME/eap``, else ``/var/lib/eap`` for root, else
+    ``~/.local/state/eap``.
+    """
+    if given := os.environ.get(VARIABLE):
+        return Path(given)
+    if base := os.environ.get("XDG_STATE_HOME"):
+        return Path(base) / "eap"
+    if os.geteuid() == 0:
+        return Path("/var/lib/eap")
+    return Path.home() / ".local/state/eap"
+
+
+class Store:
+    """The configurations of the stations of one plant."""
+
+    def __init__(self, plant: str) -> None:
+        self.path = state_root() / folder_name(plant)
+
+    def file(self, station: str) -> Path:
+        """Return the file of one station."""
+        return self.path / f"{folder_name(station)}.json"
+
+    def load(self, station: str) -> Stored | None:
+        """Return what is stored of *station*, None if nothing is that can be used.
+
+        A damaged file is put aside under its name with ``.damaged``, and a warning says so.
+        """
+        path = self.file(station)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as exc:
+            logger.warning(
+                "station %s: its configuration in %s cannot be read (%s); the plant file runs",
+                station,
+                path,
+                exc.strerror,
+            )
+            return None
+        try:
+            return decode_stored(data)
+        except ConfigError as exc:
+            aside = path.with_suffix(".damaged")
+            logger.warning(
+                "station %s: its configuration in %s cannot be used: %s; it is kept as %s, and the"
+                " plant file runs",
+                station,
+                path,
+                exc,
+                aside.name,
+            )
+            _put_aside(path, aside)
+            return None
+
+    def save(self, station: str, stored: Stored) -> None:
+        """Keep *stored*, in the place of what there was.
+
+        Raises:
+            EnvironmentalError: it cannot be written; what there was is still there.
+        """
+        path = self.file(station)
+        try:
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _replace(path, encode_stored(stored))
+        except OSError as exc:
+            raise EnvironmentalError(
+                f"station {station}: its configuration cannot be kept in {path}: {exc.strerror};"
+                f" set {VARIABLE} to a directory that you may write"
+            ) from None
+
+
+def effective(
+    plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP
+) -> tuple[Effective, ...]:
+    """Return what *stations* of the plant file are to run, each in the state asked for last.
+
+    Args:
+        plant: Its name.
+        stations: As the plant file has them.
+        state: Of stations that were never asked for another.
+    """
+    store = Store(plant)
+    return tuple(_effective(store, spec, state) for spec in stations)
+
+
+def _effective(store: Store, spec: StationSpec, state: DeviceState) -> Effective:
+    stored = store.load(spec.name)
+    if stored is None:
+        return Effective(spec, state)
+    base = digest_of(spec)
+    if stored.base == base:
+        return Effective(stored.spec, stored.state)
+    rebased = _rebase(stored, spec, base, state)
+    if rebased.spec is not stored.spec:
+        logger.warning(
+            "station %s: the plant file was edited since it was configured; the file runs, and"
+            " what ran before is kept for a rollback",
+            spec.name,
+        )
+    try:
+        store.save(spec.name, rebased)
+    except EnvironmentalError as exc:
+        logger.warning("%s", exc)
+    return Effective(rebased.spec, rebased.state)
+
+
+def _rebase(stored: Stored, spec: StationSpec, base: str, state: DeviceState) -> Stored:
+    """Return *stored* with the plant file's *spec* in force."""
+    if stored.spec == spec:  # the file has caught up with what was applied
+        return replace(stored, base=base)
+    previous = Configuration(base=stored.base, spec=stored.spec, objects=stored.objects)
+    return Stored(base=base, spec=spec, state=state, previous=previous)
+
+
+def _replace(path: Path, data: bytes) -> None:
+    temporary = path.with_suffix(".new")  # what a kill leaves behind is overwritten next time
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(folder)  # the name, too, is to survive a loss of power
+    finally:
+        os.close(folder)
+
+
+def _put_aside(path: Path, aside: Path) -> None:
+    try:
+        path.replace(aside)
+    except OSError as exc:
+        logger.warning("%s cannot be renamed: %s", path, exc.strerror)
