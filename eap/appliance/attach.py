@@ -40,6 +40,7 @@ class AttachedStation:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file = open_image(path)
+        self._opened_ns = monotonic_ns()
         self._writes = False
 
     def __enter__(self) -> Self:
@@ -147,16 +148,19 @@ class AttachedStation:
         if self._file.retired:
             self._move()
         image = self._file.image
-        silent_s = (monotonic_ns() - image.words[StationWord.CYCLE_AT_NS]) / 1e9
+        ran_at_ns = image.words[StationWord.CYCLE_AT_NS]
+        silent_s = (monotonic_ns() - (ran_at_ns or self._opened_ns)) / 1e9
         if silent_s > self._patience_s():
+            missed = "a cycle" if ran_at_ns else "its first cycle"
             raise EngineGoneError(
-                f"station {self.name}: its engine has not run a cycle for {silent_s:.1f} s; "
+                f"station {self.name}: its engine has not run {missed} for {silent_s:.1f} s; "
                 f"start the plant again"
             )
         return image
 
     def _move(self) -> None:
         old, self._file = self._file, open_image(self._path)
+        self._opened_ns = monotonic_ns()
         old.close()
         if self._writes:
             self._file.acquire_writer(Writer.APPLICATION)

@@ -1,8 +1,9 @@
 """The engine process: the cycles of all stations of an appliance, and nothing beside them.
 
-It is started by the supervisor with one argument, the descriptor of its handover.  Once it runs it
-does not log and waits for nobody.  Its cycles make nothing that the garbage collector would look
-for; what requests to buses leave behind when they fail is collected between them.
+It is started by the supervisor with one argument, the descriptor of its handover, and says that it
+is ready when its stations have run a cycle.  From then on it does not log and waits for nobody.
+Its cycles make nothing that the garbage collector would look for; what requests to buses leave
+behind when they fail is collected between them.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import gc
 import signal
 import socket
 import sys
+from collections.abc import Callable
+from functools import partial
 from time import monotonic_ns
 
 from eap.appliance.arrivals import Arrivals
@@ -39,14 +42,20 @@ class StopFlag:
         self.is_set = True
 
 
-def run_cycles(plant: EnginePlant, link: socket.socket, stop: StopFlag) -> None:
-    """Run every cycle when it is due, until *stop* is set."""
+def run_cycles(
+    plant: EnginePlant, link: socket.socket, stop: StopFlag, tell: Callable[[], None]
+) -> None:
+    """Run every cycle when it is due, until *stop* is set; *tell* once the stations run."""
     engine = plant.engine
     look_ns = 0
+    is_told = False
     ticker = Ticker()
     try:
         arrivals = Arrivals(ticker, plant.arrivals)
         while not stop.is_set:
+            if not is_told and engine.is_under_way:
+                is_told = True
+                tell()
             if not arrivals.wait(engine.next_timeout()):
                 continue
             now_ns = monotonic_ns()
@@ -70,8 +79,9 @@ def run_engine(handover: Handover) -> None:
     try:
         report = _prepare(handover.options)
         plant.start(monotonic_ns())
-        tell_ready(handover.ready_fd, {"realtime": report})
-        run_cycles(plant, link, stop)
+        # A program that attaches behind the ready line finds values of a cycle, not an empty image.
+        tell = partial(tell_ready, handover.ready_fd, {"realtime": report})
+        run_cycles(plant, link, stop, tell)
         plant.stop()
     finally:
         plant.close()

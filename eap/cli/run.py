@@ -45,8 +45,9 @@ def run(
 ) -> None:
     """Run the stations of the plant file PLANT until Ctrl-C or SIGTERM.
 
-    When all run, one line {"ready": true, "stations": [...]} appears on stdout; messages go to
-    stderr.  Exits with 2, and starts nothing, when the file or this machine is not fit.
+    When each has run its first cycle, one line {"ready": true, "stations": [...]} appears on
+    stdout; messages go to stderr.  Exits with 2, and starts nothing, when the file or this machine
+    is not fit.
     """
     from eap.appliance import supervisor  # processes and sockets; --help must not wait for them
     from eap.appliance.handover import EngineOptions

@@ -9,6 +9,9 @@ from eap.pd.link import Channel, CyclicBus
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 
+SOON_NS = 1_000_000_000
+"""A station whose cycle is longer is not waited for when the engine starts."""
+
 
 class Engine:
     """Runs each station when its cycle is due; a cycle it comes too late for is left out."""
@@ -28,6 +31,11 @@ class Engine:
         self._buses = [bus for station in self._stations for bus in station.buses]
         self._due = [(station.start(now_ns), index) for index, station in enumerate(self._stations)]
         heapify(self._due)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether every station has run a cycle since the start, or has one beyond SOON_NS."""
+        return all(each.has_run or each.cycle_ns > SOON_NS for each in self._stations)
 
     def stop(self) -> None:
         """Bring all stations out of Op."""

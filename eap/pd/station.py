@@ -27,6 +27,7 @@ from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
 
 _CYCLE = int(StationWord.CYCLE)
 _CYCLE_AT_NS = int(StationWord.CYCLE_AT_NS)
+_STARTED_AT_NS = int(StationWord.STARTED_AT_NS)
 _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
 _FUTEX = int(StationWord.FUTEX)
 _WAITERS = int(StationWord.WAITERS)
@@ -152,7 +153,7 @@ class Station:
         for request in (Request.SAFEOP, Request.OP):
             self.device.request(request)
         words[StationWord.STATE] = self.device.state
-        words[StationWord.STARTED_AT_NS] = now_ns
+        words[_STARTED_AT_NS] = now_ns
         words[_SEQUENCE] += words[_SEQUENCE] % 2  # a killed engine may have left it odd
         for subscriber in self._subscribers.values():
             subscriber.open(now_ns)
@@ -163,9 +164,15 @@ class Station:
             elapsed = (now_ns - previous_ns) // self.cycle_ns
             words[_CYCLE] += elapsed
             return int(previous_ns + (elapsed + 1) * self.cycle_ns)
+        words[_CYCLE_AT_NS] = 0  # of a time before the host was booted
         phase_ns = self.spec.phase_us * 1000
         grid_ns = now_ns - now_ns % self.cycle_ns + phase_ns
         return grid_ns if grid_ns > now_ns else grid_ns + self.cycle_ns
+
+    @property
+    def has_run(self) -> bool:
+        """Whether a cycle has run since :meth:`start`."""
+        return bool(self._words[_CYCLE_AT_NS] > self._words[_STARTED_AT_NS])
 
     def stop(self) -> None:
         """Leave Op: nothing is taken or sent any more."""

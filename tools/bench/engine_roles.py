@@ -80,7 +80,7 @@ def run(job: dict[str, Any]) -> None:
             plant.engine = recorder
             answer({"ready": True})
             with socket.socket(fileno=os.dup(shared.engine_link)) as link:
-                run_cycles(plant, link, stop)
+                run_cycles(plant, link, stop, lambda: None)
             answer({"late_ns": recorder.latencies.values()})
 
 

@@ -31,6 +31,7 @@ from eap.pd.spec import (
 )
 from eap.pd.station import Station
 from eap.pd.trigger import EVENT_BIT
+from eap.pd.words import StationWord
 
 pytestmark = pytest.mark.net  # threads and real time
 
@@ -144,7 +145,7 @@ def test_unknown_names_suggest_the_near_one(path: Path) -> None:
 
 
 def test_only_what_goes_by_event_can_be_fired(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 1e9)  # nobody runs this image
+    monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 60.0)  # nobody runs this image
     pds = (
         TxPdSpec("state", 1, ("mode",)),
         TxPdSpec("alarm", 2, ("mode",), trigger=TriggerSpec(event=True)),
@@ -188,6 +189,17 @@ def test_a_gone_engine_is_an_error_not_a_hang(path: Path, monkeypatch: pytest.Mo
             station.wait_cycle()
         with pytest.raises(EngineGoneError):
             station["setpoint"]
+
+
+def test_an_engine_that_has_not_run_yet_is_waited_for(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with create_image(path, plan_layout(spec())) as file, eap.attach("mixer") as station:
+        assert file.image.words[StationWord.CYCLE_AT_NS] == 0
+        assert station["setpoint"] == 7
+        monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 0.1)
+        with pytest.raises(EngineGoneError, match=r"has not run its first cycle for \d+\.\d s"):
+            station.wait_cycle()
 
 
 def test_moves_to_a_new_layout_and_stays_the_writer(path: Path) -> None:

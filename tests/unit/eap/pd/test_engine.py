@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.pd.engine import Engine
+from eap.pd.engine import SOON_NS, Engine
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
 from eap.pd.station import Station
 from eap.pd.words import StationWord
@@ -55,6 +55,23 @@ def test_a_start_before_the_phase_of_this_cycle_does_not_wait_for_the_next():
     engine = Engine([made])
     engine.start(5 * MS + 100_000)
     assert engine.next_timeout() == 5 * MS + 700_000
+
+
+def test_it_is_under_way_when_every_station_has_run_but_those_with_long_cycles():
+    fast, _ = make("fast")
+    slow, _ = make("slow", cycle_us=4000)
+    minute, _ = make("minute", cycle_us=60_000_000, phase_us=59_000_000)
+    assert minute.cycle_ns > SOON_NS
+    engine = Engine([fast, slow, minute])
+    engine.start(10 * MS)
+    run(engine, 11 * MS)
+    assert (fast.has_run, slow.has_run, engine.is_under_way) == (True, False, False)
+    run(engine, 12 * MS)
+    assert (slow.has_run, minute.has_run, engine.is_under_way) == (True, False, True)
+    engine.start(13 * MS)  # as one that was started again, on the same image
+    assert not engine.is_under_way
+    run(engine, 16 * MS)
+    assert engine.is_under_way
 
 
 def test_early_calls_do_nothing():

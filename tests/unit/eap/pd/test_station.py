@@ -302,6 +302,7 @@ def test_a_host_that_was_booted_begins_a_new_grid():
     wire.image.words[StationWord.CYCLE_AT_NS] = 10**15
     assert made.start(5 * MS) == 6 * MS
     assert wire.image.words[StationWord.RESTARTS] == 0
+    assert not made.has_run
 
 
 def test_lateness_is_kept_as_a_histogram_with_its_maximum():
