@@ -1,7 +1,8 @@
 """Classic BPF programs by which the kernel sorts frames between engine and services.
 
 Frame types 2, 3 and 5 are acyclic and go to services; 1, 4 and everything unknown go to the
-engine, which counts what it does not know.  Sockets of buses take type 1 alone.
+engine, which counts what it does not know.  Sockets of buses take type 1 alone, those that monitor
+subscribers take ARP.
 """
 
 from __future__ import annotations
@@ -9,11 +10,14 @@ from __future__ import annotations
 import ctypes
 import socket
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
+from ipaddress import IPv4Address
 from typing import TypeAlias
 
+from eap.codec.arp import ETHERTYPE_ARP
 from eap.codec.ethercat import ETHERTYPE, FrameType
+from eap.errors import EnvironmentalError
 
 SO_ATTACH_FILTER = 26
 SO_ATTACH_REUSEPORT_CBPF = 51
@@ -38,6 +42,10 @@ _PACKET_TYPE = 0xFFFFF000 + 4  # SKF_AD_OFF + SKF_AD_PKTTYPE
 _ALL = 0x40000
 _UDP_HEADER = 8
 _ETHERNET_HEADER = 14
+_ARP_SENDER = _ETHERNET_HEADER + 14
+_ARP_TARGET = _ETHERNET_HEADER + 24
+MAX_ADDRESSES = 1000
+"""Addresses of one ARP filter: the kernel takes programs of up to 4096 instructions."""
 
 
 def _by_type(offset: int, services: int, others: int) -> list[Instruction]:
@@ -107,6 +115,30 @@ def type1_filter() -> list[Instruction]:
         (_RETURN, 0, 0, _ALL),
         (_RETURN, 0, 0, 0),
     ]
+
+
+def arp_filter(addresses: Iterable[IPv4Address]) -> list[Instruction]:
+    """Keep ARP messages from *addresses*, and probes for them.
+
+    Raises:
+        EnvironmentalError: there are more than MAX_ADDRESSES.
+    """
+    wanted = sorted(set(addresses))
+    if len(wanted) > MAX_ADDRESSES:
+        raise EnvironmentalError(
+            f"{len(wanted)} addresses to monitor on one interface, at most {MAX_ADDRESSES} can be"
+        )
+    program: list[Instruction] = [
+        (_LOAD_HALF, 0, 0, 12),
+        (_EQUAL, 1, 0, ETHERTYPE_ARP),
+        (_RETURN, 0, 0, 0),
+        (_LOAD_WORD, 0, 0, _ARP_SENDER),
+        (_EQUAL, 0, 1, 0),
+        (_LOAD_WORD, 0, 0, _ARP_TARGET),
+    ]
+    for address in wanted:
+        program += [(_EQUAL, 0, 1, int(address)), (_RETURN, 0, 0, _ALL)]
+    return [*program, (_RETURN, 0, 0, 0)]
 
 
 def attach(

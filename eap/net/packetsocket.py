@@ -1,4 +1,7 @@
-"""Opening AF_PACKET sockets: for EAP a pair, the engine's and that of services; for a bus one."""
+"""Opening AF_PACKET sockets: for EAP a pair, the engine's and that of services; for a bus one.
+
+One more, for services, is for ARP where subscribers are monitored.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import shlex
 import socket
 import struct
 import sys
+from collections.abc import Sequence
 
 from eap.codec.ethercat import ETHERTYPE
 from eap.errors import EnvironmentalError
@@ -20,9 +24,9 @@ PACKET_AUXDATA = 8
 PACKET_IGNORE_OUTGOING = 23
 PACKET_MR_MULTICAST = 0
 PACKET_MR_PROMISC = 1
+ARPHRD_LOOPBACK = 772
 _ETH_P_ALL = 3
 _ARPHRD_ETHER = 1
-_ARPHRD_LOOPBACK = 772
 
 
 def open_packet_pair(interface: str) -> tuple[socket.socket, socket.socket]:
@@ -38,9 +42,9 @@ def open_packet_pair(interface: str) -> tuple[socket.socket, socket.socket]:
         EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
     """
     check_interface(interface)
-    engine = _open(interface, bpf.Role.ENGINE)
+    engine = _open(interface, bpf.packet_filter(bpf.Role.ENGINE))
     try:
-        return engine, _open(interface, bpf.Role.SERVICES)
+        return engine, _open(interface, bpf.packet_filter(bpf.Role.SERVICES))
     except BaseException:
         engine.close()
         raise
@@ -81,10 +85,20 @@ def join_type1(sock: socket.socket, interface: str, group: bytes) -> None:
     sock.setsockopt(SOL_PACKET, PACKET_ADD_MEMBERSHIP, membership)
 
 
-def _open(interface: str, role: bpf.Role) -> socket.socket:
+def open_arp(interface: str) -> socket.socket:
+    """Open *interface* for ARP: nothing is heard until a prober watches addresses.
+
+    Raises:
+        EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
+    """
+    check_interface(interface)
+    return _open(interface, bpf.arp_filter(()))
+
+
+def _open(interface: str, program: Sequence[bpf.Instruction]) -> socket.socket:
     sock = _deaf_socket(interface)
     try:
-        bpf.attach(sock, bpf.packet_filter(role))
+        bpf.attach(sock, program)
         sock.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
         prepare_receiver(sock)
         _join(sock, interface, _ETH_P_ALL)
@@ -105,7 +119,7 @@ def _deaf_socket(interface: str) -> socket.socket:
 def _join(sock: socket.socket, interface: str, protocol: int) -> None:
     sock.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
     sock.bind((interface, protocol))
-    if sock.getsockname()[3] not in (_ARPHRD_ETHER, _ARPHRD_LOOPBACK):
+    if sock.getsockname()[3] not in (_ARPHRD_ETHER, ARPHRD_LOOPBACK):
         raise EnvironmentalError(f"interface {interface} is not an Ethernet interface")
 
 

@@ -1,0 +1,232 @@
+"""Subscriber monitoring: is there anybody where unicast frames go?  ETG.1005, FrameState bit 2.
+
+A target is asked for once an interval, sooner while the answer is in doubt, and all targets
+together at most so often a second.  Whoever drives this asks, and hands over what comes of it.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from typing import NamedTuple
+
+from eap.ids import MacAddr
+from eap.pd.presence import DEFAULT_POLICY, Evidence, Judge, Presence, PresencePolicy
+
+_SECOND_NS = 1_000_000_000
+_CLAIMANTS_KEPT = 64
+_NOT_PLANNED = -1
+
+
+class MonitorTarget(NamedTuple):
+    """Whom to ask for."""
+
+    name: str
+    """Unique within the monitor."""
+    interval_ns: int
+    mac: MacAddr | None = None
+    """Where the frames go: an answer from another MAC address does not count.  None: any does."""
+
+
+class MonitorPolicy(NamedTuple):
+    """How often to ask."""
+
+    answer_ns: int = 500_000_000
+    """How long an answer may take; never longer than the interval."""
+    retry_ns: int = _SECOND_NS
+    """Interval while in doubt, if it is the shorter one."""
+    claim_ns: int = 10 * _SECOND_NS
+    """How long not to ask a host that is checking whether its address is free.
+
+    It would take the question for a rival's (RFC 5227 2.1.1) and give the address up; its own check
+    takes 9 s at most.
+    """
+    claimant_ns: int = 60 * _SECOND_NS
+    """Who goes on asking for longer than *claim_ns*, with no gap longer than this, monitors too."""
+    probes_per_s: int = 50
+    """Most questions in any second, to all targets together."""
+    presence: PresencePolicy = DEFAULT_POLICY
+
+
+USUAL_POLICY = MonitorPolicy()
+
+
+class PresenceChanged(NamedTuple):
+    """A target came, went or was lost from sight."""
+
+    name: str
+    old: Presence
+    new: Presence
+    cause: Evidence
+    answered_by: MacAddr | None
+    """Who answered last for its address; not where the frames go if it is missing all the same."""
+
+
+class _Claim:
+    """Questions of one host for an address that it may want for itself."""
+
+    __slots__ = ("first_ns", "last_ns")
+
+    def __init__(self, now_ns: int) -> None:
+        self.first_ns = self.last_ns = now_ns
+
+
+class _Watch:
+    """One target, and the round that it is in."""
+
+    def __init__(self, target: MonitorTarget, now_ns: int, policy: PresencePolicy) -> None:
+        self.target = target
+        self.judge = Judge(target.interval_ns, now_ns, policy)
+        self.answered_by: MacAddr | None = None
+        self.waits = False
+        self.queued = False
+        self.asked_at_ns = now_ns - target.interval_ns
+        self.due_ns = self.claimed_until_ns = now_ns
+        self.claims: dict[MacAddr, _Claim] = {}
+
+    def ask(self, now_ns: int) -> None:
+        self.judge.begin_round()
+        self.asked_at_ns = now_ns
+        self.waits = True
+        self.queued = False
+
+    def claim(self, mac: MacAddr, now_ns: int, policy: MonitorPolicy) -> bool:
+        """Note a claim of *mac*; return whether to keep quiet for it."""
+        known = self.claims.get(mac)
+        if known is None or now_ns - known.last_ns > policy.claimant_ns:
+            if len(self.claims) >= _CLAIMANTS_KEPT:
+                del self.claims[next(iter(self.claims))]
+            known = self.claims[mac] = _Claim(now_ns)
+        known.last_ns = now_ns
+        until_ns = known.first_ns + policy.claim_ns
+        self.claimed_until_ns = max(self.claimed_until_ns, until_ns)
+        return until_ns > now_ns
+
+
+class SubscriberMonitor:
+    """Decides whom to ask when, and what to make of the answers.
+
+    The driver's turn: hand over all that was heard, then :meth:`probes_to_send`, ask for each of
+    those, and come again at :meth:`next_timeout`.  What cannot be asked gets Evidence.BLIND; who
+    looks instead of asking hands over what it saw at once.
+    """
+
+    def __init__(self, now_ns: int, policy: MonitorPolicy = USUAL_POLICY) -> None:
+        self._policy = policy
+        self._watches: dict[str, _Watch] = {}
+        self._heap: list[tuple[int, str]] = []
+        self._queue: deque[_Watch] = deque()
+        self._events: deque[PresenceChanged] = deque()
+        burst = max(1, policy.probes_per_s // 10)
+        self._gap_ns = -(-_SECOND_NS // (policy.probes_per_s - burst + 1))
+        self._slack_ns = (burst - 1) * self._gap_ns
+        self._booked_ns = now_ns
+
+    def add(self, target: MonitorTarget, now_ns: int) -> None:
+        """Watch *target* from now on; one of the same name is forgotten with all it was."""
+        self._watches[target.name] = watch = _Watch(target, now_ns, self._policy.presence)
+        heapq.heappush(self._heap, (watch.due_ns, target.name))
+
+    def remove(self, name: str) -> None:
+        """Forget target *name*; one that is not there is no error."""
+        self._watches.pop(name, None)
+
+    def presence(self, name: str) -> Presence:
+        """Return what is known of target *name*; unknown for one that is not watched."""
+        watch = self._watches.get(name)
+        return Presence.UNKNOWN if watch is None else watch.judge.presence
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`probes_to_send` must be called again; None if never."""
+        times = [self._heap[0][0]] if self._heap else []
+        if self._queue:
+            times.append(self._booked_ns - self._slack_ns)
+        return min(times, default=None)
+
+    def probes_to_send(self, now_ns: int) -> list[str]:
+        """Return the names of the targets to ask for now, first who has waited longest."""
+        self.handle_timeout(now_ns)
+        names = []
+        while self._queue and now_ns >= self._booked_ns - self._slack_ns:
+            watch = self._queue.popleft()
+            if self._watches.get(watch.target.name) is not watch:
+                continue
+            if watch.claimed_until_ns > now_ns:
+                self._postpone(watch)
+                continue
+            self._booked_ns = max(self._booked_ns, now_ns) + self._gap_ns
+            watch.ask(now_ns)
+            self._schedule(watch)
+            names.append(watch.target.name)
+        return names
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Judge the questions whose answer is late, and queue the targets that are due."""
+        while self._heap and self._heap[0][0] <= now_ns:
+            due_ns, name = heapq.heappop(self._heap)
+            watch = self._watches.get(name)
+            if watch is None or watch.due_ns != due_ns or watch.queued:
+                continue
+            watch.due_ns = _NOT_PLANNED
+            if watch.waits:
+                self._take(watch, Evidence.MISSED, now_ns)
+            elif watch.claimed_until_ns > now_ns:
+                self._postpone(watch)
+            else:
+                watch.queued = True
+                self._queue.append(watch)
+
+    def receive_reply(self, name: str, mac: MacAddr, now_ns: int) -> None:
+        """Take note that *mac* has the address of target *name*; unknown names are ignored."""
+        watch = self._watches.get(name)
+        if watch is None:
+            return
+        watch.answered_by = mac
+        if watch.target.mac in {None, mac}:
+            self._take(watch, Evidence.SEEN, now_ns)
+
+    def receive_claim(self, name: str, mac: MacAddr, now_ns: int) -> None:
+        """Take note that *mac* asks whether it may take the address of target *name*.
+
+        Other monitors ask the same way, but never stop: those are not waited for.
+        """
+        watch = self._watches.get(name)
+        if watch is not None and watch.claim(mac, now_ns, self._policy):
+            self._take(watch, Evidence.PENDING, now_ns)
+
+    def receive_evidence(self, name: str, evidence: Evidence, now_ns: int) -> None:
+        """Take *evidence* about target *name*; unknown names are ignored."""
+        watch = self._watches.get(name)
+        if watch is not None:
+            self._take(watch, evidence, now_ns)
+
+    def next_event(self) -> PresenceChanged | None:
+        """Return the next change of a presence, None when there is none."""
+        return self._events.popleft() if self._events else None
+
+    def _take(self, watch: _Watch, evidence: Evidence, now_ns: int) -> None:
+        watch.waits = False
+        old = watch.judge.presence
+        new = watch.judge.take(evidence, now_ns)
+        if new is not old:
+            name = watch.target.name
+            self._events.append(PresenceChanged(name, old, new, evidence, watch.answered_by))
+        if not watch.queued:
+            self._schedule(watch)
+
+    def _postpone(self, watch: _Watch) -> None:
+        watch.queued = False
+        watch.due_ns = watch.claimed_until_ns
+        heapq.heappush(self._heap, (watch.due_ns, watch.target.name))
+
+    def _schedule(self, watch: _Watch) -> None:
+        """Note when something is to be done about *watch*: its answer is late, or it is due."""
+        pause_ns = watch.target.interval_ns
+        if watch.waits:
+            pause_ns = min(pause_ns, self._policy.answer_ns)
+        elif watch.judge.in_doubt:
+            pause_ns = min(pause_ns, self._policy.retry_ns)
+        due_ns = watch.asked_at_ns + pause_ns
+        if due_ns != watch.due_ns:
+            watch.due_ns = due_ns
+            heapq.heappush(self._heap, (due_ns, watch.target.name))

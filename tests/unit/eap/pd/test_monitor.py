@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.ids import MacAddr
+from eap.pd.monitor import USUAL_POLICY, MonitorTarget, PresenceChanged, SubscriberMonitor
+from eap.pd.presence import Evidence, Presence
+
+MS = 1_000_000
+SECOND = 1000 * MS
+THEIRS = MacAddr.parse("02:00:00:00:00:02")
+OTHER = MacAddr.parse("02:00:00:00:00:03")
+UNKNOWN, PRESENT, MISSING = Presence.UNKNOWN, Presence.PRESENT, Presence.MISSING
+
+
+class Run:
+    """A monitor and the time; *answer* says what comes of a question, None for silence."""
+
+    def __init__(self, *targets: MonitorTarget, start_ns: int = 0) -> None:
+        self.monitor = SubscriberMonitor(start_ns)
+        self.now_ns = start_ns
+        self.asked: list[tuple[int, str]] = []
+        for target in targets:
+            self.monitor.add(target, start_ns)
+
+    def until(self, end_ns: int, answer: Callable[[str], MacAddr | None] = lambda _: None) -> None:
+        while (due_ns := self.monitor.next_timeout()) is not None and due_ns <= end_ns:
+            self.now_ns = max(self.now_ns, due_ns)
+            for name in self.monitor.probes_to_send(self.now_ns):
+                self.asked.append((self.now_ns, name))
+                if mac := answer(name):
+                    self.monitor.receive_reply(name, mac, self.now_ns)
+        self.now_ns = end_ns
+
+    def presence(self, name: str = "a") -> Presence:
+        return self.monitor.presence(name)
+
+
+def target(name: str = "a", interval_ms: int = 1000, mac: MacAddr | None = None) -> MonitorTarget:
+    return MonitorTarget(name, interval_ms * MS, mac)
+
+
+def test_asked_at_once_and_then_once_an_interval() -> None:
+    run = Run(target(interval_ms=2000))
+    run.until(6 * SECOND, lambda _: THEIRS)
+    assert [at for at, _ in run.asked] == [0, 2 * SECOND, 4 * SECOND, 6 * SECOND]
+    assert run.presence() is PRESENT
+
+
+@pytest.mark.parametrize("interval_ms", [1, 100, 500, 501, 1000, 20_000])
+def test_silence_is_missing_after_three_questions(interval_ms: int) -> None:
+    run = Run(target(interval_ms=interval_ms))
+    run.until(3600 * SECOND) if interval_ms >= 1000 else run.until(10 * SECOND)
+    third = run.asked[2][0]
+    assert run.presence() is MISSING
+    assert len(run.asked) > 10
+    early = Run(target(interval_ms=interval_ms))
+    early.until(third)
+    assert early.presence() is UNKNOWN
+
+
+def test_in_doubt_it_is_asked_sooner() -> None:
+    run = Run(target(interval_ms=60_000))
+    run.until(59 * SECOND, lambda _: THEIRS)
+    run.until(70 * SECOND)
+    assert [at for at, _ in run.asked] == [0, 60 * SECOND, 61 * SECOND, 62 * SECOND]
+    assert run.presence() is MISSING
+
+
+def test_comes_back() -> None:
+    run = Run(target())
+    run.until(10 * SECOND)
+    run.until(12 * SECOND, lambda _: THEIRS)
+    assert run.presence() is PRESENT
+    events = []
+    while event := run.monitor.next_event():
+        events.append(event)
+    assert events == [
+        PresenceChanged("a", UNKNOWN, MISSING, Evidence.MISSED, None),
+        PresenceChanged("a", MISSING, PRESENT, Evidence.SEEN, THEIRS),
+    ]
+
+
+def test_answer_from_where_the_frames_do_not_go_does_not_count() -> None:
+    run = Run(target(mac=THEIRS))
+    run.until(10 * SECOND, lambda _: OTHER)
+    assert run.presence() is MISSING
+    event = run.monitor.next_event()
+    assert event is not None
+    assert event.answered_by == OTHER
+    run.until(20 * SECOND, lambda _: THEIRS)
+    assert run.presence() is PRESENT
+
+
+def test_late_answer_counts_all_the_same() -> None:
+    run = Run(target())
+    run.until(900 * MS)
+    run.monitor.receive_reply("a", THEIRS, run.now_ns)
+    assert run.presence() is PRESENT
+
+
+def test_no_more_than_fifty_questions_a_second() -> None:
+    run = Run(*(target(f"t{n}", 100) for n in range(200)))
+    run.until(20 * SECOND, lambda _: THEIRS)
+    times = [at for at, _ in run.asked]
+    for at in times:
+        assert sum(at <= other < at + SECOND for other in times) <= USUAL_POLICY.probes_per_s
+    assert {name for _, name in run.asked} == {f"t{n}" for n in range(200)}  # nobody starves
+    assert all(run.presence(f"t{n}") is PRESENT for n in range(200))
+
+
+def test_a_host_that_checks_its_address_is_left_alone() -> None:
+    run = Run(target())
+    run.until(1500 * MS, lambda _: THEIRS)
+    for at in (1600, 2600, 3600):
+        run.until(at * MS)
+        run.monitor.receive_claim("a", THEIRS, run.now_ns)
+    run.until(60 * SECOND, lambda _: THEIRS)
+    times = [at for at, _ in run.asked]
+    assert times[:3] == [0, SECOND, 1600 * MS + USUAL_POLICY.claim_ns]
+    assert run.presence() is PRESENT
+
+
+def test_two_monitors_of_one_address_do_not_silence_each_other() -> None:
+    one, two = (Run(target(), start_ns=at) for at in (0, 300 * MS))
+    for now_ns in range(0, 120 * SECOND, 50 * MS):
+        for run, mac, rival in ((one, THEIRS, two), (two, OTHER, one)):
+            before = len(run.asked)
+            run.until(now_ns, lambda _: MacAddr(b"\x02\0\0\0\0\x09"))
+            for at, name in run.asked[before:]:
+                rival.monitor.receive_claim(name, mac, at)
+    for run in (one, two):
+        assert run.presence() is PRESENT
+        late = [at for at, _ in run.asked if at > 60 * SECOND]
+        assert len(late) >= 50
+
+
+def test_claims_of_many_hosts_take_bounded_memory() -> None:
+    run = Run(target())
+    for n in range(1000):
+        run.monitor.receive_claim("a", MacAddr(b"\x02\0\0\0" + n.to_bytes(2)), n)
+    run.until(30 * SECOND, lambda _: THEIRS)
+    assert run.presence() is PRESENT
+
+
+def test_who_looks_instead_of_asking_says_at_once() -> None:
+    run = Run(target())
+    assert run.monitor.probes_to_send(0) == ["a"]
+    run.monitor.receive_evidence("a", Evidence.ABSENT, 0)
+    assert run.presence() is MISSING
+    assert run.monitor.probes_to_send(SECOND - 1) == []
+    assert run.monitor.probes_to_send(SECOND) == ["a"]
+
+
+def test_forgotten_targets_are_not_asked_for() -> None:
+    run = Run(target(), target("b"))
+    run.monitor.remove("a")
+    run.monitor.remove("nobody")
+    run.until(5 * SECOND)
+    assert {name for _, name in run.asked} == {"b"}
+    assert run.presence() is UNKNOWN
+    run.monitor.receive_reply("a", THEIRS, run.now_ns)
+    run.monitor.receive_claim("a", THEIRS, run.now_ns)
+    run.monitor.receive_evidence("a", Evidence.SEEN, run.now_ns)
+    assert run.monitor.next_event().name == "b"
+    assert run.monitor.next_event() is None
+
+
+def test_target_of_the_same_name_starts_anew() -> None:
+    run = Run(target())
+    run.until(5 * SECOND, lambda _: THEIRS)
+    run.monitor.add(target(mac=OTHER), run.now_ns)
+    assert run.presence() is UNKNOWN
+    run.until(20 * SECOND, lambda _: THEIRS)
+    assert run.presence() is MISSING
+
+
+def test_nothing_to_watch_needs_no_wake_up() -> None:
+    assert SubscriberMonitor(0).next_timeout() is None
+
+
+actions = st.lists(
+    st.tuples(
+        st.sampled_from(["wait", "reply", "other", "claim", "blind", "absent", "add", "remove"]),
+        st.sampled_from(["a", "b"]),
+        st.integers(0, 3000),
+    ),
+    max_size=40,
+)
+
+
+@given(actions)
+def test_whatever_happens_a_target_goes_on_being_asked_for(
+    steps: list[tuple[str, str, int]],
+) -> None:
+    run = Run(target("a", 700, THEIRS), target("b", 300))
+    watched = {"a", "b"}
+    for action, name, pause in steps:
+        run.until(run.now_ns + pause * MS)
+        monitor, now_ns = run.monitor, run.now_ns
+        match action:
+            case "reply":
+                monitor.receive_reply(name, THEIRS, now_ns)
+            case "other":
+                monitor.receive_reply(name, OTHER, now_ns)
+            case "claim":
+                monitor.receive_claim(name, OTHER, now_ns)
+            case "blind":
+                monitor.receive_evidence(name, Evidence.BLIND, now_ns)
+            case "absent":
+                monitor.receive_evidence(name, Evidence.ABSENT, now_ns)
+            case "add":
+                monitor.add(target(name, 700), now_ns)
+                watched.add(name)
+            case "remove":
+                monitor.remove(name)
+                watched.discard(name)
+    run.asked.clear()
+    run.until(run.now_ns + 30 * SECOND, lambda _: THEIRS)
+    assert {name for _, name in run.asked} == watched
+    assert all(run.presence(name) is PRESENT for name in watched)
