@@ -24,6 +24,7 @@ from eap.appliance.bus_request import (
     Answer,
     AskMailbox,
     Bring,
+    BusReport,
     Cancel,
     Describe,
     Hello,
@@ -110,7 +111,7 @@ class BusDesk:
             bus = self._buses[request.bus]
             match request:
                 case Describe():
-                    self._send(Answer(id=request.id, report=report_bus(bus)))
+                    self._send(Answer(id=request.id, report=self._report(bus)))
                 case AskMailbox():
                     self._ask(bus, request, now_ns)
                 case Transfer():
@@ -119,6 +120,11 @@ class BusDesk:
                     self._bring(bus, request, now_ns)
         except EapError as exc:
             self._send(Answer(id=request.id, failure=to_failure(exc)))
+
+    def _report(self, bus: EngineBus) -> BusReport:
+        return msgspec.structs.replace(
+            report_bus(bus), malformed=self.malformed, dropped=self.dropped
+        )
 
     def _ask(self, bus: EngineBus, request: AskMailbox, now_ns: int) -> None:
         self._check_room((request.bus, request.station))

@@ -116,6 +116,10 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     received_wkc: int = 0
     trip_ns: int = 0
     max_trip_ns: int = 0
+    malformed: int = 0
+    """Messages of services that were no request, for all buses of the engine together."""
+    dropped: int = 0
+    """Answers that services did not take, likewise."""
 
 
 class Failure(msgspec.Struct, frozen=True):

@@ -89,6 +89,8 @@ def appliance_status(
         stations.append(station)
     engine = _process(info.engine, meter, now_ns)
     engine["realtime"] = info.engine.report.get("realtime", {})
+    if report := next(iter(buses.values()), None):
+        engine["bus_requests"] = {"malformed": report.malformed, "dropped": report.dropped}
     processes = {
         "supervisor": {"pid": info.supervisor, **meter.measure(info.supervisor, now_ns)},
         "engine": engine,

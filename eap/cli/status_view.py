@@ -43,7 +43,7 @@ def status_tables(document: Row) -> Iterator[RenderableType]:
     if any("bus" in port for station in stations for port in station["ports"]):
         yield _buses(stations)
     yield _process_data(stations)
-    remarks = [remark for appliance in document["appliances"] for remark in _denied(appliance)]
+    remarks = [remark for appliance in document["appliances"] for remark in _of_engine(appliance)]
     remarks += [remark for station in stations for remark in _remarks(station)]
     if remarks:
         yield Text("Worth a look", style="bold")
@@ -73,12 +73,15 @@ def _processes(appliance: Row) -> RenderableType:
     return table
 
 
-def _denied(appliance: Row) -> Iterator[str]:
-    """Yield what the engine asked for, to be on time, and was not given."""
-    for what, outcome in appliance["processes"]["engine"].get("realtime", {}).items():
+def _of_engine(appliance: Row) -> Iterator[str]:
+    """Yield what the engine asked for, to be on time, and was not given; and lost requests."""
+    engine = appliance["processes"]["engine"]
+    for what, outcome in engine.get("realtime", {}).items():
         if isinstance(outcome, str) and not outcome.startswith("fifo") and outcome != _NOT_ASKED:
             reason = outcome.removeprefix("other: ")
             yield f"{appliance['plant']} engine, {what.replace('_', ' ')}: {reason}"
+    if counts := _counts(engine.get("bus_requests", {})):
+        yield f"{appliance['plant']} engine, requests to buses: {counts}"
 
 
 def _stations(stations: Sequence[Row]) -> RenderableType:

@@ -125,6 +125,12 @@ def _fits_scaled(
     if link.swap and source.size < 2:
         report.add(f"{link.at}.swap", shown, "a source of at least 2 octets")
         return False
+    is_plain = link.scale in {None, 1} and not link.offset
+    if link.swap and is_plain and source != target and source.size == target.size:
+        # Who runs it could not tell it from a swap alone, which converts nothing.
+        message = f"{shown}: a swap with {key} {getattr(link, key):g} computes nothing"
+        report.add(f"{link.at}.{key}", message, "swap alone to copy the octets, or another number")
+        return False
     return True
 
 

@@ -9,13 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.addresses import own_address
 from tests.support.simulator import FAR, NEAR, simulator, veth_pair
 
 pytestmark = pytest.mark.net
 
 BUSES = Path(__file__).parents[2] / "config" / "buses"
-COE = "udp://127.0.4.21"
-DRIVE = "udp://127.0.4.22"
+COE = f"udp://{own_address(0)}"
+DRIVE = f"udp://{own_address(1)}"
+NOBODY = f"udp://{own_address(2)}"
 
 
 def eapctl(*words, interface):
@@ -102,7 +104,7 @@ def test_other_protocols(drive):
 
 
 def test_bus_that_is_not_there():
-    done = eapctl("scan", interface="udp://127.0.4.23")
+    done = eapctl("scan", interface=NOBODY)
     assert (done.returncode, done.stdout) == (1, "")
     assert "no frame came back" in done.stderr
     assert eapctl("scan", interface="ethernet://nothere").returncode == 2

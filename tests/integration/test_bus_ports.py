@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.addresses import own_address
 from tests.support.appliance import EAPCTL, wait_until
 from tests.support.simulator import NEAR, simulator, veth_pair
 
@@ -18,30 +19,31 @@ pytestmark = pytest.mark.net
 
 BUSES = Path(__file__).parents[2] / "config" / "buses"
 OP = 8
-PLANT = """
+STATION, SLAVES = own_address(0), own_address(1)
+PLANT = f"""
 plant: buses
 stations:
   - name: one
     net_id: 5.1.1.1.1.1
     cycle_us: 5000
     ports:
-      - {name: eap0, kind: eap, interface: "udp://127.0.41.1", net_id: 5.1.1.1.2.1}
-      - {name: bus0, kind: bus, interface: "sim://coe.yaml", net_id: 5.1.1.1.3.1}
-      - {name: bus1, kind: bus, interface: "sim://io.yaml", net_id: 5.1.1.1.3.2}
+      - {{name: eap0, kind: eap, interface: "udp://{STATION}", net_id: 5.1.1.1.2.1}}
+      - {{name: bus0, kind: bus, interface: "sim://coe.yaml", net_id: 5.1.1.1.3.1}}
+      - {{name: bus1, kind: bus, interface: "sim://io.yaml", net_id: 5.1.1.1.3.2}}
     links:
-      - {from: bus1.inputs.in1, to: bus0.buttons.lamp}
+      - {{from: bus1.inputs.in1, to: bus0.buttons.lamp}}
 """
-REMOTE = """
+REMOTE = f"""
 plant: remote
 stations:
   - name: one
     net_id: 5.1.1.1.1.1
     cycle_us: 5000
     ports:
-      - {name: eap0, kind: eap, interface: "udp://127.0.41.1", net_id: 5.1.1.1.2.1}
+      - {{name: eap0, kind: eap, interface: "udp://{STATION}", net_id: 5.1.1.1.2.1}}
       - name: bus0
         kind: bus
-        interface: udp://127.0.41.9
+        interface: udp://{SLAVES}
         bus: coe.yaml
         net_id: 5.1.1.1.3.1
 """
@@ -150,7 +152,7 @@ def test_bus_that_comes_late_and_goes(farm, folder):
     appliance = farm.run(farm.write(REMOTE))
     assert appliance.values("one")["bus0.state"] == 0
     for _ in range(2):
-        with simulator(folder / "coe.yaml", "udp://127.0.41.9"):
+        with simulator(folder / "coe.yaml", f"udp://{SLAVES}"):
             wait_until(lambda: is_op(appliance, "bus0"))
             assert appliance.values("one")["bus0.sensor.pressure"] in range(1011, 1016)
         wait_until(lambda: appliance.values("one")["bus0.state"] == 0)
@@ -159,11 +161,11 @@ def test_bus_that_comes_late_and_goes(farm, folder):
 
 def test_slaves_rest_when_the_plant_ends(farm, folder):
     plant = farm.write(REMOTE)
-    with simulator(folder / "coe.yaml", "udp://127.0.41.9"):
+    with simulator(folder / "coe.yaml", f"udp://{SLAVES}"):
         appliance = farm.run(plant)
         wait_until(lambda: is_op(appliance, "bus0"))
         assert appliance.stop()[0] == 0
-        assert states("udp://127.0.41.9") == ["INIT"] * 3
+        assert states(f"udp://{SLAVES}") == ["INIT"] * 3
 
 
 def test_wrong_bus_file_ends_the_start(farm, folder):
@@ -180,7 +182,7 @@ def describe(appliance):
 
 @pytest.mark.root
 def test_interface_that_goes_and_comes_back(farm, folder):
-    plant = farm.write(REMOTE.replace("udp://127.0.41.9", f"ethernet://{NEAR}"))
+    plant = farm.write(REMOTE.replace(f"udp://{SLAVES}", f"ethernet://{NEAR}"))
     with veth_pair(), simulator(folder / "coe.yaml"):
         appliance = farm.run(plant)
         wait_until(lambda: is_op(appliance, "bus0"))

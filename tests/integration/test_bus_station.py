@@ -16,30 +16,32 @@ import pytest
 from eap.appliance.bus_running import open_running
 from eap.appliance.bus_sdo import read_entry
 from eap.appliance.runtime import VARIABLE
+from tests.support.addresses import own_address
 from tests.support.appliance import EAPCTL, plants, wait_until
 from tests.support.simulator import simulator
 
 pytestmark = pytest.mark.net
 
 BUSES = Path(__file__).parents[2] / "config" / "buses"
-COE, DRIVE = "udp://127.0.4.31", "udp://127.0.4.32"
+STATION = own_address(0)
+COE, DRIVE = (f"udp://{own_address(number)}" for number in (1, 2))
 OF = {"press/bus0": COE, "press/bus1": DRIVE}
 PLANT = f"""
 plant: works
 defaults: {{cycle_us: 10000}}
 stations:
   - name: press
-    net_id: 127.9.8.1.1.1
+    net_id: 10.9.8.1.1.1
     ports:
-      - {{name: eap0, kind: eap, interface: "udp://127.9.8.1", net_id: 127.9.8.1.2.1}}
+      - {{name: eap0, kind: eap, interface: "udp://{STATION}", net_id: 10.9.8.1.2.1}}
       - name: bus0
         kind: bus
         interface: "sim://{BUSES}/coe.yaml"
-        net_id: 127.9.8.1.3.1
+        net_id: 10.9.8.1.3.1
       - name: bus1
         kind: bus
         interface: "sim://{BUSES}/drive.yaml"
-        net_id: 127.9.8.1.4.1
+        net_id: 10.9.8.1.4.1
 """
 
 

@@ -181,7 +181,8 @@ def test_messages_that_are_none_are_counted(office):
     office.services.send(msgspec.msgpack.encode({"do": "everything"}))
     office.post(Describe(id=1, bus=0))
     assert office.desk.malformed == 2
-    assert office.collect()[1].report is not None
+    report = office.collect()[1].report
+    assert (report.malformed, report.dropped) == (2, 0)
 
 
 def test_only_some_are_taken_at_a_time(office):
@@ -233,6 +234,7 @@ def test_answers_that_nobody_reads_are_dropped(office):
     read_ = len(office.collect())
     assert read_ + office.desk.dropped == 2000
     assert office.ask(ask(5000)).failure is None
+    assert office.ask(Describe(id=5001, bus=0)).report.dropped == office.desk.dropped
 
 
 def test_without_services_nothing_happens(office):

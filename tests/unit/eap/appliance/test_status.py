@@ -91,13 +91,16 @@ def test_buses_and_segments(tmp_path):
     station = msgspec.structs.replace(left(), ports=(*left().ports, bus))
     info = ApplianceInfo("demo", "demo.yaml", ["left"], "now", os.getpid())
     info.segments = {"left/bus0": ProcessInfo(os.getpid(), 3)}
-    report = BusReport(is_up=True, cycles=5)
+    report = BusReport(is_up=True, cycles=5, malformed=1, dropped=2)
     with create_image(tmp_path / "left.image", plan_layout(station)) as file:
         documents = [
             appliance_status(info, [file.image], (), ProcessMeter(), buses)
             for buses in ({PortName("left", "bus0"): report}, {})
         ]
     told, silent = (document["stations"][0]["ports"] for document in documents)
+    engines = [document["processes"]["engine"] for document in documents]
+    assert engines[0]["bus_requests"] == {"malformed": 1, "dropped": 2}
+    assert "bus_requests" not in engines[1]
     assert "bus" not in told[0]
     assert (told[1]["link"], told[1]["bus"]["cycles"]) == ("up", 5)
     assert silent[1]["link"] == "down"

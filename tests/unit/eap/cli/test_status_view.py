@@ -147,6 +147,15 @@ def test_values_that_no_link_passes_on_are_worth_a_look() -> None:
     assert "held" not in show(document(links_held=0))
 
 
+def test_requests_to_buses_that_got_lost_are_worth_a_look() -> None:
+    status = document()
+    counts = {"malformed": 0, "dropped": 3}
+    status["appliances"][0]["processes"]["engine"]["bus_requests"] = counts
+    assert "engine, requests to buses: 3 dropped" in show(status)
+    counts["dropped"] = 0
+    assert "requests to buses" not in show(status)
+
+
 def test_remarks_name_all_that_is_rare() -> None:
     left = rx(
         "left", timeouts=1, duplicated=2, reordered=3, late=4, discarded={"version": 5, "length": 6}

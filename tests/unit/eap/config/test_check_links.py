@@ -37,6 +37,8 @@ def linked(*links):
         "from: heat, to: bus0.valves.speed, scale: -1",
         "from: word, to: heat, scale: 2, swap: true",
         "from: word, to: level, swap: true",
+        "from: word, to: level, swap: true, scale: 1, offset: 1",
+        "from: word, to: heat, swap: true, scale: 1",
         "from: word, to: word, from_bit: 0, to_bit: 8, bits: 8",
         "from: bits, to: level, offset: 1",
         "from: speed, to: heat",
@@ -106,6 +108,14 @@ def test_these_links_run(findings, link):
         (
             "from: small, to: word, swap: true, scale: 1",
             "small is USINT, word is UINT; a source of",
+        ),
+        (
+            "from: word, to: level, swap: true, scale: 1",
+            "word is UINT, level is INT: a swap with scale 1 computes nothing; swap alone to copy",
+        ),
+        (
+            "from: word, to: level, swap: true, offset: 0",
+            "word is UINT, level is INT: a swap with offset 0 computes nothing; swap alone",
         ),
         ("from: fault, to: bits, swap: true", "fault is BOOL, bits is BIT2; two variables of as"),
         ("from: level, to: level", "links go in a circle: level → level; one of them to be left"),
