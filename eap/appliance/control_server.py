@@ -234,6 +234,8 @@ class _Client:
                 event = watch.next_event()
             except ImageError as exc:
                 event = {"error": {"code": ErrorCode.UNAVAILABLE, "message": str(exc)}}
+            except ControlError as exc:
+                event = {"error": {"code": exc.code, "message": str(exc)}}
             if event is not None:
                 await self.send(encode_event(subscription, event))
             await asyncio.sleep(watch.period_ms / 1000)

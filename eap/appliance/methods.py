@@ -14,9 +14,9 @@ from typing import Any
 from eap.appliance import control
 from eap.appliance.control import VERSION, ErrorCode, near, parameters
 from eap.appliance.control_bus import BUS_METHODS
+from eap.appliance.station_image import StationImage
 from eap.codec import datatypes
 from eap.errors import ControlError, WriterConflictError
-from eap.net.image_file import ImageFile
 from eap.pd.image import Image
 from eap.pd.layout import VariablePlace
 from eap.pd.report import account_word, pd_list, quality
@@ -31,7 +31,7 @@ class Methods:
 
     Args:
         identity: What ``hello`` says beside the protocol's version.
-        files: The process image of each station.
+        images: The process image of each station.
         status: Makes the answer to ``status``.
         stop: Asks the appliance to end.
     """
@@ -39,13 +39,13 @@ class Methods:
     def __init__(
         self,
         identity: Mapping[str, Any],
-        files: Mapping[str, ImageFile],
+        images: Mapping[str, StationImage],
         *,
         status: Callable[[], Awaitable[dict[str, Any]]],
         stop: Callable[[], None],
     ) -> None:
         self._identity = identity
-        self._files = files
+        self._images = images
         self._status = status
         self._stop = stop
         self._methods: dict[str, Callable[[dict[str, Any]], Any]] = {
@@ -79,13 +79,13 @@ class Methods:
                 f" that need each cycle attach to the process image",
                 code=ErrorCode.BAD_REQUEST,
             )
-        image = self._image(wanted.station)
-        places = _places(image, wanted.names)
-        return Watch(image, places, wanted.period_ms, only_changes=wanted.on == "change")
+        station = self._station(wanted.station)
+        _places(station.image, wanted.names)
+        return Watch(station, wanted.names, wanted.period_ms, only_changes=wanted.on == "change")
 
     def _hello(self, params: dict[str, Any]) -> dict[str, Any]:
         parameters(params, control.NoParameters)
-        return {"version": VERSION, **self._identity, "stations": list(self._files)}
+        return {"version": VERSION, **self._identity, "stations": list(self._images)}
 
     async def _get_status(self, params: dict[str, Any]) -> dict[str, Any]:
         parameters(params, control.NoParameters)
@@ -93,7 +93,7 @@ class Methods:
 
     def _pd_list(self, params: dict[str, Any]) -> list[dict[str, Any]]:
         wanted = parameters(params, control.PdListParameters).station
-        names = [wanted] if wanted else list(self._files)
+        names = [wanted] if wanted else list(self._images)
         return [{"station": name, **pd} for name in names for pd in pd_list(self._image(name))]
 
     def _variables(self, params: dict[str, Any]) -> list[dict[str, Any]]:
@@ -116,19 +116,19 @@ class Methods:
 
     def _write(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control.WriteParameters)
-        file = self._file(wanted.station)
-        places = _places(file.image, wanted.values)
+        station = self._station(wanted.station)
+        places = _places(station.image, wanted.values)
         values = {place.name: _checked(place, wanted.values[place.name]) for place in places}
         try:
-            file.acquire_writer(Writer.APPLICATION)
+            station.acquire_writer(Writer.APPLICATION)
         except WriterConflictError as exc:
             raise ControlError(str(exc), code=ErrorCode.REFUSED) from None
         try:
-            with file.image.writing(Writer.APPLICATION):
-                for name, value in values.items():
-                    file.image.write(name, value)
+            station.write(Writer.APPLICATION, values)
+        except ValueError as exc:  # another type, since the station was configured anew
+            raise ControlError(str(exc), code=ErrorCode.VALUE) from None
         finally:
-            file.release_writer(Writer.APPLICATION)
+            station.release_writer(Writer.APPLICATION)
         return {"written": len(values)}
 
     def _ask_to_stop(self, params: dict[str, Any]) -> dict[str, Any]:
@@ -137,14 +137,14 @@ class Methods:
         return {"stopping": True}
 
     def _image(self, station: str) -> Image:
-        return self._file(station).image
+        return self._station(station).image
 
-    def _file(self, station: str) -> ImageFile:
+    def _station(self, station: str) -> StationImage:
         try:
-            return self._files[station]
+            return self._images[station]
         except KeyError:
             raise ControlError(
-                f"no station {station!r} here{near(station, self._files)}",
+                f"no station {station!r} here{near(station, self._images)}",
                 code=ErrorCode.UNKNOWN_NAME,
             ) from None
 
@@ -154,21 +154,27 @@ class Watch:
 
     def __init__(
         self,
-        image: Image,
-        places: list[VariablePlace],
+        station: StationImage,
+        names: Iterable[str],
         period_ms: int,
         *,
         only_changes: bool,
     ) -> None:
         self.period_ms = period_ms
-        self._image = image
-        self._places = places
+        self._station = station
+        self._names = names
         self._only_changes = only_changes
         self._last: dict[str, Any] = {}
 
     def next_event(self) -> dict[str, Any] | None:
-        """Return what to send now, None if nothing changed; raise ImageError as a read does."""
-        event = _snapshot(self._image, self._places)
+        """Return what to send now, None if nothing changed.
+
+        Raises:
+            ImageError: the values cannot be read.
+            ControlError: the station was configured anew, and one of the variables is gone.
+        """
+        image = self._station.image
+        event = _snapshot(image, _places(image, self._names))
         if self._only_changes:
             values = event["values"]
             changed = {

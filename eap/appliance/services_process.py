@@ -36,13 +36,13 @@ from eap.appliance.methods import Methods
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.segment_link import SegmentLink
 from eap.appliance.sources import play_sources
+from eap.appliance.station_image import StationImage
 from eap.appliance.status import ProcessMeter, appliance_status
 from eap.appliance.tcp_door import TcpDoor
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.ids import InterfaceUri
 from eap.net import realtime
 from eap.net.ethernet import EthernetInterface, packet_batch
-from eap.net.image_file import ImageFile, open_image
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 
@@ -70,17 +70,17 @@ class Services:
 
     async def run(self) -> None:
         """Serve until SIGTERM."""
-        files = {name: await self._open_image(name) for name in self._names}
+        images = {name: await self._open_image(name) for name in self._names}
         # Not before: whoever waits for images of an engine that failed just ends.
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
         self._watch_sockets()
         buses = self._buses()
-        server = ControlServer(self._methods(files, buses), buses)
+        server = ControlServer(self._methods(images, buses), buses)
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(server.serve(self._listener))]
             tasks += [group.create_task(door.serve()) for door in self._doors()]
             tasks += [
-                group.create_task(play_sources(station, files[station.name]))
+                group.create_task(play_sources(station, images[station.name]))
                 for station in self._handover.stations
             ]
             tell_ready(self._handover.ready_fd, {})
@@ -88,30 +88,32 @@ class Services:
             for task in tasks:
                 task.cancel()
 
-    async def _open_image(self, station: str) -> ImageFile:
+    async def _open_image(self, station: str) -> StationImage:
         """Open one image; at the first start the engine is just making it."""
         deadline_ns = monotonic_ns() + int(IMAGE_PATIENCE_S * 1e9)
         while True:
             try:
-                return self._resources.enter_context(open_image(self._folder.image(station)))
+                image = StationImage(self._folder.image(station))
             except ImageError:
                 if monotonic_ns() > deadline_ns:
                     raise
+            else:
+                self._resources.callback(image.close)
+                return image
             await asyncio.sleep(_IMAGE_PAUSE_S)
 
-    def _methods(self, files: dict[str, ImageFile], buses: Buses) -> Methods:
+    def _methods(self, images: dict[str, StationImage], buses: Buses) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
             DiscardCounters(self._folder.discards("engine"), self._names)
         )
-        images = [file.image for file in files.values()]
         release = version("eap-appliance")
         identity = {"release": release, "plant": self._handover.plant, "pid": os.getpid()}
 
         async def status() -> dict[str, Any]:
             return appliance_status(
                 self._folder.read_info(),
-                images,
+                [each.image for each in images.values()],
                 (engine.stats(), self._counters.stats()),
                 meter,
                 await buses.reports(STATUS_PATIENCE_S),
@@ -119,7 +121,7 @@ class Services:
 
         return Methods(
             identity,
-            files,
+            images,
             status=status,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
         )

@@ -9,19 +9,18 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
+from eap.appliance.station_image import StationImage
 from eap.codec import datatypes
 from eap.codec.values import DataType
-from eap.errors import EnvironmentalError
+from eap.errors import EnvironmentalError, ImageError
 from eap.net.csv_replay import open_replay
 from eap.net.host import Host
-from eap.net.image_file import ImageFile
-from eap.pd.image import Image
 from eap.pd.spec import CsvSource, HostSource, StationSpec, Writer
 
 logger = logging.getLogger(__name__)
 
 
-async def play_sources(station: StationSpec, file: ImageFile) -> None:
+async def play_sources(station: StationSpec, image: StationImage) -> None:
     """Write every host and CSV source of *station* in its own rhythm until cancelled.
 
     Raises:
@@ -41,27 +40,28 @@ async def play_sources(station: StationSpec, file: ImageFile) -> None:
             logger.warning("%s/%s keeps its value: %s", station.name, source.variable, exc)
     if not players:
         return
-    file.acquire_writer(Writer.SERVICES)
+    image.acquire_writer(Writer.SERVICES)
     async with asyncio.TaskGroup() as group:
         for source, feed in players:
-            group.create_task(_play(file.image, source.variable, source.period_ms, feed))
+            label = f"{station.name}/{source.variable}"
+            group.create_task(_play(image, label, source.variable, source.period_ms, feed))
 
 
-async def _play(image: Image, variable: str, period_ms: int, feed: Callable[[], Any]) -> None:
+async def _play(
+    image: StationImage, label: str, variable: str, period_ms: int, feed: Callable[[], Any]
+) -> None:
     """Write the next value each *period_ms*; periods that came too late are left out."""
     clock = asyncio.get_running_loop().time
     due = clock()
     complaint = ""
     while True:
         try:
-            value = feed()
-            with image.writing(Writer.SERVICES):
-                image.write(variable, value)
+            image.write(Writer.SERVICES, {variable: feed()})
             complaint = ""
-        except (EnvironmentalError, ValueError) as exc:
+        except (EnvironmentalError, ImageError, ValueError) as exc:
             if str(exc) != complaint:
                 complaint = str(exc)
-                logger.warning("%s/%s keeps its value: %s", image.layout.station, variable, exc)
+                logger.warning("%s keeps its value: %s", label, exc)
         due = max(due + period_ms / 1000, clock())
         await asyncio.sleep(due - clock())
 

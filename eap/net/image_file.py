@@ -13,6 +13,7 @@ import mmap
 import os
 import struct
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -69,6 +70,10 @@ class ImageFile:
         The mapping goes with the last view of it; a view that outlives the file does no harm.
         """
         if self._fd >= 0:
+            # The mapping has a descriptor of its own, which would keep the locks.
+            everything = _FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, 0, 0, 0)
+            with suppress(OSError):
+                fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, everything)
             os.close(self._fd)
             self._fd = -1
 

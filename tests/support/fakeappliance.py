@@ -22,6 +22,7 @@ from eap.appliance.handover import PortName
 from eap.appliance.methods import Methods
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
 from eap.appliance.segment_link import SegmentLink
+from eap.appliance.station_image import StationImage
 from eap.appliance.status import ProcessMeter, appliance_status
 from eap.net.image_file import ImageFile, create_image
 from eap.pd.layout import plan_layout
@@ -111,8 +112,10 @@ class Appliance:
             )
             for name in names
         }
-        for file in self.files.values():
+        self.images = {name: StationImage(folder.image(name)) for name in names}
+        for name, file in self.files.items():
             _receive(file)
+            stack.callback(self.images[name].close)
         self._listener = stack.enter_context(socket.socket(socket.AF_UNIX))
         self._listener.bind(str(folder.control_socket))
         self._listener.listen()
@@ -160,13 +163,13 @@ class Appliance:
         links = {port: SegmentLink(segment.services) for port, segment in segments.items()}
         buses = Buses(tuple(self._specs.values()), BusClient(link, self._ports), links)
         meter = ProcessMeter()
-        images = [file.image for file in self.files.values()]
+        images = [each.image for each in self.images.values()]
 
         async def status() -> dict[str, Any]:
             reports = await buses.reports(1)
             return appliance_status(self.info, images, {}, meter, reports)
 
-        methods = Methods({"plant": self.info.plant}, self.files, status=status, stop=lambda: None)
+        methods = Methods({"plant": self.info.plant}, self.images, status=status, stop=lambda: None)
         try:
             await ControlServer(methods, buses).serve(self._listener)
         finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from eap.appliance.station_image import StationImage
 from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
@@ -70,3 +71,12 @@ def files(tmp_path, stations):
     yield opened
     for file in opened.values():
         file.close()
+
+
+@pytest.fixture
+def images(files):
+    """The same images, as services keeps them."""
+    opened = {name: StationImage(file.path) for name, file in files.items()}
+    yield opened
+    for image in opened.values():
+        image.close()

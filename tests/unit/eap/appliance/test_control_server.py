@@ -14,8 +14,8 @@ from eap.appliance.bus_methods import Buses
 from eap.appliance.control import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.appliance.control_server import ControlServer
 from eap.appliance.engine_link import EngineLink
-from eap.appliance.methods import Methods
-from eap.errors import TornReadError
+from eap.appliance.methods import Methods, Watch
+from eap.errors import ControlError, TornReadError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
@@ -28,8 +28,8 @@ async def torn():
 
 
 @pytest.fixture
-def methods(files):
-    return Methods({"plant": "demo"}, files, status=torn, stop=lambda: 1 / 0)
+def methods(images):
+    return Methods({"plant": "demo"}, images, status=torn, stop=lambda: 1 / 0)
 
 
 NO_BUSES = Buses((), None, {})
@@ -118,6 +118,30 @@ def test_subscriptions_run_beside_requests_until_unsubscribed(methods):
             assert answer["result"] == {"unsubscribed": number}
             again = await client.ask("unsubscribe", subscription=number)
             assert again["error"]["code"] == "unknown_name"
+
+    asyncio.run(talk())
+
+
+@pytest.mark.parametrize(
+    ("exc", "code"),
+    [
+        (TornReadError("torn", writer="engine"), "unavailable"),
+        (ControlError("gone", code="unknown_name"), "unknown_name"),
+    ],
+)
+def test_a_subscription_outlives_what_cannot_be_read(methods, monkeypatch, exc, code):
+    def fail(self):
+        raise exc
+
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            with monkeypatch.context() as patch:
+                patch.setattr(Watch, "next_event", fail)
+                await client.ask("subscribe", station="left", names=["name"], period_ms=10)
+                assert (await client.hear())["event"]["error"]["code"] == code
+            while "error" in (event := (await client.hear())["event"]):
+                pass
+            assert event["values"] == {"name": "abc"}
 
     asyncio.run(talk())
 

@@ -7,11 +7,14 @@ import subprocess
 import sys
 
 import pytest
+from msgspec.structs import replace
 
 from eap.appliance.control import ErrorCode
 from eap.appliance.methods import Methods
 from eap.errors import ControlError
-from eap.pd.spec import Writer
+from eap.net.image_file import create_image
+from eap.pd.layout import plan_layout
+from eap.pd.spec import VariableSpec, Writer
 
 
 async def status():
@@ -28,10 +31,10 @@ def stopped():
 
 
 @pytest.fixture
-def methods(files, stopped):
+def methods(images, stopped):
     return Methods(
         {"plant": "demo", "release": "0"},
-        files,
+        images,
         status=status,
         stop=lambda: stopped.append(True),
     )
@@ -180,3 +183,18 @@ def test_a_watch_is_checked_when_it_begins(methods):
         methods.watch({"station": "middle"})
     with pytest.raises(ControlError, match="did you mean name"):
         methods.watch({"station": "left", "names": ["nam"]})
+
+
+def test_a_watch_goes_on_when_the_station_is_configured_anew(methods, files, stations):
+    some = methods.watch({"station": "left", "names": ["running", "name"]})
+    all_of_them = methods.watch({"station": "left"})
+    more = (*stations[0].variables, VariableSpec("more", "UINT"))
+    with create_image(files["left"].path, plan_layout(replace(stations[0], variables=more))):
+        assert some.next_event()["values"] == {"running": False, "name": "abc"}
+        assert "more" in all_of_them.next_event()["values"]
+    fewer = tuple(each for each in stations[0].variables if each.name != "running")
+    without = replace(stations[0], variables=fewer, frames=())
+    with create_image(files["left"].path, plan_layout(without)):
+        with pytest.raises(ControlError, match="no variable 'running'"):
+            some.next_event()
+        assert "running" not in all_of_them.next_event()["values"]

@@ -25,53 +25,53 @@ def test_a_number_is_fitted_to_its_type(number, kind, fitted):
     assert fit(number, datatypes.parse(kind)) == fitted
 
 
-def play(file, *sources, seconds: float = 0.2) -> None:
+def play(image, *sources, seconds: float = 0.2) -> None:
     async def run():
         async with asyncio.timeout(seconds):
-            await play_sources(msgspec.structs.replace(left(), sources=sources), file)
+            await play_sources(msgspec.structs.replace(left(), sources=sources), image)
 
     with suppress(TimeoutError):
         asyncio.run(run())
 
 
-def test_a_measurement_arrives(files):
-    play(files["left"], HostSource("load", Measure.PROCESSES, period_ms=10))
-    assert files["left"].image.read("load") > 0
+def test_a_measurement_arrives(images):
+    play(images["left"], HostSource("load", Measure.PROCESSES, period_ms=10))
+    assert images["left"].image.read("load") > 0
 
 
-def test_a_column_is_replayed_from_the_start_again(files, tmp_path):
+def test_a_column_is_replayed_from_the_start_again(images, tmp_path):
     (tmp_path / "data.csv").write_text("time,load\n0,17\n1,18\n")
-    file = files["left"]
+    image = images["left"]
     seen = set()
 
     async def run():
         source = CsvSource("load", str(tmp_path / "data.csv"), "load", period_ms=10)
         station = msgspec.structs.replace(left(), sources=(source,))
         async with asyncio.timeout(5), asyncio.TaskGroup() as group:
-            task = group.create_task(play_sources(station, file))
+            task = group.create_task(play_sources(station, image))
             while seen != {17, 18}:
                 await asyncio.sleep(0.001)
-                seen.add(file.image.read("load"))
+                seen.add(image.image.read("load"))
                 seen.discard(0)
             task.cancel()
 
     asyncio.run(run())
 
 
-def test_what_cannot_be_read_keeps_its_value_and_is_said_once(files, tmp_path, caplog):
+def test_what_cannot_be_read_keeps_its_value_and_is_said_once(images, tmp_path, caplog):
     (tmp_path / "data.csv").write_text("load\nmany\n")
     play(
-        files["left"],
+        images["left"],
         HostSource("load", Measure.RX_OCTETS, "nosuch0", period_ms=10),
         CsvSource("load", str(tmp_path / "data.csv"), "load", period_ms=10),
         CsvSource("load", str(tmp_path / "gone.csv"), "load"),
     )
-    assert files["left"].image.read("load") == 0
-    assert sorted(record.args[1] for record in caplog.records) == ["load"] * 3
+    assert images["left"].image.read("load") == 0
+    assert sorted(record.getMessage().split()[0] for record in caplog.records) == ["left/load"] * 3
 
 
-def test_without_sources_nothing_is_claimed(files):
-    play(files["left"])
+def test_without_sources_nothing_is_claimed(images):
+    play(images["left"])
     code = (
         "import sys\n"
         "from pathlib import Path\n"
@@ -83,11 +83,11 @@ def test_without_sources_nothing_is_claimed(files):
         "sys.stdin.read()\n"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", code, str(files["left"].path)],
+        [sys.executable, "-c", code, str(images["left"].file.path)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     ) as other:
         assert other.stdout.readline() == b"holding\n"
         with pytest.raises(WriterConflictError, match=str(other.pid)):
-            play(files["left"], HostSource("load", Measure.LOAD1))
+            play(images["left"], HostSource("load", Measure.LOAD1))
         other.stdin.close()

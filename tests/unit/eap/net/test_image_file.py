@@ -179,6 +179,16 @@ for _ in range(2):
     ended(process)
 
 
+def test_closing_gives_up_the_right_while_somebody_still_looks(path, engine):
+    first = open_image(path)
+    first.acquire_writer(Writer.APPLICATION)
+    image = first.image
+    first.close()
+    with open_image(path) as second:
+        second.acquire_writer(Writer.APPLICATION)
+    assert image.read("x") == 0
+
+
 def test_a_lock_that_fails_for_another_reason_is_not_a_conflict(engine, monkeypatch):
     def no_locks(*_: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
