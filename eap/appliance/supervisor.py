@@ -58,14 +58,26 @@ def run(
     plant = _load(plant_file)
     chosen = _choose(plant, stations)
     require_own_buses(chosen)
-    logging.basicConfig(format="supervisor: %(message)s", level=logging.INFO)
     subset = [station.name for station in chosen] if stations else []
+    info = make_info(plant.name, str(plant_file.resolve()), chosen)
+    return _run(info, chosen, folder_name(plant.name, subset), options)
+
+
+def run_blank(plant: Plant, *, options: EngineOptions) -> int:
+    """Run *plant*, which no file describes, until told to stop; returns and raises as ``run``."""
+    info = make_info(plant.name, "", plant.stations)
+    return _run(info, plant.stations, folder_name(plant.name), options)
+
+
+def _run(
+    info: ApplianceInfo, stations: tuple[StationSpec, ...], folder: str, options: EngineOptions
+) -> int:
+    logging.basicConfig(format="supervisor: %(message)s", level=logging.INFO)
     with (
-        ApplianceFolder.claim(folder_name(plant.name, subset)) as folder,
-        SharedSockets(chosen, folder.control_socket) as sockets,
+        ApplianceFolder.claim(folder) as claimed,
+        SharedSockets(stations, claimed.control_socket) as sockets,
     ):
-        info = make_info(plant.name, str(plant_file.resolve()), chosen)
-        return Supervisor(info, chosen, folder, sockets, options=options).run()
+        return Supervisor(info, stations, claimed, sockets, options=options).run()
 
 
 def _load(plant_file: Path) -> Plant:

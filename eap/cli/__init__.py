@@ -18,6 +18,7 @@ from eap.cli.group import LazyGroup
         "bus": "eap.cli.bus:bus",
         "check": "eap.cli.check:check",
         "decode": "eap.cli.decode:decode",
+        "new": "eap.cli.new:new",
         "pd": "eap.cli.pd:pd",
         "run": "eap.cli.run:run",
         "sim": "eap.cli.sim:sim",

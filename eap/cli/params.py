@@ -10,6 +10,9 @@ import click
 
 CommandT = TypeVar("CommandT", bound=Callable[..., Any])
 
+MIN_CYCLE_US = 100
+MAX_CYCLE_US = 60_000_000
+
 PLANT_FILE = click.Path(path_type=Path)
 """A plant file; whether it can be read is for the loader to say, in its own words."""
 
@@ -78,3 +81,21 @@ def parse_assignment(words: tuple[str, ...]) -> tuple[VariableName, str]:
         if station and name:
             return VariableName(station, name), words[1]
     raise click.UsageError("expected STATION VAR VALUE (or STATION/VAR VALUE)")
+
+
+def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) -> int | None:
+    """Return the microseconds of a device cycle given in milliseconds, as an option's callback.
+
+    Raises:
+        click.BadParameter: a device cannot have such a cycle.
+    """
+    del ctx, param
+    if text is None:
+        return None
+    try:
+        cycle_us = float(text) * 1000
+    except ValueError:
+        cycle_us = 0.0
+    if not MIN_CYCLE_US <= cycle_us <= MAX_CYCLE_US or cycle_us % 1:
+        raise click.BadParameter(f"{text!r} is no device cycle: expected 0.1 to 60000 milliseconds")
+    return int(cycle_us)

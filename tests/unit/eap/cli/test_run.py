@@ -56,3 +56,34 @@ def test_options_out_of_range(option: list[str]) -> None:
     result = CliRunner().invoke(main, ["run", "plant.yaml", *option])
     assert result.exit_code == 2
     assert f"Invalid value for '{option[0]}'" in result.stderr
+
+
+BLANK = ["--blank", "mixer", "--interface", "udp://127.9.7.1", "--net-id", "127.9.7.1.2.1"]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ([], "say what to run: PLANT, or --blank NAME"),
+        (["plant.yaml", *BLANK], "takes the place of PLANT"),
+        ([*BLANK, "--station", "mixer"], "takes the place of PLANT and --station"),
+        (BLANK[:4], "needs --interface URI and --net-id N"),
+        (["plant.yaml", "--cycle", "5"], "go with --blank NAME"),
+        ([*BLANK, "--cycle", "0"], "0.1 to 60000 milliseconds"),
+    ],
+)
+def test_blank_and_plant_are_two_forms(words: list[str], reason: str) -> None:
+    result = CliRunner().invoke(main, ["run", *words])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert reason in result.stderr
+
+
+def test_findings_of_a_blank_station_name_the_options() -> None:
+    words = ["--blank", "a/b", "--interface", "upd://127.9.7.1", "--net-id", "127.9"]
+    result = CliRunner().invoke(main, ["run", *words])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert sorted(line.partition(":")[0] for line in result.stderr.splitlines()) == [
+        "--blank",
+        "--interface",
+        "--net-id",
+    ]

@@ -1,0 +1,84 @@
+"""``eapctl new``."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from eap.cli import main
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return lambda *words: CliRunner().invoke(main, ["new", *words])
+
+
+def check(path):
+    return CliRunner().invoke(main, ["check", str(path)])
+
+
+def test_a_ring_unless_told_otherwise(run, tmp_path):
+    result = run("hall.yaml")
+    assert result.output == "hall.yaml: plant hall, 3 stations in a ring; eapctl run hall.yaml\n"
+    assert check(tmp_path / "hall.yaml").exit_code == 0
+    assert "#   eapctl apply hall.yaml\n" in (tmp_path / "hall.yaml").read_text()
+
+
+def test_a_star(run, tmp_path):
+    words = ("--star", "--stations", "7", "--name", "line", "--address", "10.0.0.11")
+    result = run("hall.yaml", *words, "--json")
+    assert json.loads(result.stdout) == {
+        "file": "hall.yaml",
+        "plant": "line",
+        "shape": "star",
+        "stations": 7,
+    }
+    assert "7 stations, 12 PDs sent, 12 PDs received" in check(tmp_path / "hall.yaml").output
+
+
+def test_stdout(run, tmp_path):
+    result = run("-", "--cycle", "0.5")
+    assert "defaults: {cycle_us: 500}\n" in result.stdout
+    assert "plant: plant\n" in result.stdout
+    assert run("-", "--json").exit_code == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_is_there_stays(run, tmp_path):
+    (tmp_path / "hall.yaml").write_text("mine")
+    result = run("hall.yaml")
+    assert (result.exit_code, result.stderr) == (
+        1,
+        "hall.yaml exists: write over it with --force\n",
+    )
+    assert (tmp_path / "hall.yaml").read_text() == "mine"
+    assert run("hall.yaml", "--force").exit_code == 0
+    assert check(tmp_path / "hall.yaml").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ((), "Missing argument 'FILE'"),
+        (("a.yaml", "--stations", "1"), "2<=x<=250"),
+        (("a.yaml", "--cycle", "0.01"), "0.1 to 60000 milliseconds"),
+        (("a.yaml", "--cycle", "0.1234"), "0.1 to 60000 milliseconds"),
+        (("a.yaml", "--cycle", "fast"), "0.1 to 60000 milliseconds"),
+        (("a.yaml", "--address", "300.1.1.1"), "is not an IPv4 address"),
+        (("a b.yaml",), "plant name 'a b'"),
+    ],
+)
+def test_what_cannot_be_is_said(run, tmp_path, words, reason):
+    result = run(*words)
+    assert result.exit_code == 2
+    assert reason in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_folder_that_is_not_there(run):
+    result = run("nowhere/hall.yaml")
+    assert result.exit_code == 1
+    assert "No such file or directory" in result.stderr
