@@ -177,6 +177,24 @@ class TxFrameSpec(Record, frozen=True):
     modulo: int = 0
 
 
+class TakenVariableSpec(Record, frozen=True):
+    """One variable as it is sent; *name* is that of the RxPD's variable, empty if it has none."""
+
+    name: str
+    type: str
+
+
+class RxAlternateSpec(Record, frozen=True):
+    """Another layout of a PD that is taken as well, while its sender changes from one to the other.
+
+    What it has in common with the RxPD goes to the same variables; all others keep their values.
+    """
+
+    version: int
+    variables: tuple[TakenVariableSpec, ...]
+    """Everything that is sent, in PDO order."""
+
+
 class RxPdSpec(Record, frozen=True):
     """One PD to receive into *variables* of this station, in PDO order."""
 
@@ -195,6 +213,8 @@ class RxPdSpec(Record, frozen=True):
     """The sender's device cycle, 0 if unknown: needed for jitter, lateness and long gaps."""
     step: int = 0
     """Sender cycles between two of this PD, 0 if it has no fixed step: needed to count losses."""
+    alternates: tuple[RxAlternateSpec, ...] = ()
+    """Each with a version and size of its own."""
 
 
 class PortKind(StrEnum):

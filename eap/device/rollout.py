@@ -1,0 +1,238 @@
+"""In which order stations change over, so that nobody ever receives what it does not expect.
+
+Rule 1: who receives a PD whose layout is about to change takes the old and the new one side by
+side.  A station that does not itself change what it sends has all else that is new at once.
+Rule 2: then the senders change over, those first that receive nothing old any more.
+Rule 3: at the end nobody takes an old layout any longer.
+
+No station is ever asked to run anything but its old or its new specification, either of them with
+alternates; so three steps are the most that one needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from eap.codec import datatypes, pdo
+from eap.pd.spec import RxAlternateSpec, RxPdSpec, StationSpec, TakenVariableSpec
+
+
+class Step(NamedTuple):
+    """One station's change: *spec* is what it runs from now on, *why* a line for people."""
+
+    station: str
+    spec: StationSpec
+    why: str
+
+
+def steps(old: Mapping[str, StationSpec], new: Mapping[str, StationSpec]) -> list[Step]:
+    """Return how to get from *old* to *new* without a PD that is sent and not taken.
+
+    Stations that are the same in both, or only in one of them, need no step.  Between two steps
+    frames on their way have to arrive: configure a station, wait for its answer, go on.
+
+    Args:
+        old: What runs now, by station; it may hold alternates of a change that was broken off.
+        new: What is to run, of which every subscription takes what its publisher sends.
+    """
+    return _Rollout(old, new).run()
+
+
+class _Variable(NamedTuple):
+    name: str
+    type: str
+    bit_offset: int
+
+
+class _Layout(NamedTuple):
+    """What a PD looks like; *size* in octets."""
+
+    version: int
+    size: int
+    variables: tuple[_Variable, ...]
+    any_version: bool = False
+    """Of what is received: whether another version fits as well."""
+
+
+class _Wire:
+    """What all stations send at one moment."""
+
+    def __init__(self, specs: Mapping[str, StationSpec]) -> None:
+        self._sent: dict[str, dict[tuple[str, int], list[_Layout]]] = {}
+        self._senders: dict[int, dict[str, None]] = {}
+        for name, spec in specs.items():
+            self.switch(name, spec)
+
+    def switch(self, station: str, spec: StationSpec) -> None:
+        """Let *station* send what *spec* says."""
+        net_ids = {port.name: port.net_id for port in spec.ports}
+        types = _types(spec)
+        sent = self._sent[station] = {}
+        for frame in spec.frames:
+            for pd in frame.pds:
+                layout = _layout(pd.version, ((name, types[name]) for name in pd.variables))
+                sent.setdefault((net_ids[frame.port], pd.pd_id), []).append(layout)
+                self._senders.setdefault(pd.pd_id, {})[station] = None
+
+    def of(self, station: str) -> dict[tuple[str, int], list[_Layout]]:
+        """Return what *station* sends, by NetID and PD id."""
+        return self._sent.get(station, {})
+
+    def heard(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, _Layout]]:
+        """Yield every other station that sends what *pd* of *station* is for, and the layout."""
+        for sender in self._senders.get(pd.pd_id, {}):
+            if sender == station:
+                continue
+            sent = self._sent[sender]
+            keys = (key for key in sent if key[1] == pd.pd_id)
+            for key in [(pd.publisher, pd.pd_id)] if pd.publisher else keys:
+                yield from ((sender, layout) for layout in sent.get(key, ()))
+
+
+class _Rollout:
+    """The steps so far, and what runs after them."""
+
+    def __init__(self, old: Mapping[str, StationSpec], new: Mapping[str, StationSpec]) -> None:
+        self._current = dict(old)
+        self._new = new
+        self._now = _Wire(old)
+        self._later = _Wire(new)
+        self._changed = [name for name in old if name in new and old[name] != new[name]]
+        self._steps: list[Step] = []
+
+    def run(self) -> list[Step]:
+        senders = {name for name in self._changed if self._sends_otherwise(name)}
+        waiting = []
+        for name in self._changed:
+            prepared = self._tolerant(name, self._current[name], self._later)
+            if prepared == self._current[name]:
+                waiting.append(name)
+            elif name in senders:
+                self._step(name, prepared, "takes old and new layouts; sends as before")
+                waiting.append(name)
+            else:
+                self._change(name)
+        self._change_in_order(waiting, senders)
+        for name in self._changed:
+            if self._current[name] != self._new[name]:
+                self._step(name, self._new[name], "takes no old layouts any more")
+        return self._steps
+
+    def _change_in_order(self, waiting: list[str], senders: set[str]) -> None:
+        """Change all of *waiting* over: who needs no alternates first, else a sender."""
+        left = dict.fromkeys(waiting)
+        old_senders = {name: self._senders_of_old(name) for name in waiting}
+        while left:
+            free = (name for name in left if not old_senders[name] & left.keys())
+            name = next(free, None) or next((s for s in left if s in senders), next(iter(left)))
+            del left[name]
+            self._change(name)
+
+    def _change(self, name: str) -> None:
+        """Let *name* run what is new, and take what is still sent otherwise."""
+        new = self._tolerant(name, self._new[name], self._now)
+        more = "" if new == self._new[name] else "; takes old layouts too"
+        self._step(name, new, f"is as it is to be{more}")
+
+    def _step(self, name: str, spec: StationSpec, why: str) -> None:
+        self._current[name] = spec
+        self._now.switch(name, spec)
+        self._steps.append(Step(name, spec, why))
+
+    def _sends_otherwise(self, name: str) -> bool:
+        now = self._now.of(name)
+        return any(now.get(key) != sent for key, sent in self._later.of(name).items())
+
+    def _senders_of_old(self, name: str) -> set[str]:
+        """Return who sends what *name* will not take when it has changed over."""
+        spec = self._new[name]
+        types = _types(spec)
+        return {
+            sender
+            for pd in spec.subscriptions
+            for sender, layout in self._now.heard(name, pd)
+            if not _takes(_forms(pd, types), layout)
+        }
+
+    def _tolerant(self, name: str, spec: StationSpec, wire: _Wire) -> StationSpec:
+        """Return *spec* with alternates for what *wire* brings *name* beside what it takes."""
+        types = _types(spec)
+        pds = tuple(self._with_alternates(name, pd, types, wire) for pd in spec.subscriptions)
+        return spec if pds == spec.subscriptions else replace(spec, subscriptions=pds)
+
+    def _with_alternates(
+        self, name: str, pd: RxPdSpec, types: Mapping[str, str], wire: _Wire
+    ) -> RxPdSpec:
+        for _, layout in wire.heard(name, pd):
+            forms = _forms(pd, types)
+            if not _takes(forms, layout):
+                ours = self._own_names(name, pd, forms)
+                if ours is not None:
+                    pd = replace(pd, alternates=(*pd.alternates, _alternate(ours, layout)))
+        return pd
+
+    def _own_names(
+        self, name: str, pd: RxPdSpec, forms: list[_Layout]
+    ) -> dict[tuple[str, str], str] | None:
+        """Return what *pd* of *name* calls each variable that its sender names, by name and type.
+
+        That is known from a layout that both are made for, now or later; None if there is none.
+        What nobody sends yet has no names, as there is nothing to keep up to date.
+        """
+        for wire in (self._now, self._later):
+            for _, layout in wire.heard(name, pd):
+                for form in forms:
+                    if _takes([form], layout):
+                        return _names(form, layout)
+        return None if any(self._now.heard(name, pd)) else {}
+
+
+def _types(spec: StationSpec) -> dict[str, str]:
+    return {variable.name: variable.type for variable in spec.variables}
+
+
+def _layout(version: int, variables: Iterable[tuple[str, str]]) -> _Layout:
+    kinds = [(name, datatypes.parse(text)) for name, text in variables]
+    plan = pdo.layout(kind for _, kind in kinds)
+    rows = zip(kinds, plan.bit_offsets, strict=True)
+    return _Layout(
+        version, plan.size, tuple(_Variable(name, kind.text, bit) for (name, kind), bit in rows)
+    )
+
+
+def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[_Layout]:
+    """Return the layout of *pd* itself and those of its alternates, with its own names."""
+    own = _layout(pd.version, ((name, types[name]) for name in pd.variables))
+    return [own._replace(any_version=pd.ignore_version)] + [
+        _layout(each.version, ((v.name, v.type) for v in each.variables)) for each in pd.alternates
+    ]
+
+
+def _takes(forms: list[_Layout], layout: _Layout) -> bool:
+    """Tell whether a PD of *layout* is taken by one of *forms*."""
+    return any(
+        form.size == layout.size and (form.any_version or form.version == layout.version)
+        for form in forms
+    )
+
+
+def _names(form: _Layout, layout: _Layout) -> dict[tuple[str, str], str]:
+    """Return what *form* calls the variables of *layout* that lie where its own do."""
+    places = {(each.bit_offset, each.type): each.name for each in form.variables}
+    return {
+        (each.name, each.type): places[each.bit_offset, each.type]
+        for each in layout.variables
+        if (each.bit_offset, each.type) in places
+    }
+
+
+def _alternate(ours: dict[tuple[str, str], str], layout: _Layout) -> RxAlternateSpec:
+    """Return *layout* with the own name of each variable, empty for what there is none of."""
+    variables = (
+        TakenVariableSpec(ours.pop((each.name, each.type), ""), each.type)
+        for each in layout.variables
+    )
+    return RxAlternateSpec(layout.version, tuple(variables))

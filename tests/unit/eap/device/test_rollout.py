@@ -1,0 +1,298 @@
+"""Changes of layout in any number of stations: no PD is ever sent that is not taken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from eap.codec import datatypes, pdo
+from eap.device.rollout import Step, steps
+from eap.pd.spec import (
+    RxAlternateSpec,
+    RxPdSpec,
+    StationSpec,
+    TakenVariableSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
+from tests.support.cyclic import eap_port
+
+LAYOUTS = (
+    {"n": "UINT"},
+    {"n": "UINT", "on": "BOOL"},
+    {"on": "BOOL", "level": "REAL", "n": "UINT"},
+    {"n": "UDINT"},
+    {"level": "REAL"},
+)
+"""A PD's variables by its version."""
+
+Plant = dict[str, StationSpec]
+
+
+def net_id(number: int) -> str:
+    return f"5.1.1.{number}.1.1"
+
+
+def plant(
+    versions: Mapping[tuple[str, int], int],
+    heard: Mapping[str, Sequence[tuple[str, int]]],
+    *,
+    ignoring: bool = False,
+) -> Plant:
+    """Stations of one letter; *versions* of the PDs each sends by id, and what each receives."""
+    names = sorted({station for station, _ in versions} | set(heard))
+    found = {}
+    for number, name in enumerate(names, 1):
+        sent = {pd_id: version for (who, pd_id), version in versions.items() if who == name}
+        taken = [(who, pd_id, versions[who, pd_id]) for who, pd_id in heard.get(name, ())]
+        found[name] = StationSpec(
+            name, net_id(100 + number), 1000, (eap_port(net_id=net_id(number)),),
+            variables=tuple(_variables(sent, taken)),
+            frames=(
+                TxFrameSpec("f", "eap0", "somewhere", tuple(
+                    TxPdSpec(f"pd{pd_id}", pd_id,
+                             tuple(f"{pd_id}.{each}" for each in LAYOUTS[version]), version)
+                    for pd_id, version in sent.items()
+                )),
+            ),
+            subscriptions=tuple(
+                RxPdSpec(f"{who}{pd_id}", "eap0", pd_id,
+                         tuple(f"{who}{pd_id}.{each}" for each in LAYOUTS[version]),
+                         net_id(1 + names.index(who)), version, ignore_version=ignoring)
+                for who, pd_id, version in taken
+            ),
+        )  # fmt: skip
+    return found
+
+
+def _variables(
+    sent: Mapping[int, int], taken: Sequence[tuple[str, int, int]]
+) -> Iterator[VariableSpec]:
+    for pd_id, version in sent.items():
+        for name, kind in LAYOUTS[version].items():
+            yield VariableSpec(f"{pd_id}.{name}", kind)
+    for who, pd_id, version in taken:
+        for name, kind in LAYOUTS[version].items():
+            yield VariableSpec(f"{who}{pd_id}.{name}", kind, Writer.ENGINE)
+
+
+def size(types: Sequence[str]) -> int:
+    return pdo.layout([datatypes.parse(each) for each in types]).size
+
+
+def mismatches(running: Plant) -> list[str]:
+    """Subscriptions that discard what somebody sends them."""
+    sent: dict[tuple[str, int], tuple[int, int]] = {}
+    for spec in running.values():
+        types = {each.name: each.type for each in spec.variables}
+        for frame in spec.frames:
+            for pd in frame.pds:
+                key = spec.ports[0].net_id, pd.pd_id
+                sent[key] = pd.version, size([types[name] for name in pd.variables])
+    return [
+        f"{spec.name} {pd.name}"
+        for spec in running.values()
+        for pd in spec.subscriptions
+        for (publisher, pd_id), what in sent.items()
+        if pd_id == pd.pd_id
+        and pd.publisher in ("", publisher)
+        and publisher != spec.ports[0].net_id
+        and not takes(pd, {each.name: each.type for each in spec.variables}, what)
+    ]
+
+
+def takes(pd: RxPdSpec, types: Mapping[str, str], what: tuple[int, int]) -> bool:
+    own = size([types[name] for name in pd.variables])
+    others = {(each.version, size([v.type for v in each.variables])) for each in pd.alternates}
+    return what in {(pd.version, own), *others} or (pd.ignore_version and own == what[1])
+
+
+def follow(old: Plant, new: Plant, *, until: int | None = None) -> tuple[list[Step], Plant]:
+    """Go the way from *old* to *new* (its first *until* steps), looking at what is received."""
+    running = dict(old)
+    way = steps(old, new)
+    for step in way[:until]:
+        assert running[step.station] != step.spec, f"{step.why}: nothing is different"
+        running[step.station] = step.spec
+        assert mismatches(running) == [], step
+    return way, running
+
+
+def shown(way: Sequence[Step]) -> list[str]:
+    return [f"{step.station} {step.why}" for step in way]
+
+
+def test_nothing_changes_without_a_difference():
+    old = plant({("a", 1): 0}, {"b": [("a", 1)]})
+    assert steps(old, dict(old)) == []
+
+
+def test_the_receiver_goes_first_and_once_more():
+    heard = {"b": [("a", 1)], "c": []}
+    old, new = plant({("a", 1): 0}, heard), plant({("a", 1): 1}, heard)
+    way, running = follow(old, new)
+    assert shown(way) == [
+        "b is as it is to be; takes old layouts too",
+        "a is as it is to be",
+        "b takes no old layouts any more",
+    ]
+    assert running == new
+    assert way[0].spec.subscriptions[0].alternates == (
+        RxAlternateSpec(0, (TakenVariableSpec("a1.n", "UINT"),)),
+    )
+
+
+def test_what_has_another_type_or_is_gone_has_no_place():
+    heard = {"b": [("a", 1)]}
+    old, new = plant({("a", 1): 2}, heard), plant({("a", 1): 3}, heard)
+    first = steps(old, new)[0].spec.subscriptions[0]
+    assert [(each.name, each.type) for each in first.alternates[0].variables] == [
+        ("", "BOOL"),
+        ("", "REAL"),
+        ("", "UINT"),
+    ]
+
+
+def test_stations_that_send_and_receive_take_both_before_they_send_anew():
+    heard = {"a": [("b", 2)], "b": [("a", 1)]}
+    versions = {("a", 1): 0, ("b", 2): 0}
+    old, new = plant(versions, heard), plant(dict.fromkeys(versions, 1), heard)
+    way, running = follow(old, new)
+    assert shown(way) == [
+        "a takes old and new layouts; sends as before",
+        "b takes old and new layouts; sends as before",
+        "a is as it is to be; takes old layouts too",
+        "b is as it is to be",
+        "a takes no old layouts any more",
+    ]
+    assert running == new
+    assert replace(way[0].spec.subscriptions[0], alternates=()) == old["a"].subscriptions[0]
+
+
+def test_in_a_line_senders_follow_each_other():
+    versions = {("c", 1): 0, ("b", 2): 0, ("a", 3): 0}
+    heard = {"b": [("c", 1)], "a": [("b", 2)], "d": [("a", 3)]}
+    way, running = follow(plant(versions, heard), plant(dict.fromkeys(versions, 1), heard))
+    assert [step.station for step in way] == ["a", "b", "d", "c", "b", "a", "d"]
+    assert running == plant(dict.fromkeys(versions, 1), heard)
+
+
+def test_who_does_not_change_what_it_sends_or_receives_has_one_step():
+    heard = {"b": [("a", 1)], "c": [("a", 1)]}
+    old, new = plant({("a", 1): 0, ("c", 9): 0}, heard), plant({("a", 1): 1, ("c", 9): 0}, heard)
+    old["d"], new["d"] = replace(new["c"], name="d", cycle_us=1), replace(new["c"], name="d")
+    old["d"] = replace(old["d"], subscriptions=(), frames=())
+    new["d"] = replace(new["d"], subscriptions=(), frames=())
+    way, _ = follow(old, new)
+    assert [step.station for step in way].count("d") == 1
+
+
+def test_who_receives_a_changed_pd_from_now_on_waits_for_its_sender():
+    old = plant({("a", 1): 0}, {"b": []})
+    new = plant({("a", 1): 1}, {"b": [("a", 1)]})
+    way, _ = follow(old, new)
+    assert shown(way) == ["a is as it is to be", "b is as it is to be"]
+
+
+def test_who_receives_it_no_longer_goes_first():
+    old = plant({("a", 1): 0}, {"b": [("a", 1)]})
+    new = plant({("a", 1): 1}, {"b": []})
+    way, _ = follow(old, new)
+    assert [step.station for step in way] == ["b", "a"]
+    assert way[0].spec == new["b"]
+
+
+def test_stations_that_are_in_one_plant_only_have_no_step():
+    old = plant({("a", 1): 0}, {"b": [("a", 1)]})
+    new = plant({("a", 1): 1, ("c", 3): 0}, {"b": [("a", 1)]})
+    del old["b"]
+    assert [step.station for step in steps(old, new)] == ["a"]
+
+
+def test_any_publisher_takes_the_layouts_of_all():
+    heard = {"d": [("a", 1), ("b", 1)]}
+    plants = []
+    for versions in ({("a", 1): 0, ("b", 1): 0}, {("a", 1): 1, ("b", 1): 1}):
+        made = plant(versions, heard)
+        first = replace(made["d"].subscriptions[0], publisher="")
+        made["d"] = replace(made["d"], subscriptions=(first,))
+        plants.append(made)
+    way, running = follow(*plants)
+    assert [step.station for step in way] == ["d", "a", "b", "d"]
+    assert len(way[0].spec.subscriptions[0].alternates) == 1
+    assert running == plants[1]
+
+
+def test_a_version_that_is_ignored_needs_no_alternate():
+    heard = {"b": [("a", 1)]}
+    old, new = (plant({("a", 1): 0}, heard, ignoring=True) for _ in range(2))
+    pd = replace(new["a"].frames[0].pds[0], version=9)
+    new["a"] = replace(new["a"], frames=(replace(new["a"].frames[0], pds=(pd,)),))
+    way, _ = follow(old, new)
+    assert shown(way) == ["a is as it is to be"]
+
+
+def test_what_no_plant_sends_gets_no_alternate():
+    old = plant({("a", 1): 0}, {"b": [("a", 1)]})
+    new = plant({("a", 1): 1}, {"b": [("a", 1)]})
+    for each in (old, new):  # b is for something that neither sends
+        pd = replace(each["b"].subscriptions[0], version=77)
+        each["b"] = replace(each["b"], subscriptions=(pd,))
+    assert [step.station for step in steps(old, new)] == ["a", "b"]
+    assert all(not pd.alternates for step in steps(old, new) for pd in step.spec.subscriptions)
+
+
+STATIONS = "abcd"
+PDS = [(station, 10 * number + pd) for number, station in enumerate(STATIONS) for pd in (1, 2)]
+versions_of_all = st.fixed_dictionaries(
+    {}, optional={key: st.integers(0, len(LAYOUTS) - 1) for key in PDS}
+)
+wishes = st.fixed_dictionaries({name: st.sets(st.sampled_from(PDS)) for name in STATIONS})
+
+
+@st.composite
+def plants(draw: st.DrawFn) -> Plant:
+    versions = draw(versions_of_all)
+    heard = {
+        name: [key for key in PDS if key in wanted and key in versions and key[0] != name]
+        for name, wanted in draw(wishes).items()
+    }
+    return plant(versions, heard)
+
+
+@given(plants(), plants())
+def test_whatever_changes_every_pd_that_is_sent_is_taken(old, new):
+    way, running = follow(old, new)
+    assert running == new
+    counts = {name: sum(step.station == name for step in way) for name in STATIONS}
+    assert all((old[name] != new[name]) <= counts[name] <= 3 for name in STATIONS)
+    assert not any(counts[name] for name in STATIONS if old[name] == new[name])
+    assert steps(old, new) == way
+
+
+@given(plants(), plants(), plants(), st.integers(0, 12))
+def test_a_change_that_was_broken_off_can_be_finished_taken_back_or_followed_by_another(
+    old, new, another, done
+):
+    _, broken_off = follow(old, new, until=done)
+    for goal in (old, new, another):
+        assert follow(broken_off, goal)[1] == goal
+
+
+def test_who_receives_its_own_pd_changes_both_ends_at_once():
+    heard = {"a": [("a", 1)]}
+    way = steps(plant({("a", 1): 0}, heard), plant({("a", 1): 1}, heard))
+    assert shown(way) == ["a is as it is to be"]
+
+
+def test_in_a_ring_only_the_first_needs_a_third_step():
+    count = 100
+    versions = {(f"s{n:03}", n): 0 for n in range(count)}
+    heard = {f"s{n:03}": [(f"s{(n + 1) % count:03}", (n + 1) % count)] for n in range(count)}
+    old, new = plant(versions, heard), plant(dict.fromkeys(versions, 1), heard)
+    assert len(steps(old, new)) == 2 * count + 1
