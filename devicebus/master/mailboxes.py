@@ -285,7 +285,7 @@ class Mailbox:
                 f"slave {self.station}: a mailbox error of {len(data)} octets, expected 4"
             )
         return MailboxRefusedError(
-            f"slave {self.station}: mailbox error {MailboxError.name_of(detail)}", detail=detail
+            f"slave {self.station}: mailbox error {MailboxError.text_of(detail)}", detail=detail
         )
 
 

@@ -60,7 +60,8 @@ class FaultySegment:
         needs_slave = spec.kind not in _ON_FRAMES or spec.kind is FaultKind.CORRUPT
         if needs_slave and spec.slave not in self._numbers:
             known = ", ".join(self._numbers)
-            raise ValueError(f"fault {spec.kind.value}: no slave {spec.slave!r} (one of {known})")
+            problem = f"no slave {spec.slave!r}" if spec.slave else "it needs a slave"
+            raise ValueError(f"fault {spec.kind.value}: {problem} (one of {known})")
         if spec.kind is FaultKind.SDO:
             parse_entry(spec.object)
         if spec.kind is FaultKind.TX_PDO and not 0 <= parse_entry(spec.object)[0] - TX_PDO < 0x200:

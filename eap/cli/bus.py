@@ -14,7 +14,7 @@ from eap.cli.bus_params import (
 from eap.cli.bus_place import BusCommand, BusPort, Place, bus_options, open_session
 from eap.cli.group import LazyGroup
 from eap.cli.output import write_json, write_tables, write_text
-from eap.cli.params import json_option
+from eap.cli.params import examples, json_option
 
 STATES = ("INIT", "PREOP", "BOOT", "SAFEOP", "OP")
 _U32 = 0xFFFFFFFF
@@ -33,6 +33,12 @@ _U16 = 0xFFFF
         "state": "eap.cli.bus:state",
         "voe": "eap.cli.bus:voe",
     },
+    epilog=examples(
+        "eapctl bus scan island-02/bus0",
+        "eapctl bus sdo read island-01/bus0 drive 0x1018:1",
+        "eapctl bus foe put island-01/bus0 drive new.bin firmware.bin",
+        "eapctl bus scan --interface udp://127.0.4.1",
+    ),
 )
 def bus() -> None:
     """Look at a bus of slaves and talk to them.
@@ -66,10 +72,10 @@ def scan(bus: Place, as_json: bool) -> None:
 @click.argument("words", nargs=-1, metavar="[SLAVE] [INIT|PREOP|SAFEOP|OP|BOOT]")
 @json_option("Print one object.")
 def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
-    """Show states, or bring one slave or all of them to a state.
+    """Show states, or bring slaves to a state.
 
-    The master of a running station keeps them there.  Behind an interface nobody does: a slave with
-    outputs leaves OP when nobody sends it process data.
+    One slave, or all of them.  The master of a running station keeps them there.  Behind an
+    interface nobody does: a slave with outputs leaves OP when nobody sends it process data.
     """
     from eap.appliance.bus_info import state_rows
 
@@ -94,7 +100,7 @@ def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
 @click.argument("slave", required=False, metavar="[SLAVE]")
 @json_option("Print one object.")
 def diag(slave: str | None, bus: Place, as_json: bool) -> None:
-    """Show states, error counters of every port, and where frames get damaged."""
+    """Show states, errors of ports, and where they start."""
     from eap.appliance.bus_info import diagnosis
 
     with open_session(bus) as session:

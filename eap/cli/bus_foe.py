@@ -48,7 +48,10 @@ def get(
     bus: Place,
     as_json: bool,
 ) -> None:
-    """Read the file NAME of a slave into FILE, by default NAME in this folder."""
+    """Read the file NAME of a slave into FILE.
+
+    FILE is NAME in this folder if left out.
+    """
     from eap.appliance.bus_foe import get_file
 
     target = file or Path(Path(name).name)

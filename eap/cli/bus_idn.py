@@ -75,7 +75,10 @@ def read(slave: str, number: Idn, drive: int, bus: Place, as_json: bool) -> None
 @_drive_option
 @json_option("Print one object: what was written.")
 def write(slave: str, number: Idn, value: str, drive: int, bus: Place, as_json: bool) -> None:
-    """Write the value of an IDN; the numbers of a list have commas between them."""
+    """Write the value of an IDN.
+
+    The numbers of a list have commas between them.
+    """
     from eap.appliance.bus_idn import write_idn
 
     with open_session(bus) as session:

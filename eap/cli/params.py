@@ -99,3 +99,8 @@ def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) ->
     if not MIN_CYCLE_US <= cycle_us <= MAX_CYCLE_US or cycle_us % 1:
         raise click.BadParameter(f"{text!r} is no device cycle: expected 0.1 to 60000 milliseconds")
     return int(cycle_us)
+
+
+def examples(*lines: str) -> str:
+    """Return what to show below the options of a command: some ways to call it."""
+    return "\n  ".join(("\b\nExamples:", *lines))

@@ -9,6 +9,7 @@ import click
 
 from eap.cli.group import LazyGroup
 from eap.cli.output import write_json
+from eap.cli.params import examples
 from eap.ids import InterfaceUri
 
 
@@ -30,10 +31,15 @@ def _parse_interface(
     },
 )
 def sim() -> None:
-    """Simulated slaves for masters that speak the EtherCAT device protocol."""
+    """Run simulated slaves, and let things happen.
+
+    A master of the EtherCAT device protocol takes them for real ones.
+    """
 
 
-@click.command()
+@click.command(
+    epilog=examples("eapctl sim run config/buses/drive.yaml --interface udp://127.0.4.1")
+)
 @click.argument("bus", type=click.Path(dir_okay=False, path_type=Path))
 @click.option(
     "--interface",
@@ -50,9 +56,10 @@ def sim() -> None:
 )
 @click.option("--faults", is_flag=True, help="Take faults as JSON, one a line, from stdin.")
 def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults: bool) -> None:
-    """Run the slaves of the bus file BUS until Ctrl-C or SIGTERM.
+    """Run the slaves of the bus file BUS.
 
-    When they answer, one line {"ready": true, "slaves": n} appears on stdout.
+    When they answer, one line {"ready": true, "slaves": n} appears on stdout; Ctrl-C or SIGTERM
+    ends them.  docs/simulator.md describes bus files; config/buses has some to start from.
     """
     from eap.appliance import busfile, segment_process  # yaml and sockets; --help must not wait
 

@@ -8,7 +8,7 @@ import click
 
 from eap.cli.bus_place import BusPort, parse_port
 from eap.cli.output import write_json, write_text
-from eap.cli.params import CommandT, json_option, plant_option
+from eap.cli.params import CommandT, examples, json_option, plant_option
 
 _EXAMPLE = "such as power slave=drive for_ms=500"
 
@@ -57,7 +57,13 @@ def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> BusPort:
     return port
 
 
-@click.command()
+@click.command(
+    epilog=examples(
+        "eapctl sim fault island-01/bus0 power slave=drive for_ms=500",
+        "eapctl sim fault island-02/bus0 cut slave=sensor",
+        "eapctl sim fault island-02/bus0 cut slave=sensor --end",
+    )
+)
 @_place_argument
 @click.argument("words", nargs=-1, required=True, metavar="JSON|KIND [KEY=VALUE]...")
 @click.option("--end", is_flag=True, help="End the fault that is described, instead of beginning.")
@@ -68,7 +74,9 @@ def fault(
 ) -> None:
     """Let a fault happen on a simulated bus of a running station.
 
-    docs/simulator.md lists the kinds and their keys, such as: power slave=drive for_ms=500
+    KIND is loss, delay, corrupt, wkc, cut, power, mailbox, foe, sdo, eeprom, tx-pdo, emergency,
+    al-error, refuse or drift; most want slave=NAME, and take at_ms and for_ms.  docs/simulator.md
+    says what each does, and its keys.
     """
     command = parse_fault(words) | ({"end": True} if end else {})
     _send(bus, command, plant)
@@ -78,7 +86,14 @@ def fault(
         write_text(f"{bus}: fault {command.get('kind')} {'ends' if end else 'begins'}")
 
 
-@click.command("set", context_settings={"ignore_unknown_options": True})
+@click.command(
+    "set",
+    context_settings={"ignore_unknown_options": True},
+    epilog=examples(
+        "eapctl sim set island-02/bus0 buttons start true",
+        "eapctl sim set island-02/bus0 buttons start --release",
+    ),
+)
 @_place_argument
 @click.argument("slave")
 @click.argument("entry")
@@ -95,10 +110,10 @@ def set_value(
     plant: str | None,
     as_json: bool,
 ) -> None:
-    """Let an entry of a simulated slave keep a value, whatever it would be otherwise.
+    """Make an entry of a simulated slave keep a value.
 
-    SLAVE is its name in the bus file, ENTRY the name of an input or another entry, or such as
-    0x6000:1.
+    It does so whatever it would be otherwise, until --release.  SLAVE is its name in the bus file,
+    ENTRY the name of an input or another entry, or such as 0x6000:1.
     """
     if release == (value is not None):
         raise click.UsageError("expected either VALUE or --release")

@@ -60,6 +60,24 @@ class MailboxError(IntEnum):
         """Return the name of a detail code, or its number for one nobody documents."""
         return cls(detail).name if detail in cls._value2member_map_ else f"0x{detail:04x}"
 
+    @classmethod
+    def text_of(cls, detail: int) -> str:
+        """Return the name of a detail code and what it means, or its number."""
+        meaning = _MEANINGS.get(detail)
+        return cls.name_of(detail) + (f", {meaning}" if meaning else "")
+
+
+_MEANINGS: dict[int, str] = {
+    MailboxError.SYNTAX: "it cannot read the mailbox header",
+    MailboxError.UNSUPPORTED_PROTOCOL: "it does not speak this protocol, or not in its state",
+    MailboxError.INVALID_CHANNEL: "the channel is wrong",
+    MailboxError.SERVICE_NOT_SUPPORTED: "it does not offer this service",
+    MailboxError.INVALID_HEADER: "it cannot read the header of the protocol",
+    MailboxError.SIZE_TOO_SHORT: "the message is too short",
+    MailboxError.NO_MORE_MEMORY: "it is out of memory",
+    MailboxError.INVALID_SIZE: "the length of the message is wrong",
+    MailboxError.SERVICE_IN_WORK: "it is still busy with an earlier request",
+}
 
 ERROR_REPLY = 1
 """The only kind of message that the standard knows behind type 0."""

@@ -141,7 +141,7 @@ def test_fault_inside_a_slave():
     ("spec", "message"),
     [
         (fault("cut", slave="x"), r"no slave 'x' \(one of a, b, c\)"),
-        (fault("corrupt"), "no slave ''"),
+        (fault("corrupt"), "fault corrupt: it needs a slave"),
         (fault("sdo", slave="a", object="x"), "not an entry"),
         (fault("refuse", slave="a", state="RUN"), "no state 'RUN'"),
     ],

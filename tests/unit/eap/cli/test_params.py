@@ -3,7 +3,7 @@ from __future__ import annotations
 import click
 import pytest
 
-from eap.cli.params import VariableName, parse_assignment, parse_names
+from eap.cli.params import VariableName, examples, parse_assignment, parse_names
 
 
 @pytest.mark.parametrize(
@@ -48,3 +48,9 @@ def test_assignment_in_both_forms() -> None:
 def test_assignment_that_is_none(words: tuple[str, ...]) -> None:
     with pytest.raises(click.UsageError, match="STATION VAR VALUE"):
         parse_assignment(words)
+
+
+def test_examples_stay_as_they_are_written():
+    command = click.Command("do", epilog=examples("eapctl do this", "eapctl do that"))
+    shown = command.get_help(click.Context(command, info_name="do"))
+    assert shown.endswith("  Examples:\n    eapctl do this\n    eapctl do that")

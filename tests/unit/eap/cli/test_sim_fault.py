@@ -7,6 +7,7 @@ import json
 import click
 import pytest
 
+from devicebus.sim.spec import FaultKind
 from eap.cli import main
 from eap.cli.sim_fault import parse_fault, parse_value
 
@@ -31,6 +32,13 @@ def test_faults_in_words_and_in_json():
     for wrong in (("power", "slave"), ("power", "=1"), ("{",), ("{1}",)):
         with pytest.raises(click.UsageError):
             parse_fault(wrong)
+
+
+def test_help_names_every_kind(command):
+    code, out, _ = command("fault", "--help")
+    words = out.replace(",", " ").replace(";", " ").split()
+    assert code == 0
+    assert [kind for kind in FaultKind if kind.value not in words] == []
 
 
 @pytest.mark.parametrize(

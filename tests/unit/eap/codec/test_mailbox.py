@@ -87,4 +87,6 @@ def test_error_reply_names_its_reason() -> None:
     reply = MailboxErrorReply.decode(bytes.fromhex("0100 0200"))
     assert reply == MailboxErrorReply(detail=MailboxError.UNSUPPORTED_PROTOCOL)
     assert MailboxError.name_of(reply.detail) == "UNSUPPORTED_PROTOCOL"
+    assert MailboxError.text_of(reply.detail).startswith("UNSUPPORTED_PROTOCOL, it does not speak")
+    assert MailboxError.text_of(0x99) == MailboxError.name_of(0x99) == "0x0099"
     assert MailboxError.name_of(0x1234) == "0x1234"
