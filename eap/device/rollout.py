@@ -11,12 +11,12 @@ alternates; so three steps are the most that one needs.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from eap.codec import datatypes, pdo
+from eap.device.pdlayout import PdKey, PdLayout, lay_out, sent_pds, types_of
 from eap.pd.spec import RxAlternateSpec, RxPdSpec, StationSpec, TakenVariableSpec
 
 
@@ -41,54 +41,34 @@ def steps(old: Mapping[str, StationSpec], new: Mapping[str, StationSpec]) -> lis
     return _Rollout(old, new).run()
 
 
-class _Variable(NamedTuple):
-    name: str
-    type: str
-    bit_offset: int
-
-
-class _Layout(NamedTuple):
-    """What a PD looks like; *size* in octets."""
-
-    version: int
-    size: int
-    variables: tuple[_Variable, ...]
-    any_version: bool = False
-    """Of what is received: whether another version fits as well."""
-
-
 class _Wire:
     """What all stations send at one moment."""
 
     def __init__(self, specs: Mapping[str, StationSpec]) -> None:
-        self._sent: dict[str, dict[tuple[str, int], list[_Layout]]] = {}
+        self._sent: dict[str, dict[PdKey, list[PdLayout]]] = {}
         self._senders: dict[int, dict[str, None]] = {}
         for name, spec in specs.items():
             self.switch(name, spec)
 
     def switch(self, station: str, spec: StationSpec) -> None:
         """Let *station* send what *spec* says."""
-        net_ids = {port.name: port.net_id for port in spec.ports}
-        types = _types(spec)
         sent = self._sent[station] = {}
-        for frame in spec.frames:
-            for pd in frame.pds:
-                layout = _layout(pd.version, ((name, types[name]) for name in pd.variables))
-                sent.setdefault((net_ids[frame.port], pd.pd_id), []).append(layout)
-                self._senders.setdefault(pd.pd_id, {})[station] = None
+        for key, _, layout in sent_pds(spec):
+            sent.setdefault(key, []).append(layout)
+            self._senders.setdefault(key.pd_id, {})[station] = None
 
-    def of(self, station: str) -> dict[tuple[str, int], list[_Layout]]:
-        """Return what *station* sends, by NetID and PD id."""
+    def of(self, station: str) -> dict[PdKey, list[PdLayout]]:
+        """Return what *station* sends."""
         return self._sent.get(station, {})
 
-    def heard(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, _Layout]]:
+    def heard(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, PdLayout]]:
         """Yield every other station that sends what *pd* of *station* is for, and the layout."""
         for sender in self._senders.get(pd.pd_id, {}):
             if sender == station:
                 continue
             sent = self._sent[sender]
-            keys = (key for key in sent if key[1] == pd.pd_id)
-            for key in [(pd.publisher, pd.pd_id)] if pd.publisher else keys:
+            keys = [key for key in sent if key.pd_id == pd.pd_id]
+            for key in [PdKey(pd.publisher, pd.pd_id)] if pd.publisher else keys:
                 yield from ((sender, layout) for layout in sent.get(key, ()))
 
 
@@ -149,7 +129,7 @@ class _Rollout:
     def _senders_of_old(self, name: str) -> set[str]:
         """Return who sends what *name* will not take when it has changed over."""
         spec = self._new[name]
-        types = _types(spec)
+        types = types_of(spec)
         return {
             sender
             for pd in spec.subscriptions
@@ -159,7 +139,7 @@ class _Rollout:
 
     def _tolerant(self, name: str, spec: StationSpec, wire: _Wire) -> StationSpec:
         """Return *spec* with alternates for what *wire* brings *name* beside what it takes."""
-        types = _types(spec)
+        types = types_of(spec)
         pds = tuple(self._with_alternates(name, pd, types, wire) for pd in spec.subscriptions)
         return spec if pds == spec.subscriptions else replace(spec, subscriptions=pds)
 
@@ -175,7 +155,7 @@ class _Rollout:
         return pd
 
     def _own_names(
-        self, name: str, pd: RxPdSpec, forms: list[_Layout]
+        self, name: str, pd: RxPdSpec, forms: list[PdLayout]
     ) -> dict[tuple[str, str], str] | None:
         """Return what *pd* of *name* calls each variable that its sender names, by name and type.
 
@@ -190,28 +170,15 @@ class _Rollout:
         return None if any(self._now.heard(name, pd)) else {}
 
 
-def _types(spec: StationSpec) -> dict[str, str]:
-    return {variable.name: variable.type for variable in spec.variables}
-
-
-def _layout(version: int, variables: Iterable[tuple[str, str]]) -> _Layout:
-    kinds = [(name, datatypes.parse(text)) for name, text in variables]
-    plan = pdo.layout(kind for _, kind in kinds)
-    rows = zip(kinds, plan.bit_offsets, strict=True)
-    return _Layout(
-        version, plan.size, tuple(_Variable(name, kind.text, bit) for (name, kind), bit in rows)
-    )
-
-
-def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[_Layout]:
+def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[PdLayout]:
     """Return the layout of *pd* itself and those of its alternates, with its own names."""
-    own = _layout(pd.version, ((name, types[name]) for name in pd.variables))
+    own = lay_out(pd.version, ((name, types[name]) for name in pd.variables))
     return [own._replace(any_version=pd.ignore_version)] + [
-        _layout(each.version, ((v.name, v.type) for v in each.variables)) for each in pd.alternates
+        lay_out(each.version, ((v.name, v.type) for v in each.variables)) for each in pd.alternates
     ]
 
 
-def _takes(forms: list[_Layout], layout: _Layout) -> bool:
+def _takes(forms: list[PdLayout], layout: PdLayout) -> bool:
     """Tell whether a PD of *layout* is taken by one of *forms*."""
     return any(
         form.size == layout.size and (form.any_version or form.version == layout.version)
@@ -219,7 +186,7 @@ def _takes(forms: list[_Layout], layout: _Layout) -> bool:
     )
 
 
-def _names(form: _Layout, layout: _Layout) -> dict[tuple[str, str], str]:
+def _names(form: PdLayout, layout: PdLayout) -> dict[tuple[str, str], str]:
     """Return what *form* calls the variables of *layout* that lie where its own do."""
     places = {(each.bit_offset, each.type): each.name for each in form.variables}
     return {
@@ -229,7 +196,7 @@ def _names(form: _Layout, layout: _Layout) -> dict[tuple[str, str], str]:
     }
 
 
-def _alternate(ours: dict[tuple[str, str], str], layout: _Layout) -> RxAlternateSpec:
+def _alternate(ours: dict[tuple[str, str], str], layout: PdLayout) -> RxAlternateSpec:
     """Return *layout* with the own name of each variable, empty for what there is none of."""
     variables = (
         TakenVariableSpec(ours.pop((each.name, each.type), ""), each.type)
