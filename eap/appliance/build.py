@@ -25,7 +25,7 @@ from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
 from eap.pd.link import Channel, Taker
-from eap.pd.spec import PortKind, PortSpec, Wake
+from eap.pd.spec import REQUESTER, PortKind, PortSpec, Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 
@@ -152,12 +152,14 @@ class EnginePlant:
         sends_tcp = any(
             Destination.parse(frame.destination).kind is DestinationKind.TCP
             for frame in station.spec.frames
-            if frame.port == name.port
+            if frame.port == name.port and frame.destination != REQUESTER
         )
         if datagrams is not None and not spec.tcp and not sends_tcp:
             station.connect(name.port, datagrams)
             return
-        port = TcpPort(InterfaceUri.parse(spec.interface).host, datagrams)
+        asks = any(pd.poll_request and pd.port == name.port for pd in station.spec.subscriptions)
+        answers = [self._taker(name)] if asks else []
+        port = TcpPort(InterfaceUri.parse(spec.interface).host, datagrams, answers)
         self._resources.callback(port.close)
         self._tcp_ports[name] = port
         self._tallies.append(Tally(self._counters, [name.station], port.closed, _tcp_reason))

@@ -13,6 +13,7 @@ from typing import Protocol
 
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.pd.link import Origin
 
 
 class DrainedChannel(Protocol):
@@ -33,8 +34,9 @@ class FrameIntake:
         self._counters = counters
         self._from_ns = from_ns
 
-    def take(self, data: memoryview, size: int, at_ns: int) -> None:
-        """Count one frame that arrived at *at_ns* on the monotonic clock."""
+    def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
+        """Count one frame that arrived at *at_ns* on the monotonic clock, whoever sent it."""
+        del origin
         reason = Refusal.STALE if at_ns < self._from_ns else _reason(data, size)
         for station in self._stations:
             self._counters.count(station, reason)

@@ -58,7 +58,8 @@ def _heading(pd: Row) -> str:
         arrow, way = "→", f"to {pd['destination']}"
     else:
         arrow, way = "←", f"from {pd['publisher'] or 'any publisher'}"
-    return f"{arrow}  {pd['name']}  id {pd['id']}, version {pd['version']}, {pd['port']} {way}"
+    line = f"{arrow}  {pd['name']}  id {pd['id']}, version {pd['version']}, {pd['port']} {way}"
+    return f"{line}, polled by {pd['poll']}" if pd.get("poll") else line
 
 
 def _typed(variable: Row) -> str:

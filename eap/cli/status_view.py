@@ -31,7 +31,10 @@ _REASONS = {
     "change": "on change",
     "change_timeout": "resend",
     "event": "event",
+    "poll": "on request",
 }
+_FRAME_STATES = {2: "larger than its network carries", 4: "nobody is there"}
+"""What the bits of FrameState say beyond that a frame was not sent."""
 
 
 def status_tables(document: Row) -> Iterator[RenderableType]:
@@ -142,7 +145,7 @@ def _bus_remarks(name: str, bus: Row) -> Iterator[str]:
 
 def _process_data(stations: Sequence[Row]) -> RenderableType:
     table = _table("", "Process data", "State", "Frames", "Lost", "Quality", "Age")
-    table.add_column("Jitter µs\np50 / p99 / max")
+    table.add_column("Jitter, response µs\np50 / p99 / max")
     for column in table.columns[3:]:
         column.justify, column.no_wrap = "right", True
     for station in stations:
@@ -158,8 +161,9 @@ def _process_data(stations: Sequence[Row]) -> RenderableType:
 
 
 def _received(row: Row) -> tuple[RenderableType, ...]:
-    lost, quality, age, jitter = row["lost"], row["quality"], row["age_us"], row["jitter_us"]
-    spread = [jitter[key] for key in ("p50", "p99", "max")]
+    lost, quality, age = row["lost"], row["quality"], row["age_us"]
+    times = row.get("response_us") or row["jitter_us"]
+    spread = [times[key] for key in ("p50", "p99", "max")]
     return (
         "←",
         row["name"],
@@ -204,6 +208,9 @@ def _own_remarks(station: Row) -> Iterator[str]:
 def _sent_remarks(row: Row) -> Iterator[str]:
     if row["skipped"]:
         yield f"skipped {words.times(row['skipped'])}"
+    for bit, meaning in _FRAME_STATES.items():
+        if row.get("frame_state", 0) & bit:
+            yield meaning
     if len(row["reason"]) > 1:
         yield "sent " + ", ".join(
             f"{_REASONS.get(why, why)} {words.times(count)}" for why, count in row["reason"].items()

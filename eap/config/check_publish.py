@@ -9,7 +9,7 @@ from eap.config.destination import EXPECTED, frame_budget, resolve
 from eap.config.finding import Report, near, one_of
 from eap.config.index import Index
 from eap.config.structs import Frame, Publish, Station
-from eap.pd.spec import PortKind
+from eap.pd.spec import REQUESTER, PortKind
 
 
 def check_publish(index: Index, report: Report) -> None:
@@ -50,7 +50,7 @@ def _check_frame(index: Index, report: Report, station: Station, frame: Frame) -
     if uri is None or index.eap_port(station, frame.port) is None:
         return
     try:
-        destination = resolve(frame.to, uri, index)
+        destination = None if frame.to == REQUESTER else resolve(frame.to, uri, index)
     except ValueError as exc:
         if not set(frame.to.split("/")) & report.broken and uri.scheme in EXPECTED:
             message = f"destination of frame {frame.name!r}: {exc}"
@@ -64,7 +64,7 @@ def _check_frame(index: Index, report: Report, station: Station, frame: Frame) -
     budget = frame_budget(destination, uri)
     if size > budget:
         message = f"frame {frame.name!r} has {size} octets with its {len(pds)} PDs"
-        expected = f"at most {budget} to {destination} (more frames carry more)"
+        expected = f"at most {budget} to {destination or 'who asks'} (more frames carry more)"
         report.add(frame.at, message, expected)
 
 

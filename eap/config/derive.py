@@ -16,9 +16,10 @@ from eap.config.check_buses import bus_file
 from eap.config.destination import IP_BROADCAST, group_of, resolve
 from eap.config.index import Index, SentPd
 from eap.config.links import ends, in_order, is_bitwise
-from eap.config.structs import From, Port, Publish, Station, Subscribe, Variable
+from eap.config.structs import Frame, From, Port, Publish, Station, Subscribe, Variable
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.spec import (
+    REQUESTER,
     BusPortSpec,
     CsvSource,
     HostSource,
@@ -154,11 +155,17 @@ def _frames(index: Index, station: Station) -> Iterator[TxFrameSpec]:
         yield TxFrameSpec(
             name=frame.name,
             port=frame.port,
-            destination=str(resolve(frame.to, index.uris[station.name, frame.port], index)),
+            destination=_destination(index, station, frame),
             pds=tuple(_pd(pd) for pd in station.publish if pd.frame == frame.name),
             divider=frame.divider or 0,
             modulo=frame.modulo or 0,
         )
+
+
+def _destination(index: Index, station: Station, frame: Frame) -> str:
+    if frame.to == REQUESTER:
+        return REQUESTER
+    return str(resolve(frame.to, index.uris[station.name, frame.port], index))
 
 
 def _pd(pd: Publish) -> TxPdSpec:
@@ -169,7 +176,7 @@ def _pd(pd: Publish) -> TxPdSpec:
         on_change=pd.on_change,
         event=pd.event,
     )
-    return TxPdSpec(pd.name, pd.id, pd.variables, pd.version, trigger)
+    return TxPdSpec(pd.name, pd.id, pd.variables, pd.version, trigger, pd.poll)
 
 
 def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
@@ -196,6 +203,7 @@ def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
         substitute=subscription.substitute,
         sender_cycle_us=sender_cycle_us,
         step=step,
+        poll_request=subscription.poll,
     )
 
 
@@ -247,5 +255,7 @@ def _heard(index: Index, station: Station, port: Port) -> Iterator[Destination]:
     for subscription in station.subscribe:
         if subscription.port == port.name:
             for sent in index.publishers(subscription):
+                if sent.frame.to == REQUESTER:
+                    continue
                 uri = index.uris[sent.station.name, sent.port.name]
                 yield resolve(sent.frame.to, uri, index)

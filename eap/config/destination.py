@@ -27,10 +27,10 @@ _ALLOWED = {
     "loop": (DestinationKind.MAC,),
 }
 EXPECTED = {
-    "udp": "an IPv4 address, tcp:// and one, STATION/PORT or broadcast",
-    "tcp": "tcp:// and an IPv4 address, or STATION/PORT",
-    "ethernet": "a MAC address, multicast or broadcast",
-    "loop": "STATION/PORT, a MAC address, multicast or broadcast",
+    "udp": "an IPv4 address, tcp:// and one, STATION/PORT, broadcast or requester",
+    "tcp": "tcp:// and an IPv4 address, STATION/PORT or requester",
+    "ethernet": "a MAC address, multicast, broadcast or requester",
+    "loop": "STATION/PORT, a MAC address, multicast, broadcast or requester",
 }
 """What ``to`` may be on each kind of interface."""
 _KEYWORDS = {
@@ -84,8 +84,14 @@ def takes_tcp(port: Port, uri: InterfaceUri) -> bool:
     return uri.scheme == "tcp" or (uri.scheme == "udp" and port.tcp)
 
 
-def frame_budget(destination: Destination, uri: InterfaceUri) -> int:
-    """Return the octets of the largest frame to *destination*, its EtherCAT header included."""
+def frame_budget(destination: Destination | None, uri: InterfaceUri) -> int:
+    """Return the octets of the largest frame to *destination*, its EtherCAT header included.
+
+    Without a destination it goes to who asked, by any way that leads to a port on *uri*.
+    """
+    if destination is None:
+        budgets = {"udp": MAX_UDP_FRAME, "ethernet": MAX_ETHERNET_FRAME}
+        return budgets.get(uri.scheme, MAX_STREAM_FRAME)
     if destination.kind is DestinationKind.TCP or uri.scheme == "loop":
         return MAX_STREAM_FRAME
     return MAX_UDP_FRAME if destination.kind is DestinationKind.IP else MAX_ETHERNET_FRAME

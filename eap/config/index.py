@@ -109,6 +109,10 @@ class Index:
             return [sent] if sent else []
         return [sent for sent in self.sent.values() if _matches(source, sent)]
 
+    def subscription(self, station: Station, name: str) -> Subscribe | None:
+        """Return the subscription *name* of *station*, if it has one."""
+        return next((each for each in station.subscribe if each.name == name), None)
+
     def received(self, subscription: Subscribe) -> dict[str, str]:
         """Return the variables of *subscription* and their types as texts, in PDO order."""
         if subscription.variables is not None:
@@ -148,7 +152,7 @@ class Index:
     def step(self, sent: SentPd) -> int:
         """Return the sender cycles between two of a PD, 0 if it has no fixed step."""
         pd = sent.pd
-        if pd.on_change is not None or pd.event:
+        if pd.on_change is not None or pd.event or pd.poll:
             return 0
         if pd.cycle_us:
             return max(pd.cycle_us // self.cycle_us(sent.station), 1)

@@ -9,6 +9,7 @@ import msgspec
 from eap.config.bus import DescribeBus
 from eap.config.check_buses import describe_buses
 from eap.config.check_links import check_links
+from eap.config.check_polls import check_polls
 from eap.config.check_ports import check_ports
 from eap.config.check_publish import check_publish
 from eap.config.check_subscribe import check_subscribe
@@ -50,6 +51,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     check_variables(index, report, path.parent)
     check_publish(index, report)
     check_subscribe(index, report)
+    check_polls(index, report)
     check_links(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)

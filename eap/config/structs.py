@@ -99,6 +99,7 @@ class Publish(Section, frozen=True):
     modulo: U16 | None = None
     on_change: OnChangeSpec | None = None
     event: bool = False
+    poll: str = ""
 
 
 class From(Section, frozen=True):
@@ -122,6 +123,7 @@ class Subscribe(Section, frozen=True):
     timeout_ms: Milliseconds = 0
     substitute: Substitute = Substitute.HOLD
     foreign: bool = False
+    poll: str = ""
 
 
 class Link(Section, frozen=True):

@@ -31,7 +31,7 @@ _MAC_MASK = int.from_bytes(b"\xff" * 6 + bytes(2), sys.byteorder)
 
 def packet_batch() -> ReceiveBatch:
     """Return receive memory for the Ethernet interfaces of a process, which may share it."""
-    return ReceiveBatch(_CONTROL_SIZE, ETHERNET_HEADER)
+    return ReceiveBatch(_CONTROL_SIZE, ETHERNET_HEADER, with_senders=False)
 
 
 class EthernetInterface:
@@ -114,6 +114,15 @@ class EthernetInterface:
                 else:
                     self._local.append((taker, data, now_ns))
 
+    def sender_of(self, data: memoryview) -> str:
+        """Return the source address of the frame in *data*; nothing if it is none of a station."""
+        position = self._batch.position(data)
+        if position is None:
+            return str(self.address)  # another port of this interface, by way of deliver()
+        start = position * BUFFER_SIZE + 6
+        source = MacAddr(self._batch.octets[start : start + 6])
+        return "" if source.is_group else str(source)
+
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when a frame waits."""
         return self._sock.fileno()
@@ -128,7 +137,7 @@ class EthernetInterface:
             return 0
         view, size, at_ns = self._batch.arrival()
         for take in takers:
-            take(view, size - ETHERNET_HEADER, at_ns)
+            take(view, size - ETHERNET_HEADER, at_ns, self)
         return 1
 
     def _dispatch(self, count: int) -> int:
@@ -141,7 +150,7 @@ class EthernetInterface:
             if len(only) == 1:  # a burst of one sender for one port: nothing to tell apart
                 take = only[0]
                 for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):
-                    take(view, size - ETHERNET_HEADER, at_ns)
+                    take(view, size - ETHERNET_HEADER, at_ns, self)
                 return count
         find = self._takers
         for view, size, at_ns, head, tag in zip(
@@ -150,7 +159,7 @@ class EthernetInterface:
             if takers := find(head, tag):
                 taken += 1
                 for take in takers:
-                    take(view, size - ETHERNET_HEADER, at_ns)
+                    take(view, size - ETHERNET_HEADER, at_ns, self)
         return taken
 
     def _takers(self, head: int, tag: int) -> Sequence[Taker]:
@@ -165,7 +174,7 @@ class EthernetInterface:
         count = len(self._local)
         for _ in range(count):
             take, data, at_ns = self._local.popleft()
-            take(data, len(data), at_ns)
+            take(data, len(data), at_ns, self)
         return count
 
 

@@ -6,6 +6,7 @@ plant, or a test of one, runs the same way every time.
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ from eap.pd.link import OutFrame, Taker
 DRAIN_LIMIT = 256
 HOLD_NS = 100_000_000
 """Longest time that a frame to be reordered waits for the one that overtakes it."""
+_ADDRESS = "port "
+"""What the addresses of ports begin with; only answers have one of them as destination."""
+_numbers = itertools.count(1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,16 +66,20 @@ class Faults:
 class _Waiting:
     """One frame under way to one port."""
 
-    __slots__ = ("data", "due_ns", "order")
+    __slots__ = ("data", "due_ns", "order", "sender")
 
-    def __init__(self, data: memoryview, due_ns: int, order: float) -> None:
+    def __init__(self, data: memoryview, due_ns: int, order: float, sender: str) -> None:
         self.data = data
+        self.sender = sender
         self.due_ns = due_ns
         self.order = order
 
 
 class LoopbackChannel:
-    """One port on a line; what it sends reaches every other port of the line."""
+    """One port on a line; what it sends reaches every other port of the line.
+
+    Only an answer reaches no port but the one that asked.
+    """
 
     minimum_size = 0
 
@@ -84,6 +92,8 @@ class LoopbackChannel:
         self._queue: list[_Waiting] = []
         self._held: list[_Waiting] = []
         self._order = 0
+        self._address = f"{_ADDRESS}{next(_numbers)}"
+        self._sender = ""
         ports.append(self)
 
     def drain(self, now_ns: int) -> int:
@@ -96,14 +106,23 @@ class LoopbackChannel:
         for frame in due:
             self._queue.remove(frame)
         for frame in due:
+            self._sender = frame.sender
             for take in self.takers:
-                take(frame.data, len(frame.data), frame.due_ns)
+                take(frame.data, len(frame.data), frame.due_ns, self)
         return len(due)
+
+    def sender_of(self, data: memoryview) -> str:
+        """Return which port of the line sent *data*."""
+        del data  # the one that is being handed over
+        return self._sender
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Put copies of *frames* on the line; a lost frame counts as sent, as on a wire."""
         for frame in frames:
-            self._transmit(memoryview(bytes(frame.view[frame.headroom :])), now_ns)
+            to, ports = frame.destination, self._ports
+            if to.startswith(_ADDRESS):
+                ports = [port for port in ports if port._address == to]  # noqa: SLF001  as below
+            self._transmit(memoryview(bytes(frame.view[frame.headroom :])), now_ns, ports)
         return ()
 
     def link_header(self, destination: str) -> bytes:
@@ -115,16 +134,16 @@ class LoopbackChannel:
         """Leave the line."""
         self._ports.remove(self)
 
-    def _transmit(self, data: memoryview, now_ns: int) -> None:
+    def _transmit(self, data: memoryview, now_ns: int, ports: Sequence[LoopbackChannel]) -> None:
         faults, draw = self._faults, self._random.random
         due_ns = now_ns + faults.delay_ns
         overtaken, self._held = self._held, []
-        for port in self._ports:
+        for port in ports:
             if port is self or (faults.loss and draw() < faults.loss):
                 continue
             for _ in range(2 if faults.duplicate and draw() < faults.duplicate else 1):
                 self._order += 1
-                frame = _Waiting(data, due_ns, self._order)
+                frame = _Waiting(data, due_ns, self._order, self._address)
                 port._queue.append(frame)  # noqa: SLF001  another port of the same line
                 if faults.reorder and draw() < faults.reorder:
                     frame.due_ns += HOLD_NS

@@ -30,6 +30,9 @@ _MMSGHDR = struct.Struct("@QQQQQQQQ")  # name, namelen, iov, iovlen, control, co
 _IOVEC = struct.Struct("@QQ")
 _CACHED_BATCHES = 256
 _CACHED_FRAMES = 4096
+_CACHED_ADDRESSES = 1024
+_SOCKADDR_SIZE = 16  # of IPv4
+_SENDER = struct.Struct("!2xH4s8x").unpack_from
 _CLOCK_NOISE_NS = 1000
 
 _library = ctypes.CDLL(None, use_errno=True)
@@ -60,26 +63,34 @@ class ReceiveBatch:
     *control_size* must be exactly what the kernel writes for one message, the time stamp first:
     then it leaves every header as it was and nothing needs to be set up again.
 
+    The same holds for the addresses of the senders, which are kept when *with_senders*.
+
     Attributes:
         views: The messages, each from behind *headroom* octets to the end of its memory.
         octets: All of that memory, BUFFER_SIZE for each message.
         control: All control data, *control_size* for each message.
     """
 
-    def __init__(self, control_size: int = STAMP_SIZE, headroom: int = 0) -> None:
+    def __init__(
+        self, control_size: int = STAMP_SIZE, headroom: int = 0, *, with_senders: bool = True
+    ) -> None:
         self._control_size = control_size
         self._buffers = bytearray(BATCH * BUFFER_SIZE)
         self._control = bytearray(BATCH * control_size)
+        self._senders = bytearray(BATCH * _SOCKADDR_SIZE)
         iovecs = bytearray(BATCH * _IOVEC.size)
         self._headers = bytearray(BATCH * _MMSGHDR.size)
-        buffers, control, vectors = map(_address, (self._buffers, self._control, iovecs))
+        buffers, control, vectors, senders = map(
+            _address, (self._buffers, self._control, iovecs, self._senders)
+        )
+        name_size = _SOCKADDR_SIZE if with_senders else 0
         for n in range(BATCH):
             _IOVEC.pack_into(iovecs, n * _IOVEC.size, buffers + n * BUFFER_SIZE, BUFFER_SIZE)
             vector = vectors + n * _IOVEC.size
             place = control + n * control_size
-            _MMSGHDR.pack_into(
-                self._headers, n * _MMSGHDR.size, 0, 0, vector, 1, place, control_size, 0, 0
-            )
+            name = senders + n * _SOCKADDR_SIZE if with_senders else 0
+            header = (name, name_size, vector, 1, place, control_size, 0, 0)
+            _MMSGHDR.pack_into(self._headers, n * _MMSGHDR.size, *header)
         self._iovecs = iovecs  # the kernel reads it through the headers
         self._words = memoryview(self._headers).cast("Q")
         self._stamps = memoryview(self._control).cast("q")
@@ -118,6 +129,17 @@ class ReceiveBatch:
         if times[0] > now_ns:  # the wall clock was set back since
             times = [now_ns] * count
         return words[7 : count * 8 : 8].tolist(), times
+
+    def position(self, view: memoryview) -> int | None:
+        """Return which message of the batch *view* is, None if it is no view of this batch."""
+        return next((n for n, known in enumerate(self.views) if known is view), None)
+
+    def sender(self, view: memoryview) -> tuple[str, int]:
+        """Return IPv4 address and port of who sent *view*, as long as the batch holds it."""
+        position = self.position(view)
+        assert position is not None  # noqa: S101  only what was just handed over is asked for
+        port, host = _SENDER(self._senders, position * _SOCKADDR_SIZE)
+        return socket.inet_ntoa(host), port
 
     def _read_clocks(self) -> int:
         """Return the monotonic time and see how far the wall clock, which stamps, is from it.
@@ -173,7 +195,7 @@ class SendBatch:
         self._fd = sock.fileno()
         self._address_of = address_of
         self._addresses: dict[str, tuple[bytearray, tuple[str, int]]] = {}
-        self._headers: dict[OutFrame, tuple[bytes, bytearray]] = {}
+        self._headers: dict[OutFrame, tuple[bytes, bytearray, bytearray]] = {}
         self._batches: dict[tuple[OutFrame, ...], tuple[Callable[[], int], bytearray]] = {}
 
     def send(self, frames: Sequence[OutFrame]) -> Sequence[OutFrame]:
@@ -189,7 +211,7 @@ class SendBatch:
                     known = known or self._resolve(frame.destination)
                     self._sock.sendto(frame.buffer, known[1])
             except OSError as error:
-                count_error(self.errors, error.errno)
+                self._fail(frame, error.errno)
                 return frames
             return ()
         return self._send_many(frames) if frames else ()
@@ -210,13 +232,17 @@ class SendBatch:
         done = 0
         while True:
             if sent < 0:
-                count_error(self.errors, ctypes.get_errno())
+                self._fail(frames[done], ctypes.get_errno())
                 failed.append(frames[done])
                 sent = 1
             done += sent
             if done >= len(frames):
                 return failed
             sent = self._call(headers, done)()
+
+    def _fail(self, frame: OutFrame, number: int | None) -> None:
+        frame.oversized = number == errno.EMSGSIZE
+        count_error(self.errors, number)
 
     def _call(self, headers: bytearray, first: int) -> Callable[[], int]:
         place = ctypes.c_void_p(_address(headers) + first * _MMSGHDR.size)
@@ -235,19 +261,22 @@ class SendBatch:
         batch = self._batches[frames] = self._call(headers, 0), headers
         return batch
 
-    def _describe(self, frame: OutFrame) -> tuple[bytes, bytearray]:
+    def _describe(self, frame: OutFrame) -> tuple[bytes, bytearray, bytearray]:
         """Return the kernel's description of *frame*; it holds for the life of the frame."""
-        name = name_size = 0
+        address = bytearray()
         if self._address_of is not None:
             known = self._addresses.get(frame.destination) or self._resolve(frame.destination)
-            name, name_size = _address(known[0]), len(known[0])
+            address = known[0]
+        name = _address(address) if address else 0
         iovec = bytearray(_IOVEC.pack(_address(frame.buffer), len(frame.buffer)))
-        header = _MMSGHDR.pack(name, name_size, _address(iovec), 1, 0, 0, 0, 0)
-        self._headers[frame] = header, iovec
-        return header, iovec
+        header = _MMSGHDR.pack(name, len(address), _address(iovec), 1, 0, 0, 0, 0)
+        described = self._headers[frame] = header, iovec, address
+        return described
 
     def _resolve(self, destination: str) -> tuple[bytearray, tuple[str, int]]:
         assert self._address_of is not None  # noqa: S101  the callers asked
+        if len(self._addresses) >= _CACHED_ADDRESSES:
+            self._addresses.clear()  # who asks for data can make up any number of them
         packed, address = self._address_of(destination)
         known = self._addresses[destination] = bytearray(packed), address
         return known

@@ -2,11 +2,13 @@
 
 The two octets of the frame header are the only delimiter on the stream.  Nothing here waits: the
 cycle drives connecting, sending and receiving, and a peer that is slow loses frames instead.
+Answers to a request come back on the connection that it went by.
 """
 
 from __future__ import annotations
 
 import errno
+import itertools
 import socket
 from collections.abc import Sequence
 
@@ -14,6 +16,7 @@ from eap.codec.ethercat import EAP_PORT, EtherCatHeader, FrameType
 from eap.errors import EnvironmentalError
 from eap.ids import Destination
 from eap.net.mmsg import count_error
+from eap.net.tcpwriter import TcpWriter
 from eap.net.udpsocket import bind_failure
 from eap.pd.link import OutFrame, Taker
 
@@ -22,12 +25,14 @@ FRAMES_PER_DRAIN = 256
 _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 2_000_000_000
 _CONNECT_NS = 1_000_000_000
-_DEAD_PEER_MS = 3000
-_SEND_BUFFER = 32 << 10
 _RECEIVE_BUFFER = 32 << 10
 _BACKLOG = 64
 _CONNECTING = (errno.EINPROGRESS, errno.EALREADY)
 _CONNECTED = (0, errno.EISCONN)
+
+CONNECTION = "connection "
+"""What the destinations of answers on accepted connections begin with."""
+_numbers = itertools.count(1)
 
 
 def open_tcp_listener(address: str, port: int = EAP_PORT) -> socket.socket:
@@ -52,16 +57,26 @@ class TcpSender:
 
     A frame that has begun is always finished.  While that lasts, and while there is no connection,
     frames are lost as a whole and counted in *errors* as ``slow_peer`` and ``not_connected``.
+    What comes back goes to *takers*, and is thrown away without any.
     """
 
-    def __init__(self, destination: str, source: str, errors: dict[str, int]) -> None:
+    def __init__(
+        self,
+        destination: str,
+        source: str,
+        errors: dict[str, int],
+        takers: Sequence[Taker] = (),
+    ) -> None:
         where = Destination.parse(destination)
+        self._destination = destination
         self._address = where.host, where.port or EAP_PORT
         self._source = source
         self._errors = errors
+        self._takers = takers
         self._sock: socket.socket | None = None
         self._connected = False
-        self._rest = memoryview(b"")
+        self._writer: TcpWriter | None = None
+        self._receiver: TcpReceiver | None = None
         self._backoff_ns = _FIRST_BACKOFF_NS
         self._next_ns = 0
         self._scratch = bytearray(2048)
@@ -71,35 +86,35 @@ class TcpSender:
         """Whether frames can be sent now."""
         return self._connected
 
-    def poll(self, now_ns: int) -> None:
-        """Go on connecting, finish a frame that has begun, notice that the peer has left."""
+    def poll(self, now_ns: int) -> int:
+        """Go on connecting, finish a frame that has begun, notice that the peer has left.
+
+        Returns:
+            How many frames came back.
+        """
         if self._sock is None:
             if now_ns >= self._next_ns:
                 self._connect(now_ns)
-        elif not self._connected:
+            return 0
+        if self._writer is None or not self._connected:
             self._go_on_connecting(self._sock, now_ns)
-        elif self._peer_is_there(self._sock, now_ns) and self._rest:
-            self._flush(self._sock, now_ns)
+            return 0
+        try:
+            self._writer.flush()
+            return self._receive(self._sock, now_ns)
+        except OSError as error:
+            self._fail(error.errno, now_ns)
+            return 0
 
     def send(self, frame: OutFrame, now_ns: int) -> bool:
         """Send *frame* or begin to; return whether it is on its way."""
-        sock = self._sock
-        if sock is None or not self._connected:
+        if self._writer is None or not self._connected:
             return self._lose("not_connected")
-        if self._rest:
-            self._flush(sock, now_ns)
-            if self._rest or not self._connected:
-                return self._lose("slow_peer" if self._connected else "not_connected")
         try:
-            sent = sock.send(frame.buffer)
-        except BlockingIOError:
-            return self._lose("slow_peer")
+            return self._writer.send(frame) or self._lose("slow_peer")
         except OSError as error:
             self._fail(error.errno, now_ns)
             return False
-        if sent < len(frame.buffer):
-            self._rest = memoryview(bytes(frame.view[sent:]))
-        return True
 
     def close(self) -> None:
         """Close the connection; :meth:`poll` would open the next one."""
@@ -107,7 +122,8 @@ class TcpSender:
             self._sock.close()
         self._sock = None
         self._connected = False
-        self._rest = memoryview(b"")
+        self._writer = None
+        self._receiver = None
 
     def _lose(self, reason: str) -> bool:
         self._errors[reason] = self._errors.get(reason, 0) + 1
@@ -122,12 +138,8 @@ class TcpSender:
         self._sock = sock
         self._next_ns = now_ns + _CONNECT_NS
         try:
-            sock.setblocking(False)
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # What does not go out soon is stale: neither queue much of it nor retry for minutes.
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _DEAD_PEER_MS)
             sock.bind((self._source, 0))
+            self._writer = TcpWriter(sock)
         except OSError as error:
             self._fail(error.errno, now_ns)
             return
@@ -137,30 +149,33 @@ class TcpSender:
         number = sock.connect_ex(self._address)
         if number in _CONNECTED:
             self._connected = True
+            self._listen(sock, now_ns)
         elif number not in _CONNECTING:
             self._fail(number, now_ns)
         elif now_ns >= self._next_ns:
             self._fail(errno.ETIMEDOUT, now_ns)
 
-    def _peer_is_there(self, sock: socket.socket, now_ns: int) -> bool:
-        """Throw away what the peer says: only a publisher speaks on its connection."""
-        try:
-            if sock.recv_into(self._scratch):
-                return True
-            self._fail(errno.ECONNRESET, now_ns)
-        except BlockingIOError:
-            return True
-        except OSError as error:
-            self._fail(error.errno, now_ns)
-        return False
-
-    def _flush(self, sock: socket.socket, now_ns: int) -> None:
-        try:
-            self._rest = self._rest[sock.send(self._rest) :]
-        except BlockingIOError:
+    def _listen(self, sock: socket.socket, now_ns: int) -> None:
+        if not self._takers:
             return
+        try:
+            self._receiver = TcpReceiver(sock, self._takers, self._destination, self._writer)
         except OSError as error:
             self._fail(error.errno, now_ns)
+
+    def _receive(self, sock: socket.socket, now_ns: int) -> int:
+        """Take what the peer says; raise OSError if it is lost."""
+        if self._receiver is not None:
+            count = self._receiver.drain(now_ns)
+            if self._receiver.closed:
+                self._fail(errno.ECONNRESET, now_ns)
+            return count
+        try:
+            if not sock.recv_into(self._scratch):
+                self._fail(errno.ECONNRESET, now_ns)
+        except BlockingIOError:
+            pass
+        return 0
 
     def _fail(self, number: int | None, now_ns: int) -> None:
         count_error(self._errors, number)
@@ -172,19 +187,33 @@ class TcpSender:
 
 
 class TcpReceiver:
-    """One accepted connection; its frames go to *takers*.
+    """One connection whose frames go to *takers*, and answers back.
+
+    Args:
+        sock: The connection.
+        takers: Who takes its frames.
+        name: The destination of answers to them, if it has been connected to; else it gets one.
+        writer: Who sends on it; else it is made.
 
     Attributes:
+        name: The destination of answers.
         closed: Why the connection ended, empty while it lasts.
     """
 
-    def __init__(self, sock: socket.socket, takers: Sequence[Taker]) -> None:
-        sock.setblocking(False)
+    def __init__(
+        self,
+        sock: socket.socket,
+        takers: Sequence[Taker],
+        name: str = "",
+        writer: TcpWriter | None = None,
+    ) -> None:
+        self._writer = writer or TcpWriter(sock)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
         self.takers = list(takers)
+        self.name = name or f"{CONNECTION}{next(_numbers)}"
         self.closed = ""
         self._sock = sock
         self._buffer = bytearray(_RECEIVE_BUFFER)
@@ -199,10 +228,20 @@ class TcpReceiver:
         """
         if self.closed:
             return 0
+        self._write(None)
         count = self._take_frames(now_ns, FRAMES_PER_DRAIN)
         if count < FRAMES_PER_DRAIN and not self.closed and self._read():
             count += self._take_frames(now_ns, FRAMES_PER_DRAIN - count)
         return count
+
+    def sender_of(self, data: memoryview) -> str:
+        """Return the name of the connection."""
+        del data  # all that comes from it has one sender
+        return self.name
+
+    def send(self, frame: OutFrame) -> bool:
+        """Send an answer or begin to; return whether it is on its way."""
+        return not self.closed and self._write(frame)
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when octets wait, -1 once closed."""
@@ -212,6 +251,14 @@ class TcpReceiver:
         """Close the connection."""
         self.closed = self.closed or reason
         self._sock.close()
+
+    def _write(self, frame: OutFrame | None) -> bool:
+        """Send *frame*, or just go on with one that has begun."""
+        try:
+            return self._writer.flush() if frame is None else self._writer.send(frame)
+        except OSError as error:
+            self.close(errno.errorcode.get(error.errno or 0, str(error.errno)))
+            return False
 
     def _read(self) -> int:
         rest = self._end - self._start
@@ -244,5 +291,5 @@ class TcpReceiver:
                 return count
             self._start += size
             for take in self.takers:
-                take(self._view[start : start + size], size, now_ns)
+                take(self._view[start : start + size], size, now_ns, self)
         return limit

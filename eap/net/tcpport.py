@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from eap.ids import Destination, DestinationKind
-from eap.net.tcp import TcpReceiver, TcpSender
-from eap.pd.link import Channel, OutFrame
+from eap.net.tcp import CONNECTION, TcpReceiver, TcpSender
+from eap.pd.link import Channel, OutFrame, Taker
 
 MOST_CONNECTIONS = 32
 """Incoming connections of a port: each costs a system call a cycle, whether it says anything."""
@@ -15,6 +15,11 @@ MOST_CONNECTIONS = 32
 class TcpPort:
     """One station's port: *datagrams*, connections to destinations, connections from publishers.
 
+    Args:
+        address: Where outgoing connections come from.
+        datagrams: The port's UDP channel, if it has one.
+        answers: Who takes the answers that come back on outgoing connections.
+
     Attributes:
         errors: Frames lost and failed calls of all outgoing connections, by name.
         closed: Incoming connections that ended, by reason.
@@ -22,7 +27,10 @@ class TcpPort:
 
     minimum_size = 0
 
-    def __init__(self, address: str, datagrams: Channel | None = None) -> None:
+    def __init__(
+        self, address: str, datagrams: Channel | None = None, answers: Sequence[Taker] = ()
+    ) -> None:
+        self._answers = answers
         self.errors: dict[str, int] = {}
         self.closed: dict[str, int] = {}
         self._address = address
@@ -32,9 +40,13 @@ class TcpPort:
 
     def link_header(self, destination: str) -> bytes:
         """Nothing; but from now on there is a connection to a TCP *destination*."""
+        if destination.startswith(CONNECTION):
+            return b""
         is_tcp = Destination.parse(destination).kind is DestinationKind.TCP
         if is_tcp and destination not in self._senders:
-            self._senders[destination] = TcpSender(destination, self._address, self.errors)
+            self._senders[destination] = TcpSender(
+                destination, self._address, self.errors, self._answers
+            )
         return b""
 
     @property
@@ -50,7 +62,7 @@ class TcpPort:
         """Hand over what has arrived, and keep the outgoing connections going."""
         total = self._datagrams.drain(now_ns) if self._datagrams is not None else 0
         for sender in self._senders.values():
-            sender.poll(now_ns)
+            total += sender.poll(now_ns)
         for receiver in self._receivers:
             total += receiver.drain(now_ns)
             if receiver.closed:
@@ -65,13 +77,27 @@ class TcpPort:
         rest: list[OutFrame] = []
         for frame in frames:
             sender = self._senders.get(frame.destination)
-            if sender is None:
+            if sender is not None:
+                if not sender.send(frame, now_ns):
+                    failed.append(frame)
+            elif frame.destination.startswith(CONNECTION):
+                if not self._answer(frame):
+                    failed.append(frame)
+            else:
                 rest.append(frame)
-            elif not sender.send(frame, now_ns):
-                failed.append(frame)
         if rest:
             failed += rest if self._datagrams is None else self._datagrams.send(rest, now_ns)
         return failed
+
+    def _answer(self, frame: OutFrame) -> bool:
+        """Send *frame* back on the connection that it answers."""
+        asked = (each for each in self._receivers if each.name == frame.destination)
+        receiver = next(asked, None)
+        if receiver is not None and receiver.send(frame):
+            return True
+        reason = "not_connected" if receiver is None or receiver.closed else "slow_peer"
+        self.errors[reason] = self.errors.get(reason, 0) + 1
+        return False
 
     def close(self) -> None:
         """Close all connections; the datagrams belong to somebody else."""

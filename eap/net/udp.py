@@ -12,6 +12,7 @@ from eap.net.mmsg import BATCH, ReceiveBatch, SendBatch, note_receive_error
 from eap.pd.link import OutFrame, Taker
 
 _BATCHES_PER_DRAIN = 4
+_NO_ADDRESS = "0.0.0.0"  # noqa: S104  a source, which Linux would take for this host
 
 
 class UdpChannel:
@@ -44,7 +45,7 @@ class UdpChannel:
             if count == 1:
                 view, size, at_ns = self._batch.arrival()
                 for take in self.takers:
-                    take(view, size, at_ns)
+                    take(view, size, at_ns, self)
                 return total + 1
             if count < 0:
                 note_receive_error(self.errors)
@@ -52,11 +53,15 @@ class UdpChannel:
             sizes, times = self._batch.arrivals(count)
             for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):
                 for take in self.takers:
-                    take(view, size, at_ns)
+                    take(view, size, at_ns, self)
             total += count
             if count < BATCH:
                 break
         return total
+
+    def sender_of(self, data: memoryview) -> str:
+        """Return ``address:port`` of who sent *data*; nothing for who has no address yet."""
+        return _destination(*self._batch.sender(data))
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* to their destinations; return those that the kernel refused."""
@@ -85,3 +90,9 @@ def _socket_address(destination: str) -> tuple[bytes, tuple[str, int]]:
     return struct.pack("@H", socket.AF_INET) + port + socket.inet_aton(where.host) + bytes(
         8
     ), address
+
+
+def _destination(host: str, port: int) -> str:
+    if host == _NO_ADDRESS:
+        return ""
+    return f"{host}:{port}" if port else host

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from eap.codec.pd import PdHeader
 from eap.pd.account import Account
+from eap.pd.poll import Answer
 
 Copy: TypeAlias = tuple[slice, slice]
 """Octets of the frame and where they go in the image."""
@@ -47,19 +48,25 @@ class FramePlan:
         is_single: Whether there is one PD in it.
         parts: For each account that the frame concerns, the copies to make if it agrees.
         taken_words: First words of the RxPDs that take one of its PDs.
+        has_more: Whether there is anything of the next three.
         refused: The PDs that nobody takes.
+        requests: RxPDs that ask this station for something, with their accounts.
+        answers: RxPDs that this station asked for, likewise.
         roaming: Accounts that follow any publisher.
         publisher: The frame's, as a number.
     """
 
     __slots__ = (
+        "answers",
         "end",
         "expected",
+        "has_more",
         "headers",
         "is_single",
         "parts",
         "publisher",
         "refused",
+        "requests",
         "roaming",
         "taken_words",
     )
@@ -71,6 +78,8 @@ class FramePlan:
         taken: Iterable[Taken],
         refused: Iterable[Refused],
         *,
+        requests: Iterable[tuple[Account, str]] = (),
+        answers: Iterable[tuple[Account, Answer]] = (),
         roaming: Iterable[Account] = (),
         publisher: bytes = b"",
     ) -> None:
@@ -85,6 +94,9 @@ class FramePlan:
         self.parts = _parts(taken)
         self.taken_words = tuple(pd.words for pd in taken)
         self.refused = tuple(refused)
+        self.requests = tuple(requests)
+        self.answers = tuple(answers)
+        self.has_more = bool(self.refused or self.requests or self.answers)
         self.roaming = tuple(roaming)
         self.publisher = int.from_bytes(publisher)
 

@@ -30,7 +30,7 @@ from eap.pd.spec import (
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 
 MAGIC = b"EAPIMAGE"
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 HEADER = struct.Struct("<8sIIQQQ")
 """Magic, layout version, generation, offset and length of the directory, size of the file."""
 WORDS_OFFSET = 64
@@ -97,6 +97,8 @@ class TxPlace(Record, frozen=True):
     """Whether that schedule is a cycle time (or each cycle), not a divider."""
     event: bool
     """Whether the application can send it."""
+    poll_request: str = ""
+    """The RxPD that asks for it."""
 
 
 class RxPlace(Record, frozen=True):
@@ -115,6 +117,8 @@ class RxPlace(Record, frozen=True):
     sender_cycle_us: int
     timeout_ms: int
     substitute: Substitute
+    poll_request: str = ""
+    """The TxPD that asks for it."""
 
 
 class ImageLayout(Record, frozen=True):
@@ -271,9 +275,10 @@ def _tx_places(
                 variables=pd.variables,
                 words=words.take(TxWord.SIZE),
                 frame_words=place.words,
-                by_schedule=trigger.on_change is None and not trigger.event,
+                by_schedule=not (trigger.on_change or trigger.event or pd.poll_request),
                 event=trigger.event,
                 cyclic=bool(trigger.cycle_us) or not (trigger.divider or frame.divider),
+                poll_request=pd.poll_request,
             )
 
 
@@ -304,4 +309,5 @@ def _rx_places(
             sender_cycle_us=pd.sender_cycle_us,
             timeout_ms=pd.timeout_ms,
             substitute=pd.substitute,
+            poll_request=pd.poll_request,
         )

@@ -8,8 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeAlias
 
-Taker: TypeAlias = Callable[[memoryview, int, int], None]
-"""Takes one frame: ``take(data, size, at_ns)``.
+
+class Origin(Protocol):
+    """Whoever hands a frame to a taker, and can tell whose it is: asked only for polled data."""
+
+    def sender_of(self, data: memoryview) -> str:
+        """Return the destination by which the port's channel reaches the sender of *data*.
+
+        Only valid while the taker has it.  A reply is an ordinary frame to that destination;
+        there can be none when it is empty.
+        """
+
+
+Taker: TypeAlias = Callable[[memoryview, int, int, Origin], None]
+"""Takes one frame: ``take(data, size, at_ns, origin)``.
 
 *data* starts at the EtherCAT header and may be longer than the frame; *size* octets of it arrived.
 *at_ns* is the kernel's receive time on the monotonic clock.  The view is valid during the call.
@@ -22,15 +34,19 @@ class OutFrame:
     *buffer* holds *headroom* octets that belong to the channel (an Ethernet header, or nothing),
     then the EtherCAT frame, then padding.  A channel may cache whatever it derives from the
     object: buffer and destination never change, only the octets do.
+
+    Attributes:
+        oversized: Whether a channel could not send it last because it is too large for its wire.
     """
 
-    __slots__ = ("buffer", "destination", "headroom", "view")
+    __slots__ = ("buffer", "destination", "headroom", "oversized", "view")
 
     def __init__(self, buffer: bytearray, headroom: int, destination: str) -> None:
         self.buffer = buffer
         self.headroom = headroom
         self.destination = destination
         self.view = memoryview(buffer)
+        self.oversized = False
 
 
 class Channel(Protocol):
@@ -40,7 +56,10 @@ class Channel(Protocol):
         """Hand every waiting frame to its takers, at most a bounded number; return how many."""
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
-        """Send *frames* at once, never blocking; return those that could not be sent."""
+        """Send *frames* at once, never blocking; return those that could not be sent.
+
+        A destination is what a specification says, or what an origin of the same port gave.
+        """
 
     def link_header(self, destination: str) -> bytes:
         """Return the headroom octets of every frame to *destination*; empty for UDP and TCP."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Sequence
+from typing import TypeAlias
 
 from eap.ids import NetId
 from eap.pd.gather import Gather
@@ -14,11 +14,13 @@ from eap.pd.link import Channel, OutFrame
 from eap.pd.spec import TxFrameSpec
 from eap.pd.trigger import EVENT_BIT, SUPPRESS_BIT, Schedule, Trigger, plan_schedule
 from eap.pd.txframe import Selection, TxFrame, TxPd
-from eap.pd.words import FrameWord, TxWord
+from eap.pd.words import FrameState, FrameWord, TxWord
 
-_NOT_SENT = 1
-_put_sent = struct.Struct("2q").pack_into
-"""Writes STATE and SENT_AT_NS of a frame, which lie side by side."""
+NOT_SENT = int(FrameState.NOT_SENT)
+"""The bit of FrameState, and of VarState."""
+FrameRow: TypeAlias = tuple[TxFrameSpec, FramePlace, tuple[TxPlace, ...]]
+"""A TxFrame with its place and the places of its PDs."""
+_COUNTED_WHOLE = (FrameWord.WHOLE, FrameWord.STATE, FrameWord.SENT_AT_NS)
 
 
 class _Group:
@@ -33,8 +35,7 @@ class _Group:
         self.out = [frame.whole.out for frame in frames]
         self.patches = [frame.whole.patch for frame in frames]
         self.counters = [
-            (frame.place.words + FrameWord.WHOLE, 8 * (frame.place.words + FrameWord.STATE))
-            for frame in frames
+            tuple(frame.place.words + word for word in _COUNTED_WHOLE) for frame in frames
         ]
 
 
@@ -55,7 +56,7 @@ class Publisher:
         inputs: Inputs,
         publisher: NetId,
         channel: Channel,
-        frames: Iterable[tuple[TxFrameSpec, FramePlace, tuple[TxPlace, ...]]],
+        frames: Iterable[FrameRow],
     ) -> None:
         self._image = image
         self._inputs = inputs
@@ -80,16 +81,23 @@ class Publisher:
         self._due: list[_Group] = []
         self._others: list[TxFrame] = []
         self._sending: list[tuple[TxFrame, Selection]] = []
+        self._unsent = {
+            pd
+            for frame in self.frames
+            for pd in frame.pds
+            if self._words[pd.place.words + TxWord.STATE]
+        }
+        """PDs whose VarState tells that they were not sent: rarely any, so sending asks first."""
         self.read_controls()
 
     def read_controls(self) -> None:
         """Follow the control variables; called when the application has written."""
         for frame in self.frames:
-            control = self._control(frame.place.name + FRAME_CTRL)
+            control = read_control(self._image, self._inputs, frame.place.name + FRAME_CTRL)
             frame.suppressed = bool(control & SUPPRESS_BIT)
             for pd in frame.pds:
                 name = pd.place.name + VAR_CTRL
-                control = self._control(name)
+                control = read_control(self._image, self._inputs, name)
                 before = self._controls.get(name, control)  # a bit left set is no rising bit
                 self._controls[name] = control
                 pd.trigger.suppressed = bool(control & SUPPRESS_BIT)
@@ -141,16 +149,20 @@ class Publisher:
         if failed:  # then each frame has to be looked at by itself
             sending = sending + [(frame, frame.whole) for group in due for frame in group.frames]
             due = []
+        if self._unsent:
+            self._clear_unsent(due, [each for _, each in sending if each.out not in failed])
         for group in due:
-            for whole, state in group.counters:
+            for whole, state, sent_at in group.counters:
                 words[whole] += 1
-                _put_sent(words, state, 0, now_ns)
+                words[state] = 0  # one by one: pack_into would show readers a time of 0 in between
+                words[sent_at] = now_ns
         for frame, selection in sending:
             if failed and selection.out in failed:
                 self._fail(frame, selection)
                 continue
             first = frame.place.words
-            _put_sent(words, 8 * (first + FrameWord.STATE), 0, now_ns)
+            words[first + FrameWord.STATE] = 0
+            words[first + FrameWord.SENT_AT_NS] = now_ns
             if frame.schedule is not None and selection is frame.whole:
                 words[first + FrameWord.WHOLE] += 1
             else:
@@ -169,20 +181,40 @@ class Publisher:
     def _fail(self, frame: TxFrame, selection: Selection) -> None:
         """The network refused a frame: change and event triggers try again in the next cycle."""
         words, first = self._words, frame.place.words
-        words[first + FrameWord.STATE] = _NOT_SENT
+        words[first + FrameWord.STATE] = refused_state(selection.out)
         words[first + FrameWord.SKIPPED] += 1
-        for pd in selection.pds:
-            words[pd.place.words + TxWord.SKIPPED] += 1
+        self._enter_unsent(selection.pds)
 
     def _skip(self, frame: TxFrame, pds: Sequence[TxPd]) -> None:
         words = self._words
         if frame.suppressed:
-            words[frame.place.words + FrameWord.STATE] = _NOT_SENT
+            words[frame.place.words + FrameWord.STATE] = NOT_SENT
             words[frame.place.words + FrameWord.SKIPPED] += 1
+        self._enter_unsent(pds)
         for pd in pds:
-            words[pd.place.words + TxWord.SKIPPED] += 1
             pd.trigger.use_up_event()
 
-    def _control(self, name: str) -> int:
-        place = self._image.places[name]
-        return int.from_bytes(self._inputs.memory[place.bit_offset // 8 :][:2], "little")
+    def _enter_unsent(self, pds: Iterable[TxPd]) -> None:
+        words = self._words
+        for pd in pds:
+            words[pd.place.words + TxWord.SKIPPED] += 1
+            words[pd.place.words + TxWord.STATE] = NOT_SENT
+            self._unsent.add(pd)
+
+    def _clear_unsent(self, groups: Iterable[_Group], selections: Iterable[Selection]) -> None:
+        sent = {pd for group in groups for frame in group.frames for pd in frame.pds}
+        sent.update(pd for selection in selections for pd in selection.pds)
+        for pd in self._unsent & sent:
+            self._words[pd.place.words + TxWord.STATE] = 0
+            self._unsent.remove(pd)
+
+
+def refused_state(frame: OutFrame) -> int:
+    """Return the FrameState of *frame* after a channel refused it."""
+    return int(NOT_SENT | FrameState.OVERSIZED if frame.oversized else NOT_SENT)
+
+
+def read_control(image: Image, inputs: Inputs, name: str) -> int:
+    """Return the control variable *name* as this cycle sees it."""
+    place = image.places[name]
+    return int.from_bytes(inputs.memory[place.bit_offset // 8 :][:2], "little")

@@ -11,11 +11,13 @@ from eap.codec.pd import PdHeader
 from eap.pd.device import DeviceState
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace, TxPlace
+from eap.pd.presence import Presence
 from eap.pd.words import (
     DISCARDS,
     HISTOGRAM_BINS,
     REASON_INDEX,
     REASONS,
+    FrameState,
     FrameWord,
     Reason,
     RxState,
@@ -84,6 +86,7 @@ def pd_list(image: Image) -> list[dict[str, Any]]:
             "version": place.version,
             "length": place.size,
             "port": place.port,
+            "poll": place.poll_request or None,
             **more,
             "variables": variables(place.variables),
         }
@@ -109,15 +112,24 @@ def account_word(image: Image, place: RxPlace) -> int:
 def quality(image: Image, place: RxPlace) -> int:
     """Return the age of a subscription's data in units of 100 us, saturated at 65535.
 
-    It is the Quality that the frame carried plus the receiver's own cycles since; what is left
-    over of a unit is carried from cycle to cycle.
+    It is the Quality that the frame carried plus the receiver's own cycles since, and with polled
+    data the time from the request to the answer; what is left over of a unit is carried from cycle
+    to cycle.
     """
     words = image.words
     first = account_word(image, place)
     cycles = words[StationWord.CYCLE] - words[first + RxWord.ARRIVED_IN_CYCLE]
-    own = max(cycles, 0) * image.layout.cycle_us * 1000 // _QUALITY_NS
+    own_ns = max(cycles, 0) * image.layout.cycle_us * 1000 + words[place.words + RxWord.RESPONSE_NS]
     sent = PdHeader.decode(image.memory, place.offset).quality
-    return min(sent + own, _QUALITY_MAX)
+    return min(sent + own_ns // _QUALITY_NS, _QUALITY_MAX)
+
+
+def frame_state(image: Image, first_word: int) -> int:
+    """Return the FrameState of the frame whose first word is at index *first_word*."""
+    words = image.words
+    is_missing = words[first_word + FrameWord.PRESENCE] == Presence.MISSING
+    missing = FrameState.SUBSCRIBER_MISSING if is_missing else 0
+    return int(words[first_word + FrameWord.STATE] | missing)
 
 
 def var_state(image: Image, place: RxPlace) -> int:
@@ -145,7 +157,7 @@ def _discarded(image: Image, first: int) -> dict[str, int]:
 def _tx(image: Image, place: TxPlace) -> dict[str, Any]:
     words = image.words
     counts = words[place.words + TxWord.REASON : place.words + TxWord.SIZE].tolist()
-    whole = words[place.frame_words + FrameWord.WHOLE]
+    whole = 0 if place.poll_request else words[place.frame_words + FrameWord.WHOLE]
     scheduled = REASON_INDEX[Reason.CYCLE if place.cyclic else Reason.DIVIDER]
     counts[scheduled] += whole
     last = words[place.words + TxWord.LAST_REASON] if not whole else scheduled
@@ -157,7 +169,9 @@ def _tx(image: Image, place: TxPlace) -> dict[str, Any]:
         "skipped": words[place.words + TxWord.SKIPPED],
         "reason": {r.value: n for r, n in zip(REASONS, counts, strict=True) if n},
         "last_reason": REASONS[last].value if sum(counts) else None,
-        "frame_state": words[place.frame_words + FrameWord.STATE],
+        "var_state": words[place.words + TxWord.STATE],
+        "frame_state": frame_state(image, place.frame_words),
+        "subscriber": Presence(words[place.frame_words + FrameWord.PRESENCE]).name.lower(),
     }
 
 
@@ -167,6 +181,9 @@ def _rx(image: Image, place: RxPlace, now_ns: int, wall_ns: int | None) -> dict[
     received = words[first + RxWord.RECEIVED]
     bins = words[first + RxWord.JITTER : first + RxWord.JITTER + HISTOGRAM_BINS].tolist()
     age_ns = now_ns - words[first + RxWord.ARRIVED_AT_NS]
+    spread = _spread(bins, words[first + RxWord.JITTER_MAX_US])
+    response_ns = words[place.words + RxWord.RESPONSE_NS]
+    last_us = response_ns // 1000 if response_ns else None
     return {
         "name": place.name,
         "port": place.port,
@@ -182,6 +199,7 @@ def _rx(image: Image, place: RxPlace, now_ns: int, wall_ns: int | None) -> dict[
         "var_state": var_state(image, place),
         "age_us": max(age_ns, 0) // 1000 if received else None,
         "last_good": round((wall_ns - age_ns) / 1e9, 3) if received and wall_ns else None,
-        "jitter_us": _spread(bins, words[first + RxWord.JITTER_MAX_US]),
+        "jitter_us": _spread([], 0) if place.poll_request else spread,
+        "response_us": {"last": last_us, **spread} if place.poll_request else None,
         "state": RxState(words[first + RxWord.STATE]).name.lower(),
     }

@@ -153,6 +153,10 @@ class TriggerSpec(Record, frozen=True):
     """Send when the application raises bit 1 of the PD's ``.VarCtrl``."""
 
 
+REQUESTER = "requester"
+"""Destination of a frame that only answers: whoever asked."""
+
+
 class TxPdSpec(Record, frozen=True):
     """One PD to send: *variables* of this station, in PDO order."""
 
@@ -161,12 +165,15 @@ class TxPdSpec(Record, frozen=True):
     variables: tuple[str, ...]
     version: int = 0
     trigger: TriggerSpec = TriggerSpec()
+    poll_request: str = ""
+    """Name of the RxPD, of the same port, that asks for it; all triggers are off then."""
 
 
 class TxFrameSpec(Record, frozen=True):
     """One frame to send from *port* to *destination*.
 
-    *destination* is a MAC address, an IPv4 address (``address[:port]``) or ``tcp://address[:port]``.
+    *destination* is a MAC address, an IPv4 address (``address[:port]``), ``tcp://address[:port]``
+    or, when all PDs are polled, REQUESTER.  Polled PDs go in frames of their own, to who asked.
     """
 
     name: str
@@ -215,6 +222,11 @@ class RxPdSpec(Record, frozen=True):
     """Sender cycles between two of this PD, 0 if it has no fixed step: needed to count losses."""
     alternates: tuple[RxAlternateSpec, ...] = ()
     """Each with a version and size of its own."""
+    poll_request: str = ""
+    """Name of the TxPD, of the same port, that asks for it: quality and time-out count from that.
+
+    The step is 0 then.
+    """
 
 
 class PortKind(StrEnum):

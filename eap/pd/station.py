@@ -10,17 +10,21 @@ that a reader sees inputs and what follows from them in one cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 
+import msgspec
+
 from eap.ids import NetId
+from eap.pd.answerer import Answerer
 from eap.pd.device import Device, DeviceState, Request
 from eap.pd.generator import Generators
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
 from eap.pd.link import Channel, CyclicBus, Taker
 from eap.pd.links import Links
-from eap.pd.publisher import Publisher
+from eap.pd.poll import Question, questions_of, requests_at
+from eap.pd.publisher import FrameRow, Publisher
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
@@ -73,22 +77,17 @@ class Station:
         """Whether anything follows from what was received."""
         self._has_own_variables = self._computes
         self.buses: list[CyclicBus] = []
-        self._publishers: list[tuple[Publisher, Channel]] = []
+        self._publishers: list[tuple[Publisher | Answerer, Channel]] = []
         self._channels: list[Channel] = []
         self._drains: list[Callable[[int], object]] = []
         self._rarely: list[Callable[[int], int]] = []
         self._rarely_every = max(1, _UNREAD_FOR_US // spec.cycle_us)
-        layout = image.layout
+        self._requests = {port.name: requests_at(spec, port.name) for port in spec.ports}
+        questions = questions_of(image)
+        self._closing: list[Callable[[int], None]] = [q.look for q in questions.values()]
+        """What ends a cycle, after everything has been sent to other stations."""
         self._subscribers = {
-            port.name: Subscriber(
-                image,
-                [
-                    (pd, place)
-                    for pd, place in zip(spec.subscriptions, layout.rx, strict=True)
-                    if pd.port == port.name
-                ],
-                self.cycle_ns,
-            )
+            port.name: self._subscriber(port.name, questions)
             for port in spec.ports
             if port.kind is PortKind.EAP
         }
@@ -100,6 +99,11 @@ class Station:
         self.takers: dict[str, Taker] = {
             name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
         }
+
+    def _subscriber(self, port: str, questions: dict[str, Question]) -> Subscriber:
+        rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
+        own = [(pd, place) for pd, place in rows if pd.port == port]
+        return Subscriber(self.image, own, self.cycle_ns, self._requests[port], questions)
 
     def connect(self, port: str, channel: Channel) -> None:
         """Send the frames of *port* through *channel*, and drain it.
@@ -116,10 +120,14 @@ class Station:
             self.drain_also(channel)
         else:
             self._rarely.append(channel.drain)
-        if frames:
-            net_id = next(p.net_id for p in self.spec.ports if p.name == port)
-            publisher = Publisher(self.image, self._inputs, NetId.parse(net_id), channel, frames)
+        net_id = NetId.parse(next(p.net_id for p in self.spec.ports if p.name == port))
+        if pushed := _pds_of(frames, polled=False):
+            publisher = Publisher(self.image, self._inputs, net_id, channel, pushed)
             self._publishers.append((publisher, channel))
+        if polled := _pds_of(frames, polled=True):
+            requests = self._requests[port]
+            answerer = Answerer(self.image, self._inputs, net_id, channel, polled, requests)
+            self._publishers.append((answerer, channel))
 
     def drain_also(self, channel: Channel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""
@@ -133,6 +141,7 @@ class Station:
         self.buses.append(bus)
         self._drains.append(bus.receive)
         self._supervisors.append(partial(_supervise, bus))
+        self._closing.append(bus.exchange)
         self._has_own_variables = True
 
     def memory_of(self, writer: Writer) -> memoryview:
@@ -179,6 +188,8 @@ class Station:
         self._words[StationWord.STATE] = self.device.request(Request.PREOP)
         for subscriber in self._subscribers.values():
             subscriber.close()
+        for requests in self._requests.values():
+            requests.take()
 
     def cycle(self, due_ns: int, now_ns: int) -> None:
         """Run one cycle that was due at *due_ns*."""
@@ -197,9 +208,9 @@ class Station:
             frames = publisher.frames_to_send(cycle, now_ns)
             if frames:
                 publisher.sent(channel.send(frames, now_ns), now_ns)
-        if self.buses:
-            for bus in self.buses:
-                bus.exchange(now_ns)
+        if self._closing:
+            for close in self._closing:
+                close(now_ns)
         late_ns = now_ns - due_ns
         late_us = late_ns // 1000
         bin_ = BIN_OF_US[late_us] if 0 <= late_us < _BINS_KNOWN else histogram_bin(late_us)
@@ -240,3 +251,15 @@ def _supervise(bus: CyclicBus, now_ns: int) -> None:
     if due_ns is not None and due_ns <= now_ns:
         bus.handle_timeout(now_ns)
     bus.take_inputs()
+
+
+def _pds_of(frames: Iterable[FrameRow], *, polled: bool) -> list[FrameRow]:
+    """Return the frames with those of their PDs that are polled, or those that are not."""
+    rows: list[FrameRow] = []
+    for spec, place, places in frames:
+        kept = [index for index, pd in enumerate(spec.pds) if bool(pd.poll_request) is polled]
+        if kept:
+            pds = tuple(spec.pds[index] for index in kept)
+            own = msgspec.structs.replace(spec, pds=pds)
+            rows.append((own, place, tuple(places[index] for index in kept)))
+    return rows

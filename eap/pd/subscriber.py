@@ -7,7 +7,8 @@ the frame straight into the process image; state and counters live there too.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
@@ -17,7 +18,10 @@ from eap.pd.account import Account, Timing
 from eap.pd.frame_plan import FramePlan, Refused, Taken
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace
+from eap.pd.link import Origin
+from eap.pd.poll import Question, Requests
 from eap.pd.spec import RxPdSpec
+from eap.pd.subscription import Subscription
 from eap.pd.substitute import SubstituteValue
 from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
 
@@ -39,27 +43,6 @@ _CYCLE = int(StationWord.CYCLE)
 _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
 
 
-class Subscription:
-    """One RxPD at run time."""
-
-    __slots__ = ("account", "ignore_version", "place", "substitute", "timeout_ns")
-
-    def __init__(self, spec: RxPdSpec, place: RxPlace, substitute: SubstituteValue) -> None:
-        self.place = place
-        self.ignore_version = spec.ignore_version
-        self.timeout_ns = spec.timeout_ms * 1_000_000
-        self.substitute = substitute
-        self.account: Account  # the subscriber opens it
-
-    def mismatch(self, version: int, length: int) -> Discard | None:
-        """Return why a PD of this version and length does not fit, None if it does."""
-        if version != self.place.version and not self.ignore_version:
-            return Discard.VERSION
-        if length != self.place.size:
-            return Discard.LENGTH
-        return None
-
-
 class Subscriber:
     """Takes the frames of one port.
 
@@ -67,15 +50,25 @@ class Subscriber:
         image: The station's process image.
         subscriptions: The port's RxPDs, each with its place.
         own_cycle_ns: The station's device cycle.
+        requests: Where the requests of others go.
+        questions: What the station itself asks, by the TxPD that does it.
     """
 
     def __init__(
-        self, image: Image, subscriptions: Iterable[tuple[RxPdSpec, RxPlace]], own_cycle_ns: int
+        self,
+        image: Image,
+        subscriptions: Iterable[tuple[RxPdSpec, RxPlace]],
+        own_cycle_ns: int,
+        requests: Requests,
+        questions: Mapping[str, Question] = MappingProxyType({}),
     ) -> None:
+        self._requests = requests
         self._memory = image.memory
         self._words = image.words
         self._subscriptions = [
-            Subscription(spec, place, SubstituteValue(image, place))
+            Subscription(
+                spec, place, SubstituteValue(image, place), questions.get(spec.poll_request)
+            )
             for spec, place in subscriptions
         ]
         self._by_key: dict[tuple[bytes, int], list[Subscription]] = {}
@@ -104,8 +97,8 @@ class Subscriber:
         self._closed_reason = Discard.SUPPRESSED
         self._next_timeout_ns = _NEVER
 
-    def receive_frame(self, data: memoryview, size: int, at_ns: int) -> None:
-        """Take one EtherCAT frame of *size* octets that arrived at *at_ns*."""
+    def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
+        """Take one EtherCAT frame of *size* octets that arrived at *at_ns* from *origin*."""
         plan = self._find_plan(data, size) or self._learn(data, size)
         if plan is None:
             return
@@ -127,8 +120,10 @@ class Subscriber:
                     memory[target] = data[source]
         if outside:
             words[_SEQUENCE] += 1
-        if plan.refused:
+        if plan.has_more:
             self._refuse(plan, at_ns)
+            self._enter_answers(plan, cycle, at_ns)
+            self._note_requests(plan, cycle, data, origin)
 
     @property
     def has_timeouts(self) -> bool:
@@ -156,8 +151,10 @@ class Subscriber:
                 # It may start to run at any moment, and then has this long.
                 following = min(following, now_ns + timeout_ns)
                 continue
-            deadline_ns = account.arrived_at_ns + timeout_ns
-            if deadline_ns <= now_ns:
+            deadline_ns = subscription.deadline_ns()
+            if deadline_ns is None:
+                following = min(following, now_ns + timeout_ns)
+            elif deadline_ns <= now_ns:
                 expired.setdefault(account, []).append(subscription)
                 following = min(following, now_ns + timeout_ns)
             else:
@@ -202,6 +199,10 @@ class Subscriber:
                 for s, offset in chosen
             ],
             refused,
+            requests=[
+                (s.account, s.place.name) for s, _ in chosen if s.place.name in self._requests.names
+            ],
+            answers=[(s.account, s.answer) for s, _ in chosen if s.answer is not None],
             roaming={s.account for s, _ in chosen if not s.place.publisher},
             publisher=publisher,
         )
@@ -246,6 +247,27 @@ class Subscriber:
                 words[first_word + RxWord.MISMATCH] = bit
                 words[first_word + RxWord.MISMATCH_AT_NS] = at_ns
 
+    def _enter_answers(self, plan: FramePlan, cycle: int, at_ns: int) -> None:
+        entered: set[Account] = set()
+        for account, answer in plan.answers:
+            if not account.has_taken(cycle):
+                continue
+            response_ns = answer.question.answered(answer.name, at_ns)
+            self._words[answer.words + RxWord.RESPONSE_NS] = response_ns or 0
+            if response_ns is not None and account not in entered:
+                entered.add(account)
+                account.enter_response(response_ns)
+
+    def _note_requests(self, plan: FramePlan, cycle: int, data: memoryview, origin: Origin) -> None:
+        names = [name for account, name in plan.requests if account.has_taken(cycle)]
+        if not names:
+            return
+        sender = origin.sender_of(data)
+        if not sender or not self._requests.add(sender, names):
+            reason = Discard.TOO_MANY_REQUESTS if sender else Discard.NO_SENDER
+            refused = [s.place.words for s in self._subscriptions if s.place.name in names]
+            self._discard(reason, len(names), refused)
+
     def _open_accounts(self, own_cycle_ns: int) -> None:
         """Find the accounts that an earlier engine left in the image, or start new ones."""
         accounts: dict[object, Account] = {}
@@ -256,10 +278,17 @@ class Subscriber:
                 step=place.step,
                 sender_cycle_ns=place.sender_cycle_us * 1000,
                 own_cycle_ns=own_cycle_ns,
+                polled=bool(place.poll_request),
             )
             # Only PDs that are judged alike can share; with any publisher nothing is known.
             history: object = first_word or (
-                (place.publisher, place.step, place.sender_cycle_us, subscription.timeout_ns)
+                (
+                    place.publisher,
+                    place.step,
+                    place.sender_cycle_us,
+                    subscription.timeout_ns,
+                    place.poll_request,
+                )
                 if place.publisher
                 else place.name
             )

@@ -122,15 +122,21 @@ class TxFrame:
         return selection
 
     def _build(self, pds: tuple[TxPd, ...]) -> OutFrame:
-        destination = self.place.destination
-        header = self._channel.link_header(destination)
-        body = PdFrameHeader(self._publisher, len(pds), 0).encode()
-        for pd in pds:
-            body += PdHeader(pd.place.pd_id, pd.place.version, pd.place.size).encode()
-            body += bytes(pd.place.size)
-        octets = header + EtherCatHeader(len(body)).encode() + body
-        buffer = bytearray(octets.ljust(self._channel.minimum_size, b"\0"))
-        return OutFrame(buffer, len(header), destination)
+        return build_frame(self._publisher, pds, self._channel, self.place.destination)
+
+
+def build_frame(
+    publisher: NetId, pds: tuple[TxPd, ...], channel: Channel, destination: str
+) -> OutFrame:
+    """Return a frame with all headers and no data yet."""
+    header = channel.link_header(destination)
+    body = PdFrameHeader(publisher, len(pds), 0).encode()
+    for pd in pds:
+        body += PdHeader(pd.place.pd_id, pd.place.version, pd.place.size).encode()
+        body += bytes(pd.place.size)
+    octets = header + EtherCatHeader(len(body)).encode() + body
+    buffer = bytearray(octets.ljust(channel.minimum_size, b"\0"))
+    return OutFrame(buffer, len(header), destination)
 
 
 def _data_offsets(pds: tuple[TxPd, ...], headroom: int) -> Iterator[int]:

@@ -7,7 +7,7 @@ there is no second copy: that is why they survive the engine.
 
 from __future__ import annotations
 
-from enum import IntEnum, StrEnum, auto
+from enum import IntEnum, IntFlag, StrEnum, auto
 from itertools import accumulate
 
 
@@ -26,6 +26,10 @@ class Discard(StrEnum):
     COUNT_TOO_LARGE = auto()
     WRONG_TYPE = auto()
     """The frame is of a type that has no business here, such as TwinCAT's undocumented 7."""
+    TOO_MANY_REQUESTS = auto()
+    """The data was taken, but more stations asked in one cycle than are answered in one."""
+    NO_SENDER = auto()
+    """The data was taken, but its frame does not tell whom to answer."""
 
 
 class Reason(StrEnum):
@@ -36,6 +40,7 @@ class Reason(StrEnum):
     CHANGE = auto()
     CHANGE_TIMEOUT = auto()
     EVENT = auto()
+    POLL = auto()
 
 
 DISCARDS = tuple(Discard)
@@ -94,9 +99,21 @@ class FrameWord(IntEnum):
     SKIPPED = 2
     """Due, but suppressed or refused by the network."""
     STATE = 3
-    """FrameState: bit 0 not sent."""
+    """FrameState as its publisher sees it."""
     SENT_AT_NS = 4
-    SIZE = 5
+    PRESENCE = 5
+    """Whether the subscriber is there: a Presence (presence.py), written by its monitor."""
+    SIZE = 6
+
+
+class FrameState(IntFlag):
+    """FrameState of ETG.1005, as a reader puts it together from STATE and PRESENCE."""
+
+    NOT_SENT = 1
+    """When it was due last."""
+    OVERSIZED = 2
+    """Because it is larger than its network carries."""
+    SUBSCRIBER_MISSING = 4
 
 
 class TxWord(IntEnum):
@@ -107,7 +124,9 @@ class TxWord(IntEnum):
     LAST_REASON = 1
     """Index into REASONS of the last time it was sent on its own account."""
     SENT_AT_NS = 2
-    REASON = 3
+    STATE = 3
+    """VarState: bit 0 not sent when it was due last."""
+    REASON = 4
     SIZE = REASON + len(REASONS)
 
 
@@ -122,7 +141,9 @@ class RxWord(IntEnum):
     MISMATCH = 1
     """VarState: bit 0 version, bit 1 length, of the last PD refused."""
     MISMATCH_AT_NS = 2
-    DISCARDED = 3
+    RESPONSE_NS = 3
+    """From a request to its answer: of the one that was taken last; 0 if nobody asked."""
+    DISCARDED = 4
     RECEIVED = DISCARDED + len(DISCARDS)
     DUPLICATED = RECEIVED + 1
     REORDERED = RECEIVED + 2
@@ -144,6 +165,7 @@ class RxWord(IntEnum):
     SENDER = RECEIVED + 13
     """With any publisher: the NetID that the account follows, as a number."""
     JITTER_MAX_US = RECEIVED + 14
+    """This and JITTER: deviation from the sender's rhythm; of answers the time they took."""
     JITTER = RECEIVED + 15
     SIZE = JITTER + HISTOGRAM_BINS
 

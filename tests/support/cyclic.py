@@ -10,6 +10,7 @@ from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image, format_image
 from eap.pd.layout import RxPlace, VariablePlace, plan_layout
 from eap.pd.link import OutFrame, Taker
+from eap.pd.poll import Requests
 from eap.pd.spec import (
     BusEntrySpec,
     BusPortSpec,
@@ -72,9 +73,20 @@ def octets(
     )
 
 
-def give(taker: Taker, frame: bytes, at_ns: int) -> None:
+class From:
+    """An origin whose frames all come from one sender."""
+
+    def __init__(self, sender: str = "somebody") -> None:
+        self._sender = sender
+
+    def sender_of(self, data: memoryview) -> str:
+        del data
+        return self._sender
+
+
+def give(taker: Taker, frame: bytes, at_ns: int, sender: str = "somebody") -> None:
     """Hand *frame* over as a driver does: in a buffer that is longer than it."""
-    taker(memoryview(frame + b"\xee" * 32), len(frame), at_ns)
+    taker(memoryview(frame + b"\xee" * 32), len(frame), at_ns, From(sender))
 
 
 class Receiver:
@@ -88,7 +100,9 @@ class Receiver:
     def start(self, now_ns: int) -> None:
         """Start as an engine does, also once more on the same image."""
         pairs = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
-        self.subscriber = Subscriber(self.image, list(pairs), self.spec.cycle_us * 1000)
+        self.subscriber = Subscriber(
+            self.image, list(pairs), self.spec.cycle_us * 1000, Requests(())
+        )
         self.subscriber.open(now_ns)
 
     def give(self, frame: bytes, at_ns: int) -> None:

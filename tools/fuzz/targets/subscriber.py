@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
+from eap.pd.poll import Requests
 from eap.pd.spec import PortKind, PortSpec, RxPdSpec, StationSpec, VariableSpec, Writer
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import DISCARDS, RxWord, StationWord
@@ -27,14 +28,28 @@ _SPEC = StationSpec(
 )
 _LAYOUT = plan_layout(_SPEC)
 _IMAGE = format_image(memoryview(bytearray(_LAYOUT.size)), _LAYOUT, 1)
-_SUBSCRIBER = Subscriber(_IMAGE, zip(_SPEC.subscriptions, _LAYOUT.rx, strict=True), 1_000_000)
+_REQUESTS = Requests(_NAMES[:1])
+_SUBSCRIBER = Subscriber(
+    _IMAGE, zip(_SPEC.subscriptions, _LAYOUT.rx, strict=True), 1_000_000, _REQUESTS
+)
 _SUBSCRIBER.open(0)
+
+
+class _Somebody:
+    """The sender of every frame."""
+
+    def sender_of(self, data: memoryview) -> str:
+        """Return a destination for answers."""
+        del data
+        return "somebody"
 
 
 def fuzz_one(data: bytes) -> None:
     """Take the frame at a time that its own octets give."""
     before = _counted()
-    _SUBSCRIBER.receive_frame(memoryview(data + bytes(16)), len(data), len(data) * 300_000)
+    at_ns = len(data) * 300_000
+    _SUBSCRIBER.receive_frame(memoryview(data + bytes(16)), len(data), at_ns, _Somebody())
+    _REQUESTS.take()
     if _IMAGE.words[StationWord.ENGINE_SEQUENCE] % 2:
         raise AssertionError("the engine's region stayed marked as changing")
     carries_none = len(data) >= 14 and data[8:10] == b"\0\0"

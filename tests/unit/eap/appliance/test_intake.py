@@ -15,8 +15,10 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.net.udpsocket import prepare_receiver
+from tests.support.cyclic import From
 
 MAILBOX = memoryview(EtherCatHeader(6, 0, 5).encode() + bytes(6))
+NOBODY = From()
 UNKNOWN = memoryview(EtherCatHeader(0, 0, 7).encode())
 
 
@@ -28,11 +30,11 @@ def counters(tmp_path):
 
 def test_each_frame_is_counted_once_at_every_station(counters):
     intake = FrameIntake(["a", "b"], counters, from_ns=100)
-    intake.take(MAILBOX, 8, 99)
-    intake.take(MAILBOX, 8, 100)
-    intake.take(MAILBOX, 8, 101)
-    intake.take(UNKNOWN, 2, 100)
-    intake.take(UNKNOWN, 1, 100)
+    intake.take(MAILBOX, 8, 99, NOBODY)
+    intake.take(MAILBOX, 8, 100, NOBODY)
+    intake.take(MAILBOX, 8, 101, NOBODY)
+    intake.take(UNKNOWN, 2, 100, NOBODY)
+    intake.take(UNKNOWN, 1, 100, NOBODY)
     expected = {"mailbox": 2, "stale": 1, "wrong_type": 1, "truncated": 1}
     assert counters.stats() == {"a": expected, "b": expected}
 

@@ -47,6 +47,7 @@ def test_list_names_every_pd_and_variable(appliance: Appliance) -> None:
         "version": 3,
         "length": 6,
         "port": "eap0",
+        "poll": None,
         "publisher": "1.1.1.1.2.1",
         "frame": "to-right",
         "destination": "239.1.2.3",

@@ -136,6 +136,29 @@ def test_sent_pds() -> None:
     assert "mixer → alarm: sent on change once, resend 8 times" in text
 
 
+def test_polled_pds_show_how_long_answers_took() -> None:
+    times = {"last": 1700, "p50": 1791, "p99": 1877, "max": 1900}
+    none = {"p50": None, "p99": None, "max": None}
+    text = show(
+        document(
+            tx=[tx("part", reason={"poll": 9}, last_reason="poll")],
+            rx=[rx("answer", lost=None, quality=17, jitter_us=none, response_us=times)],
+        )
+    )
+    assert row_of(text, "part") == "→ part on request 9"
+    assert (
+        row_of(text, "answer") == "← answer running 123400 unknown 1.7 ms 4.2 ms 1791 / 1877 / 1900"
+    )
+
+
+def test_the_state_of_a_frame_is_worth_a_look_when_it_is_more_than_skipped() -> None:
+    rows = [tx("a", skipped=2, frame_state=3), tx("b", frame_state=4), tx("c", frame_state=1)]
+    text = show(document(tx=rows))
+    assert "mixer → a: skipped 2 times; larger than its network carries" in text
+    assert "mixer → b: nobody is there" in text
+    assert "mixer → c" not in text
+
+
 @pytest.mark.parametrize(("cycle_us", "hangs"), [(10_000, True), (1_000_000, False)])
 def test_station_whose_engine_hangs(cycle_us: int, hangs: bool) -> None:
     text = show(document(cycle_us=cycle_us, cycle_age_us=3_100_000))

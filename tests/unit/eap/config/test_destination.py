@@ -135,3 +135,12 @@ def test_a_group_is_of_the_kind_of_its_interface():
     assert is_group("01:01:05:04:00:07", ethernet)
     assert not is_group("02:01:05:04:00:07", ethernet)
     assert not is_group("239.1.1.1", ethernet)
+
+
+@pytest.mark.parametrize(
+    ("interface", "size"),
+    [("udp://10.0.0.1", 1472), ("ethernet://eth0", 1500), ("tcp://10.0.0.1", 2049),
+     ("loop://line", 2049)],
+)  # fmt: skip
+def test_an_answer_fits_every_way_back(interface, size):
+    assert frame_budget(None, InterfaceUri.parse(interface)) == size

@@ -26,11 +26,13 @@ class Listener:
     def __init__(self, interface, **options):
         self.got = []
         self.times = []
+        self.senders = []
         self.port = interface.port(self.take, **options)
 
-    def take(self, data, size, at_ns):
+    def take(self, data, size, at_ns, origin):
         self.got.append(bytes(data[: min(size, 3)]))
         self.times.append(at_ns)
+        self.senders.append(origin.sender_of(data))
 
     def drain(self, count):
         """Drain until *count* frames have been taken: under load they come a little later."""
@@ -218,3 +220,39 @@ def test_drain_is_bounded(ends):
     assert receiver.port.drain(0) <= 256
     receiver.drain(300)
     assert sender.port.fileno() == ends[0].fileno()
+
+
+def test_an_answer_goes_to_the_mac_address_that_asked(ends, raw):
+    client, server, idle = Listener(ends[0]), Listener(ends[1]), Listener(ends[1])
+    for count in (1, 2):
+        client.port.send([client.frame(n) for n in range(count)], 0)
+        server.drain(len(server.got) + count)
+        assert server.senders[-count:] == [str(ends[0].address)] * count
+    server.port.send([server.frame(7, server.senders[0])], 0)
+    assert client.drain(1) == [expect(7)]
+    assert expect(7) not in idle.got
+
+
+def test_neighbours_on_one_interface_answer_each_other(ends):
+    client, server = Listener(ends[0]), Listener(ends[0])
+    client.port.send([client.frame(1)], 0)
+    server.drain(1)
+    server.port.send([server.frame(2, server.senders[0])], 0)
+    assert client.drain(1) == [expect(2)]
+
+
+def test_nobody_answers_a_group(ends, raw):
+    server = Listener(ends[0])
+    head = bytes.fromhex("010105040000 010105040000 88a4")
+    raw.send((head + bytes([1, 0x40, 1])).ljust(60, b"\0"))
+    server.drain(1)
+    assert server.senders == [""]
+
+
+def test_a_frame_above_the_mtu_is_refused_as_too_large(ends):
+    sender = Listener(ends[0])
+    ip("link set left mtu 500")
+    frame = sender.frame(1)
+    large = OutFrame(bytearray(frame.buffer.ljust(600, b"\0")), 14, GROUP)
+    assert list(sender.port.send([frame, large], 0)) == [large]
+    assert (frame.oversized, large.oversized) == (False, True)

@@ -20,8 +20,9 @@ class Listener:
         self.channel.takers.append(self.take)
         self.got = []
 
-    def take(self, data, size, at_ns):
+    def take(self, data, size, at_ns, origin):
         self.got.append((bytes(data[:size]), at_ns))
+        self.sender = origin.sender_of(data)
 
     def numbers(self):
         return [data[0] for data, _ in self.got]
@@ -157,3 +158,20 @@ def test_line_asks_for_no_headroom():
 def test_wrong_option_is_named(options, message):
     with pytest.raises(ConfigError, match=message):
         LoopbackLines().open(InterfaceUri.parse("loop://line" + options))
+
+
+def test_an_answer_reaches_nobody_but_who_asked():
+    lines = LoopbackLines()
+    asking, asked, third = (Listener(lines) for _ in range(3))
+    asking.channel.send([frame(1)], 0)
+    asked.channel.drain(0)
+    answer = OutFrame(bytearray([2, 0x40]), 0, asked.sender)
+    assert asked.channel.send([answer], 0) == ()
+    third.channel.drain(0)
+    asking.channel.drain(0)
+    assert asking.numbers() == [2]
+    assert third.numbers() == [1]
+    asking.channel.close()
+    asked.channel.send([answer], 0)
+    third.channel.drain(0)
+    assert third.numbers() == [1]

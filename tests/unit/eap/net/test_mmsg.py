@@ -224,3 +224,51 @@ def test_what_is_kept_of_frames_that_come_and_go_is_bounded(
             assert batch.send(pair) == ()
             assert [right.recv(9) for _ in pair] == [bytes((number, 1)), bytes((number, 2))]
             assert len(batch._headers) <= 10
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_who_sent_a_message_is_known_as_long_as_it_is_held(pair, count):
+    sender, receiver = pair
+    SendBatch(sender, _socket_address).send(frames_to(receiver, count))
+    batch = ReceiveBatch()
+    assert batch.reader(receiver.fileno())() == count
+    for position, view in enumerate(batch.views[:count]):
+        assert batch.position(view) == position
+        assert batch.sender(view) == sender.getsockname()
+    assert batch.position(memoryview(b"other")) is None
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_frame_that_is_too_large_for_the_network_says_so(pair, count):
+    sender, receiver = pair
+    batch = SendBatch(sender, _socket_address)
+    frames = frames_to(receiver, count, size=65_508)
+    assert list(batch.send(frames)) == frames
+    assert all(frame.oversized for frame in frames)
+    assert batch.errors == {"EMSGSIZE": count}
+    refused = OutFrame(bytearray(3), 0, "0.0.0.1")
+    assert list(batch.send([refused])) == [refused]
+    assert not refused.oversized
+
+
+def test_addresses_are_not_remembered_without_end(pair):
+    sender, receiver = pair
+    batch = SendBatch(sender, _socket_address)
+    usual = frames_to(receiver, 2)
+    batch.send(usual)
+    for number in range(2 * mmsg._CACHED_ADDRESSES):
+        batch.send([OutFrame(bytearray(3), 0, f"127.0.3.{number % 200 + 30}:{number + 1000}")])
+    assert len(batch._addresses) <= mmsg._CACHED_ADDRESSES
+    while receiver.recv(100) and not _is_empty(receiver):
+        pass
+    # What was prepared before still goes where it should.
+    assert batch.send(usual) == ()
+    assert {receiver.recv(100) for _ in usual} == {bytes(frame.buffer) for frame in usual}
+
+
+def _is_empty(sock):
+    try:
+        sock.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return True
+    return False

@@ -11,7 +11,7 @@ from itertools import pairwise
 import pytest
 
 from eap.errors import EnvironmentalError
-from eap.net.tcp import FRAMES_PER_DRAIN, TcpReceiver, TcpSender, open_tcp_listener
+from eap.net.tcp import CONNECTION, FRAMES_PER_DRAIN, TcpReceiver, TcpSender, open_tcp_listener
 from eap.pd.link import OutFrame
 
 pytestmark = pytest.mark.net
@@ -64,7 +64,8 @@ def receiving():
         with socket.create_connection((HERE, 34980)) as client:
             accepted, _ = server.accept()
             receiver = TcpReceiver(
-                accepted, [lambda data, size, at_ns: got.append((bytes(data[:size]), at_ns))]
+                accepted,
+                [lambda data, size, at_ns, _origin: got.append((bytes(data[:size]), at_ns))],
             )
             yield client, receiver, got
             receiver.close()
@@ -274,3 +275,68 @@ def test_listener_in_use_names_the_holder(listener):
 def test_listener_on_a_foreign_address_is_refused():
     with pytest.raises(EnvironmentalError, match="is not an address of this machine"):
         open_tcp_listener("203.0.113.9")
+
+
+def test_answers_go_back_on_the_connection_that_asked(receiving):
+    client, receiver, got = receiving
+    client.sendall(frame_octets(1))
+    drain_until(receiver, got, 1)
+    assert receiver.sender_of(memoryview(b"")) == receiver.name
+    assert receiver.name.startswith(CONNECTION)
+    assert receiver.send(out_frame(2))
+    assert read(client, 22) == frame_octets(2)
+
+
+def test_who_does_not_read_the_answers_goes_without_and_disturbs_nobody(receiving):
+    client, receiver, got = receiving
+    client.sendall(frame_octets(1))
+    drain_until(receiver, got, 1)
+    results = [receiver.send(out_frame(number % 250, 2000)) for number in range(4000)]
+    assert not all(results)
+    assert not receiver.closed
+    client.sendall(frame_octets(3))
+    drain_until(receiver, got, 2)
+    # Once it reads, what was begun is finished by the cycle's drain.
+    expected = b"".join(frame_octets(n % 250, 2000) for n, sent in enumerate(results) if sent)
+    client.settimeout(5)
+    received = b""
+    while len(received) < len(expected):
+        receiver.drain(7)
+        received += client.recv(65536)
+    assert received == expected
+
+
+def test_an_answer_to_who_has_left_ends_the_connection(receiving):
+    client, receiver, _ = receiving
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.close()
+    limit = time.monotonic() + 5
+    while receiver.send(out_frame(1)):
+        assert time.monotonic() < limit
+    assert receiver.closed in {"ECONNRESET", "EPIPE"}
+    assert not receiver.send(out_frame(1))
+    assert receiver.drain(7) == 0
+
+
+def test_what_comes_back_is_taken_by_who_wants_it(listener):
+    got = []
+    errors = {}
+
+    def take(data, size, at_ns, origin):
+        got.append((bytes(data[:size]), at_ns, origin.sender_of(data)))
+
+    sender = TcpSender(DESTINATION, HERE, errors, [take])
+    try:
+        sender.poll(0)
+        with listener.accept()[0] as connection:
+            until(sender, lambda: sender.connected)
+            assert sender.send(out_frame(1), 0)
+            assert read(connection, 22) == frame_octets(1)
+            connection.sendall(frame_octets(8) + frame_octets(9))
+            until(sender, lambda: len(got) == 2, now_ns=5)
+        until(sender, lambda: errors)
+    finally:
+        sender.close()
+    assert got == [(frame_octets(n), 5, DESTINATION) for n in (8, 9)]
+    assert errors == {"ECONNRESET": 1}
+    assert not sender.connected

@@ -22,7 +22,7 @@ class Listener:
     def __init__(self):
         self.got = []
 
-    def take(self, data, size, _at_ns):
+    def take(self, data, size, _at_ns, _origin):
         self.got.append(bytes(data[:size]))
 
 
@@ -90,3 +90,38 @@ def test_port_needs_no_headroom():
     assert port.link_header("127.0.3.24") == b""
     assert port.minimum_size == 0
     assert port.drain(0) == 0
+
+
+def test_an_answer_takes_the_connection_that_asked_and_comes_back_to_the_asker():
+    answers, requests = Listener(), Listener()
+    near, far = TcpPort(HERE, None, [answers.take]), TcpPort(THERE)
+    with open_tcp_listener(THERE) as listener:
+        listener.settimeout(5)
+        near.link_header(TCP)
+        near.drain(0)
+        accepted = [TcpReceiver(listener.accept()[0], [requests.take])]
+        far.accept(accepted[0])
+        drain_until(near, lambda: near.send([frame(1, TCP)], 0) == [])
+        drain_until(far, lambda: requests.got)
+        back = accepted[0].name
+        assert far.link_header(back) == b""
+        assert far.send([frame(2, back), frame(3, back)], 0) == []
+        drain_until(near, lambda: len(answers.got) == 2)
+        assert answers.got == [b"\x01\x40\x02", b"\x01\x40\x03"]
+    near.close()
+    drain_until(far, lambda: far.closed)
+    late = frame(4, back)
+    assert far.send([late], 0) == [late]
+    assert far.errors == {"not_connected": 1}
+    far.close()
+
+
+def test_answers_that_nobody_reads_are_returned_and_counted(plant):
+    near, far, _, taken = plant
+    near.send([frame(1, TCP)], 0)
+    drain_until(far, lambda: taken.got)
+    name = far._receivers[0].name
+    large = OutFrame(bytearray(2000), 0, name)
+    failed = [each for _ in range(4000) for each in far.send([large], 0)]
+    assert failed[-1] is large
+    assert far.errors == {"slow_peer": len(failed)}

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 
 import pytest
 
 from eap.net.mmsg import ReceiveBatch
-from eap.net.udp import UdpChannel, _socket_address
+from eap.net.udp import UdpChannel, _destination, _socket_address
 from eap.net.udpsocket import open_udp_pair
 from eap.pd.link import OutFrame
 
@@ -35,7 +36,7 @@ def process_data(number):
 def test_frames_reach_the_only_taker(channels):
     sender, receiver = channels
     got = []
-    receiver.takers.append(lambda view, size, _at: got.append(bytes(view[:size])))
+    receiver.takers.append(lambda view, size, _at, _origin: got.append(bytes(view[:size])))
     assert sender.send([process_data(n) for n in range(3)], 0) == ()
     assert receiver.drain(0) == 3
     assert got == [bytes([n, 0x40, n]) for n in range(3)]
@@ -47,8 +48,8 @@ def test_every_taker_of_a_shared_socket_gets_every_frame(channels):
     sender, receiver = channels
     got = []
     receiver.takers += [
-        lambda view, _size, _at: got.append(("a", view[0])),
-        lambda view, _size, _at: got.append(("b", view[0])),
+        lambda view, _size, _at, _origin: got.append(("a", view[0])),
+        lambda view, _size, _at, _origin: got.append(("b", view[0])),
     ]
     sender.send([process_data(5), process_data(6)], 0)
     assert receiver.drain(0) == 2
@@ -58,7 +59,7 @@ def test_every_taker_of_a_shared_socket_gets_every_frame(channels):
 def test_drain_is_bounded(channels):
     sender, receiver = channels
     got = []
-    receiver.takers.append(lambda view, _size, _at: got.append(view[0]))
+    receiver.takers.append(lambda view, _size, _at, _origin: got.append(view[0]))
     frame = process_data(1)
     for _ in range(300):
         sender.send((frame,), 0)
@@ -92,3 +93,28 @@ def test_destination_without_a_port_goes_to_the_usual_one():
     assert address == ("127.0.3.13", 34980)
     assert packed[2:] == b"\x88\xa4\x7f\x00\x03\x0d" + bytes(8)
     assert _socket_address("127.0.3.13:9")[1] == ("127.0.3.13", 9)
+
+
+def test_an_answer_goes_to_the_address_and_port_that_asked(channels):
+    server, _ = channels
+    senders = []
+    server.takers.append(lambda view, _size, _at, origin: senders.append(origin.sender_of(view)))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.settimeout(5)
+        client.bind(("127.0.3.14", 0))
+        for count in (1, 2):
+            for _ in range(count):
+                client.sendto(b"\x01\x40\x01", server._sock.getsockname())
+            assert server.drain(0) == count
+        host, port = client.getsockname()
+        assert senders == [f"{host}:{port}"] * 3
+        server.send([OutFrame(bytearray(b"\x01\x40\x02"), 0, senders[0])], 0)
+        assert client.recv(10) == b"\x01\x40\x02"
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "destination"),
+    [("10.0.0.1", 34980, "10.0.0.1:34980"), ("10.0.0.1", 0, "10.0.0.1"), ("0.0.0.0", 9, "")],
+)
+def test_who_has_no_address_or_no_port_of_its_own(host, port, destination):
+    assert _destination(host, port) == destination

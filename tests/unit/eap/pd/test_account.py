@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from eap.pd.account import REORDER_WINDOW, Account, Timing
 from eap.pd.words import RxState, RxWord, histogram_bin
-from tests.support.cyclic import MS
+from tests.support.cyclic import MS, SECOND
 
 COUNTERS = ("received", "lost", "duplicated", "reordered", "late")
 
@@ -16,9 +16,11 @@ COUNTERS = ("received", "lost", "duplicated", "reordered", "late")
 class Book:
     """An account, fed one frame a millisecond unless a test says otherwise."""
 
-    def __init__(self, *, step: int = 1, sender_cycle_ns: int = MS) -> None:
+    def __init__(self, *, step: int = 1, sender_cycle_ns: int = MS, polled: bool = False) -> None:
         self.words = memoryview(bytearray(8 * RxWord.SIZE * 2)).cast("q")
-        self.timing = Timing(step=step, sender_cycle_ns=sender_cycle_ns, own_cycle_ns=MS)
+        self.timing = Timing(
+            step=step, sender_cycle_ns=sender_cycle_ns, own_cycle_ns=MS, polled=polled
+        )
         self.account = Account(self.words, 0, self.timing)
         self.now = 0
 
@@ -293,3 +295,33 @@ def test_any_counters_and_times_are_taken_without_an_exception(frames, step, sen
         book.feed(cycle, every_ns=later_ns)
     assert book.received + book.reordered == len(frames)
     assert book.lost >= 0
+
+
+def test_an_answer_is_late_when_it_missed_the_senders_next_cycle_too():
+    book = Book(sender_cycle_ns=4 * MS)
+    book.account.enter_response(5 * MS)
+    assert (book.late, book.jitter_max_us) == (0, 5000)
+    book.account.enter_response(5 * MS + 1)
+    book.account.enter_response(300_000)
+    assert (book.late, book.jitter_max_us) == (1, 5000)
+    bins = book.words[RxWord.JITTER : RxWord.SIZE].tolist()
+    assert (bins[histogram_bin(5000)], bins[histogram_bin(300)]) == (2, 1)
+
+
+def test_answers_of_a_sender_that_tells_no_cycle_are_never_late():
+    book = Book(sender_cycle_ns=0)
+    book.account.enter_response(SECOND)
+    assert book.late == 0
+
+
+def test_answers_have_no_jitter_however_they_come():
+    book = Book(step=0, polled=True)
+    book.feed(1, 2, 9, every_ns=7 * MS)
+    assert (book.received, book.lost, book.late, book.jitter_max_us) == (3, 0, 0, 0)
+
+
+def test_what_was_entered_last_was_taken_or_not():
+    book = Book()
+    assert book.feed(0x1_0005, 0x1_0006, 0x1_0005) == [True, True, False]
+    assert book.account.has_taken(6)
+    assert not book.account.has_taken(5)

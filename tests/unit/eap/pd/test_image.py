@@ -209,7 +209,7 @@ def damaged(change: str) -> memoryview:
     [
         ("short", "shorter than the header"),
         ("magic", "magic is missing"),
-        ("version", "layout version 2, this program knows 1"),
+        ("version", "layout version 3, this program knows 2"),
         ("cut", "cut off"),
         ("length", "cut off"),
         ("directory", "damaged directory"),
@@ -224,7 +224,7 @@ def test_a_damaged_image_is_refused_by_what_is_wrong(change, message):
 
 @given(st.binary(max_size=200), st.binary(max_size=60))
 def test_any_octets_are_an_image_or_an_image_error(noise, directory):
-    head = HEADER.pack(b"EAPIMAGE", 1, 1, 64, len(directory), 64 + len(directory))
+    head = HEADER.pack(b"EAPIMAGE", 2, 1, 64, len(directory), 64 + len(directory))
     for octets in (noise, head.ljust(64, b"\0") + directory + noise):
         with pytest.raises(ImageError):
             read_header(memoryview(octets))
@@ -235,4 +235,4 @@ def test_the_header_is_where_other_languages_expect_it():
     memory = memoryview(bytearray(layout.size))
     format_image(memory, layout, 3)
     assert bytes(memory[:8]) == b"EAPIMAGE"
-    assert struct.unpack_from("<IIQ", memory, 8) == (1, 3, layout.directory_offset)
+    assert struct.unpack_from("<IIQ", memory, 8) == (2, 3, layout.directory_offset)

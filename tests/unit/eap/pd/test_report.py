@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eap.pd.presence import Presence
 from eap.pd.report import pd_list, quality, station_status
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, Writer
-from eap.pd.words import RxWord, StationWord
+from eap.pd.words import FrameWord, RxWord, StationWord
 from tests.support.cyclic import (
     MS,
     OWN,
@@ -114,6 +115,7 @@ def test_a_subscription_that_waits_knows_nothing():
         "age_us": None,
         "last_good": None,
         "jitter_us": {"p50": None, "p99": None, "max": None},
+        "response_us": None,
         "state": "waiting",
     }
 
@@ -175,6 +177,7 @@ def test_the_list_names_every_pd_with_its_variables():
         "version": 4,
         "length": 2,
         "port": "eap0",
+        "poll": None,
         "publisher": OWN,
         "frame": "f",
         "destination": "10.0.0.9",
@@ -188,3 +191,20 @@ def test_values_that_links_held_back_are_counted():
     image = image_of(station())
     image.words[StationWord.LINKS_HELD] = 3
     assert station_status(image, 0)["links_held"] == 3
+
+
+def test_the_state_of_a_frame_has_what_its_publisher_and_its_monitor_know():
+    spec = station(
+        variables=written("x:UINT"),
+        frames=(TxFrameSpec("f", "eap0", "10.0.0.9", (TxPdSpec("p", 1, ("x",)),)),),
+    )
+    image = image_of(spec)
+    first = image.layout.frames[0].words
+    seen = []
+    for state, presence in ((0, Presence.UNKNOWN), (3, Presence.MISSING), (1, Presence.PRESENT)):
+        image.words[first + FrameWord.STATE] = state
+        image.words[first + FrameWord.PRESENCE] = presence
+        (row,) = station_status(image, 0)["pd"]["tx"]
+        seen.append((row["frame_state"], row["subscriber"]))
+    assert seen == [(0, "unknown"), (7, "missing"), (1, "present")]
+    assert msgspec.json.encode(station_status(image, 0))

@@ -408,7 +408,7 @@ def pair(options: str) -> tuple[Engine, Image, Image, LoopbackChannel, list[int]
         made = Station(spec, image, lambda: None)
         if spec is taker:
             channel.takers.append(
-                lambda data, size, at_ns: arrived.append(int.from_bytes(data[10:12], "little"))
+                lambda data, size, at_ns, _: arrived.append(int.from_bytes(data[10:12], "little"))
             )
         channel.takers.append(made.takers["eap0"])
         made.connect("eap0", channel)

@@ -1,0 +1,130 @@
+"""Polled exchange, both sides of it: who asked this station, and what this station asked.
+
+A request is an ordinary PD and so is its answer (ETG.1005): what makes them so is configuration on
+both sides.  An answer carries nothing of the request, so it belongs to the last one sent before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from eap.pd.image import Image
+from eap.pd.layout import TxPlace
+from eap.pd.spec import StationSpec
+from eap.pd.words import FrameWord, TxWord
+
+REQUESTERS_PER_CYCLE = 32
+"""Senders that one port answers in a cycle: each costs it a frame."""
+
+
+class Requests:
+    """Who asked for what at one port since the last answers.
+
+    Args:
+        names: The RxPDs that are requests.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.names = frozenset(names)
+        self._pending: dict[str, set[str]] = {}
+
+    def add(self, sender: str, names: Iterable[str]) -> bool:
+        """Note that *sender* asked with the RxPDs *names*; return whether there was room for it."""
+        pending = self._pending
+        asked = pending.get(sender)
+        if asked is None:
+            if len(pending) >= REQUESTERS_PER_CYCLE:
+                return False
+            asked = pending[sender] = set()
+        asked.update(names)
+        return True
+
+    def take(self) -> dict[str, set[str]]:
+        """Return the RxPDs that came, by sender, and begin anew."""
+        if not self._pending:
+            return self._pending
+        pending, self._pending = self._pending, {}
+        return pending
+
+
+class Question:
+    """One TxPD of this station that asks others.
+
+    Args:
+        words: The words of the station's image.
+        place: The TxPD.
+        answers: The RxPDs that answer it.
+    """
+
+    __slots__ = ("_answers", "_before_ns", "_place", "_sent_at_ns", "_state", "_waiting", "_words")
+
+    def __init__(self, words: memoryview, place: TxPlace, answers: Iterable[str]) -> None:
+        self._words = words
+        self._place = place
+        self._answers = tuple(answers)
+        self._sent_at_ns = 0
+        self._before_ns = 0
+        self._waiting: dict[str, int] = {}
+        self._state = self._read_state()
+
+    def look(self, now_ns: int) -> None:
+        """Note whether it was sent in the cycle that ends now and began at *now_ns*."""
+        state = self._read_state()
+        if state == self._state:
+            return
+        self._state = state
+        self._before_ns, self._sent_at_ns = self._sent_at_ns, now_ns
+        for answer in self._answers:
+            self._waiting.setdefault(answer, now_ns)
+
+    def waiting_since(self, answer: str) -> int | None:
+        """Return when the RxPD *answer* was first asked for since it came, None if it was not."""
+        return self._waiting.get(answer)
+
+    def answered(self, answer: str, at_ns: int) -> int | None:
+        """Return how long the RxPD *answer* took that arrived at *at_ns*; None if nobody asked.
+
+        What arrived before the last request, and is taken only now, answers the one before.
+        """
+        asked_ns = self._sent_at_ns if at_ns >= self._sent_at_ns else self._before_ns
+        if not 0 < asked_ns <= at_ns:
+            return None
+        if asked_ns == self._sent_at_ns:
+            self._waiting.pop(answer, None)
+        elif answer in self._waiting:
+            self._waiting[answer] = self._sent_at_ns
+        return at_ns - asked_ns
+
+    def _read_state(self) -> tuple[int, int]:
+        words, place = self._words, self._place
+        whole = words[place.frame_words + FrameWord.WHOLE] if place.by_schedule else 0
+        return whole, words[place.words + TxWord.SENT_AT_NS]
+
+
+class Answer(NamedTuple):
+    """An RxPD that answers a question."""
+
+    name: str
+    question: Question
+    words: int
+    """Index of its first word."""
+
+
+def requests_at(spec: StationSpec, port: str) -> Requests:
+    """Return where the requests go that polled PDs of *port* wait for."""
+    frames = [frame for frame in spec.frames if frame.port == port]
+    return Requests(pd.poll_request for frame in frames for pd in frame.pds if pd.poll_request)
+
+
+def questions_of(image: Image) -> dict[str, Question]:
+    """Return what a station asks, by the TxPD that does it."""
+    answers: dict[str, list[str]] = {}
+    for place in image.layout.rx:
+        if place.poll_request:
+            answers.setdefault(place.poll_request, []).append(place.name)
+    return {
+        place.name: Question(image.words, place, answers[place.name])
+        for place in image.layout.tx
+        if place.name in answers
+    }

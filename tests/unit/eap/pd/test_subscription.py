@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from eap.pd.account import Account, Timing
+from eap.pd.poll import Question
+from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
+from eap.pd.subscription import Subscription
+from eap.pd.substitute import SubstituteValue
+from eap.pd.words import Discard, FrameWord
+from tests.support.cyclic import MS, PEER, image_of, received, station, written
+
+
+def subscription(*, polled: bool = False, **options: object) -> tuple[Subscription, memoryview]:
+    """A subscription to one UINT, with a time-out of 5 ms, and the words of its station."""
+    spec = RxPdSpec("in", "eap0", 7, ("r",), PEER, version=3, timeout_ms=5, **options)
+    image = image_of(
+        station(
+            variables=(*written("x:UINT"), *received("r:UINT")),
+            frames=(TxFrameSpec("f", "eap0", "10.0.0.1", (TxPdSpec("ask", 8, ("x",)),)),),
+            subscriptions=(spec,),
+        )
+    )
+    (place,) = image.layout.rx
+    question = Question(image.words, image.layout.tx[0], ["in"]) if polled else None
+    made = Subscription(spec, place, SubstituteValue(image, place), question)
+    timing = Timing(step=1, sender_cycle_ns=MS, own_cycle_ns=MS)
+    made.account = Account(image.words, place.words, timing)
+    return made, image.words
+
+
+def test_version_and_length_have_to_fit():
+    made, _ = subscription()
+    assert made.mismatch(3, 2) is None
+    assert made.mismatch(4, 2) is made.mismatch(4, 3) is Discard.VERSION
+    assert made.mismatch(3, 3) is Discard.LENGTH
+
+
+def test_the_version_may_be_of_no_interest_but_never_the_length():
+    made, _ = subscription(ignore_version=True)
+    assert made.mismatch(4, 2) is None
+    assert made.mismatch(4, 3) is Discard.LENGTH
+
+
+def test_what_comes_by_itself_is_too_old_when_nothing_has_come_for_so_long():
+    made, _ = subscription()
+    made.account.arrived(1, 10 * MS, 1)
+    assert made.answer is None
+    assert made.deadline_ns() == 15 * MS
+
+
+def test_an_answer_is_too_old_when_it_was_asked_for_so_long_ago():
+    made, words = subscription(polled=True)
+    made.account.arrived(1, 10 * MS, 1)
+    assert made.deadline_ns() is None
+    words[made.answer.question._place.frame_words + FrameWord.WHOLE] += 1
+    made.answer.question.look(40 * MS)
+    assert made.deadline_ns() == 45 * MS
+    made.answer.question.answered("in", 41 * MS)
+    assert made.deadline_ns() is None
