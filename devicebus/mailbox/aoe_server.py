@@ -23,6 +23,21 @@ class AmsAnswer(NamedTuple):
     """Of the AMS header: why the request reached nobody."""
 
 
+def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
+    """Return the packet that brings *answer* back to who sent the request with *header*."""
+    back = AmsHeader(
+        header.source,
+        header.source_port,
+        header.target,
+        header.target_port,
+        header.command,
+        header.state_flags | StateFlags.RESPONSE,
+        error_code=answer.error_code,
+        invoke_id=header.invoke_id,
+    )
+    return encode_packet(back, answer.data)
+
+
 class AoeServer:
     """The AoE protocol of a slave.
 
@@ -79,17 +94,7 @@ class AoeServer:
         answer = self._handler(header, body)
         if answer is None or header.state_flags & StateFlags.NO_RETURN:
             return []
-        back = AmsHeader(
-            header.source,
-            header.source_port,
-            header.target,
-            header.target_port,
-            header.command,
-            header.state_flags | StateFlags.RESPONSE,
-            error_code=answer.error_code,
-            invoke_id=header.invoke_id,
-        )
-        packet = encode_packet(back, answer.data)
+        packet = response_to(header, answer)
         room = self._sizes.data_to_master - AmsHeader.SIZE
         if len(packet) <= self._sizes.data_to_master or room < 1:
             return [packet]

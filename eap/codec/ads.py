@@ -15,8 +15,11 @@ class AdsError(IntEnum):
     """Results of a service, and the errors in an AMS header that mean the way to it."""
 
     NONE = 0x000
+    INTERNAL = 0x001
+    MAILBOX_FULL = 0x004
     TARGET_PORT = 0x006
     TARGET_MACHINE = 0x007
+    COMMAND = 0x008
     FRAGMENT = 0x01C
     GENERAL = 0x700
     SERVICE = 0x701
@@ -24,8 +27,11 @@ class AdsError(IntEnum):
     INDEX_OFFSET = 0x703
     ACCESS = 0x704
     SIZE = 0x705
+    VALUE = 0x706
+    BUSY = 0x708
     NO_MEMORY = 0x70A
     NOT_FOUND = 0x70C
+    STATE = 0x712
 
 
 class IndexGroup(IntEnum):
