@@ -85,6 +85,11 @@ class AoeDesk:
                 logger.exception("AoE request from %s failed", request.header.source)
                 answer = AmsAnswer(error_code=AdsError.INTERNAL)
             request.finish(answer)
+            self._waiting.task_done()
+
+    async def wait_idle(self) -> None:
+        """Wait until nothing waits."""
+        await self._waiting.join()
 
 
 class AoeDoor:

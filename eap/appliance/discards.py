@@ -17,7 +17,7 @@ class Refusal(StrEnum):
     """Why a frame or a connection went no further."""
 
     MAILBOX = auto()
-    """Type 5, and nothing in this release answers it."""
+    """Type 5 that is no AoE request to this station: nothing in this release answers it."""
     STALE = auto()
     """It had waited in its socket since before services started."""
     WRONG_TYPE = auto()
@@ -31,7 +31,7 @@ class Refusal(StrEnum):
     TCP_FULL = auto()
     """More connections than there is room for."""
     TCP_TYPE = auto()
-    """A type-4 connection that went on with a frame of another type, and was closed."""
+    """A connection that went on with a frame of another type, and was closed."""
     ENGINE_BUSY = auto()
     """The engine did not take a connection that was meant for it."""
     OTHER_VLAN = auto()

@@ -1,7 +1,8 @@
 """The TCP listener of a station: who connects shows by the first frame where it belongs.
 
 Type 4 goes to the engine, descriptor and all; nothing is read here, so the engine finds the frame
-whole.  All other connections are closed, and the reason is counted at the station.
+whole.  Type 5 is answered in this process.  All other connections are closed, and the reason is
+counted at the station.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from eap.appliance.aoe_desk import AoeDesk
 from eap.appliance.discards import Refusal
 from eap.appliance.handover import PortName
+from eap.appliance.mailbox_stream import serve_stream
 from eap.appliance.passing import PassedConnection, pass_connection
 from eap.codec.ethercat import EtherCatHeader, FrameType
 
@@ -20,6 +23,8 @@ FIRST_FRAME_S = 5.0
 """How long a connection may stay silent before its first frame header."""
 MAX_WAITING = 32
 """Connections of one listener whose first frame has not come yet."""
+MAX_STREAMS = 32
+"""Connections of one listener that carry type 5."""
 _PEEK_PAUSE_S = 0.02
 
 logger = logging.getLogger(__name__)
@@ -33,6 +38,7 @@ class TcpDoor:
         takers: Ports that take type 4 from TCP; may be empty.
         link: To the engine.
         refuse: Counts a connection that was closed.
+        desks: Of the stations that answer type 5 here.
     """
 
     def __init__(
@@ -41,6 +47,7 @@ class TcpDoor:
         takers: tuple[PortName, ...],
         link: socket.socket,
         refuse: Callable[[Refusal], None],
+        desks: Sequence[AoeDesk],
         *,
         first_frame_s: float = FIRST_FRAME_S,
     ) -> None:
@@ -48,8 +55,10 @@ class TcpDoor:
         self._takers = takers
         self._link = link
         self._refuse = refuse
+        self._desks = desks
         self._first_frame_s = first_frame_s
         self._waiting = 0
+        self._streams = 0
 
     async def serve(self) -> None:
         """Accept until cancelled."""
@@ -76,20 +85,32 @@ class TcpDoor:
                 frame_type = await _first_type(connection)
         except TimeoutError:
             self._close(connection, peer, Refusal.TCP_SILENT)
+            return
         except OSError:
             connection.close()  # it left before it said anything
+            return
         except asyncio.CancelledError:
             connection.close()
             raise
-        else:
-            self._dispatch(connection, peer, frame_type)
         finally:
             self._waiting -= 1
+        if frame_type == FrameType.MAILBOX:
+            await self._serve_stream(connection, peer)
+        else:
+            self._dispatch(connection, peer, frame_type)
+
+    async def _serve_stream(self, connection: socket.socket, peer: str) -> None:
+        if self._streams >= MAX_STREAMS:
+            self._close(connection, peer, Refusal.TCP_FULL)
+            return
+        self._streams += 1
+        try:
+            await serve_stream(connection, self._desks, self._refuse)
+        finally:
+            self._streams -= 1
 
     def _dispatch(self, connection: socket.socket, peer: str, frame_type: int) -> None:
-        if frame_type == FrameType.MAILBOX:
-            self._close(connection, peer, Refusal.MAILBOX)
-        elif frame_type != FrameType.PROCESS_DATA:
+        if frame_type != FrameType.PROCESS_DATA:
             self._close(connection, peer, Refusal.WRONG_TYPE)
         elif not self._takers:
             self._close(connection, peer, Refusal.TCP_OFF)

@@ -14,10 +14,12 @@ from eap.appliance.handover import PortName
 from eap.appliance.passing import take_connection
 from eap.appliance.tcp_door import TcpDoor
 from eap.codec.ethercat import EtherCatHeader
+from tests.support import aoe
 
 pytestmark = pytest.mark.net
 
 OWNERS = (PortName("a", "eap0"),)
+TARGET = "1.1.1.1.2.1"
 
 
 def frame(kind: int) -> bytes:
@@ -55,11 +57,15 @@ def play(
     async def run():
         services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with services, engine, socket.create_server(("127.0.0.1", 0)) as listener:
-            door = TcpDoor(listener, takers, services, refused.append, first_frame_s=first_frame_s)
-            serving = asyncio.ensure_future(door.serve())
+            desk = aoe.echoing_desk(TARGET)
+            door = TcpDoor(
+                listener, takers, services, refused.append, [desk], first_frame_s=first_frame_s
+            )
+            serving = [asyncio.ensure_future(each.serve()) for each in (door, desk)]
             await script(Scene(listener, engine, refused))
-            serving.cancel()
-            await asyncio.wait([serving])
+            for task in serving:
+                task.cancel()
+            await asyncio.wait(serving)
 
     asyncio.run(run())
     return refused
@@ -89,7 +95,7 @@ def test_type_4_goes_to_the_engine_with_its_first_frame():
 @pytest.mark.parametrize(
     ("kind", "takers", "reason"),
     [
-        (5, OWNERS, Refusal.MAILBOX),
+        (5, OWNERS, Refusal.TCP_TYPE),
         (4, (), Refusal.TCP_OFF),
         (7, OWNERS, Refusal.WRONG_TYPE),
     ],
@@ -99,6 +105,32 @@ def test_others_are_closed_with_a_reason(kind, takers, reason):
         assert await scene.send(frame(kind)) == b""
 
     assert play(script, takers) == [reason]
+
+
+def test_type_5_is_answered_here():
+    async def script(scene):
+        reader, writer = await scene.connect()
+        writer.write(aoe.frame(aoe.packet(TARGET, 4, b"abc")))
+        writer.write_eof()
+        back = await asyncio.wait_for(reader.read(), 5)
+        assert aoe.answer(back).data == b"\4cba"
+        writer.close()
+
+    assert play(script) == []
+
+
+def test_there_is_a_limit_to_those_who_talk(monkeypatch):
+    monkeypatch.setattr(tcp_door, "MAX_STREAMS", 1)
+    question = aoe.frame(aoe.packet(TARGET, 4, b""))
+
+    async def script(scene):
+        reader, writer = await scene.connect()
+        writer.write(question)
+        await asyncio.wait_for(reader.readexactly(8), 5)
+        assert await scene.send(question) == b""
+        writer.close()
+
+    assert play(script) == [Refusal.TCP_FULL]
 
 
 def test_who_says_nothing_is_closed():
@@ -114,9 +146,9 @@ def test_who_leaves_before_a_frame_is_not_counted():
             _, writer = await scene.connect()
             writer.close()
             await writer.wait_closed()
-        assert await scene.send(frame(5)) == b""
+        assert await scene.send(frame(7)) == b""
 
-    assert play(script) == [Refusal.MAILBOX]
+    assert play(script) == [Refusal.WRONG_TYPE]
 
 
 def test_a_gone_engine_link_closes_the_connection():
