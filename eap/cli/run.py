@@ -85,8 +85,9 @@ def run(
     With --blank, run one station that has an EAP port and nothing else, in PREOP: 'eapctl od
     write', 'eapctl apply' or another tool configures it.
 
-    When all run, one line {"ready": true, "stations": [...]} appears on stdout; messages go to
-    stderr.  Exits with 2, and starts nothing, when the file or this machine is not fit.
+    When each has run its first cycle, one line {"ready": true, "stations": [...]} appears on
+    stdout; messages go to stderr.  Exits with 2, and starts nothing, when the file or this machine
+    is not fit.
     """
     _check_form(ctx)
     from eap.appliance import supervisor  # processes and sockets; --help must not wait for them

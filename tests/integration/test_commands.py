@@ -75,7 +75,7 @@ def test_a_value_set_here_arrives_there(demo: Appliance) -> None:
         assert after["value"] == value
         assert after["cycle"] > before["cycle"]
         process.send_signal(signal.SIGINT)
-        assert process.wait(5) == 0
+        assert process.wait(20) == 0
 
 
 def test_watch_of_stations_in_one_stream(demo: Appliance) -> None:

@@ -55,7 +55,7 @@ def control(monkeypatch):
         assert process.stdout is not None
         assert process.stdout.readline()
         yield folder / "kiln" / "control"
-        assert process.wait(5) == 0  # the last exchange of the page stops it
+        assert process.wait(20) == 0  # the last exchange of the page stops it
     finally:
         process.kill()
         process.communicate()

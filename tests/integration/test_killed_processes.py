@@ -17,6 +17,7 @@ import pytest
 
 from tests.support.appliance import Appliance, Plants, troubles, wait_until
 from tests.support.listener import Listener, listen_to_group
+from tests.support.machine import slowness
 
 pytestmark = pytest.mark.net
 
@@ -87,8 +88,9 @@ def test_a_killed_engine_leaves_a_gap_of_its_true_length(
     (gap,) = (index for index, step in enumerate(steps) if step != 1)
     missing = steps[gap] - 1
     assert missing > 0
-    assert pauses[gap] < 1_000_000_000
-    assert took_s < 1.0
+    limit_s = 1.0 * slowness()
+    assert pauses[gap] < limit_s * 1e9
+    assert took_s < limit_s
     assert abs(steps[gap] * CYCLE_NS - pauses[gap]) < 3 * CYCLE_NS
     assert other.rx("far", "sender")["lost"] == missing
     # What waited at the killed engine is not taken by the new one: lost, and counted as stale.

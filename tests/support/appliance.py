@@ -21,7 +21,7 @@ from eap.appliance.client import connect
 from eap.appliance.runtime import VARIABLE
 
 EAPCTL = [sys.executable, "-m", "eap"]
-READY_S = 15.0
+READY_S = 30.0
 
 
 class Appliance:
@@ -52,7 +52,7 @@ class Appliance:
         assert ready["ready"] is True
         return list(ready["stations"])
 
-    def finish(self, timeout_s: float = 5.0) -> tuple[int, str, str]:
+    def finish(self, timeout_s: float = 10.0) -> tuple[int, str, str]:
         """Wait for its end; return exit code, stdout and stderr."""
         out, err = self.process.communicate(timeout=timeout_s)
         return self.process.returncode, out, err
@@ -158,7 +158,7 @@ def plants() -> Iterator[Plants]:
         shutil.rmtree(folder)
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 5.0) -> float:
+def wait_until(condition: Callable[[], object], timeout_s: float = 20.0) -> float:
     """Return the seconds it took until *condition* held."""
     start = time.monotonic()
     while not condition():

@@ -99,13 +99,13 @@ def test_it_says_that_it_is_ready_and_ends_when_asked(tmp_path):
         assert report == {"realtime": {"scheduler": "other: not asked for"}}
         assert min(cycles(tmp_path)) >= 1
         engine.process.terminate()
-        assert engine.process.communicate(timeout=5)[1] == ""
+        assert engine.process.communicate(timeout=20)[1] == ""
         assert engine.process.returncode == 0
 
 
 def test_what_is_missing_is_one_line_and_exit_code_2(tmp_path):
     with Engine(handover(tmp_path / "nowhere")) as engine:
-        error = engine.process.communicate(timeout=10)[1]
+        error = engine.process.communicate(timeout=20)[1]
         assert engine.process.returncode == 2
         assert os.read(engine.ready, 1) == b""
     assert error.startswith("engine: ")
@@ -115,7 +115,7 @@ def test_what_is_missing_is_one_line_and_exit_code_2(tmp_path):
 def test_an_orphan_does_not_start(tmp_path):
     orphan = msgspec.structs.replace(handover(tmp_path), supervisor=1)
     with Engine(orphan) as engine:
-        engine.process.communicate(timeout=10)
+        engine.process.communicate(timeout=20)
         assert engine.process.returncode == -signal.SIGKILL
     assert list(tmp_path.iterdir()) == []
 

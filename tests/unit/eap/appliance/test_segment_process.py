@@ -59,7 +59,7 @@ def run_with(script):
 
     def command(text):
         os.write(write_end, text.encode() + b"\n")
-        return answers.get(timeout=5)
+        return answers.get(timeout=20)
 
     def play():
         try:
@@ -205,7 +205,7 @@ def test_child_answers_what_came_after_its_start_and_ends_when_asked(bus_file):
         assert child.scan() == 2
         assert not select.select([child.frames], [], [], 0.1)[0]
         child.process.terminate()
-        assert child.process.communicate(timeout=5)[1] == ""
+        assert child.process.communicate(timeout=20)[1] == ""
         assert child.process.returncode == 0
 
 
@@ -229,7 +229,7 @@ def test_child_that_nobody_listens_to_goes_on(bus_file):
 def test_child_without_a_bus_file_says_so_in_its_exit_code(bus_file):
     bus_file.write_text("bus: b\nslaves: []\n")
     with Child(bus_file) as child:
-        error = child.process.communicate(timeout=10)[1]
+        error = child.process.communicate(timeout=20)[1]
         assert child.process.returncode == 2
         assert os.read(child.ready, 1) == b""
     assert error.startswith("segment: ")
@@ -238,5 +238,5 @@ def test_child_without_a_bus_file_says_so_in_its_exit_code(bus_file):
 
 def test_child_of_a_supervisor_that_has_gone_does_not_start(bus_file):
     with Child(bus_file, supervisor=1) as child:
-        child.process.communicate(timeout=10)
+        child.process.communicate(timeout=20)
         assert child.process.returncode == -signal.SIGKILL

@@ -88,7 +88,7 @@ def test_it_answers_counts_and_ends_when_asked(tmp_path, stations):
             assert left["discarded"] == {"mailbox": 1}
             assert right["discarded"] == {}
         services.process.terminate()
-        assert services.process.communicate(timeout=5)[1] == ""
+        assert services.process.communicate(timeout=20)[1] == ""
         assert services.process.returncode == 0
 
 
@@ -131,12 +131,12 @@ def test_it_asks_engine_and_segment(tmp_path, stations):
         assert client.request("bus_fault", **where, command={"kind": "loss"}) == {"ok": True}
         said.result(5)
         services.process.terminate()
-        assert services.process.communicate(timeout=5)[1] == ""
+        assert services.process.communicate(timeout=20)[1] == ""
         assert services.process.returncode == 0
 
 
 @pytest.mark.usefixtures("files")
 def test_an_orphan_does_not_start(tmp_path, stations):
     with Services(tmp_path, stations, supervisor=1) as services:
-        services.process.communicate(timeout=10)
+        services.process.communicate(timeout=20)
         assert services.process.returncode == -signal.SIGKILL

@@ -129,7 +129,7 @@ def test_watch_follows_changes_until_interrupted(appliance: Appliance) -> None:
         appliance.set("mixer", "ticks", 5)
         assert json.loads(process.stdout.readline())["value"] == 5
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=10)
+        _, errors = process.communicate(timeout=20)
     assert (process.returncode, errors) == (0, "")
 
 
@@ -140,7 +140,7 @@ def test_watch_ends_with_the_appliance(appliance: Appliance, names: list[str]) -
         for _ in names:
             process.stdout.readline()
         appliance.stop()
-        _, errors = process.communicate(timeout=10)
+        _, errors = process.communicate(timeout=20)
     assert process.returncode == 1
     assert errors.count("\n") == 1
     assert "appliance line (process 1) does not answer" in errors
