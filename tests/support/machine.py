@@ -1,4 +1,4 @@
-"""How busy this machine is: a limit on what starts a process is stretched by that, and by no more."""
+"""How busy this machine is: limits on what starts a process are stretched by that, not by more."""
 
 from __future__ import annotations
 
