@@ -16,7 +16,7 @@ from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.sdoinfo import EntryDescription
 from eap.errors import ConfigError, EapError
-from eap.od.abort import AbortCode, SdoAbortError
+from eap.od.abort import AbortCode, SdoAbortError, entry_name
 from eap.od.model import Access, ObjectCode
 
 _TEXT, _OCTETS = 0x09, 0x0A
@@ -133,16 +133,16 @@ def _dumped(bus: SlaveBus, unit: Slave, index: int, subindex: int) -> dict[str, 
         return {"name": "", "error": str(exc)}
     row: dict[str, Any] = {"name": entry.name, "access": _access(entry)}
     if not entry.access & Access.READ_ANY:
-        return row | _shown(_kind(entry), None, complete=False)
+        return row | _shown(kind_of(entry), None, complete=False)
     try:
         octets = bus.converse(unit, lambda _: coe_client.upload(index, subindex), name)
     except (SdoAbortError, MailboxProtocolError) as exc:
         return row | {"error": str(exc)}
-    return row | _shown(_kind(entry), octets, complete=False)
+    return row | _shown(kind_of(entry), octets, complete=False)
 
 
 def _name(index: int, subindex: int | None = None) -> str:
-    return f"0x{index:04X}" if subindex is None else f"0x{index:04X}:{subindex:02X}"
+    return f"0x{index:04X}" if subindex is None else entry_name(index, subindex)
 
 
 def _access(entry: EntryDescription) -> str:
@@ -156,10 +156,11 @@ def _kind_of_entry(index: int, subindex: int) -> Conversation[DataType | None]:
         entry = yield from coeinfo_client.entry_description(index, subindex)
     except (SdoAbortError, MailboxRefusedError, MailboxProtocolError):
         return None
-    return _kind(entry)
+    return kind_of(entry)
 
 
-def _kind(entry: EntryDescription) -> DataType | None:
+def kind_of(entry: EntryDescription) -> DataType | None:
+    """Return the type of an entry, None if it is none of ours."""
     size = max(1, (entry.bit_length + 7) // 8)
     if entry.data_type == _TEXT:
         return datatypes.parse(f"STRING({size})")

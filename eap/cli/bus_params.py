@@ -32,10 +32,13 @@ def number_up_to(limit: int) -> Callable[[str | int], int]:
 
 
 def parse_entry(text: str) -> Entry:
-    """Read ``INDEX[:SUB]`` in hex or decimal; raise BadParameter with an example otherwise."""
+    """Read ``INDEX[:SUB]`` in hex or decimal; raise BadParameter with an example otherwise.
+
+    Zeros in front, as in 0xD000:07, mean nothing.
+    """
     index, _, subindex = text.partition(":")
     try:
-        numbers = int(index, 0), int(subindex or "0", 0)
+        numbers = int(index, 0), int(subindex or "0", 10 if subindex.isdecimal() else 0)
     except ValueError:
         numbers = -1, 0
     if not 0 <= numbers[0] <= 0xFFFF or not 0 <= numbers[1] <= 0xFF:

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from eap.cli.words import count
+from eap.od import abort
 
 Row: TypeAlias = dict[str, Any]
 
@@ -100,7 +101,7 @@ def value_line(row: Row) -> str:
 
 def entry_name(row: Row) -> str:
     """Return index and subindex as people write them."""
-    return f"0x{row['index']:04X}:{row['subindex']:02X}"
+    return abort.entry_name(row["index"], row["subindex"])
 
 
 def object_table(rows: Iterable[Row]) -> Table:

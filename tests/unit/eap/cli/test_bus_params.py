@@ -11,6 +11,8 @@ from eap.cli.bus_params import number_up_to, parse_entry, parse_octets, parse_ty
 def test_what_is_read():
     assert parse_entry("0x1018:1") == (0x1018, 1)
     assert parse_entry("4096") == (0x1000, 0)
+    assert parse_entry("0xD000:07") == (0xD000, 7)
+    assert parse_entry("0xD000:16") == parse_entry("0xD000:0x10") == (0xD000, 16)
     assert number_up_to(255)("0xFF") == number_up_to(255)(255) == 255
     assert parse_octets("0x01ff") == b"\1\xff"
     assert parse_type("u16").text == "UINT"

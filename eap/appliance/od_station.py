@@ -1,0 +1,87 @@
+"""The object dictionary of an EAP port of a running station, over the control protocol."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from msgspec.structs import replace
+
+from eap.appliance.client import Client
+from eap.appliance.od_device import Content, EntryInfo, ObjectInfo
+from eap.codec import datatypes
+from eap.errors import ControlError
+
+ABORT = "abort"
+"""Code of a refusal by the dictionary."""
+
+
+class StationOd:
+    """The objects of *target*, which is STATION or STATION/PORT.
+
+    Raises:
+        ControlError: (every method) the station refuses, with code ``abort`` where the dictionary
+            did, or the appliance does not answer.
+    """
+
+    def __init__(self, client: Client, target: str) -> None:
+        self._client = client
+        self._target = target
+
+    def objects(self) -> list[ObjectInfo]:
+        """Return all objects without their entries."""
+        return [_object(row) for row in self._request("od_list")["objects"]]
+
+    def describe(self, index: int) -> ObjectInfo:
+        """Return one object with its entries."""
+        row = self._request("od_describe", index=index)
+        return replace(_object(row), entries=tuple(_entry(each) for each in row["entries"]))
+
+    def entry(self, index: int, subindex: int) -> EntryInfo | None:
+        """Return what is known of an entry; None if nothing is."""
+        try:
+            found = self.describe(index)
+        except ControlError as exc:
+            if exc.code != ABORT:
+                raise
+            return None
+        return next((each for each in found.entries if each.subindex == subindex), None)
+
+    def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
+        """Return the octets of an entry or of an object."""
+        where = {"index": index, "subindex": subindex, "complete": complete}
+        return bytes.fromhex(self._request("od_read", **where)["data"])
+
+    def write(self, index: int, subindex: int, octets: bytes, *, complete: bool = False) -> None:
+        """Write an entry or an object."""
+        where = {"index": index, "subindex": subindex, "complete": complete}
+        self._request("od_write", **where, data=octets.hex())
+
+    def contents(self) -> list[Content]:
+        """Return all entries of all objects."""
+        return [
+            _content(found, row)
+            for each in self._request("od_dump")["objects"]
+            for found in [_object(each)]
+            for row in each["entries"]
+        ]
+
+    def _request(self, method: str, **params: Any) -> Any:
+        return self._client.request(method, target=self._target, **params)
+
+
+def _object(row: dict[str, Any]) -> ObjectInfo:
+    return ObjectInfo(row["index"], row["name"], row["code"], row["max_subindex"])
+
+
+def _entry(row: dict[str, Any]) -> EntryInfo:
+    try:
+        kind = datatypes.parse(row["type"])
+    except ValueError:
+        kind = None  # a later release may know more of them
+    return EntryInfo(row["subindex"], row["name"], kind, row["access"], row["unit"] or "")
+
+
+def _content(found: ObjectInfo, row: dict[str, Any]) -> Content:
+    data = row["data"]
+    octets = None if data is None else bytes.fromhex(data)
+    return Content(found, _entry(row), octets, row.get("error", ""))

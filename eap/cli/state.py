@@ -1,0 +1,79 @@
+"""``eapctl state``: the state of a station's EAP device, or of a slave behind its bus."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from eap.cli.group import ExitCode
+from eap.cli.od_params import target_argument
+from eap.cli.output import write_json, write_text
+from eap.cli.params import json_option
+
+if TYPE_CHECKING:
+    from eap.appliance.od_target import Target
+
+STATES = ("PREOP", "SAFEOP", "OP")
+_OF_SLAVES = ("INIT", *STATES, "BOOT")
+
+
+@click.command(short_help="Show or request the state of a station.")
+@target_argument
+@click.argument(
+    "wanted",
+    required=False,
+    type=click.Choice(_OF_SLAVES, case_sensitive=False),
+    metavar="[PREOP|SAFEOP|OP]",
+)
+@json_option("Print one object: state, and error or null.")
+@click.pass_context
+def state(ctx: click.Context, wanted: str | None, target: Target, as_json: bool) -> None:
+    """Show the state of TARGET, or bring it to another one.
+
+    TARGET is STATION or STATION/PORT: PREOP takes configuration, SAFEOP sends, OP sends and
+    receives.  A slave is STATION/PORT/SLAVE, and has INIT and BOOT too.
+
+    Exits with 1 when the state was refused, which leaves the station where it was.
+    """
+    wanted = wanted and wanted.upper()
+    if wanted and not target.slave and wanted not in STATES:
+        raise click.UsageError(f"{wanted} cannot be requested: expected {', '.join(STATES)}")
+    answer = _of_slave(target, wanted) if target.slave else _of_station(target, wanted)
+    is_refused = wanted is not None and answer["state"] != wanted
+    if as_json:
+        write_json({"target": str(target)} | answer)
+    else:
+        write_text(f"{target}: {answer['state'] or 'no answer'}")
+    error = answer["error"]
+    if error and not as_json:
+        what = f"{wanted} was refused" if is_refused else "the last request was refused"
+        click.echo(f"{target}: {what}: {_error_text(error)}", err=True)
+    if is_refused:
+        ctx.exit(ExitCode.FAILED)
+
+
+def _of_station(target: Target, wanted: str | None) -> dict[str, Any]:
+    from eap.appliance.client import connect_station
+
+    with connect_station(target.station, target.plant) as client:
+        if wanted is None:
+            answer: dict[str, Any] = client.request("state", target=str(target))
+        else:
+            answer = client.request("request_state", target=str(target), state=wanted)
+    return answer
+
+
+def _of_slave(target: Target, wanted: str | None) -> dict[str, Any]:
+    from eap.appliance.bus_info import state_rows
+    from eap.appliance.bus_running import open_running
+
+    with open_running(target.station, target.port, target.plant) as bus:
+        (row,) = state_rows(bus, target.slave, wanted)
+    error = {"code": row["code"], "text": row["reason"]} if row["reason"] else None
+    return {"state": row["state"], "error": error}
+
+
+def _error_text(error: dict[str, Any]) -> str:
+    code = f" (0x{error['code']:04X})" if error["code"] else ""
+    return f"{error['text']}{code}"

@@ -1,0 +1,81 @@
+"""Values of entries in text and JSON."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec import datatypes
+from eap.od.notation import parse, plain, show
+
+KINDS = ["BOOL", "BIT3", "SINT", "UINT", "UDINT", "LINT", "REAL", "LREAL", "REAL[3]", "UINT24[2]",
+         "BLOCK(6)", "BLOCK(4)", "BLOCK(9)"]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "octets", "value"),
+    [
+        ("BLOCK(6)", "Destination MAC", "010105040000", "01:01:05:04:00:00"),
+        ("BLOCK(6)", "Publisher", "7f0001010201", "127.0.1.1.2.1"),
+        ("BLOCK(6)", "Destination NetID", "7f0001010201", "127.0.1.1.2.1"),
+        ("BLOCK(6)", "Key", "7f0001010201", "7f0001010201"),
+        ("BLOCK(4)", "Monitor IP", "7f000101", "127.0.1.1"),
+        ("BLOCK(4)", "Recipe", "7f000101", "7f000101"),
+        ("UINT", "Level", "0001", 256),
+        ("UINT", "Level", "00", None),
+        ("STRING(8)", "Name", "6162", "ab"),
+        ("STRING(8)", "Name", "61620000", "ab"),
+        ("REAL[2]", "Curve", "0000803f0000c03f", [1.0, 1.5]),
+    ],
+)
+def test_plain(kind, name, octets, value):
+    assert plain(datatypes.parse(kind), name, bytes.fromhex(octets)) == value
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "octets"),
+    [
+        ("BLOCK(6)", "01-01-05-04-00-00", "010105040000"),
+        ("BLOCK(6)", "127.0.1.1.2.1", "7f0001010201"),
+        ("BLOCK(6)", "7f 00 01 01 02 01", "7f0001010201"),
+        ("BLOCK(4)", "127.0.1.1", "7f000101"),
+        ("STRING(8)", "ab", "6162"),
+        ("STRING(8)", "", ""),
+        ("UDINT", "0x1A00", "001a0000"),
+        ("BOOL", "on", "01"),
+        ("UINT[2]", "1,2", "01000200"),
+    ],
+)
+def test_parse(kind, text, octets):
+    assert parse(datatypes.parse(kind), text).hex() == octets
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "reason"),
+    [
+        ("UINT", "65536", "0 to 65535"),
+        ("BLOCK(4)", "300.0.0.1", "300"),
+        ("BLOCK(6)", "300.0.0.1.1.1", "above 255"),
+        ("BLOCK(6)", "127.0.1.1", "hexadecimal"),
+        ("STRING(2)", "abc", "STRING"),
+    ],
+)
+def test_parse_says_what_was_expected(kind, text, reason):
+    with pytest.raises(ValueError, match=reason):
+        parse(datatypes.parse(kind), text)
+
+
+@given(st.sampled_from(KINDS), st.binary(min_size=24, max_size=24), st.sampled_from(["", "NetID"]))
+def test_what_is_shown_reads_as_it_was(text, octets, name):
+    kind = datatypes.parse(text)
+    value = kind.decode(octets[: kind.size], 0)
+    numbers = value if isinstance(value, tuple) else (value,)
+    if any(isinstance(number, float) and math.isnan(number) for number in numbers):
+        return  # there are many of them
+    exact = kind.encode(value)
+    shown = plain(kind, name, exact)
+    assert shown is not None
+    assert parse(kind, show(shown)) == exact
