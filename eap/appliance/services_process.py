@@ -18,6 +18,7 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
+from eap.appliance.aoe_desk import AoeDesk
 from eap.appliance.bus_client import BusClient
 from eap.appliance.bus_methods import Buses
 from eap.appliance.control_server import ControlServer
@@ -40,11 +41,12 @@ from eap.appliance.station_image import StationImage
 from eap.appliance.status import ProcessMeter, appliance_status
 from eap.appliance.tcp_door import TcpDoor
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, NetId
 from eap.net import realtime
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
+from eap.pd.spec import StationSpec
 
 IMAGE_PATIENCE_S = 15.0
 STATUS_PATIENCE_S = 0.3
@@ -67,6 +69,9 @@ class Services:
         self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
         self._batch = ReceiveBatch()
         self._stopping = asyncio.Event()
+        self._desks = {
+            station.name: AoeDesk({}, _net_ids(station)) for station in handover.stations
+        }
 
     async def run(self) -> None:
         """Serve until SIGTERM."""
@@ -79,6 +84,7 @@ class Services:
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(server.serve(self._listener))]
             tasks += [group.create_task(door.serve()) for door in self._doors()]
+            tasks += [group.create_task(desk.serve()) for desk in self._desks.values()]
             tasks += [
                 group.create_task(play_sources(station, images[station.name]))
                 for station in self._handover.stations
@@ -169,6 +175,7 @@ class Services:
                 tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
                 self._link,
                 _Refusals(self._counters, _stations_of(shared)).count,
+                [self._desks[station] for station in _stations_of(shared)],
             )
             for shared in self._handover.sockets
             if shared.kind is SocketKind.TCP
@@ -189,6 +196,10 @@ class _Refusals:
     def count(self, reason: Refusal) -> None:
         for station in self._stations:
             self._counters.count(station, reason)
+
+
+def _net_ids(station: StationSpec) -> list[NetId]:
+    return [NetId.parse(text) for text in (station.net_id, *(p.net_id for p in station.ports))]
 
 
 def _stations_of(shared: SharedSocket) -> list[str]:
