@@ -311,7 +311,8 @@ def read_to_end(connection: socket.socket) -> bytes:
 
 def test_tcp_connections_go_where_their_first_frame_belongs(appliance):
     with socket.create_connection(LEFT) as connection:
-        connection.sendall(MAILBOX)
+        connection.sendall(MAILBOX)  # for nobody, so far
+        connection.shutdown(socket.SHUT_WR)
         assert read_to_end(connection) == b""
     assert discarded()["mailbox"] == 1
     with socket.create_connection(("127.9.1.2", EAP_PORT)) as connection:
