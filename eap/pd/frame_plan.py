@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from eap.codec.pd import PdHeader
 from eap.pd.account import Account
+from eap.pd.copyplan import CopyPlan
 from eap.pd.poll import Answer
 
 Copy: TypeAlias = tuple[slice, slice]
@@ -28,6 +29,8 @@ class Taken(NamedTuple):
     target: int
     size: int
     """Octets, header included."""
+    alternate: CopyPlan | None = None
+    """What copies it, header included, if it is laid out otherwise than in the image."""
 
 
 class Refused(NamedTuple):
@@ -48,7 +51,8 @@ class FramePlan:
         is_single: Whether there is one PD in it.
         parts: For each account that the frame concerns, the copies to make if it agrees.
         taken_words: First words of the RxPDs that take one of its PDs.
-        has_more: Whether there is anything of the next three.
+        has_more: Whether there is anything of the next four.
+        alternates: PDs that are laid out otherwise: account, offset in the frame, copy to make.
         refused: The PDs that nobody takes.
         requests: RxPDs that ask this station for something, with their accounts.
         answers: RxPDs that this station asked for, likewise.
@@ -57,6 +61,7 @@ class FramePlan:
     """
 
     __slots__ = (
+        "alternates",
         "answers",
         "end",
         "expected",
@@ -92,19 +97,30 @@ class FramePlan:
         self.is_single = len(pds) == 1
         taken = tuple(taken)
         self.parts = _parts(taken)
+        self.alternates = tuple(
+            (pd.account, pd.source, pd.alternate) for pd in taken if pd.alternate is not None
+        )
         self.taken_words = tuple(pd.words for pd in taken)
         self.refused = tuple(refused)
         self.requests = tuple(requests)
         self.answers = tuple(answers)
-        self.has_more = bool(self.refused or self.requests or self.answers)
+        self.has_more = bool(self.alternates or self.refused or self.requests or self.answers)
         self.roaming = tuple(roaming)
         self.publisher = int.from_bytes(publisher)
+
+    def copy_alternates(self, data: memoryview, cycle: int, memory: memoryview) -> None:
+        """Copy what is laid out otherwise from the frame *data* of *cycle*, if it was taken."""
+        for account, source, alternate in self.alternates:
+            if account.has_taken(cycle):
+                alternate.run(data[source:], memory)
 
 
 def _parts(taken: Iterable[Taken]) -> tuple[tuple[Account, tuple[Copy, ...]], ...]:
     runs: dict[Account, list[Taken]] = {}
     for pd in taken:
         pieces = runs.setdefault(pd.account, [])
+        if pd.alternate is not None:
+            continue
         if pieces and _continues(pieces[-1], pd):
             pieces[-1] = pieces[-1]._replace(size=pieces[-1].size + pd.size)
         else:

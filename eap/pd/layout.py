@@ -18,6 +18,7 @@ import msgspec
 
 from eap.codec import datatypes, pdo
 from eap.codec.pd import PdHeader
+from eap.pd.alternate import AlternatePlace, place_alternates
 from eap.pd.busplace import mirror
 from eap.pd.spec import (
     BusEntrySpec,
@@ -119,6 +120,7 @@ class RxPlace(Record, frozen=True):
     substitute: Substitute
     poll_request: str = ""
     """The TxPD that asks for it."""
+    alternates: tuple[AlternatePlace, ...] = ()
 
 
 class ImageLayout(Record, frozen=True):
@@ -147,7 +149,11 @@ class ImageLayout(Record, frozen=True):
 
 
 def plan_layout(spec: StationSpec) -> ImageLayout:
-    """Give everything in *spec* its place."""
+    """Give everything in *spec* its place.
+
+    Raises:
+        ValueError: an alternate of an RxPD does not belong to it.
+    """
     words = _Allocator(0)
     words.take(StationWord.SIZE)
     frames = tuple(
@@ -290,11 +296,13 @@ def _rx_places(
 ) -> Iterable[RxPlace]:
     named = {variable.name: variable for variable in spec.variables}
     for pd, first_word in zip(spec.subscriptions, words, strict=True):
-        plan = pdo.layout([datatypes.parse(named[name].type) for name in pd.variables])
+        kinds = [datatypes.parse(named[name].type) for name in pd.variables]
+        plan = pdo.layout(kinds)
         offset = octets.take(PdHeader.SIZE + plan.size)
         data = 8 * (offset + PdHeader.SIZE)
-        for name, bit_offset in zip(pd.variables, plan.bit_offsets, strict=True):
-            places[name] = _place(named[name], data + bit_offset)
+        bits = [data + bit_offset for bit_offset in plan.bit_offsets]
+        for name, bit_offset in zip(pd.variables, bits, strict=True):
+            places[name] = _place(named[name], bit_offset)
         yield RxPlace(
             name=pd.name,
             port=pd.port,
@@ -310,4 +318,5 @@ def _rx_places(
             timeout_ms=pd.timeout_ms,
             substitute=pd.substitute,
             poll_request=pd.poll_request,
+            alternates=place_alternates(pd, kinds, bits, offset),
         )

@@ -118,12 +118,13 @@ class Subscriber:
             if account.arrived(cycle, at_ns, own_cycle):
                 for source, target in copies:
                     memory[target] = data[source]
-        if outside:
-            words[_SEQUENCE] += 1
         if plan.has_more:
+            plan.copy_alternates(data, cycle, memory)
             self._refuse(plan, at_ns)
             self._enter_answers(plan, cycle, at_ns)
             self._note_requests(plan, cycle, data, origin)
+        if outside:
+            words[_SEQUENCE] += 1
 
     @property
     def has_timeouts(self) -> bool:
@@ -181,29 +182,27 @@ class Subscriber:
             self._discard(pds, 1)
             return None
         publisher = bytes(data[PD_FRAME_START : PD_FRAME_START + 6])
-        chosen: list[tuple[Subscription, int]] = []
+        chosen: list[tuple[Subscription, PdHeader, int]] = []
         refused = []
         for header, offset in pds:
             match = self._match(publisher, header)
             if isinstance(match, Refused):
                 refused.append(match)
             else:
-                chosen += [(subscription, offset) for subscription in match]
-        if self._part_accounts({subscription for subscription, _ in chosen}):
+                chosen += [(subscription, header, offset) for subscription in match]
+        taking = [subscription for subscription, _, _ in chosen]
+        if self._part_accounts(set(taking)):
             self._forget_plans()
         plan = FramePlan(
             PD_FRAME_START + EtherCatHeader.decode(data).length,
             [(bytes(data[offset : offset + 6]), header.length) for header, offset in pds],
-            [
-                Taken(s.account, s.place.words, offset, s.place.offset, 8 + s.place.size)
-                for s, offset in chosen
-            ],
+            [_take(subscription, header, offset) for subscription, header, offset in chosen],
             refused,
             requests=[
-                (s.account, s.place.name) for s, _ in chosen if s.place.name in self._requests.names
+                (s.account, s.place.name) for s in taking if s.place.name in self._requests.names
             ],
-            answers=[(s.account, s.answer) for s, _ in chosen if s.answer is not None],
-            roaming={s.account for s, _ in chosen if not s.place.publisher},
+            answers=[(s.account, s.answer) for s in taking if s.answer is not None],
+            roaming={s.account for s in taking if not s.place.publisher},
             publisher=publisher,
         )
         if size < _SHORTEST:
@@ -320,6 +319,14 @@ class Subscriber:
 
 _UNKNOWN_ID = Refused((StationWord.DISCARDED + DISCARD_INDEX[Discard.UNKNOWN_ID],))
 _VAR_STATE = {Discard.VERSION: 1, Discard.LENGTH: 2}
+
+
+def _take(subscription: Subscription, header: PdHeader, offset: int) -> Taken:
+    """Return how *subscription* takes the PD with *header* at *offset* of the frame."""
+    place = subscription.place
+    alternate = subscription.alternates.get((header.version, header.length))
+    size = PdHeader.SIZE + place.size
+    return Taken(subscription.account, place.words, offset, place.offset, size, alternate)
 
 
 def _refuse_all(reasons: list[tuple[Subscription, Discard]]) -> Refused:

@@ -21,10 +21,19 @@ class Subscription:
 
     Attributes:
         account: Where its arrivals are entered; the subscriber opens it.
+        alternates: What copies another layout that is taken as well, by version and length.
         answer: What it is to its question; None if it comes by itself.
     """
 
-    __slots__ = ("account", "answer", "ignore_version", "place", "substitute", "timeout_ns")
+    __slots__ = (
+        "account",
+        "alternates",
+        "answer",
+        "ignore_version",
+        "place",
+        "substitute",
+        "timeout_ns",
+    )
 
     def __init__(
         self,
@@ -35,6 +44,7 @@ class Subscription:
     ) -> None:
         self.place = place
         self.answer = None if question is None else Answer(spec.name, question, place.words)
+        self.alternates = {(each.version, each.size): each.copy_plan() for each in place.alternates}
         self.ignore_version = spec.ignore_version
         self.timeout_ns = spec.timeout_ms * 1_000_000
         self.substitute = substitute
@@ -42,6 +52,8 @@ class Subscription:
 
     def mismatch(self, version: int, length: int) -> Discard | None:
         """Return why a PD of this version and length does not fit, None if it does."""
+        if (version, length) in self.alternates:
+            return None
         if version != self.place.version and not self.ignore_version:
             return Discard.VERSION
         if length != self.place.size:

@@ -5,30 +5,62 @@ from __future__ import annotations
 from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
 from eap.pd.poll import Requests
-from eap.pd.spec import PortKind, PortSpec, RxPdSpec, StationSpec, VariableSpec, Writer
+from eap.pd.spec import (
+    PortKind,
+    PortSpec,
+    RxAlternateSpec,
+    RxPdSpec,
+    StationSpec,
+    TakenVariableSpec,
+    VariableSpec,
+    Writer,
+)
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import DISCARDS, RxWord, StationWord
 
 _SIZES = {1: 1, 2: 2, 0x03E9: 1, 0x1234: 4}
 """PDs to subscribe to, those of the golden vectors among them, and their octets."""
-_NAMES = [f"v{pd_id}" for pd_id in _SIZES]
+
+
+def _shifted(name: str, size: int) -> tuple[RxAlternateSpec, ...]:
+    """The same variable behind three bits, in another version and, told by the length, in this."""
+    variables = TakenVariableSpec("", "BIT3"), TakenVariableSpec(name, f"BLOCK({size})")
+    return RxAlternateSpec(0, variables), RxAlternateSpec(1, variables)
+
+
+def _block(name: str, pd_id: int, size: int) -> RxPdSpec:
+    alternates = _shifted(name, size)
+    return RxPdSpec(
+        name, "eap0", pd_id, (name,), sender_cycle_us=1000, step=1, alternates=alternates
+    )
+
+
+_LIES_OTHERWISE = (
+    TakenVariableSpec("", "BIT3"),
+    TakenVariableSpec("level", "BIT8"),
+    TakenVariableSpec("on", "BOOL"),
+)
 _SPEC = StationSpec(
     "fuzzed",
     "5.1.1.1.1.1",
     1000,
     (PortSpec("eap0", PortKind.EAP, "loop://line", "5.1.1.1.2.1"),),
-    variables=tuple(
-        VariableSpec(name, f"BLOCK({size})", Writer.ENGINE)
-        for name, size in zip(_NAMES, _SIZES.values(), strict=True)
+    variables=(
+        *(VariableSpec(f"v{n}", f"BLOCK({size})", Writer.ENGINE) for n, size in _SIZES.items()),
+        VariableSpec("on", "BOOL", Writer.ENGINE),
+        VariableSpec("level", "BIT8", Writer.ENGINE),
     ),
-    subscriptions=tuple(
-        RxPdSpec(name, "eap0", pd_id, (name,), sender_cycle_us=1000, step=1)
-        for name, pd_id in zip(_NAMES, _SIZES, strict=True)
+    subscriptions=(
+        *(_block(f"v{pd_id}", pd_id, size) for pd_id, size in _SIZES.items()),
+        RxPdSpec(
+            "bits", "eap0", 3, ("on", "level"), alternates=(RxAlternateSpec(1, _LIES_OTHERWISE),)
+        ),
     ),
 )
 _LAYOUT = plan_layout(_SPEC)
 _IMAGE = format_image(memoryview(bytearray(_LAYOUT.size)), _LAYOUT, 1)
-_REQUESTS = Requests(_NAMES[:1])
+_DIRECTORY = bytes(_IMAGE.memory[_LAYOUT.directory_offset :])
+_REQUESTS = Requests(["v1"])
 _SUBSCRIBER = Subscriber(
     _IMAGE, zip(_SPEC.subscriptions, _LAYOUT.rx, strict=True), 1_000_000, _REQUESTS
 )
@@ -50,6 +82,8 @@ def fuzz_one(data: bytes) -> None:
     at_ns = len(data) * 300_000
     _SUBSCRIBER.receive_frame(memoryview(data + bytes(16)), len(data), at_ns, _Somebody())
     _REQUESTS.take()
+    if _IMAGE.memory[_LAYOUT.directory_offset :] != _DIRECTORY:
+        raise AssertionError("what lies behind the variables was overwritten")
     if _IMAGE.words[StationWord.ENGINE_SEQUENCE] % 2:
         raise AssertionError("the engine's region stayed marked as changing")
     carries_none = len(data) >= 14 and data[8:10] == b"\0\0"

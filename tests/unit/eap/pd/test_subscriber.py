@@ -14,8 +14,8 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import PdFrameHeader
 from eap.ids import NetId
 from eap.pd.poll import REQUESTERS_PER_CYCLE, Requests
-from eap.pd.report import station_status
-from eap.pd.spec import RxPdSpec, Substitute
+from eap.pd.report import quality, station_status
+from eap.pd.spec import RxAlternateSpec, RxPdSpec, Substitute, TakenVariableSpec
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import RxState, RxWord
 from tests.support.cyclic import MS, OWN, PEER, SECOND, Receiver, give, octets, received
@@ -100,6 +100,35 @@ def test_the_version_can_be_ignored():
     r = receiver(ignore_version=True)
     r.give(octets([(7, b"ab", 9)]), 0)
     assert r.word("r", RxWord.RECEIVED) == 1
+
+
+def test_an_alternate_is_told_by_version_and_length():
+    other = RxAlternateSpec(2, (TakenVariableSpec("", "BOOL"), TakenVariableSpec("x", "UINT")))
+    r = receiver(alternates=(other,))
+    r.give(octets([(7, b"\xff\x34\x12", 2, 50)], cycle=1), MS)
+    assert (r.image.read("x"), quality(r.image, r.place("r"))) == (0x1234, 50)
+    r.give(octets([(7, b"\x35\x12", 3, 0)], cycle=2), 2 * MS)
+    assert (r.image.read("x"), quality(r.image, r.place("r"))) == (0x1235, 0)
+    for version, data in ((2, b"ab"), (3, b"abc"), (4, b"abc")):
+        r.give(octets([(7, data, version)], cycle=3), 3 * MS)
+    assert (r.word("r", RxWord.RECEIVED), r.word("r", RxWord.LOST)) == (2, 0)
+    assert r.discarded("r") == {"version": 2, "length": 1}
+
+
+def test_an_alternate_is_preferred_to_ignoring_the_version():
+    other = RxAlternateSpec(2, (TakenVariableSpec("y", "UINT"), TakenVariableSpec("x", "UINT")))
+    pd = RxPdSpec("r", "eap0", 7, ("x", "y"), version=3, ignore_version=True, alternates=(other,))
+    r = Receiver(pd, variables=received("x:UINT", "y:UINT"))
+    for version, values in ((3, [1, 2]), (2, [2, 1]), (4, [1, 2])):
+        r.give(octets([(7, b"\1\0\2\0", version)]), 0)
+        assert [r.image.read(name) for name in "xy"] == values
+
+
+def test_an_older_frame_of_an_alternate_leaves_the_newer_data():
+    r = receiver(alternates=(RxAlternateSpec(4, (TakenVariableSpec("x", "UINT"),)),))
+    for cycle, version, data in ((1, 4, b"aa"), (3, 3, b"cc"), (2, 4, b"bb")):
+        r.give(octets([(7, data, version)], cycle=cycle), cycle * MS)
+    assert r.image.read("x") == int.from_bytes(b"cc", "little")
 
 
 def test_any_publisher_is_taken_each_with_its_own_counter():
