@@ -66,7 +66,7 @@ class ObjectDictionary:
         """Write the octets of one entry."""
         entry = self.entry(index, subindex)
         _check_writable(entry, index, subindex, state)
-        _check_value(entry, index, subindex, data)
+        check_value(entry, index, subindex, data)
         _store(entry, index, subindex, data)
 
     def check_download(
@@ -123,8 +123,8 @@ class ObjectDictionary:
         for (subindex, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
             if not entry.access & state.write_right:
                 continue
-            octets = _take_bits(data, bit_offset, entry)
-            _check_value(entry, index, subindex, octets)
+            octets = take_bits(data, bit_offset, entry)
+            check_value(entry, index, subindex, octets)
             accepted.append((subindex, entry, octets))
         if count is not None:
             counter = self[index].entries[0]
@@ -140,7 +140,7 @@ class ObjectDictionary:
             return None
         if len(data) < 2:
             raise SdoAbortError(AbortCode.TOO_SHORT, index, 0, "subindex 0 takes two octets")
-        _check_value(item.entries[0], index, 0, data[:1])
+        check_value(item.entries[0], index, 0, data[:1])
         if data[0] > max(item.entries):
             raise SdoAbortError(AbortCode.NO_SUBINDEX, index, data[0])
         return data[0]
@@ -191,7 +191,12 @@ def _check_size(entry: Entry, index: int, subindex: int, given: int) -> None:
     raise SdoAbortError(code, index, subindex, f"{given} octets for {entry.kind.text}")
 
 
-def _check_value(entry: Entry, index: int, subindex: int, data: bytes) -> None:
+def check_value(entry: Entry, index: int, subindex: int, data: bytes) -> None:
+    """Refuse what has not the size of *entry* or is beyond its limits, rights aside.
+
+    Raises:
+        SdoAbortError: TOO_LONG, TOO_SHORT, TOO_HIGH or TOO_LOW.
+    """
     _check_size(entry, index, subindex, len(data))
     if entry.minimum is None and entry.maximum is None:
         return
@@ -225,7 +230,8 @@ def _put_bits(data: bytearray, bit_offset: int, entry: Entry) -> None:
         data[offset + 1] |= value >> 8
 
 
-def _take_bits(data: bytes, bit_offset: int, entry: Entry) -> bytes:
+def take_bits(data: bytes, bit_offset: int, entry: Entry) -> bytes:
+    """Return the octets of *entry* out of the data of a complete access."""
     offset, bit = divmod(bit_offset, 8)
     if not entry.kind.is_bits:
         octets = data[offset : offset + entry.kind.size]

@@ -167,6 +167,8 @@ class TxPdSpec(Record, frozen=True):
     trigger: TriggerSpec = TriggerSpec()
     poll_request: str = ""
     """Name of the RxPD, of the same port, that asks for it; all triggers are off then."""
+    changeable: bool = False
+    """Whether its ID and poll request may be written in SafeOp and Op."""
 
 
 class TxFrameSpec(Record, frozen=True):
@@ -182,6 +184,8 @@ class TxFrameSpec(Record, frozen=True):
     pds: tuple[TxPdSpec, ...]
     divider: int = 0
     modulo: int = 0
+    changeable: bool = False
+    """Whether its destination may be written in SafeOp and Op."""
 
 
 class TakenVariableSpec(Record, frozen=True):
@@ -227,6 +231,8 @@ class RxPdSpec(Record, frozen=True):
 
     The step is 0 then.
     """
+    changeable: bool = False
+    """Whether its ID, publisher and poll request may be written in SafeOp and Op."""
 
 
 class PortKind(StrEnum):
@@ -330,6 +336,8 @@ class PortSpec(Record, frozen=True):
     tcp: bool = False
     """Whether type 4 is taken from TCP connections too."""
     wake: Wake = Wake.CYCLE
+    eap_sm: bool = False
+    """Whether the frames sent carry the device's state in the EAP SM octet."""
     bus: BusPortSpec | None = None
     """Bus ports only."""
 

@@ -1,0 +1,275 @@
+"""From a station's specification to the objects of one of its EAP ports.
+
+Variables that the station has for itself are objects of its first EAP port; another port has those
+that it sends.  What is received is an object of the port that it comes to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from ipaddress import IPv4Address
+from typing import Any
+
+from eap.codec import datatypes
+from eap.device.eap_content import COUNTED, PORT, bus_variables
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_mapping import encode_mapping
+from eap.device.eap_rules import GROUPS
+from eap.device.fault import DeviceFault, FaultCode
+from eap.ids import Destination, DestinationKind, MacAddr, NetId
+from eap.od.profiles import eap1000 as profile
+from eap.od.profiles.eap1000keys import (
+    AddressMode,
+    Configured,
+    Frame,
+    Port,
+    Rx,
+    RxFlag,
+    Substituted,
+    Tx,
+    Var,
+    Waking,
+    WrittenBy,
+)
+from eap.od.profiles.table import ObjectRange
+from eap.pd.spec import (
+    REQUESTER,
+    PortKind,
+    RxPdSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+)
+
+_MODES = {
+    DestinationKind.MAC: AddressMode.MAC,
+    DestinationKind.IP: AddressMode.IP,
+    DestinationKind.TCP: AddressMode.TCP,
+}
+
+
+def fill(dictionary: EapDictionary, like: EapDictionary | None = None) -> None:
+    """Make objects of what the station of *dictionary* says of its port.
+
+    Args:
+        dictionary: An empty one.
+        like: Another one of the same port; what has the same name there gets the same index.
+
+    Raises:
+        DeviceFault: the port has more than there are objects for, or a PD more variables than a
+            mapping has entries, or a text is too long for its entry.
+    """
+    _Filling(dictionary, like).run()
+
+
+class _Filling:
+    def __init__(self, dictionary: EapDictionary, like: EapDictionary | None) -> None:
+        self._dictionary = dictionary
+        self._like = like
+        station, port = dictionary.station, dictionary.port.name
+        self._station = station
+        self._frames = [frame for frame in station.frames if frame.port == port]
+        self._tx = [pd for frame in self._frames for pd in frame.pds]
+        self._rx = [pd for pd in station.subscriptions if pd.port == port]
+        named = {variable.name: variable for variable in station.variables}
+        received = {name for pd in self._rx for name in pd.variables}
+        self._tx_variables = [named[name] for name in self._sent(received)]
+        self._rx_variables = [v for v in station.variables if v.name in received]
+        self._types = {name: datatypes.parse(each.type) for name, each in named.items()}
+        self._objects: dict[str, int] = {}
+        """Index of each variable, by name."""
+
+    def _sent(self, received: set[str]) -> list[str]:
+        """Return the names of the variables that are to be Tx variables, in their order."""
+        station = self._station
+        wanted = {name for pd in self._tx for name in pd.variables}
+        first = next(port for port in station.ports if port.kind is PortKind.EAP)
+        if first.name == self._dictionary.port.name:
+            elsewhere = {name for pd in station.subscriptions for name in pd.variables}
+            elsewhere |= bus_variables(station)
+            wanted |= {each.name for each in station.variables} - elsewhere
+        return [each.name for each in station.variables if each.name in wanted - received]
+
+    def run(self) -> None:
+        """Make all objects."""
+        self._fill_device()
+        for row, variables in (
+            (profile.TX_VARIABLE, self._tx_variables),
+            (profile.RX_VARIABLE, self._rx_variables),
+        ):
+            places = self._assign((row,), [each.name for each in variables])
+            self._objects |= places
+            for variable in variables:
+                self._fill_variable(row, places[variable.name], variable)
+        tx = self._assign((profile.TX_PD,), [pd.name for pd in self._tx])
+        rx = self._assign((profile.RX_PD,), [pd.name for pd in self._rx])
+        tx_pdos = self._mappings((profile.TX_PDO, profile.MORE_TX_PDO), tx)
+        rx_pdos = self._mappings((profile.RX_PDO, profile.MORE_RX_PDO), rx)
+        for sent in self._tx:
+            self._fill_mapping(tx_pdos[sent.name], sent)
+            self._fill_tx(tx[sent.name], tx_pdos[sent.name], sent, rx)
+        for received in self._rx:
+            self._fill_mapping(rx_pdos[received.name], received)
+            self._fill_rx(rx[received.name], rx_pdos[received.name], received, tx)
+        frames = self._assign((profile.TX_FRAME,), [frame.name for frame in self._frames])
+        for frame in self._frames:
+            self._fill_frame(frames[frame.name], frame, tx)
+
+    def _assign(self, rows: tuple[ObjectRange, ...], names: list[str]) -> dict[str, int]:
+        """Return an index of *rows* for each name: that which it has elsewhere, or another."""
+        like = self._like
+        before = {like.name_of(i): i for i in like.members(*rows)} if like is not None else {}
+        return self._choose(rows, names, before)
+
+    def _mappings(self, rows: tuple[ObjectRange, ...], pds: Mapping[str, int]) -> dict[str, int]:
+        """Return the index of each PD's mapping: the one it has elsewhere, or its own number."""
+        before: dict[str, int] = {}
+        if self._like is not None:
+            members = set(self._like.members(*rows))
+            for name, index in pds.items():
+                if index in self._like and self._like.name_of(index) == name:
+                    mapping = self._like[index].entries[Tx.PDO_INDEX].value
+                    if mapping in members and mapping not in before.values():
+                        before[name] = mapping
+        return self._choose(rows, list(pds), before)
+
+    def _choose(
+        self, rows: tuple[ObjectRange, ...], names: list[str], before: Mapping[str, int]
+    ) -> dict[str, int]:
+        chosen = {name: before[name] for name in names if name in before}
+        taken = set(chosen.values())
+        free = (i for row in rows for i in range(row.first, row.last + 1) if i not in taken)
+        for name in names:
+            if name not in chosen:
+                index = next(free, None)
+                if index is None:
+                    room = sum(row.last - row.first + 1 for row in rows)
+                    detail = f"{len(names)} objects, there is room for {room}"
+                    raise DeviceFault(FaultCode.NO_ROOM, detail, rows[0].first)
+                chosen[name] = index
+        return chosen
+
+    def _fill_device(self) -> None:
+        station, port = self._station, self._dictionary.port
+        self._set(COUNTED, {
+            Configured.DEVICE_CYCLE_TIME: station.cycle_us,
+            Configured.PHASE: station.phase_us,
+        })  # fmt: skip
+        self._set(PORT, {
+            Port.VLAN_ID: port.vlan_id,
+            Port.VLAN_PRIORITY: port.vlan_priority,
+            Port.TCP: port.tcp,
+            Port.BROADCAST: port.broadcast,
+            Port.WAKE: Waking[port.wake.name],
+            Port.EAP_SM: port.eap_sm,
+        })  # fmt: skip
+        self._set_list(GROUPS, 1, port.join)
+
+    def _fill_variable(self, row: ObjectRange, index: int, variable: VariableSpec) -> None:
+        kind = self._types[variable.name]
+        self._dictionary.make(row, index)
+        values: dict[int, Any] = {
+            Var.TYPE_NAME: kind.text,
+            Var.NAME: variable.name,
+            Var.UNIT: variable.unit,
+            Var.COMMENT: variable.comment,
+        }
+        if row is profile.TX_VARIABLE:
+            values[Var.WRITER] = WrittenBy[variable.writer.name]
+        self._set(index, values)
+        if variable.default is not None:
+            default = kind.from_plain(variable.default)
+            self._set(index, {Var.DEFAULT_GIVEN: True, Var.DEFAULT: default})
+
+    def _fill_mapping(self, index: int, pd: TxPdSpec | RxPdSpec) -> None:
+        mapped = [(self._objects[name], self._types[name]) for name in pd.variables]
+        self._dictionary.make(profile.row_of(index), index)
+        try:
+            words = encode_mapping(mapped)
+        except ValueError as exc:
+            raise DeviceFault(FaultCode.NO_ROOM, f"PD {pd.name}: {exc}", index) from None
+        self._set_list(index, 1, words)
+
+    def _fill_tx(self, index: int, pdo: int, pd: TxPdSpec, rx: Mapping[str, int]) -> None:
+        trigger = pd.trigger
+        values: dict[int, Any] = {
+            Tx.PDO_INDEX: pdo,
+            Tx.PD_ID: pd.pd_id,
+            Tx.VERSION: pd.version,
+            Tx.ENABLED: True,
+            Tx.CYCLE_TIME: trigger.cycle_us,
+            Tx.DIVIDER: trigger.divider,
+            Tx.MODULO: trigger.modulo,
+            Tx.POLL_REQUEST_RXPD: rx[pd.poll_request] if pd.poll_request else 0,
+            Tx.NAME: pd.name,
+            Tx.ON_CHANGE: trigger.on_change is not None,
+            Tx.EVENT: trigger.event,
+            Tx.CHANGEABLE: pd.changeable,
+        }
+        if trigger.on_change is not None:
+            values[Tx.ON_CHANGE_TIMEOUT] = trigger.on_change.timeout_ms
+            values[Tx.ON_CHANGE_INHIBIT] = trigger.on_change.inhibit_us
+        self._dictionary.make(profile.TX_PD, index)
+        self._set(index, values)
+
+    def _fill_rx(self, index: int, pdo: int, pd: RxPdSpec, tx: Mapping[str, int]) -> None:
+        flags = RxFlag.ENABLED | (RxFlag.IGNORE_VERSION if pd.ignore_version else 0)
+        self._dictionary.make(profile.RX_PD, index)
+        self._set(index, {
+            Rx.PDO_INDEX: pdo,
+            Rx.PD_ID: pd.pd_id,
+            Rx.VERSION: pd.version,
+            Rx.FLAGS: flags,
+            Rx.PUBLISHER: NetId.parse(pd.publisher) if pd.publisher else bytes(6),
+            Rx.POLL_REQUEST_TXPD: tx[pd.poll_request] if pd.poll_request else 0,
+            Rx.NAME: pd.name,
+            Rx.TIME_OUT: pd.timeout_ms,
+            Rx.SUBSTITUTE: Substituted[pd.substitute.name],
+            Rx.SENDER_CYCLE: pd.sender_cycle_us,
+            Rx.STEP: pd.step,
+            Rx.CHANGEABLE: pd.changeable,
+        })  # fmt: skip
+
+    def _fill_frame(self, index: int, frame: TxFrameSpec, tx: Mapping[str, int]) -> None:
+        values: dict[int, Any] = {
+            Frame.ENABLED: True,
+            Frame.NAME: frame.name,
+            Frame.DIVIDER: frame.divider,
+            Frame.MODULO: frame.modulo,
+            Frame.CHANGEABLE: frame.changeable,
+        }
+        self._dictionary.make(profile.TX_FRAME, index)
+        self._set(index, values | _address(frame.destination))
+        self._set_list(index, Frame.TXPD, [tx[pd.name] for pd in frame.pds])
+
+    def _set_list(self, index: int, first: int, values: Iterable[Any]) -> None:
+        numbered = dict(enumerate(values, first))
+        last = max(numbered, default=first - 1)
+        if last > profile.MAX_ENTRIES:
+            detail = f"{len(numbered)} entries, there is room for {profile.MAX_ENTRIES - first + 1}"
+            raise DeviceFault(FaultCode.NO_ROOM, detail, index)
+        self._dictionary.resize(index, last)
+        self._set(index, numbered)
+
+    def _set(self, index: int, values: Mapping[int, Any]) -> None:
+        for subindex, value in values.items():
+            entry = self._dictionary[index].entries[subindex]
+            try:
+                octets = entry.kind.encode(value)
+            except ValueError as exc:
+                raise DeviceFault(FaultCode.NO_ROOM, str(exc), index, subindex) from None
+            self._dictionary.put(index, subindex, octets.rstrip(b"\0") if entry.is_text else octets)
+
+
+def _address(text: str) -> dict[int, Any]:
+    """Return the entries of a TxFrame that say where it goes."""
+    if text == REQUESTER:
+        return {Frame.ADDRESS_MODE: AddressMode.REQUESTER}
+    destination = Destination.parse(text)
+    values: dict[int, Any] = {Frame.ADDRESS_MODE: _MODES[destination.kind]}
+    if destination.kind is DestinationKind.MAC:
+        values[Frame.DESTINATION_MAC] = bytes(MacAddr.parse(destination.host))
+    else:
+        values[Frame.DESTINATION_IP] = IPv4Address(destination.host).packed
+        values[Frame.PORT_NUMBER] = destination.port
+    return values

@@ -1,0 +1,154 @@
+"""The EAP state machine: who may ask for which state, what is checked, what is kept of a refusal.
+
+Rule 1: Init is left at the start and never asked for again.
+Rule 2: a request goes through the states in between; where one refuses, the device stays in the
+last that it reached, and keeps error code and text until a request succeeds.
+Rule 3: the way from PreOp to SafeOp checks everything that the dictionaries say (ETG.1005).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.fault import DeviceFault, FaultCode
+from eap.od.model import OdState
+from eap.pd.device import Device, DeviceState, Request
+from eap.pd.spec import StationSpec
+
+ERROR_BIT = 0x10
+"""Of the status word, as in the AL status."""
+
+_OD_STATES = {
+    DeviceState.PREOP: OdState.PREOP,
+    DeviceState.SAFEOP: OdState.SAFEOP,
+    DeviceState.OP: OdState.OP,
+}
+_REQUESTS = {
+    DeviceState.PREOP: Request.PREOP,
+    DeviceState.SAFEOP: Request.SAFEOP,
+    DeviceState.OP: Request.OP,
+}
+
+
+class StateActions(Protocol):
+    """What transitions do; each may raise DeviceFault to refuse, the stops may not."""
+
+    def start_sending(self, spec: StationSpec) -> None:
+        """PreOp to SafeOp: run *spec*; it is what was read back from the dictionaries."""
+
+    def start_receiving(self) -> None:
+        """SafeOp to Op."""
+
+    def stop_receiving(self) -> None:
+        """Op to SafeOp."""
+
+    def stop_sending(self) -> None:
+        """SafeOp to PreOp."""
+
+
+class StateResult(NamedTuple):
+    """Where the device stands after a request; *fault* is why it is not where it was asked to."""
+
+    state: DeviceState
+    fault: DeviceFault | None
+
+    @property
+    def word(self) -> int:
+        """The status word: the state, with bit 4 if there is an error."""
+        return self.state | (ERROR_BIT if self.fault is not None else 0)
+
+
+class EapStateMachine:
+    """The state of a station's EAP device.
+
+    Args:
+        check: Reads the specification back from the dictionaries; raises DeviceFault.
+        actions: What transitions do.
+    """
+
+    def __init__(self, check: Callable[[], StationSpec], actions: StateActions) -> None:
+        self._check = check
+        self._actions = actions
+        self._device = Device()
+        self._fault: DeviceFault | None = None
+        self._dictionaries: list[EapDictionary] = []
+
+    @property
+    def status(self) -> StateResult:
+        """State and last refusal."""
+        return StateResult(self._device.state, self._fault)
+
+    @property
+    def od_state(self) -> OdState | None:
+        """The rights with which clients reach the dictionaries; None without a mailbox."""
+        return _OD_STATES.get(self._device.state)
+
+    def serve(self, dictionary: EapDictionary) -> None:
+        """Show the state in *dictionary* and take requests from there."""
+        self._dictionaries.append(dictionary)
+        dictionary.on_request = self.request
+        self._show()
+
+    def start(self, *, has_mailbox: bool = True) -> StateResult:
+        """Go from Init to PreOp, once clients can reach the dictionaries."""
+        if self._device.state is DeviceState.INIT:
+            if has_mailbox:
+                self._device.request(Request.START)
+                self._fault = None
+            else:
+                self._fault = DeviceFault(FaultCode.NO_MAILBOX)
+        self._show()
+        return self.status
+
+    def request(self, wanted: int) -> StateResult:
+        """Go to the state numbered *wanted* as far as possible."""
+        try:
+            self._walk(_state_of(wanted, self._device.state))
+        except DeviceFault as exc:
+            self._fault = exc
+        else:
+            self._fault = None
+        self._show()
+        return self.status
+
+    def fall_back(self, fault: DeviceFault) -> StateResult:
+        """Note that nothing runs any more, because of *fault*: back to PreOp without actions."""
+        if self._device.state is not DeviceState.INIT:
+            self._device.request(Request.PREOP)
+        self._fault = fault
+        self._show()
+        return self.status
+
+    def _walk(self, wanted: DeviceState) -> None:
+        device, actions = self._device, self._actions
+        while device.state < wanted:
+            if device.state is DeviceState.PREOP:
+                actions.start_sending(self._check())
+                device.request(Request.SAFEOP)
+            else:
+                actions.start_receiving()
+                device.request(Request.OP)
+        if device.state is DeviceState.OP and wanted < DeviceState.OP:
+            actions.stop_receiving()
+        if device.state.sends and not wanted.sends:
+            actions.stop_sending()
+        device.request(_REQUESTS[wanted])
+
+    def _show(self) -> None:
+        for dictionary in self._dictionaries:
+            dictionary.show_status(self.status.word, self._fault)
+
+
+def _state_of(wanted: int, now: DeviceState) -> DeviceState:
+    """Return the state numbered *wanted*; refuse what is none, and what cannot be asked for."""
+    try:
+        state = DeviceState(wanted)
+    except ValueError:
+        detail = f"{wanted}, there are 2 PreOp, 4 SafeOp and 8 Op"
+        raise DeviceFault(FaultCode.UNKNOWN_STATE, detail) from None
+    if state is DeviceState.INIT or now is DeviceState.INIT:
+        detail = f"{state.name} in {now.name}"
+        raise DeviceFault(FaultCode.INVALID_REQUEST, detail)
+    return state

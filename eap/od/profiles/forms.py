@@ -1,0 +1,68 @@
+"""How people read and write the entries of a profile: addresses, references, numbers, texts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from enum import StrEnum
+from ipaddress import IPv4Address
+
+from eap.codec.datatypes import DataType
+from eap.ids import MacAddr, NetId
+
+
+class Form(StrEnum):
+    """What an entry is to people, beside its data type."""
+
+    PLAIN = "plain"
+    """As its type is written."""
+    HEX = "hex"
+    INDEX = "index"
+    """Of another object; 0 is none."""
+    MAPPING = "mapping"
+    """Index, sub-index and bit length, as ``6000:01/16``."""
+    MAC = "mac"
+    NET_ID = "net_id"
+    IP = "ip"
+
+
+def to_text(form: Form, kind: DataType, octets: bytes) -> str:
+    """Return the *octets* of an entry as people write them; :func:`from_text` reads it again."""
+    if form in _BLOCKS:
+        return _BLOCKS[form][0](octets)
+    value = kind.decode(octets.ljust(kind.size, b"\0"), 0)
+    if form is Form.MAPPING and isinstance(value, int):
+        return f"{value >> 16:04X}:{value >> 8 & 0xFF:02X}/{value & 0xFF}"
+    if form in {Form.HEX, Form.INDEX} and isinstance(value, int):
+        return f"0x{value:0{2 * kind.size}X}"
+    if isinstance(value, bytes):
+        return value.hex(" ")
+    if isinstance(value, tuple):
+        return ", ".join(str(number) for number in value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def from_text(form: Form, kind: DataType, text: str) -> bytes:
+    """Return the octets that *text* stands for.
+
+    Raises:
+        ValueError: it is nothing of the form, or no value of the type.
+    """
+    if form in _BLOCKS:
+        return _BLOCKS[form][1](text)
+    if form is Form.MAPPING and "/" in text:
+        match = _MAPPING.fullmatch(text.strip())
+        if match is None:
+            raise ValueError(f"{text!r} is no mapping such as 6000:01/16")
+        word = int(match[1], 16) << 16 | int(match[2], 16) << 8 | int(match[3])
+        return kind.encode(word)
+    octets = kind.encode(kind.parse_text(text))
+    return octets.rstrip(b"\0") if kind.code == 0x09 else octets
+
+
+_MAPPING = re.compile(r"([0-9A-Fa-f]{1,4}):([0-9A-Fa-f]{1,2})/(\d{1,2}|1\d\d|2[0-4]\d|25[0-5])")
+_BLOCKS: dict[Form, tuple[Callable[[bytes], str], Callable[[str], bytes]]] = {
+    Form.MAC: (lambda octets: str(MacAddr(octets)), lambda text: bytes(MacAddr.parse(text))),
+    Form.NET_ID: (lambda octets: str(NetId(octets)), lambda text: bytes(NetId.parse(text))),
+    Form.IP: (lambda octets: str(IPv4Address(octets)), lambda text: IPv4Address(text).packed),
+}

@@ -1,0 +1,174 @@
+"""Faults of single objects; what reads back without any is tested with ``eap_read``."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_records import PortReader
+from eap.device.fault import DeviceFault, FaultCode
+from eap.od.profiles.eap1000keys import AddressMode, Frame, Port, Rx, RxFlag, Tx
+from eap.pd.spec import OnChangeSpec, PortKind, PortSpec, TriggerSpec
+from tests.support.downloads import (
+    frame,
+    mapping,
+    receiver,
+    rx_pd,
+    sender,
+    tx_pd,
+    variable,
+    write,
+)
+from tests.support.stations import BLANK
+
+
+def _fault(dictionary: EapDictionary) -> tuple[FaultCode, int, int]:
+    reader = PortReader(dictionary)
+    with pytest.raises(DeviceFault) as caught:
+        _ = reader.port(), list(reader.frames()), list(reader.subscriptions())
+    assert caught.value.port == dictionary.port.name
+    return caught.value.code, caught.value.index, caught.value.subindex
+
+
+def _on(interface: str) -> EapDictionary:
+    ports = (PortSpec("eap0", PortKind.EAP, interface, "1.1.1.1.2.1"),)
+    return sender(EapDictionary(replace(BLANK, ports=ports), "eap0"))
+
+
+def _change(dictionary: EapDictionary, *writes: tuple[int, int, object]) -> EapDictionary:
+    for where in writes:
+        write(dictionary, *where)
+    return dictionary
+
+
+@pytest.mark.parametrize(
+    ("writes", "fault"),
+    [
+        ([(0xD000, Tx.PDO_INDEX, 0)], (FaultCode.NO_PDO, 0xD000, Tx.PDO_INDEX)),
+        ([(0xD000, Tx.PDO_INDEX, 0x1A09)], (FaultCode.MISSING_OBJECT, 0xD000, Tx.PDO_INDEX)),
+        ([(0x1A00, 0, 0)], (FaultCode.EMPTY_PDO, 0x1A00, 0)),
+        ([(0x8000, 17, 0xD009)], (FaultCode.MISSING_OBJECT, 0x8000, 17)),
+        ([(0x8000, 17, 0xD000)], (FaultCode.PD_IN_TWO_FRAMES, 0x8000, 17)),
+        ([(0x8001, 16, 0xD000)], (FaultCode.PD_IN_TWO_FRAMES, 0x8001, 16)),
+        ([(0x8000, 16, 0)], (FaultCode.EMPTY_FRAME, 0x8000, 16)),
+        ([(0xD000, Tx.ENABLED, 0)], (FaultCode.EMPTY_FRAME, 0x8000, 16)),
+        ([(0x8000, 16, 0), (0x8000, 1, 0)], (FaultCode.PD_WITHOUT_FRAME, 0xD000, 0)),
+        ([(0x8000, 5, bytes(4))], (FaultCode.NO_DESTINATION, 0x8000, 5)),
+        ([(0x8000, 2, AddressMode.MAC)], (FaultCode.NO_DESTINATION, 0x8000, 2)),
+        (
+            [(0x8000, 2, AddressMode.TCP), (0x8000, 5, b"\xef\1\1\1")],
+            (FaultCode.NO_DESTINATION, 0x8000, 5),
+        ),
+        (
+            [(0xD000, Tx.POLL_REQUEST_RXPD, 0xE004)],
+            (FaultCode.MISSING_OBJECT, 0xD000, Tx.POLL_REQUEST_RXPD),
+        ),
+        (
+            [(0xE000, Rx.POLL_REQUEST_TXPD, 0xD004)],
+            (FaultCode.MISSING_OBJECT, 0xE000, Rx.POLL_REQUEST_TXPD),
+        ),
+        ([(0xE000, Rx.PDO_INDEX, 0)], (FaultCode.NO_PDO, 0xE000, Rx.PDO_INDEX)),
+        ([(0xF810, Port.VLAN_ID, 5)], (FaultCode.PORT, 0xF810, Port.VLAN_ID)),
+        ([(0xF811, 1, "01:00:5e:00:00:01")], (FaultCode.PORT, 0xF811, 1)),
+    ],
+)
+def test_each_fault_names_its_object(udp, writes, fault):
+    receiver(sender(udp))
+    assert _fault(_change(udp, *writes)) == fault
+
+
+@pytest.mark.parametrize(
+    ("interface", "mode", "is_way"),
+    [
+        (interface, mode, mode in modes)
+        for interface, modes in {
+            "udp://10.0.0.1": {AddressMode.IP, AddressMode.TCP, AddressMode.REQUESTER},
+            "tcp://10.0.0.1": {AddressMode.TCP, AddressMode.REQUESTER},
+            "ethernet://eth0": {AddressMode.MAC, AddressMode.REQUESTER},
+            "loop://line": {AddressMode.MAC, AddressMode.REQUESTER},
+        }.items()
+        for mode in AddressMode
+    ],
+)
+def test_a_port_addresses_as_its_interface_can(interface, mode, is_way):
+    dictionary = _on(interface)
+    write(dictionary, 0x8000, Frame.ADDRESS_MODE, mode)
+    if is_way:
+        ((_, read),) = PortReader(dictionary).frames()
+        assert read.destination in {"10.0.0.2", "tcp://10.0.0.2", "01:01:05:04:00:00", "requester"}
+    else:
+        assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, Frame.ADDRESS_MODE)
+
+
+@pytest.mark.parametrize(
+    ("interface", "subindex", "is_taken"),
+    [
+        ("udp://10.0.0.1", Port.TCP, True),
+        ("ethernet://eth0", Port.TCP, False),
+        ("udp://10.0.0.1", Port.BROADCAST, True),
+        ("tcp://10.0.0.1", Port.BROADCAST, False),
+        ("ethernet://eth0", Port.VLAN_ID, True),
+        ("loop://line", Port.VLAN_ID, False),
+        ("ethernet://eth0", Port.VLAN_PRIORITY, False),
+    ],
+)
+def test_a_port_has_what_its_interface_can(interface, subindex, is_taken):
+    dictionary = _change(_on(interface), (0xF810, subindex, 1))
+    if is_taken:
+        assert PortReader(dictionary).port() != dictionary.port
+    else:
+        assert _fault(dictionary) == (FaultCode.PORT, 0xF810, subindex)
+
+
+def test_a_mapping_that_no_longer_holds_is_a_fault_of_the_mapping(udp):
+    sender(udp)
+    udp.remove(0x6000)
+    assert _fault(udp) == (FaultCode.BAD_MAPPING, 0x1A00, 0)
+
+
+def test_a_frame_that_is_too_long_is_a_fault_of_the_frame(udp):
+    for number in range(2):
+        variable(udp, 0x6000 + number, f"block{number}", "BLOCK(800)")
+        mapping(udp, 0x1A00 + number, (0x6000 + number, 255))
+        tx_pd(udp, 0xD000 + number, 0x1A00 + number, number)
+    frame(udp, 0x8000, 0xD000)
+    udp.grow(0x8000, 17)
+    udp[0x8000].entries[17].value = 0xD001
+    udp[0x8000].entries[0].value = 17
+    assert _fault(udp) == (FaultCode.FRAME_TOO_LONG, 0x8000, Frame.FRAME_LENGTH)
+
+
+def test_what_is_not_enabled_is_left_out(udp):
+    receiver(sender(udp))
+    write(udp, 0xD001, Tx.NAME, "later")
+    write(udp, 0x8001, Frame.NAME, "later")
+    write(udp, 0xE000, Rx.FLAGS, 0)
+    reader = PortReader(udp)
+    assert [index for index, _ in reader.frames()] == [0x8000]
+    assert [index for index, _, _ in reader.sent] == [0xD000]
+    assert list(reader.subscriptions()) == []
+
+
+def test_any_publisher_is_a_flag_or_no_netid(udp):
+    receiver(udp)
+    rx_pd(udp, 0xE000, 0x1600, 1)
+    read = []
+    for publisher, flags in ((bytes(6), 0), (b"\1\2\3\4\5\6", 0), (b"\1\2\3\4\5\6", 1)):
+        write(udp, 0xE000, Rx.PUBLISHER, publisher)
+        write(udp, 0xE000, Rx.FLAGS, RxFlag.ENABLED | flags)
+        read += [pd.publisher for _, pd in PortReader(udp).subscriptions()]
+    assert read == ["", "1.2.3.4.5.6", ""]
+
+
+def test_times_of_on_change_switch_it_on(udp):
+    sender(udp)
+    for subindex, spec in (
+        (Tx.ON_CHANGE_TIMEOUT, OnChangeSpec(timeout_ms=1)),
+        (Tx.ON_CHANGE_INHIBIT, OnChangeSpec(inhibit_us=1)),
+        (Tx.ON_CHANGE, OnChangeSpec()),
+    ):
+        write(udp, 0xD000, subindex, 1)
+        ((_, read),) = PortReader(udp).frames()
+        assert read.pds[0].trigger == TriggerSpec(on_change=spec)
+        write(udp, 0xD000, subindex, 0)

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from eap.codec import datatypes
+from eap.device.eap_rules import check_name, checked, is_group
+from eap.od.profiles import eap1000 as profile
+from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
+
+
+def _checked(dictionary, row, subindex, data):
+    last = row.last_subindex if row.list_row else 0
+    entry = dictionary.make_object(row, row.first, last=last).entries[subindex]
+    return checked(row, subindex, entry, data)
+
+
+GROUPS = profile.row_of(0xF811)
+CONTROL = profile.row_of(0xF200)
+
+
+@pytest.mark.parametrize(
+    ("row", "subindex", "data", "kept"),
+    [
+        (profile.TX_VARIABLE, Var.TYPE_NAME, b" u16 ", b"UINT"),
+        (profile.TX_VARIABLE, Var.TYPE_NAME, b"REAL[4]\0\0", b"REAL[4]"),
+        (profile.TX_VARIABLE, Var.NAME, b"level\0", b"level"),
+        (profile.TX_VARIABLE, Var.COMMENT, "größer".encode(), "größer".encode()),
+        (profile.TX_PD, Tx.ENABLED, b"\x7f", b"\1"),
+        (profile.TX_PD, Tx.PDO_INDEX, b"\x00\x30", b"\x00\x30"),
+        (profile.TX_PD, Tx.PDO_INDEX, b"\0\0", b"\0\0"),
+        (profile.RX_PD, Rx.FLAGS, b"\x85", b"\x85"),
+        (profile.TX_FRAME, Frame.TXPD + 3, b"\x05\xd0", b"\x05\xd0"),
+        (GROUPS, 9, b"01-00-5E-00-00-01", b"01:00:5e:00:00:01"),
+        (GROUPS, 1, b"239.1.2.3", b"239.1.2.3"),
+        (GROUPS, 1, b"", b""),
+        (CONTROL, 1, b"\x08\0", b"\x08\0"),
+    ],
+)
+def test_values_are_kept_in_their_usual_form(udp, row, subindex, data, kept):
+    assert _checked(udp, row, subindex, data) == kept
+
+
+@pytest.mark.parametrize(
+    ("row", "subindex", "data", "reason"),
+    [
+        (profile.TX_VARIABLE, Var.TYPE_NAME, b"WORT", "did you mean WORD"),
+        (profile.RX_VARIABLE, Var.NAME, b"a b", "without spaces"),
+        (profile.TX_PD, Tx.NAME, b"a/b", "without spaces and slashes"),
+        (profile.TX_VARIABLE, Var.UNIT, b"a\0b", "NUL"),
+        (profile.TX_VARIABLE, Var.UNIT, b"\xff", "UTF-8"),
+        (profile.TX_PD, Tx.PDO_INDEX, b"\x00\x16", "0x1A00 to 0x1BFF or 0x3000 to 0x3DFF"),
+        (profile.RX_PD, Rx.POLL_REQUEST_TXPD, b"\x00\xe0", "0xD000 to 0xDFFF"),
+        (profile.TX_FRAME, Frame.TXPD, b"\x01\0", "0xD000 to 0xDFFF"),
+        (profile.RX_PD, Rx.FLAGS, b"\x08", "of the flags 0x85 only"),
+        (GROUPS, 1, b"10.0.0.1", "no multicast address"),
+        (GROUPS, 1, b"02:00:00:00:00:01", "no multicast address"),
+        (CONTROL, 1, b"\x01\0", "1 cannot be requested"),
+        (CONTROL, 1, b"\x03\0", "3 cannot be requested"),
+    ],
+)
+def test_what_an_entry_cannot_hold_is_refused_with_the_reason(udp, row, subindex, data, reason):
+    with pytest.raises(ValueError, match=reason):
+        _checked(udp, row, subindex, data)
+
+
+def test_a_default_is_a_finite_number_and_nothing_beside_its_bits(udp):
+    def default(text, data):
+        item = udp.make_object(profile.TX_VARIABLE, 0x6000, datatypes.parse(text))
+        return checked(profile.TX_VARIABLE, Var.DEFAULT, item.entries[Var.DEFAULT], data)
+
+    assert default("BIT3", b"\xff") == b"\x07"
+    assert default("BOOL", b"\x40") == b"\x01"
+    assert default("STRING(5)", b"ab\0\0\0") == b"ab"
+    for text, data in (
+        ("REAL", struct.pack("<f", float("nan"))),
+        ("REAL[2]", struct.pack("<2f", 0, float("inf"))),
+    ):
+        with pytest.raises(ValueError, match="finite"):
+            default(text, data)
+
+
+def test_control_variables_are_the_appliances_own():
+    for name in ("state.VarCtrl", "frame.FrameCtrl"):
+        with pytest.raises(ValueError, match="made by the appliance"):
+            check_name(name)
+
+
+def test_groups_are_told_by_the_kind_of_interface():
+    assert is_group("239.1.1.1", ethernet=False)
+    assert not is_group("239.1.1.1", ethernet=True)
+    assert is_group("01:01:05:04:00:00", ethernet=True)
+    assert not is_group("239.1.1.1", ethernet=None)
