@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
@@ -130,18 +130,27 @@ def connect(plant: str | None = None, station: str | None = None) -> list[Client
     Raises:
         ControlError: there is none; the message says which others run, and where it looked.
     """
-    running = find_running()
-    chosen = [
-        (folder, info)
-        for folder, info in running
-        if (not plant or info.plant == plant) and (not station or station in info.stations)
-    ]
-    if not chosen:
-        raise _none_runs(plant, station, [info for _, info in running])
+    clients = connect_those(
+        lambda info: (
+            (not plant or info.plant == plant) and (not station or station in info.stations)
+        )
+    )
+    if not clients:
+        raise _none_runs(plant, station, [info for _, info in find_running()])
+    return clients
+
+
+def connect_those(wanted: Callable[[ApplianceInfo], bool]) -> list[Client]:
+    """Connect to the running appliances that are *wanted*; there may be none.
+
+    Raises:
+        ControlError: one of them cannot be reached.
+    """
     clients: list[Client] = []
     try:
-        for folder, info in chosen:
-            clients.append(_connect_one(folder, info))
+        for folder, info in find_running():
+            if wanted(info):
+                clients.append(_connect_one(folder, info))
     except ControlError:
         for client in clients:
             client.close()

@@ -15,12 +15,15 @@ from eap.cli.group import LazyGroup
 @click.group(
     cls=LazyGroup,
     commands_at={
+        "apply": "eap.cli.apply:apply",
         "bus": "eap.cli.bus:bus",
         "check": "eap.cli.check:check",
         "decode": "eap.cli.decode:decode",
         "new": "eap.cli.new:new",
         "od": "eap.cli.od:od",
         "pd": "eap.cli.pd:pd",
+        "plan": "eap.cli.plan:plan",
+        "rollback": "eap.cli.apply:rollback",
         "run": "eap.cli.run:run",
         "sim": "eap.cli.sim:sim",
         "state": "eap.cli.state:state",

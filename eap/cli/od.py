@@ -80,8 +80,8 @@ def read(
 
 @od.command(context_settings={"ignore_unknown_options": True})
 @target_argument
-@click.argument("entry", required=False, metavar="INDEX[:SUB]")
-@click.argument("value", required=False)
+@click.argument("entry", required=False, metavar="[INDEX[:SUB]]")
+@click.argument("value", required=False, metavar="[VALUE]")
 @_TYPE
 @click.option(
     "--hex", "octets", type=parse_octets, metavar="DIGITS", help="Octets as they are, for VALUE."

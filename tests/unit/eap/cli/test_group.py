@@ -121,11 +121,16 @@ HELP = [
     ["bus", "sdo", "read"],
     ["check"],
     ["decode"],
+    ["od", "write"],
     ["pd"],
     ["pd", "watch"],
     ["pd", "set"],
+    ["plan"],
+    ["apply"],
+    ["new"],
     ["run"],
     ["sim", "fault"],
+    ["state"],
     ["status"],
 ]
 

@@ -1,0 +1,123 @@
+"""The stations of one plant that run here, and what they can be asked about their configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from eap.appliance.client import Client, connect_those
+from eap.appliance.control import ErrorCode
+from eap.config.load import Plant
+from eap.errors import ControlError
+from eap.pd.spec import StationSpec
+
+PATIENCE_S = 60.0
+"""For one station: it is checked, stored, and built anew between two cycles."""
+
+
+class StationPlan(msgspec.Struct, frozen=True):
+    """What differs between a running station and its plant file."""
+
+    station: str
+    changes: list[dict[str, Any]]
+    """Objects of its ports: port, index, subindex, name, change, old, new."""
+    notes: list[str]
+    """What is no object: sources, links, buses."""
+    refused: list[str]
+    """Why it cannot be as the file says."""
+
+    @property
+    def differs(self) -> bool:
+        """Whether there is anything to do, or to refuse."""
+        return bool(self.changes or self.notes or self.refused)
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """What became of a change of one station."""
+
+    ok: bool
+    results: list[dict[str, Any]]
+    """As the changes of a plan, each with *ok* and *reason*."""
+    refused: list[str]
+
+
+class Running(msgspec.Struct, frozen=True):
+    """What a station runs, and what a rollback would bring back, if anything."""
+
+    spec: StationSpec
+    previous: StationSpec | None = None
+
+
+class PlantLink:
+    """Connections to all appliances that run stations of a plant.
+
+    Args:
+        clients: The appliance of each station.
+    """
+
+    def __init__(self, clients: Mapping[str, Client]) -> None:
+        self._clients = clients
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """Those that run here."""
+        return tuple(self._clients)
+
+    def export(self, station: str) -> Running:
+        """Return what a station runs; raises as the other methods do.
+
+        Raises:
+            ControlError: the appliance refused, or does not answer.
+        """
+        return msgspec.convert(self._ask("export", station), Running)
+
+    def plan(self, spec: StationSpec) -> StationPlan:
+        """Return what differs between *spec* and the station of its name."""
+        answer = self._ask("plan", spec.name, spec=msgspec.to_builtins(spec))
+        return StationPlan(spec.name, answer["changes"], answer["station"], answer["refused"])
+
+    def apply(self, spec: StationSpec) -> Outcome:
+        """Let the station of its name be as *spec* says."""
+        answer = self._ask("apply", spec.name, spec=msgspec.to_builtins(spec))
+        return msgspec.convert(answer, Outcome)
+
+    def rollback(self, spec: StationSpec) -> Outcome:
+        """Let the station of its name be what it was before, which is *spec*, alternates aside."""
+        answer = self._ask("rollback", spec.name, spec=msgspec.to_builtins(spec))
+        return msgspec.convert(answer, Outcome)
+
+    def _ask(self, method: str, station: str, **params: Any) -> Any:
+        client = self._clients[station]
+        return client.request_within(PATIENCE_S, method, station=station, **params)
+
+
+@contextmanager
+def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
+    """Connect to the appliances that run stations of *plant*, for the length of a block.
+
+    Blank stations belong to every plant that has a station of their name.
+
+    Raises:
+        ControlError: none of its stations runs here.
+    """
+    names = {station.name for station in plant.stations}
+    clients = connect_those(
+        lambda info: (
+            info.plant == plant.name if info.plant_file else not names.isdisjoint(info.stations)
+        )
+    )
+    try:
+        found = {name: each for each in clients for name in each.info.stations if name in names}
+        if not found:
+            raise ControlError(
+                f"no station of plant {plant.name} runs here: start them with 'eapctl run {file}'",
+                code=ErrorCode.UNAVAILABLE,
+            )
+        yield PlantLink({name: found[name] for s in plant.stations if (name := s.name) in found})
+    finally:
+        for client in clients:
+            client.close()

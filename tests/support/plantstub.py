@@ -1,0 +1,93 @@
+"""Stations that can be planned, applied and rolled back, without anything that runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+import msgspec
+
+from eap.errors import ControlError
+from eap.pd.spec import StationSpec
+from tests.support.controlstub import ControlStub
+
+
+class PlantStub:
+    """The specifications of a plant's stations, behind a control socket.
+
+    Attributes:
+        specs: What each station runs.
+        previous: What each ran before.
+        unable: Stations that say so when they are planned.
+        refuses: Tells whether a station refuses a specification when it is applied.
+        taken: Everything that was applied, in order.
+    """
+
+    def __init__(self, plant: str, specs: Sequence[StationSpec], stack: ExitStack,
+                 plant_file: str = "plant.yaml") -> None:  # fmt: skip
+        self.specs = {spec.name: spec for spec in specs}
+        self.previous: dict[str, StationSpec] = {}
+        self.unable: set[str] = set()
+        self.refuses: Callable[[StationSpec], bool] = lambda _: False
+        self.taken: list[StationSpec] = []
+        methods = {
+            each.__name__: each for each in (self.export, self.plan, self.apply, self.rollback)
+        }
+        self.stub = ControlStub(plant, list(self.specs), methods, stack, plant_file=plant_file)
+
+    def export(self, params: dict[str, Any]) -> Any:
+        name = params["station"]
+        return {"spec": self.specs[name], "previous": self.previous.get(name)}
+
+    def plan(self, params: dict[str, Any]) -> Any:
+        name, spec = self._asked(params)
+        refused = ["port eap0 would be new"] if name in self.unable else []
+        changes = [] if refused else self._changes(name, spec)
+        return {"changes": changes, "station": [], "refused": refused}
+
+    def apply(self, params: dict[str, Any]) -> Any:
+        name, spec = self._asked(params)
+        before = self.specs[name]
+        answer = self._take(name, spec)
+        if answer["ok"] and plain(before) != plain(spec):
+            self.previous[name] = plain(before)
+        return answer
+
+    def rollback(self, params: dict[str, Any]) -> Any:
+        name, spec = self._asked(params)
+        if name not in self.previous:
+            raise ControlError(f"station {name} has nothing to go back to")
+        assert plain(spec) == self.previous[name]
+        before = plain(self.specs[name])
+        answer = self._take(name, spec)
+        if answer["ok"]:
+            self.previous[name] = before
+        return answer
+
+    def _asked(self, params: dict[str, Any]) -> tuple[str, StationSpec]:
+        return params["station"], msgspec.convert(params["spec"], StationSpec)
+
+    def _take(self, name: str, spec: StationSpec) -> Any:
+        is_ok = not self.refuses(spec)
+        results = [
+            change | {"ok": is_ok, "reason": "" if is_ok else "not today"}
+            for change in self._changes(name, spec)
+        ]
+        if is_ok:
+            self.specs[name] = spec
+            self.taken.append(spec)
+        return {"ok": is_ok, "results": results, "refused": [] if is_ok else ["not today"]}
+
+    def _changes(self, name: str, spec: StationSpec) -> list[dict[str, Any]]:
+        """Compare the cycle times only: one of them is enough for a test to see."""
+        old, new = self.specs[name].cycle_us, spec.cycle_us
+        row = {"port": "eap0", "index": 0xF800, "subindex": 8, "change": "changed",
+               "name": "Configured objects: Device cycle time"}  # fmt: skip
+        return [] if old == new else [row | {"old": f"{old} us", "new": f"{new} us"}]
+
+
+def plain(spec: StationSpec) -> StationSpec:
+    """Return *spec* without alternates."""
+    pds = tuple(msgspec.structs.replace(pd, alternates=()) for pd in spec.subscriptions)
+    return msgspec.structs.replace(spec, subscriptions=pds)

@@ -1,0 +1,72 @@
+"""``eapctl plan``."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+
+import pytest
+from click.testing import CliRunner
+
+from eap.appliance.plant_change import load_or_raise
+from eap.cli import main
+from eap.config.new_plant import Shape, plant_text
+from tests.support.plantstub import PlantStub
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "ring.yaml"
+    path.write_text(plant_text("ring", 3, Shape.RING))
+    return path
+
+
+@pytest.fixture
+def stub(file, runtime):
+    with ExitStack() as stack:
+        yield PlantStub("ring", load_or_raise(file).stations, stack)
+
+
+def plan(*words):
+    return CliRunner().invoke(main, ["plan", *map(str, words)])
+
+
+def test_nothing_differs(stub, file):
+    assert plan(file).output == "nothing differs: all 3 stations are as the file says\n"
+    assert plan(file, "--station", "station-02").output == (
+        "nothing differs: station-02 is as the file says\n"
+    )
+    assert json.loads(plan(file, "--json").output)["ok"] is True
+
+
+def test_differences(stub, file):
+    file.write_text(
+        file.read_text().replace("name: station-02\n", "name: station-02\n    cycle_us: 5000\n")
+    )
+    assert plan(file).output.splitlines()[:3] == [
+        "station-02",
+        "  ~ 0xF800:08 Configured objects: Device cycle time  10000 us -> 5000 us",
+        "1 station of 3 to change (1 changed), 2 as the file says",
+    ]
+    document = json.loads(plan(file, "--json").output)
+    assert document["ok"] is True
+    assert [len(each["changes"]) for each in document["stations"]] == [0, 1, 0]
+    assert {step["station"] for step in document["steps"]} >= {"station-02"}
+    assert stub.taken == []
+
+
+def test_what_cannot_be(stub, file):
+    stub.unable = {"station-03"}
+    result = plan(file)
+    assert result.exit_code == 1
+    assert result.output.splitlines()[:2] == ["station-03", "  ! port eap0 would be new"]
+    result = plan(file, "--json")
+    assert (result.exit_code, json.loads(result.output)["ok"]) == (1, False)
+
+
+def test_no_plant(stub, file):
+    result = plan(file, "--station", "station-2")
+    assert result.exit_code == 2
+    assert "did you mean station-02?" in result.stderr
+    file.write_text("plant: 1")
+    assert plan(file).exit_code == 2

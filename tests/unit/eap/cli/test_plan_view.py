@@ -1,0 +1,59 @@
+"""Changes as lines."""
+
+from __future__ import annotations
+
+import pytest
+
+from eap.appliance.plant_link import StationPlan
+from eap.cli.plan_view import change_line, plan_lines
+from eap.device.rollout import Step
+from tests.support.fakeappliance import station
+
+
+def change(kind, old="", new="", subindex=0):
+    return {"port": "eap0", "index": 0x6003, "subindex": subindex, "name": "Tx variable 3 (speed)",
+            "change": kind, "old": old, "new": new}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (change("added"), "+ 0x6003:00 Tx variable 3 (speed)"),
+        (change("added", new="REAL", subindex=4), "+ 0x6003:04 Tx variable 3 (speed)  REAL"),
+        (change("removed"), "- 0x6003:00 Tx variable 3 (speed)"),
+        (change("changed", "1", "2", 16), "~ 0x6003:0x10 Tx variable 3 (speed)  1 -> 2"),
+    ],
+)
+def test_signs(given, line):
+    assert change_line(given) == line
+
+
+def test_all_kinds_of_differences():
+    plans = [
+        StationPlan("mixer", [change("added"), change("removed")], ["link a to b: added"], []),
+        StationPlan("oven", [], [], []),
+        StationPlan("saw", [change("changed", "1", "2")], [], []),
+    ]
+    order = [Step("saw", station("saw"), "takes both"), Step("mixer", station("mixer"), "switches")]
+    assert list(plan_lines(plans, order)) == [
+        "mixer",
+        "  + 0x6003:00 Tx variable 3 (speed)",
+        "  - 0x6003:00 Tx variable 3 (speed)",
+        "  * link a to b: added",
+        "saw",
+        "  ~ 0x6003:00 Tx variable 3 (speed)  1 -> 2",
+        "2 stations of 3 to change (1 added, 1 removed, 1 changed), 1 as the file says",
+        "'eapctl apply' goes these steps:",
+        "  1. saw takes both",
+        "  2. mixer switches",
+    ]
+
+
+def test_refusals():
+    plans = [StationPlan("mixer", [], [], ["port eap1 would be new"])]
+    assert list(plan_lines(plans, [])) == [
+        "mixer",
+        "  ! port eap1 would be new",
+        "1 station of 1 to change",
+        "cannot be applied: mixer refused",
+    ]
