@@ -16,14 +16,12 @@ from eap.device.eap_content import COUNTED, bus_variables
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_records import PortReader
 from eap.device.fault import FaultCode
+from eap.device.pdlayout import types_of
 from eap.od.profiles.eap1000keys import (
     Configured,
     Var,
 )
-from eap.pd.spec import (
-    StationSpec,
-    VariableSpec,
-)
+from eap.pd.spec import RxPdSpec, StationSpec, VariableSpec
 
 
 def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -> StationSpec:
@@ -33,7 +31,7 @@ def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -
     specification reads back as that specification.
 
     Args:
-        station: Ports, buses, sources and links, which are in no dictionary.
+        station: Ports, buses, sources, links, and alternates of RxPDs, which are in no dictionary.
         dictionaries: By name of the port; EAP ports that are missing here send and receive nothing.
 
     Raises:
@@ -57,7 +55,23 @@ def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -
         subscriptions=_in_order([each.record for each in subscriptions], station.subscriptions),
     )
     check_station(station, spec, frames, pds, subscriptions)
-    return spec
+    return _with_alternates(spec, station)
+
+
+def _with_alternates(spec: StationSpec, station: StationSpec) -> StationSpec:
+    """Return *spec* with the alternates of those RxPDs that are laid out as *station* has them."""
+    types = types_of(station)
+    known = {_expected(pd, types): pd.alternates for pd in station.subscriptions if pd.alternates}
+    if not known:
+        return spec
+    types = types_of(spec)
+    pds = (replace(pd, alternates=known.get(_expected(pd, types), ())) for pd in spec.subscriptions)
+    return replace(spec, subscriptions=tuple(pds))
+
+
+def _expected(pd: RxPdSpec, types: Mapping[str, str]) -> tuple[object, ...]:
+    variables = tuple((name, types[name]) for name in pd.variables)
+    return pd.name, pd.port, pd.publisher, pd.pd_id, pd.version, variables
 
 
 def _in_order(records: list[Any], before: tuple[Any, ...]) -> tuple[Any, ...]:

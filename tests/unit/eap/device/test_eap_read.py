@@ -6,12 +6,14 @@ from msgspec.structs import replace
 
 from eap.device.eap_read import read_back
 from eap.device.fault import DeviceFault, FaultCode
-from eap.od.profiles.eap1000keys import Configured, Var
+from eap.od.profiles.eap1000keys import Configured, Rx, Var
 from eap.pd.spec import (
     PortKind,
     PortSpec,
+    RxAlternateSpec,
     RxPdSpec,
     StationSpec,
+    TakenVariableSpec,
     TxFrameSpec,
     TxPdSpec,
     VariableSpec,
@@ -36,6 +38,20 @@ def test_what_was_filled_reads_back_alike_into_a_blank_station(station: StationS
     assert {each.name: each for each in spec.frames} == {e.name: e for e in station.frames}
     again = filled(replace(spec, sources=station.sources, links=station.links))
     assert read_back(bare, again) == spec
+
+
+def test_alternates_stay_with_what_is_laid_out_as_before():
+    alternates = (RxAlternateSpec(7, (TakenVariableSpec("limit", "UINT"),)),)
+    ports = empty()
+    receiver(ports["eap0"])
+    spec = read_back(BLANK, ports)
+    tolerant = replace(spec, subscriptions=(replace(spec.subscriptions[0], alternates=alternates),))
+    assert read_back(tolerant, ports) == tolerant
+    assert read_back(tolerant, filled(tolerant)) == tolerant
+    write(ports["eap0"], 0xE000, Rx.TIME_OUT, 50)
+    assert read_back(tolerant, ports).subscriptions[0].alternates == alternates
+    write(ports["eap0"], 0xE000, Rx.VERSION, 7)
+    assert read_back(tolerant, ports).subscriptions[0].alternates == ()
 
 
 def test_a_blank_station_is_a_whole_one(udp):
