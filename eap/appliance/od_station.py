@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from msgspec.structs import replace
@@ -10,6 +11,7 @@ from eap.appliance.client import Client
 from eap.appliance.od_device import Content, EntryInfo, ObjectInfo
 from eap.codec import datatypes
 from eap.errors import ControlError
+from eap.od.abort import AbortCode
 
 ABORT = "abort"
 """Code of a refusal by the dictionary."""
@@ -29,17 +31,16 @@ class StationOd:
 
     def objects(self) -> list[ObjectInfo]:
         """Return all objects without their entries."""
-        return [_object(row) for row in self._request("od_list")["objects"]]
+        return [_object(row) for row in self._pages("od_list")]
 
     def describe(self, index: int) -> ObjectInfo:
         """Return one object with its entries."""
-        row = self._request("od_describe", index=index)
-        return replace(_object(row), entries=tuple(_entry(each) for each in row["entries"]))
+        return _described(self._request("od_describe", index=index))
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
-        """Return what is known of an entry; None if nothing is."""
+        """Return what is known of an entry, also of one that a download would make."""
         try:
-            found = self.describe(index)
+            found = _described(self._request("od_describe", index=index, subindex=subindex))
         except ControlError as exc:
             if exc.code != ABORT:
                 raise
@@ -52,18 +53,29 @@ class StationOd:
         return bytes.fromhex(self._request("od_read", **where)["data"])
 
     def write(self, index: int, subindex: int, octets: bytes, *, complete: bool = False) -> None:
-        """Write an entry or an object."""
+        """Write an entry or an object; a refusal says what to do about it, if that is known."""
         where = {"index": index, "subindex": subindex, "complete": complete}
-        self._request("od_write", **where, data=octets.hex())
+        try:
+            self._request("od_write", **where, data=octets.hex())
+        except ControlError as exc:
+            if exc.code == ABORT and f"0x{AbortCode.DEVICE_STATE:08X}" in str(exc):
+                hint = f"bring it to PREOP first: eapctl state {self._target} PREOP"
+                raise ControlError(f"{exc}; {hint}", code=exc.code) from None
+            raise
 
-    def contents(self) -> list[Content]:
-        """Return all entries of all objects."""
-        return [
-            _content(found, row)
-            for each in self._request("od_dump")["objects"]
-            for found in [_object(each)]
-            for row in each["entries"]
-        ]
+    def contents(self) -> Iterator[Content]:
+        """Yield all entries of all objects."""
+        for each in self._pages("od_dump"):
+            found = _object(each)
+            yield from (_content(found, row) for row in each["entries"])
+
+    def _pages(self, method: str) -> Iterator[dict[str, Any]]:
+        """Yield the objects of one answer after the other, until the last one."""
+        first: int | None = 0
+        while first is not None:
+            answer = self._request(method, first=first)
+            yield from answer["objects"]
+            first = answer["next"]
 
     def _request(self, method: str, **params: Any) -> Any:
         return self._client.request(method, target=self._target, **params)
@@ -73,15 +85,18 @@ def _object(row: dict[str, Any]) -> ObjectInfo:
     return ObjectInfo(row["index"], row["name"], row["code"], row["max_subindex"])
 
 
+def _described(row: dict[str, Any]) -> ObjectInfo:
+    return replace(_object(row), entries=tuple(_entry(each) for each in row["entries"]))
+
+
 def _entry(row: dict[str, Any]) -> EntryInfo:
     try:
         kind = datatypes.parse(row["type"])
     except ValueError:
         kind = None  # a later release may know more of them
-    return EntryInfo(row["subindex"], row["name"], kind, row["access"], row["unit"] or "")
+    return EntryInfo(row["subindex"], row["name"], kind, row["access"], row["unit"])
 
 
 def _content(found: ObjectInfo, row: dict[str, Any]) -> Content:
     data = row["data"]
-    octets = None if data is None else bytes.fromhex(data)
-    return Content(found, _entry(row), octets, row.get("error", ""))
+    return Content(found, _entry(row), None if data is None else bytes.fromhex(data))

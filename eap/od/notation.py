@@ -7,48 +7,37 @@ form of an address is read as one, for whatever entry has its length.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from eap.codec.datatypes import DataType, Plain
-from eap.ids import MacAddr, NetId
+from eap.od.profiles.forms import Form, from_text, to_text
 
 _TEXT, _OCTETS = 0x09, 0x0A
 
 
 class _Address(NamedTuple):
-    """A kind of address: its length, the entries that hold it, and its text."""
+    """A kind of address: its length, the entries that hold it, and what its text looks like."""
 
+    form: Form
     size: int
     names: re.Pattern[str]
-    form: re.Pattern[str]
-    show: Callable[[bytes], str]
-    parse: Callable[[str], bytes]
+    text: re.Pattern[str]
 
 
 _ADDRESSES = (
     _Address(
+        Form.MAC,
         6,
         re.compile(r"\bMAC\b"),
         re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}"),
-        lambda octets: str(MacAddr(octets)),
-        MacAddr.parse,
     ),
     _Address(
+        Form.NET_ID,
         6,
         re.compile(r"\bNet ?ID\b|\bpublisher\b", re.IGNORECASE),
         re.compile(r"\d+(\.\d+){5}", re.ASCII),
-        lambda octets: str(NetId(octets)),
-        NetId.parse,
     ),
-    _Address(
-        4,
-        re.compile(r"\bIP\b"),
-        re.compile(r"\d+(\.\d+){3}", re.ASCII),
-        lambda octets: str(IPv4Address(octets)),
-        lambda text: IPv4Address(text).packed,
-    ),
+    _Address(Form.IP, 4, re.compile(r"\bIP\b"), re.compile(r"\d+(\.\d+){3}", re.ASCII)),
 )
 
 
@@ -61,7 +50,7 @@ def plain(kind: DataType, name: str, octets: bytes) -> Plain | None:
     if kind.code == _OCTETS:
         for each in _ADDRESSES:
             if kind.size == each.size and each.names.search(name):
-                return each.show(octets)
+                return to_text(each.form, kind, octets)
         return octets.hex()
     try:
         return kind.to_plain(kind.decode(octets, 0))
@@ -76,8 +65,8 @@ def parse(kind: DataType, text: str) -> bytes:
     """
     if kind.code == _OCTETS:
         for each in _ADDRESSES:
-            if kind.size == each.size and each.form.fullmatch(text):
-                return bytes(each.parse(text))
+            if kind.size == each.size and each.text.fullmatch(text):
+                return from_text(each.form, kind, text)
     octets = kind.encode(kind.parse_text(text))
     return octets.rstrip(b"\0") if kind.code == _TEXT else octets
 

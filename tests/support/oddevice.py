@@ -104,7 +104,7 @@ def methods(device: MemoryDevice) -> dict[str, Any]:
     """Return the control methods that serve *device*."""
 
     def od_list(params: dict[str, Any]) -> Any:
-        return {"objects": [_object_row(item) for item in device.dictionary]}
+        return _page([_object_row(item) for item in device.dictionary], params["first"])
 
     def od_describe(params: dict[str, Any]) -> Any:
         item = device.dictionary[params["index"]]
@@ -121,7 +121,8 @@ def methods(device: MemoryDevice) -> dict[str, Any]:
         return {}
 
     def od_dump(params: dict[str, Any]) -> Any:
-        return {"objects": [od_describe({"index": item.index}) for item in device.dictionary]}
+        rows = [od_describe({"index": item.index}) for item in device.dictionary]
+        return _page(rows, params["first"])
 
     return {each.__name__: each for each in (od_list, od_describe, od_read, od_write, od_dump)}
 
@@ -163,3 +164,9 @@ def _entry_row(subindex: int, entry: Entry) -> dict[str, Any]:
         "unit": "us" if entry.unit else "",
         "data": None if octets is None else octets.hex(),
     }
+
+
+def _page(rows: list[dict[str, Any]], first: int) -> dict[str, Any]:
+    """Return four objects at a time, so that there is more than one page."""
+    chosen = [row for row in rows if row["index"] >= first]
+    return {"objects": chosen[:4], "next": chosen[4]["index"] if chosen[4:] else None}

@@ -9,6 +9,7 @@ import pytest
 from eap.appliance.client import connect_station
 from eap.appliance.od_station import StationOd
 from eap.errors import ControlError
+from eap.od.model import OdState
 from tests.support.controlstub import ControlStub
 from tests.support.oddevice import MemoryDevice, methods, mixer
 
@@ -46,13 +47,21 @@ def test_read_and_write(station, device):
     station.write(0xD000, 7, b"\1\0\0\0")
     assert station.read(0xD000, 7) == b"\1\0\0\0"
     assert station.read(0xD000, 0, complete=True) == b"\7\0\1\0\0\0"
-    assert station.contents() == device.contents()
+    assert list(station.contents()) == device.contents()
 
 
 def test_refusal(station):
     with pytest.raises(ControlError, match=r"0x1000:00.*0x06010002") as caught:
         station.write(0x1000, 0, bytes(4))
     assert caught.value.code == "abort"
+
+
+def test_refusal_because_of_the_state(station, device):
+    device.state = OdState.OP
+    with pytest.raises(
+        ControlError, match="bring it to PREOP first: eapctl state mixer/eap0 PREOP"
+    ):
+        station.write(0xD000, 7, bytes(4))
 
 
 def test_refusal_of_another_kind(station, answers):
@@ -66,6 +75,6 @@ def test_refusal_of_another_kind(station, answers):
 
 def test_type_of_a_later_release(station, answers):
     row = {"index": 1, "name": "", "code": "VAR", "max_subindex": 0}
-    entry = {"subindex": 0, "name": "New", "type": "DATE", "access": "r", "unit": None}
+    entry = {"subindex": 0, "name": "New", "type": "DATE", "access": "r", "unit": ""}
     answers["od_describe"] = lambda _: row | {"entries": [entry]}
     assert station.entry(1, 0).kind is None
