@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import TypeAlias
 
 import msgspec
-from msgspec.structs import replace
 
 from eap.appliance.control import near
 from eap.appliance.plant_link import Outcome, PlantLink, StationPlan
 from eap.appliance.plantfile import load_plant
 from eap.config.load import Plant
-from eap.device.rollout import Step, steps
+from eap.device.rollout import Step, steps, without_alternates
 from eap.errors import ConfigError
 from eap.pd.spec import StationSpec
 
@@ -107,12 +106,6 @@ def _back(
         yield step, link.rollback if goes_back and step.station not in is_back else link.apply
         if goes_back:
             is_back.add(step.station)
-
-
-def without_alternates(spec: StationSpec) -> StationSpec:
-    """Return *spec* with nothing of a change that is under way."""
-    pds = tuple(replace(pd, alternates=()) for pd in spec.subscriptions)
-    return replace(spec, subscriptions=pds)
 
 
 def _walk(walk: Iterable[tuple[Step, Do]], *, keep_going: bool) -> Iterator[Done]:

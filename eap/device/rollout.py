@@ -41,6 +41,12 @@ def steps(old: Mapping[str, StationSpec], new: Mapping[str, StationSpec]) -> lis
     return _Rollout(old, new).run()
 
 
+def without_alternates(spec: StationSpec) -> StationSpec:
+    """Return *spec* with nothing of a change that is under way."""
+    pds = tuple(replace(pd, alternates=()) for pd in spec.subscriptions)
+    return spec if pds == spec.subscriptions else replace(spec, subscriptions=pds)
+
+
 class _Wire:
     """What all stations send at one moment."""
 

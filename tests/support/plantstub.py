@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from eap.device.rollout import without_alternates
 from eap.errors import ControlError
 from eap.pd.spec import StationSpec
 from tests.support.controlstub import ControlStub
@@ -50,16 +51,16 @@ class PlantStub:
         name, spec = self._asked(params)
         before = self.specs[name]
         answer = self._take(name, spec)
-        if answer["ok"] and plain(before) != plain(spec):
-            self.previous[name] = plain(before)
+        if answer["ok"] and without_alternates(before) != without_alternates(spec):
+            self.previous[name] = without_alternates(before)
         return answer
 
     def rollback(self, params: dict[str, Any]) -> Any:
         name, spec = self._asked(params)
         if name not in self.previous:
             raise ControlError(f"station {name} has nothing to go back to")
-        assert plain(spec) == self.previous[name]
-        before = plain(self.specs[name])
+        assert without_alternates(spec) == self.previous[name]
+        before = without_alternates(self.specs[name])
         answer = self._take(name, spec)
         if answer["ok"]:
             self.previous[name] = before
@@ -85,9 +86,3 @@ class PlantStub:
         row = {"port": "eap0", "index": 0xF800, "subindex": 8, "change": "changed",
                "name": "Configured objects: Device cycle time"}  # fmt: skip
         return [] if old == new else [row | {"old": f"{old} us", "new": f"{new} us"}]
-
-
-def plain(spec: StationSpec) -> StationSpec:
-    """Return *spec* without alternates."""
-    pds = tuple(msgspec.structs.replace(pd, alternates=()) for pd in spec.subscriptions)
-    return msgspec.structs.replace(spec, subscriptions=pds)

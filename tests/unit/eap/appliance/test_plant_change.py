@@ -14,11 +14,11 @@ from eap.appliance.plant_change import (
     plan_all,
     roll_back,
     steps_to,
-    without_alternates,
 )
 from eap.appliance.plant_link import link_to
 from eap.config.load import Plant
 from eap.config.new_plant import Shape, plant_text
+from eap.device.rollout import without_alternates
 from eap.errors import ConfigError
 from eap.pd.spec import StationSpec
 from tests.support.plantstub import PlantStub
