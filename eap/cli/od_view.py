@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 from eap.codec import datatypes
+from eap.codec.datatypes import DataType
 from eap.od import notation
 from eap.od.abort import entry_name
 
@@ -47,19 +48,20 @@ def object_line(row: Row) -> str:
 
 def _literal(row: Row) -> str:
     """Return type and value, in a form that reads as the very octets."""
-    kind = row.get("type") and datatypes.parse(row["type"])
-    if kind:
-        value = notation.plain(kind, row["name"], bytes.fromhex(row["data"]))
-        if value is not None:
-            text = notation.show(value)
-            try:
-                is_exact = notation.parse(kind, text) == bytes.fromhex(row["data"])
-            except ValueError:
-                is_exact = False
-            if is_exact:
-                is_text = kind.text.startswith("STRING")
-                return f"{kind.text} {json.dumps(text, ensure_ascii=False) if is_text else text}"
-    return f"{RAW} {row['data']}"
+    octets = bytes.fromhex(row["data"])
+    kind = datatypes.parse(row["type"]) if row.get("type") else None
+    text = notation.show(kind, row["name"], octets) if kind else None
+    if kind is None or text is None or not _is_exact(kind, text, octets):
+        return f"{RAW} {row['data']}"
+    is_text = kind.text.startswith("STRING")
+    return f"{kind.text} {json.dumps(text, ensure_ascii=False) if is_text else text}"
+
+
+def _is_exact(kind: DataType, text: str, octets: bytes) -> bool:
+    try:
+        return notation.parse(kind, text) == octets
+    except ValueError:
+        return False
 
 
 def _hexadecimal(row: Row) -> str:

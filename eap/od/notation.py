@@ -1,7 +1,8 @@
 """Values of entries as people read and write them, and as JSON carries them.
 
-Octets that are an address are shown as one, told by the name of their entry; what is written in the
-form of an address is read as one, for whatever entry has its length.
+What is an address, a mapping or the index of another object is shown as that, told by the name of
+its entry, for that is all that a foreign device tells.  What is written in one of these forms is
+read as that, for whatever entry has its length.
 """
 
 from __future__ import annotations
@@ -15,29 +16,41 @@ from eap.od.profiles.forms import Form, from_text, to_text
 _TEXT, _OCTETS = 0x09, 0x0A
 
 
-class _Address(NamedTuple):
-    """A kind of address: its length, the entries that hold it, and what its text looks like."""
+class _Known(NamedTuple):
+    """What an entry of a type and a name is, and what its text looks like."""
 
     form: Form
-    size: int
+    type: str
     names: re.Pattern[str]
     text: re.Pattern[str]
 
 
-_ADDRESSES = (
-    _Address(
+_KNOWN = (
+    _Known(
         Form.MAC,
-        6,
+        "BLOCK(6)",
         re.compile(r"\bMAC\b"),
         re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}"),
     ),
-    _Address(
+    _Known(
         Form.NET_ID,
-        6,
+        "BLOCK(6)",
         re.compile(r"\bNet ?ID\b|\bpublisher\b", re.IGNORECASE),
         re.compile(r"\d+(\.\d+){5}", re.ASCII),
     ),
-    _Address(Form.IP, 4, re.compile(r"\bIP\b"), re.compile(r"\d+(\.\d+){3}", re.ASCII)),
+    _Known(Form.IP, "BLOCK(4)", re.compile(r"\bIP\b"), re.compile(r"\d+(\.\d+){3}", re.ASCII)),
+    _Known(
+        Form.MAPPING,
+        "UDINT",
+        re.compile(r"Mapping \d+"),
+        re.compile(r"[0-9A-Fa-f]{1,4}:[0-9A-Fa-f]{1,2}/\d+", re.ASCII),
+    ),
+    _Known(
+        Form.INDEX,
+        "UINT",
+        re.compile(r"PDO index|TxPD \d+|Poll request [RT]xPD"),
+        re.compile(r"0x[0-9A-Fa-f]{4}"),
+    ),
 )
 
 
@@ -48,10 +61,8 @@ def plain(kind: DataType, name: str, octets: bytes) -> Plain | None:
     if len(octets) != kind.size:
         return None
     if kind.code == _OCTETS:
-        for each in _ADDRESSES:
-            if kind.size == each.size and each.names.search(name):
-                return to_text(each.form, kind, octets)
-        return octets.hex()
+        form = _form(kind, name)
+        return octets.hex() if form is Form.PLAIN else to_text(form, kind, octets)
     try:
         return kind.to_plain(kind.decode(octets, 0))
     except ValueError:
@@ -63,18 +74,28 @@ def parse(kind: DataType, text: str) -> bytes:
 
     A text of the dictionary is as long as it is: nothing is filled up.
     """
-    if kind.code == _OCTETS:
-        for each in _ADDRESSES:
-            if kind.size == each.size and each.text.fullmatch(text):
-                return from_text(each.form, kind, text)
+    for each in _KNOWN:
+        if kind.text == each.type and each.text.fullmatch(text):
+            return from_text(each.form, kind, text)
     octets = kind.encode(kind.parse_text(text))
     return octets.rstrip(b"\0") if kind.code == _TEXT else octets
 
 
-def show(value: Plain) -> str:
-    """Return a value of ``plain`` in the form that ``parse`` reads."""
+def show(kind: DataType, name: str, octets: bytes) -> str | None:
+    """Return the value of an entry as ``parse`` reads it; None if *octets* are no such value."""
+    value = plain(kind, name, octets)
+    if value is None:
+        return None
+    form = _form(kind, name)
+    if form is not Form.PLAIN:
+        return to_text(form, kind, octets)
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, list):
-        return ",".join(map(str, value))
-    return str(value)
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _form(kind: DataType, name: str) -> Form:
+    for each in _KNOWN:
+        if kind.text == each.type and each.names.search(name):
+            return each.form
+    return Form.PLAIN

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from eap.appliance.od_load import Loaded, load
+from eap.appliance.plantfile import load_plant
+from eap.config.blank import blank
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_fill import fill
+from eap.device.eap_read import read_back
 from eap.errors import ControlError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, Entry, OdState, record
 from tests.support.oddevice import MemoryDevice, mixer
+
+CONFIG = Path(__file__).parents[4] / "config"
 
 
 def test_order():
@@ -37,6 +46,28 @@ def test_what_is_there_is_left_alone():
     entries += [(0xD000, 7, bytes(4)), (0xF200, 1, b"\x02\0")]
     assert load(device, entries) == Loaded(1, 3)
     assert device.written == [(0xD000, 7, bytes(4))]
+
+
+@pytest.mark.parametrize("name", ["demo", "solar-line", "triggers"])
+def test_what_a_station_is_goes_into_a_blank_one(name):
+    plant = load_plant(CONFIG / f"{name}.yaml").plant
+    assert plant is not None
+    bare = blank("spare", "udp://127.9.9.9", "127.9.9.9.2.1", 10_000).plant
+    assert bare is not None
+    for spec in plant.stations:
+        full = EapDictionary(spec, "eap0")
+        fill(full)
+        spare = EapDictionary(bare.stations[0], "eap0")
+        fill(spare)
+        contents = MemoryDevice(full).contents()
+        entries = [
+            (each.object.index, each.entry.subindex, each.octets)
+            for each in contents
+            if "w" in each.entry.access and each.octets is not None
+        ]
+        load(MemoryDevice(spare), entries)
+        got = read_back(bare.stations[0], {"eap0": spare})
+        assert (got.frames, got.subscriptions) == (spec.frames, spec.subscriptions)
 
 
 def test_refusal_says_how_far_it_went():

@@ -48,8 +48,8 @@ def test_list(command, stub):
         ("0xD000:07", "0xD000:07 = UDINT 10000  # Cycle time, us, 0x2710"),
         ("0xD000:7", "0xD000:07 = UDINT 10000  # Cycle time, us, 0x2710"),
         ("0x6000:8", "0x6000:08 = BOOL true  # Default given"),
-        ("0x8000:16", "0x8000:0x10 = UINT 53248  # TxPD 1, 0xD000"),
-        ("0x8000:0x10", "0x8000:0x10 = UINT 53248  # TxPD 1, 0xD000"),
+        ("0x8000:16", "0x8000:0x10 = UINT 0xD000  # TxPD 1, 0xD000"),
+        ("0x8000:0x10", "0x8000:0x10 = UINT 0xD000  # TxPD 1, 0xD000"),
         ("0x8000:3", "0x8000:03 = BLOCK(6) 01:01:05:04:00:00  # Destination MAC"),
         ("0x8000:4", "0x8000:04 = BLOCK(6) 127.0.1.2.2.1  # Destination NetID"),
         ("0x8000:5", "0x8000:05 = BLOCK(4) 127.0.1.2  # Destination IP"),
@@ -84,7 +84,7 @@ def test_whole_objects(command):
     assert command("read", "mixer", "0x1A00", "--complete").output.splitlines() == [
         "# 0x1A00 TxPDO mapping 0",
         "0x1A00:00 = USINT 1  # SubIndex 000",
-        "0x1A00:01 = UDINT 1610613024  # Mapping 1, 0x60000120",
+        "0x1A00:01 = UDINT 6000:01/32  # Mapping 1, 0x60000120",
     ]
     row = json.loads(command("read", "mixer", "0xD000:1", "--complete", "--json").output)
     assert (row["data"], row["complete"]) == ("10270000", True)

@@ -47,6 +47,8 @@ def test_plain(kind, name, octets, value):
         ("UDINT", "0x1A00", "001a0000"),
         ("BOOL", "on", "01"),
         ("UINT[2]", "1,2", "01000200"),
+        ("UDINT", "6000:01/32", "20010060"),
+        ("UINT", "0x1A00", "001a"),
     ],
 )
 def test_parse(kind, text, octets):
@@ -68,7 +70,11 @@ def test_parse_says_what_was_expected(kind, text, reason):
         parse(datatypes.parse(kind), text)
 
 
-@given(st.sampled_from(KINDS), st.binary(min_size=24, max_size=24), st.sampled_from(["", "NetID"]))
+@given(
+    st.sampled_from(KINDS),
+    st.binary(min_size=24, max_size=24),
+    st.sampled_from(["", "NetID", "Mapping 1", "PDO index"]),
+)
 def test_what_is_shown_reads_as_it_was(text, octets, name):
     kind = datatypes.parse(text)
     value = kind.decode(octets[: kind.size], 0)
@@ -76,6 +82,24 @@ def test_what_is_shown_reads_as_it_was(text, octets, name):
     if any(isinstance(number, float) and math.isnan(number) for number in numbers):
         return  # there are many of them
     exact = kind.encode(value)
-    shown = plain(kind, name, exact)
+    shown = show(kind, name, exact)
     assert shown is not None
-    assert parse(kind, show(shown)) == exact
+    assert parse(kind, shown) == exact
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "octets", "text"),
+    [
+        ("UDINT", "Mapping 3", "20010060", "6000:01/32"),
+        ("UDINT", "Cycle time", "10270000", "10000"),
+        ("UINT", "PDO index", "001a", "0x1A00"),
+        ("UINT", "TxPD 1", "00d0", "0xD000"),
+        ("UINT", "Poll request RxPD", "00e0", "0xE000"),
+        ("UINT", "Version", "0a00", "10"),
+        ("BOOL", "Enabled", "01", "true"),
+        ("BLOCK(6)", "Publisher", "7f0001010201", "127.0.1.1.2.1"),
+        ("UINT", "Version", "0a", None),
+    ],
+)
+def test_show(kind, name, octets, text):
+    assert show(datatypes.parse(kind), name, bytes.fromhex(octets)) == text
