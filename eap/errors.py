@@ -13,6 +13,7 @@ EapError
 │   ├── EngineGoneError     nobody runs the cycle any more
 │   ├── TornReadError       a writer stopped in the middle of writing
 │   └── WriterConflictError somebody else owns what was to be written
+├── EngineRefusedError      the engine goes on with what it ran before
 └── ControlError            a running appliance refused a request
 """
 
@@ -82,6 +83,10 @@ class WriterConflictError(ImageError):
     def __init__(self, message: str, *, holder: str) -> None:
         super().__init__(message)
         self.holder = holder
+
+
+class EngineRefusedError(EapError):
+    """The engine does not do what it was asked for, and goes on as before; the text says why."""
 
 
 class ControlError(EapError):

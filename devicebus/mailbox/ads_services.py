@@ -66,14 +66,15 @@ class AdsServices:
         try:
             return AmsAnswer(self._serve(command, data))
         except _RefusedError as exc:
-            result = exc.result
+            return _refusal(command, exc.result)
         except TruncatedError:
-            result = AdsError.SIZE
+            return _refusal(command, AdsError.SIZE)
         except SdoAbortError as exc:
-            result = self._result_of(exc)
-        # Clients unpack the length of what was read whatever the result is.
-        has_data = command in {AmsCommand.READ, AmsCommand.READ_WRITE}
-        return AmsAnswer(encode_result(result, b"" if has_data else None))
+            return self.refuse(command, exc)
+
+    def refuse(self, command: int, abort: SdoAbortError) -> AmsAnswer:
+        """Return the answer to *command* that tells of a refused SDO."""
+        return _refusal(command, self._result_of(abort))
 
     def _serve(self, command: int, data: bytes) -> bytes:
         if command == AmsCommand.READ_DEVICE_INFO:
@@ -125,6 +126,12 @@ class AdsServices:
             self._dictionary.download_complete(index, 0, data, self._state())
         else:
             self._dictionary.download(index, low & 0xFF, data, self._state())
+
+
+def _refusal(command: int, result: AdsError) -> AmsAnswer:
+    # Clients unpack the length of what was read whatever the result is.
+    has_data = command in {AmsCommand.READ, AmsCommand.READ_WRITE}
+    return AmsAnswer(encode_result(result, b"" if has_data else None))
 
 
 def _is_complete(low: int) -> bool:

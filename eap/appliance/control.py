@@ -16,7 +16,7 @@ import msgspec
 from eap.errors import ControlError
 
 VERSION = 1
-MAX_LINE = 1 << 20
+MAX_LINE = 1 << 23
 """Octets of the longest line in either direction, its newline included."""
 MAX_CLIENTS = 64
 MAX_SUBSCRIPTIONS = 16
@@ -44,6 +44,8 @@ class ErrorCode(StrEnum):
     """The process image cannot be read now, or there is no engine."""
     BUS = auto()
     """A bus or a slave did not do it; the kind says in which way."""
+    ABORT = auto()
+    """A dictionary refuses an SDO; the detail is its abort code."""
     INTERNAL = auto()
 
 
@@ -64,7 +66,7 @@ class Failure(msgspec.Struct, frozen=True, omit_defaults=True):
     kind: str = ""
     """With code ``bus``: the name of one of ``devicebus.errors``."""
     detail: int = 0
-    """Its number, as ``bus_failure`` packs it."""
+    """Its number, as ``bus_failure`` packs it; with code ``abort`` the abort code."""
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):

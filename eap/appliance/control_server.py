@@ -38,6 +38,7 @@ from eap.appliance.control import (
 from eap.appliance.control_bus import BUS_METHODS
 from eap.appliance.methods import Methods, Watch
 from eap.errors import ControlError, ImageError
+from eap.od.abort import SdoAbortError
 
 logger = logging.getLogger(__name__)
 
@@ -192,6 +193,9 @@ class _Client:
         except BusError as exc:
             why = to_failure(exc)
             failure = Failure(ErrorCode.BUS, why.message, why.kind, why.detail)
+            await self.send(encode_failure(number, failure))
+        except SdoAbortError as exc:
+            failure = Failure(ErrorCode.ABORT, str(exc), detail=exc.code)
             await self.send(encode_failure(number, failure))
         except Exception:
             logger.exception("control method failed")

@@ -34,6 +34,7 @@ class Methods:
         images: The process image of each station.
         status: Makes the answer to ``status``.
         stop: Asks the appliance to end.
+        more: Other methods by name.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class Methods:
         *,
         status: Callable[[], Awaitable[dict[str, Any]]],
         stop: Callable[[], None],
+        more: Mapping[str, Callable[[dict[str, Any]], Any]] | None = None,
     ) -> None:
         self._identity = identity
         self._images = images
@@ -56,10 +58,11 @@ class Methods:
             "read": self._read,
             "write": self._write,
             "stop": self._ask_to_stop,
+            **(more or {}),
         }
 
     async def call(self, method: str, params: dict[str, Any]) -> Any:
-        """Return the result of one method; raise ControlError or ImageError if it is not done."""
+        """Return the result of one method; raise EapError if it is not done."""
         try:
             function = self._methods[method]
         except KeyError:

@@ -59,7 +59,7 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
         ],
         "discarded": _discarded(image, StationWord.DISCARDED),
         "pd": {
-            "tx": [_tx(image, place) for place in layout.tx],
+            "tx": [tx_status(image, place) for place in layout.tx],
             "rx": [_rx(image, place, now_ns, wall_ns) for place in layout.rx],
         },
     }
@@ -154,7 +154,8 @@ def _discarded(image: Image, first: int) -> dict[str, int]:
     return {reason.value: count for reason, count in zip(DISCARDS, counts, strict=True) if count}
 
 
-def _tx(image: Image, place: TxPlace) -> dict[str, Any]:
+def tx_status(image: Image, place: TxPlace) -> dict[str, Any]:
+    """Return the entry of one PD to send in the status of the station."""
     words = image.words
     counts = words[place.words + TxWord.REASON : place.words + TxWord.SIZE].tolist()
     whole = 0 if place.poll_request else words[place.frame_words + FrameWord.WHOLE]

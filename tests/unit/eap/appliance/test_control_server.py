@@ -16,6 +16,7 @@ from eap.appliance.control_server import ControlServer
 from eap.appliance.engine_link import EngineLink
 from eap.appliance.methods import Methods, Watch
 from eap.errors import ControlError, TornReadError
+from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
@@ -88,11 +89,26 @@ def test_refusals_keep_the_connection(methods):
     asyncio.run(talk())
 
 
+def test_refusals_of_dictionaries_carry_their_abort_code(images):
+    def refuse(params):
+        raise SdoAbortError(AbortCode.NO_OBJECT, 0x2000, 1)
+
+    methods = Methods({}, images, status=torn, stop=lambda: None, more={"od_read": refuse})
+
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            error = (await client.ask("od_read"))["error"]
+            assert (error["code"], error["detail"]) == ("abort", 0x06020000)
+            assert error["message"].startswith("0x2000:01: object does not exist")
+
+    asyncio.run(talk())
+
+
 def test_a_line_without_end_is_refused_and_ends_the_connection(methods):
     async def talk():
         async with Talk(ControlServer(methods, NO_BUSES)) as client:
             client.say(b"x" * (MAX_LINE + 1))
-            assert "1048576" in (await client.hear())["error"]["message"]
+            assert str(MAX_LINE) in (await client.hear())["error"]["message"]
             assert await client.reader.read() == b""
 
     asyncio.run(talk())

@@ -1,0 +1,112 @@
+"""Another configuration for a running station: what it would change, tried before it is asked for.
+
+Nothing here runs anything: a plan holds dictionaries as they would be, for which nothing runs yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from eap.appliance.configuration import Configuration
+from eap.appliance.device_plan import describe_rest, find_refusals
+from eap.device import stored
+from eap.device.difference import Change, compare
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_fill import fill
+from eap.device.eap_read import read_back
+from eap.device.fault import DeviceFault
+from eap.device.stored import StoredError
+from eap.pd.spec import PortKind, StationSpec
+
+
+class Plan(NamedTuple):
+    """What another configuration would change."""
+
+    spec: StationSpec
+    changes: list[tuple[str, Change]]
+    """Each with its port, in an order in which they could be written."""
+    station: list[str]
+    """What changes beside the dictionaries."""
+    refused: list[str]
+    """Why it cannot be."""
+    dictionaries: Mapping[str, EapDictionary]
+    """As they would be."""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing would change."""
+        return not (self.changes or self.station)
+
+    def objects(self) -> dict[str, Any]:
+        """Return what the dictionaries would hold, for the store."""
+        return dump_all(self.dictionaries)
+
+
+def eap_ports(spec: StationSpec) -> list[str]:
+    """Return the names of the ports that have a dictionary."""
+    return [port.name for port in spec.ports if port.kind is PortKind.EAP]
+
+
+def dump_all(dictionaries: Mapping[str, EapDictionary]) -> dict[str, Any]:
+    """Return what *dictionaries* hold, for the store."""
+    return {name: stored.dump(each) for name, each in dictionaries.items()}
+
+
+def fill_all(
+    dictionaries: Mapping[str, EapDictionary],
+    objects: Mapping[str, Any],
+    like: Mapping[str, EapDictionary] | None = None,
+) -> None:
+    """Give *dictionaries* what was stored of them, else what their station says.
+
+    Args:
+        dictionaries: Empty ones, by port.
+        objects: What was stored, by port.
+        like: Others; what has the same name there gets the same index.
+
+    Raises:
+        DeviceFault: there is no room for all of it.
+    """
+    for name, dictionary in dictionaries.items():
+        if name in objects:
+            try:
+                stored.load(dictionary, objects[name])
+            except StoredError:
+                pass
+            else:
+                continue
+        fill(dictionary, None if like is None else like[name])
+
+
+def make_plan(
+    now: StationSpec, dictionaries: Mapping[str, EapDictionary], wanted: StationSpec,
+    objects: Mapping[str, Any],
+) -> Plan:  # fmt: skip
+    """Return what it takes to run *wanted*, with *objects* where they are given."""
+    refused = find_refusals(now, wanted)
+    if refused:
+        return Plan(wanted, [], [], refused, {})
+    fresh = {
+        name: EapDictionary(wanted, name, identity=each.identity)
+        for name, each in dictionaries.items()
+    }
+    try:
+        fill_all(fresh, objects, dictionaries)
+        read_back(wanted, fresh)
+    except DeviceFault as exc:
+        return Plan(wanted, [], [], [str(exc)], {})
+    changes = [
+        (name, change) for name, old in dictionaries.items() for change in compare(old, fresh[name])
+    ]
+    return Plan(wanted, changes, describe_rest(now, wanted), [], fresh)
+
+
+def plan_rollback(
+    now: StationSpec, dictionaries: Mapping[str, EapDictionary], previous: Configuration | None
+) -> Plan:
+    """Return what it takes to run again what ran before."""
+    if previous is None:
+        reason = "there is nothing to go back to: it has run nothing else"
+        return Plan(now, [], [], [reason], {})
+    return make_plan(now, dictionaries, previous.spec, previous.objects)

@@ -1,0 +1,183 @@
+"""Live entries of a station's dictionaries, from its process image.
+
+Nothing is kept here: each value is looked up when somebody reads it, in the image that is the
+newest then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from eap.appliance.station_image import StationImage
+from eap.codec import datatypes
+from eap.codec.values import DataType
+from eap.errors import ImageError
+from eap.od.profiles import eap1000 as profile
+from eap.od.profiles.eap1000keys import Live
+from eap.pd.image import Image
+from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, RxPlace, TxPlace
+from eap.pd.report import account_word, quality, tx_status, var_state
+from eap.pd.words import (
+    DISCARD_INDEX,
+    REASON_INDEX,
+    Discard,
+    FrameWord,
+    Reason,
+    RxWord,
+    StationWord,
+    TxWord,
+)
+
+_NEVER = 0xFFFF
+"""Quality of what has never been received: as old as can be told."""
+_KINDS: dict[str, DataType] = {
+    row.live: datatypes.parse(row.kind)
+    for each in profile.ALL
+    for row in each.entries
+    if row.live and row.kind
+}
+"""Types of the live entries, without those that hold a variable's value."""
+
+
+class ImageValues:
+    """What the dictionaries of one station show of what runs."""
+
+    def __init__(self, station: StationImage) -> None:
+        self._station = station
+        self._found: _Places | None = None
+
+    def octets(self, key: str, name: str) -> bytes | None:
+        """Return what *key* shows of the object called *name*, None if that does not run."""
+        try:
+            image = self._station.image
+            if key == Live.VALUE:
+                return _value(image, name)
+            number = self._places(image).number(key, name)
+        except ImageError:
+            return None
+        return None if number is None else _encode(_KINDS[key], number)
+
+    def _places(self, image: Image) -> _Places:
+        if self._found is None or self._found.image is not image:
+            self._found = _Places(image)
+        return self._found
+
+
+class _Places:
+    """What lies in one image, by name."""
+
+    def __init__(self, image: Image) -> None:
+        self.image = image
+        self._frames = {place.name: place for place in image.layout.frames}
+        self._tx = {place.name: place for place in image.layout.tx}
+        self._rx = {place.name: place for place in image.layout.rx}
+
+    def number(self, key: str, name: str) -> int | None:
+        if key in _OF_STATION:
+            return int(self.image.words[_OF_STATION[key]])
+        if key in _OF_FRAME:
+            return _applied(_OF_FRAME[key], self.image, self._frames.get(name))
+        if key in _OF_TX:
+            return _applied(_OF_TX[key], self.image, self._tx.get(name))
+        if key in _OF_RX:
+            return _applied(_OF_RX[key], self.image, self._rx.get(name))
+        return None
+
+
+def _applied(function: Callable[[Image, Any], int], image: Image, place: Any) -> int | None:
+    return None if place is None else function(image, place)
+
+
+def _value(image: Image, name: str) -> bytes | None:
+    place = image.places.get(name)
+    if place is None:
+        return None
+    kind = datatypes.parse(place.type)
+    return kind.encode(image.read(name)).ljust(kind.size, b"\0")
+
+
+def _encode(kind: DataType, number: int) -> bytes:
+    """Return *number* as near as *kind* can hold it."""
+    limits = kind.scalar_range
+    if limits is not None:
+        number = int(min(max(number, limits[0]), limits[1]))
+    return kind.encode(number)
+
+
+def _frame_word(word: FrameWord) -> Callable[[Image, FramePlace], int]:
+    return lambda image, place: int(image.words[place.words + word])
+
+
+def _tx_word(word: TxWord) -> Callable[[Image, TxPlace], int]:
+    return lambda image, place: int(image.words[place.words + word])
+
+
+def _sent(reason: Reason) -> Callable[[Image, TxPlace], int]:
+    return lambda image, place: int(tx_status(image, place)["reason"].get(reason.value, 0))
+
+
+def _last_reason(image: Image, place: TxPlace) -> int:
+    last = tx_status(image, place)["last_reason"]
+    return 0 if last is None else REASON_INDEX[Reason(last)]
+
+
+def _control(suffix: str) -> Callable[[Image, FramePlace | TxPlace], int]:
+    return lambda image, place: int(image.read(place.name + suffix))
+
+
+def _account(word: RxWord) -> Callable[[Image, RxPlace], int]:
+    return lambda image, place: int(image.words[account_word(image, place) + word])
+
+
+def _discarded(reason: Discard) -> Callable[[Image, RxPlace], int]:
+    offset = RxWord.DISCARDED + DISCARD_INDEX[reason]
+    return lambda image, place: int(image.words[place.words + offset])
+
+
+def _quality(image: Image, place: RxPlace) -> int:
+    return quality(image, place) if _account(RxWord.RECEIVED)(image, place) else _NEVER
+
+
+def _cycle_index(image: Image, place: RxPlace) -> int:
+    last = _account(RxWord.LAST_CYCLE)(image, place)
+    return last & 0xFFFF if _account(RxWord.RECEIVED)(image, place) else 0
+
+
+_OF_STATION: dict[str, int] = {
+    Live.STATION_CYCLE: StationWord.CYCLE,
+    Live.STATION_OVERRUNS: StationWord.OVERRUNS,
+    Live.STATION_RESTARTS: StationWord.RESTARTS,
+    Live.STATION_TORN: StationWord.TORN,
+    Live.STATION_LATENESS_MAX: StationWord.LATENESS_MAX_NS,
+    Live.STATION_LINKS_HELD: StationWord.LINKS_HELD,
+} | {
+    key: StationWord.DISCARDED + DISCARD_INDEX[reason]
+    for reason in Discard
+    if (key := f"station_discarded_{reason}") in _KINDS
+}
+_OF_FRAME: dict[str, Callable[[Image, FramePlace], int]] = {
+    Live.FRAME_STATE: _frame_word(FrameWord.STATE),
+    Live.FRAME_CTRL: _control(FRAME_CTRL),
+    Live.FRAME_WHOLE: _frame_word(FrameWord.WHOLE),
+    Live.FRAME_PARTIAL: _frame_word(FrameWord.PARTIAL),
+    Live.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
+}
+_OF_TX: dict[str, Callable[[Image, TxPlace], int]] = {
+    Live.TX_VAR_CTRL: _control(VAR_CTRL),
+    Live.TX_LAST_REASON: _last_reason,
+    Live.TX_SKIPPED: _tx_word(TxWord.SKIPPED),
+} | {key: _sent(reason) for reason in Reason if (key := f"tx_sent_{reason}") in _KINDS}
+_OF_RX: dict[str, Callable[[Image, RxPlace], int]] = {
+    Live.RX_QUALITY: _quality,
+    Live.RX_CYCLE_INDEX: _cycle_index,
+    Live.RX_VAR_STATE: var_state,
+    Live.RX_STATE: _account(RxWord.STATE),
+    Live.RX_RECEIVED: _account(RxWord.RECEIVED),
+    Live.RX_LOST: _account(RxWord.LOST),
+    Live.RX_DUPLICATED: _account(RxWord.DUPLICATED),
+    Live.RX_REORDERED: _account(RxWord.REORDERED),
+    Live.RX_LATE: _account(RxWord.LATE),
+    Live.RX_TIMEOUTS: _account(RxWord.TIMEOUTS),
+    Live.RX_JITTER_MAX: _account(RxWord.JITTER_MAX_US),
+} | {key: _discarded(reason) for reason in Discard if (key := f"rx_discarded_{reason}") in _KINDS}

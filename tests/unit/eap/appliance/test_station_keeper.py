@@ -1,0 +1,170 @@
+"""What runs and what is kept change together."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from msgspec.structs import replace
+
+from eap.appliance.configuration import digest_of
+from eap.appliance.station_keeper import StationKeeper
+from eap.appliance.store import Store, effective, state_root
+from eap.device.fault import DeviceFault, FaultCode
+from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
+from eap.pd.device import DeviceState
+from tests.support.stationengine import StationEngine
+
+OLD, NEW = {"eap0": "old"}, {"eap0": "new"}
+
+
+@pytest.fixture
+def spec(stations):
+    return stations[0]
+
+
+@pytest.fixture
+def changed(spec):
+    return replace(spec, cycle_us=20_000)
+
+
+@pytest.fixture
+def engine(spec):
+    return StationEngine(spec)
+
+
+@pytest.fixture
+def keeper(spec, engine):
+    return StationKeeper(spec, DeviceState.OP, Store("demo"), engine)
+
+
+def kept():
+    return Store("demo").load("left")
+
+
+def test_nothing_is_kept_of_what_never_changed(keeper, spec):
+    assert (keeper.spec, keeper.state, keeper.objects, keeper.previous) == (
+        spec,
+        DeviceState.OP,
+        {},
+        None,
+    )
+    assert not state_root().exists()
+
+
+def test_change_is_kept_and_runs(keeper, engine, spec, changed):
+    told = []
+    keeper.on_change = told.append
+    asyncio.run(keeper.change(changed, NEW))
+    assert engine.spec == keeper.spec == changed
+    assert told == [changed]
+    stored = kept()
+    assert (stored.spec, stored.objects, stored.base) == (changed, NEW, digest_of(spec))
+    assert (stored.previous.spec, stored.previous.objects) == (spec, {})
+    assert effective("demo", (spec,)) == ((changed, DeviceState.OP),)
+
+
+def test_next_keeper_goes_on_from_there(keeper, engine, spec, changed):
+    asyncio.run(keeper.change(changed, NEW))
+    again = StationKeeper(changed, DeviceState.OP, Store("demo"), engine)
+    assert (again.objects, again.previous.spec) == (NEW, spec)
+    asyncio.run(again.change(spec, OLD))
+    assert kept().base == digest_of(spec)
+    assert kept().previous.spec == changed
+
+
+def test_what_was_kept_of_something_else_is_not_taken(keeper, engine, spec, changed):
+    asyncio.run(keeper.change(changed, NEW))
+    assert StationKeeper(spec, DeviceState.OP, Store("demo"), engine).objects == {}
+
+
+def test_it_is_kept_before_the_engine_is_asked(keeper, engine, changed):
+    async def script():
+        engine.gate = asyncio.Event()
+        changing = asyncio.ensure_future(keeper.change(changed, NEW))
+        await engine.asked.wait()
+        assert kept().spec == changed
+        engine.gate.set()
+        await changing
+
+    asyncio.run(script())
+
+
+@pytest.mark.parametrize("error", [EngineRefusedError("no room"), EngineGoneError("it is gone")])
+def test_what_the_engine_does_not_take_is_not_kept(keeper, engine, spec, changed, error):
+    engine.failure = error
+    with pytest.raises(DeviceFault, match=str(error)) as caught:
+        asyncio.run(keeper.change(changed, NEW))
+    assert caught.value.code == FaultCode.NOT_RUNNING
+    assert keeper.spec == kept().spec == spec
+    assert keeper.previous is None
+    assert effective("demo", (spec,))[0].spec == spec
+
+
+def test_what_cannot_be_kept_does_not_run(keeper, engine, changed, monkeypatch):
+    def full(self, station, stored):
+        raise EnvironmentalError("disk full")
+
+    monkeypatch.setattr(Store, "save", full)
+    with pytest.raises(DeviceFault, match="disk full"):
+        asyncio.run(keeper.change(changed, NEW))
+    assert engine.calls == []
+
+
+def test_engine_that_went_away_is_told_again(keeper, engine, spec, changed):
+    asyncio.run(keeper.tell_again())
+    assert engine.calls == []
+    engine.failure = EngineGoneError("it is gone")
+    with pytest.raises(DeviceFault):
+        asyncio.run(keeper.change(changed, NEW))
+    engine.spec = changed  # it had been started with it
+    engine.failure = EngineRefusedError("not yet")
+    asyncio.run(keeper.tell_again())
+    asyncio.run(keeper.tell_again())
+    assert engine.spec == spec
+    engine.calls.clear()
+    asyncio.run(keeper.tell_again())
+    assert engine.calls == []
+
+
+def test_other_objects_of_the_same_specification_are_kept_without_the_engine(keeper, engine, spec):
+    asyncio.run(keeper.change(spec, NEW))
+    assert engine.calls == []
+    assert kept().objects == NEW
+    before = kept()
+    asyncio.run(keeper.change(spec, NEW))
+    assert kept() == before
+
+
+def test_states_are_kept(keeper, engine, spec):
+    asyncio.run(keeper.change_state(DeviceState.OP))
+    assert engine.calls == []
+    asyncio.run(keeper.change_state(DeviceState.PREOP))
+    assert engine.state is keeper.state is kept().state is DeviceState.PREOP
+    assert effective("demo", (spec,)) == ((spec, DeviceState.PREOP),)
+
+
+def test_way_up_can_fail_and_way_down_cannot(keeper, engine, caplog):
+    engine.failure = EngineGoneError("it is gone")
+    asyncio.run(keeper.change_state(DeviceState.PREOP))
+    assert "station left, on the way to PREOP: it is gone" in caplog.text
+    assert keeper.state is kept().state is DeviceState.PREOP
+    engine.failure = EngineGoneError("it is still gone")
+    with pytest.raises(DeviceFault, match="still gone"):
+        asyncio.run(keeper.change_state(DeviceState.OP))
+    assert keeper.state is kept().state is DeviceState.PREOP
+    asyncio.run(keeper.tell_again())
+    assert engine.state is DeviceState.PREOP
+
+
+def test_state_that_cannot_be_kept_is_told(keeper, engine, monkeypatch, caplog):
+    def full(self, station, stored):
+        raise EnvironmentalError("disk full")
+
+    monkeypatch.setattr(Store, "save", full)
+    asyncio.run(keeper.change_state(DeviceState.SAFEOP))
+    assert engine.state is keeper.state is DeviceState.SAFEOP
+    assert "disk full; after a start it will be in another state" in caplog.text
+    engine.failure = EngineRefusedError("no")
+    with pytest.raises(DeviceFault, match="disk full"):
+        asyncio.run(keeper.change(replace(keeper.spec, cycle_us=30_000), NEW))
