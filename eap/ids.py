@@ -108,10 +108,14 @@ class DestinationKind(Enum):
     MAC = auto()
     IP = auto()
     TCP = auto()
+    NET_ID = auto()
 
 
 class Destination(NamedTuple):
-    """Where a frame goes: a MAC address, an IPv4 address or ``tcp://`` and an IPv4 address."""
+    """Where a frame goes: a MAC address, an IPv4 address, ``tcp://`` and one, or a NetID.
+
+    A NetID stands for the MAC address of the port that has it.
+    """
 
     kind: DestinationKind
     host: str
@@ -125,6 +129,8 @@ class Destination(NamedTuple):
             return cls(DestinationKind.TCP, *_split_port(text[6:]))
         if text.count(":") == 5 or text.count("-") == 5:
             return cls(DestinationKind.MAC, str(MacAddr.parse(text)))
+        if text.count(".") == 5:
+            return cls(DestinationKind.NET_ID, str(NetId.parse(text)))
         return cls(DestinationKind.IP, *_split_port(text))
 
     @property
@@ -132,6 +138,8 @@ class Destination(NamedTuple):
         """Whether more than one station may listen there (multicast, or 255.255.255.255)."""
         if self.kind is DestinationKind.MAC:
             return MacAddr.parse(self.host).is_group
+        if self.kind is DestinationKind.NET_ID:
+            return False
         address = IPv4Address(self.host)
         return address.is_multicast or address == IPv4Address("255.255.255.255")
 

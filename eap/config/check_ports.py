@@ -12,7 +12,7 @@ from eap.config.destination import is_group, takes_tcp
 from eap.config.finding import Report
 from eap.config.index import Index
 from eap.config.structs import Port, Station
-from eap.ids import InterfaceUri, NetId
+from eap.ids import InterfaceUri, MacAddr, NetId
 from eap.pd.spec import PortKind
 
 _NAME = re.compile(r"[^\s/]+")
@@ -129,6 +129,14 @@ def _is_own(host: str) -> bool:
     return not address.is_multicast and str(address) != "255.255.255.255"
 
 
+def _is_station(mac: str) -> bool:
+    try:
+        address = MacAddr.parse(mac)
+    except ValueError:
+        return False
+    return any(address) and not address.is_group
+
+
 def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
     only = f"it only on a port of another kind than {uri.scheme}://"
     if port.vlan is not None and uri.scheme != "ethernet":
@@ -137,6 +145,12 @@ def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
         report.add(f"{port.at}.broadcast", f"port {port.name} listens to UDP broadcasts", only)
     if port.tcp and uri.scheme not in {"udp", "tcp"}:
         report.add(f"{port.at}.tcp", f"port {port.name} takes type 4 from TCP", only)
+    if port.mac and uri.scheme != "ethernet":
+        report.add(f"{port.at}.mac", f"port {port.name} has a MAC address", only)
+    elif port.mac and not _is_station(port.mac):
+        report.add(
+            f"{port.at}.mac", f"mac is {port.mac!r}", "the address of one station's interface"
+        )
     for position, group in enumerate(port.join):
         if not is_group(group, uri):
             kind = "MAC" if uri.scheme == "ethernet" else "IPv4"

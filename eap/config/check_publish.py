@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from eap.codec import pdo
 from eap.codec.pd import FIRST_PD, PdHeader
+from eap.config.check_address import check_address, check_monitoring
 from eap.config.check_ports import check_names
 from eap.config.destination import EXPECTED, frame_budget, resolve
 from eap.config.finding import Report, near, one_of
@@ -56,6 +57,8 @@ def _check_frame(index: Index, report: Report, station: Station, frame: Frame) -
             message = f"destination of frame {frame.name!r}: {exc}"
             report.add(f"{frame.at}.to", message, EXPECTED[uri.scheme])
         return
+    check_address(index, report, (station, frame), destination)
+    check_monitoring(report, frame, destination, uri)
     size = FIRST_PD
     for pd in pds:
         sent = index.sent.get((station.name, pd.name))

@@ -13,11 +13,12 @@ import msgspec
 
 from eap.codec import datatypes
 from eap.config.check_buses import bus_file
-from eap.config.destination import IP_BROADCAST, group_of, resolve
+from eap.config.destination import IP_BROADCAST, find_net_id, group_of, resolve
 from eap.config.index import Index, SentPd
 from eap.config.links import ends, in_order, is_bitwise
 from eap.config.structs import Frame, From, Port, Publish, Station, Subscribe, Variable
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
+from eap.pd.address import net_id_of
 from eap.pd.spec import (
     REQUESTER,
     BusPortSpec,
@@ -152,10 +153,14 @@ def _source(source: Source, folder: Path) -> Source:
 
 def _frames(index: Index, station: Station) -> Iterator[TxFrameSpec]:
     for frame in station.frames:
+        destination = _destination(index, station, frame)
         yield TxFrameSpec(
             name=frame.name,
             port=frame.port,
-            destination=_destination(index, station, frame),
+            destination=destination,
+            mac=_mac(index, destination),
+            monitor_interval_ms=frame.monitor_interval_ms or 0,
+            monitor_ip=frame.monitor_ip,
             pds=tuple(_pd(pd) for pd in station.publish if pd.frame == frame.name),
             divider=frame.divider or 0,
             modulo=frame.modulo or 0,
@@ -166,6 +171,15 @@ def _destination(index: Index, station: Station, frame: Frame) -> str:
     if frame.to == REQUESTER:
         return REQUESTER
     return str(resolve(frame.to, index.uris[station.name, frame.port], index))
+
+
+def _mac(index: Index, destination: str) -> str:
+    """Return the MAC address that the plant gives for a NetID, empty if there is none."""
+    net_id = net_id_of(destination)
+    if net_id is None:
+        return ""
+    text = "".join(index.ports[key].mac for key in find_net_id(str(net_id), index))
+    return str(MacAddr.parse(text)) if text else ""
 
 
 def _pd(pd: Publish) -> TxPdSpec:

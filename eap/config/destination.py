@@ -14,7 +14,9 @@ from eap.ids import (
     DestinationKind,
     InterfaceUri,
     MacAddr,
+    NetId,
 )
+from eap.pd.spec import PortKind
 
 IP_BROADCAST = "255.255.255.255"
 MAX_STREAM_FRAME = EtherCatHeader.SIZE + 0x7FF
@@ -27,10 +29,10 @@ _ALLOWED = {
     "loop": (DestinationKind.MAC,),
 }
 EXPECTED = {
-    "udp": "an IPv4 address, tcp:// and one, STATION/PORT, broadcast or requester",
-    "tcp": "tcp:// and an IPv4 address, STATION/PORT or requester",
-    "ethernet": "a MAC address, multicast, broadcast or requester",
-    "loop": "STATION/PORT, a MAC address, multicast, broadcast or requester",
+    "udp": "an IPv4 address, tcp:// and one, STATION/PORT, a port's NetID, broadcast or requester",
+    "tcp": "tcp:// and an IPv4 address, STATION/PORT, a port's NetID or requester",
+    "ethernet": "a MAC address, STATION/PORT, a port's NetID, multicast, broadcast or requester",
+    "loop": "STATION/PORT, a port's NetID, a MAC address, multicast, broadcast or requester",
 }
 """What ``to`` may be on each kind of interface."""
 _KEYWORDS = {
@@ -56,11 +58,47 @@ def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
     if "/" in text and "://" not in text:
         return _of_port(text, uri, index)
     destination = Destination.parse(text)
+    if destination.kind is DestinationKind.NET_ID:
+        return _of_net_id(destination, uri, index)
     if destination.kind not in _ALLOWED.get(uri.scheme, ()):
         raise ValueError(f"{text} cannot be reached from {uri}")
     if destination.kind is DestinationKind.TCP and destination.is_group:
         raise ValueError(f"{text} is a group, and TCP has none")
     return destination
+
+
+def _of_net_id(destination: Destination, uri: InterfaceUri, index: Index) -> Destination:
+    """Return where the port of that NetID is, or the one EAP port of the router that has it.
+
+    On Ethernet it may be outside the plant: what it sends tells its MAC address.
+    """
+    if not any(NetId.parse(destination.host)):
+        raise ValueError(f"NetID {destination.host} stands for any")
+    owners = find_net_id(destination.host, index)
+    if len(owners) > 1:
+        several = ", ".join(f"{station}/{name}" for station, name in owners)
+        raise ValueError(f"NetID {destination.host} is a router's, with several ports: {several}")
+    if owners:
+        return _of_port("/".join(owners[0]), uri, index)
+    if uri.scheme != "ethernet":
+        raise ValueError(f"no port of this plant has the NetID {destination.host}")
+    return destination
+
+
+def find_net_id(text: str, index: Index) -> list[tuple[str, str]]:
+    """Return station and name of the EAP port of NetID *text*, or of all ports of that router."""
+    wanted = NetId.parse(text)
+    eap = [key for key, port in index.ports.items() if port.kind is PortKind.EAP]
+    return [key for key in eap if _has(index.ports[key].net_id, wanted)] or [
+        key for key in eap if _has(index.stations[key[0]].net_id, wanted)
+    ]
+
+
+def _has(text: str, net_id: NetId) -> bool:
+    try:
+        return NetId.parse(text) == net_id
+    except ValueError:
+        return False
 
 
 def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
@@ -74,6 +112,8 @@ def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
     address = f"{target.host}:{target.port}" if target.port else target.host
     if target.scheme == uri.scheme == "udp":
         return Destination.parse(address)
+    if target.scheme == uri.scheme == "ethernet" and port.kind is PortKind.EAP:
+        return Destination.parse(port.net_id)
     if uri.scheme in {"udp", "tcp"} and takes_tcp(port, target):
         return Destination.parse(f"tcp://{address}")
     raise ValueError(f"{text} ({target}) has no address that is known for frames from {uri}")
@@ -107,8 +147,11 @@ def reaches(
     port, uri = receiver
     if sender[1].scheme == "loop" or uri.scheme == "loop":
         return (sender[1].scheme, sender[1].host) == (uri.scheme, uri.host)
-    if destination.kind is DestinationKind.MAC:
-        return uri.scheme == "ethernet" and _vid(sender[0]) == _vid(port)
+    if destination.kind in {DestinationKind.MAC, DestinationKind.NET_ID}:
+        is_for_it = destination.kind is DestinationKind.MAC or _has(
+            port.net_id, NetId.parse(destination.host)
+        )
+        return uri.scheme == "ethernet" and _vid(sender[0]) == _vid(port) and is_for_it
     if (destination.port or EAP_PORT) != (uri.port or EAP_PORT):
         return False
     if destination.kind is DestinationKind.TCP:

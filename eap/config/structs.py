@@ -16,6 +16,7 @@ from eap.pd.spec import BusTarget, OnChangeSpec, PortKind, Source, Substitute, W
 U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
 Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
 Milliseconds = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
+MonitorInterval = Annotated[int, Meta(ge=100, le=0xFFFF_FFFF)]
 DeviceCycle = Annotated[int, Meta(ge=100, le=60_000_000)]
 Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
 MAX_BITS = 8 * 0xFFFF
@@ -57,11 +58,12 @@ class Port(Section, frozen=True):
     broadcast: bool = False
     tcp: bool = False
     wake: Wake = Wake.CYCLE
+    mac: str = ""
     bus: str = ""
     target: BusTarget = BusTarget.OP
     clocks: bool = False
 
-    EAP_KEYS: ClassVar[tuple[str, ...]] = ("vlan", "join", "broadcast", "tcp", "wake")
+    EAP_KEYS: ClassVar[tuple[str, ...]] = ("vlan", "join", "broadcast", "tcp", "wake", "mac")
     BUS_KEYS: ClassVar[tuple[str, ...]] = ("bus", "target", "clocks")
 
 
@@ -84,6 +86,8 @@ class Frame(Section, frozen=True):
     to: str
     divider: Divider | None = None
     modulo: U16 | None = None
+    monitor_interval_ms: MonitorInterval | None = None
+    monitor_ip: str = ""
 
 
 class Publish(Section, frozen=True):

@@ -25,6 +25,7 @@ from eap.pd.spec import (
     Record,
     StationSpec,
     Substitute,
+    TxFrameSpec,
     VariableSpec,
     Writer,
 )
@@ -78,6 +79,8 @@ class FramePlace(Record, frozen=True):
     port: str
     destination: str
     words: int
+    monitor_interval_ms: int = 0
+    monitor_ip: str = ""
 
 
 class TxPlace(Record, frozen=True):
@@ -156,9 +159,7 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
     """
     words = _Allocator(0)
     words.take(StationWord.SIZE)
-    frames = tuple(
-        FramePlace(f.name, f.port, f.destination, words.take(FrameWord.SIZE)) for f in spec.frames
-    )
+    frames = tuple(_frame_place(frame, words) for frame in spec.frames)
     types = {variable.name: datatypes.parse(variable.type) for variable in spec.variables}
     tx = tuple(_tx_places(spec, frames, types, words))
     rx_words = [words.take(RxWord.SIZE) for _ in spec.subscriptions]
@@ -259,6 +260,17 @@ def _place(variable: VariableSpec, bit_offset: int) -> VariablePlace:
         variable.unit,
         variable.comment,
         variable.default,
+    )
+
+
+def _frame_place(frame: TxFrameSpec, words: _Allocator) -> FramePlace:
+    return FramePlace(
+        name=frame.name,
+        port=frame.port,
+        destination=frame.destination,
+        words=words.take(FrameWord.SIZE),
+        monitor_interval_ms=frame.monitor_interval_ms,
+        monitor_ip=frame.monitor_ip,
     )
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
+from eap.errors import ConfigError
 from eap.ids import NetId
+from eap.pd.address import check_target, from_word, net_id_of, to_word
 from eap.pd.gather import Gather
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
@@ -61,6 +63,8 @@ class Publisher:
         self._image = image
         self._inputs = inputs
         self._words = image.words
+        self.sought: dict[bytes, list[TxFrame]] = {}
+        """Frames that go to a NetID, by that NetID: :meth:`learn` wants its address."""
         cycle_us = image.layout.cycle_us
         self.frames: list[TxFrame] = []
         for spec, place, places in frames:
@@ -73,7 +77,13 @@ class Publisher:
                 )
                 for pd, where in zip(spec.pds, places, strict=True)
             )
-            self.frames.append(TxFrame(place, publisher, pds, gate, channel))
+            destination = spec.mac or spec.destination
+            net_id = net_id_of(destination)
+            if net_id is not None:  # what an earlier engine learned will do until it is heard anew
+                destination = str(from_word(self._words[place.words + FrameWord.ADDRESS]) or "")
+            frame = TxFrame(place, publisher, pds, gate, channel, destination)
+            self.frames.append(frame)
+            self._note_target(frame, net_id)
         self._controls: dict[str, int] = {}
         self._groups: list[_Group] = []
         self._always: _Group | None = None
@@ -90,6 +100,40 @@ class Publisher:
         """PDs whose VarState tells that they were not sent: rarely any, so sending asks first."""
         self.read_controls()
 
+    def retarget(self, name: str, destination: str) -> None:
+        """Send frame *name* to *destination* from the next cycle on, and leave all others alone.
+
+        To a NetID nothing is sent until its address is learned.
+
+        Raises:
+            ConfigError: the port sends no frame of that name, or cannot send it there.
+        """
+        frame = next((frame for frame in self.frames if frame.place.name == name), None)
+        if frame is None:
+            raise ConfigError(f"there is no frame {name!r} to send elsewhere")
+        check_target(frame.place.destination, destination)
+        for frames in self.sought.values():
+            if frame in frames:
+                frames.remove(frame)
+        net_id = net_id_of(destination)
+        frame.retarget("" if net_id is not None else destination)
+        self._note_target(frame, net_id)
+        self._group_frames()
+
+    def learn(self, net_id: bytes, destination: str) -> None:
+        """Send what goes to *net_id* to *destination*, where its frames come from."""
+        changed = [frame for frame in self.sought[net_id] if frame.destination != destination]
+        for frame in changed:
+            frame.retarget(destination)
+            self._words[frame.place.words + FrameWord.ADDRESS] = to_word(destination)
+        if changed:
+            self._group_frames()
+
+    def _note_target(self, frame: TxFrame, net_id: NetId | None) -> None:
+        if net_id is not None:
+            self.sought.setdefault(net_id, []).append(frame)
+        self._words[frame.place.words + FrameWord.ADDRESS] = to_word(frame.destination)
+
     def read_controls(self) -> None:
         """Follow the control variables; called when the application has written."""
         for frame in self.frames:
@@ -103,6 +147,10 @@ class Publisher:
                 pd.trigger.suppressed = bool(control & SUPPRESS_BIT)
                 if control & ~before & EVENT_BIT and pd.trigger.takes_events:
                     pd.trigger.raise_event()
+        self._group_frames()
+
+    def _group_frames(self) -> None:
+        """Sort out the frames that need no decision."""
         plain: dict[Schedule, list[TxFrame]] = {}
         for frame in self.frames:
             if frame.is_plain and frame.schedule is not None:
@@ -187,12 +235,13 @@ class Publisher:
 
     def _skip(self, frame: TxFrame, pds: Sequence[TxPd]) -> None:
         words = self._words
-        if frame.suppressed:
+        if frame.is_held:
             words[frame.place.words + FrameWord.STATE] = NOT_SENT
             words[frame.place.words + FrameWord.SKIPPED] += 1
         self._enter_unsent(pds)
         for pd in pds:
-            pd.trigger.use_up_event()
+            if frame.suppressed or pd.trigger.suppressed:  # else it waits for the address
+                pd.trigger.use_up_event()
 
     def _enter_unsent(self, pds: Iterable[TxPd]) -> None:
         words = self._words

@@ -9,15 +9,14 @@ from typing import Any
 
 from eap.codec.pd import PdHeader
 from eap.pd.device import DeviceState
+from eap.pd.frame_status import frame_state, frame_status, presence
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace, TxPlace
-from eap.pd.presence import Presence
 from eap.pd.words import (
     DISCARDS,
     HISTOGRAM_BINS,
     REASON_INDEX,
     REASONS,
-    FrameState,
     FrameWord,
     Reason,
     RxState,
@@ -58,6 +57,7 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
             for p in layout.ports
         ],
         "discarded": _discarded(image, StationWord.DISCARDED),
+        "frames": [frame_status(image, place) for place in layout.frames],
         "pd": {
             "tx": [tx_status(image, place) for place in layout.tx],
             "rx": [_rx(image, place, now_ns, wall_ns) for place in layout.rx],
@@ -124,14 +124,6 @@ def quality(image: Image, place: RxPlace) -> int:
     return min(sent + own_ns // _QUALITY_NS, _QUALITY_MAX)
 
 
-def frame_state(image: Image, first_word: int) -> int:
-    """Return the FrameState of the frame whose first word is at index *first_word*."""
-    words = image.words
-    is_missing = words[first_word + FrameWord.PRESENCE] == Presence.MISSING
-    missing = FrameState.SUBSCRIBER_MISSING if is_missing else 0
-    return int(words[first_word + FrameWord.STATE] | missing)
-
-
 def var_state(image: Image, place: RxPlace) -> int:
     """Return VarState: bit 0 version, bit 1 length differ in what arrives now; 0 is well."""
     words = image.words
@@ -172,7 +164,7 @@ def tx_status(image: Image, place: TxPlace) -> dict[str, Any]:
         "last_reason": REASONS[last].value if sum(counts) else None,
         "var_state": words[place.words + TxWord.STATE],
         "frame_state": frame_state(image, place.frame_words),
-        "subscriber": Presence(words[place.frame_words + FrameWord.PRESENCE]).name.lower(),
+        "subscriber": presence(image, place.frame_words),
     }
 
 

@@ -175,7 +175,8 @@ class TxFrameSpec(Record, frozen=True):
     """One frame to send from *port* to *destination*.
 
     *destination* is a MAC address, an IPv4 address (``address[:port]``), ``tcp://address[:port]``
-    or, when all PDs are polled, REQUESTER.  Polled PDs go in frames of their own, to who asked.
+    or, on Ethernet, the NetID of a port; when all PDs are polled it is REQUESTER.  Polled PDs go in
+    frames of their own, to who asked.
     """
 
     name: str
@@ -186,6 +187,12 @@ class TxFrameSpec(Record, frozen=True):
     modulo: int = 0
     changeable: bool = False
     """Whether its destination may be written in SafeOp and Op."""
+    mac: str = ""
+    """MAC address behind a NetID; empty if it is to be learned from what that port sends."""
+    monitor_interval_ms: int = 0
+    """How often to look whether anybody is at a unicast destination; 0 never."""
+    monitor_ip: str = ""
+    """Ethernet: IPv4 address of the subscriber, to probe for by ARP; empty leaves it unknown."""
 
 
 class TakenVariableSpec(Record, frozen=True):

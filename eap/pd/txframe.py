@@ -18,6 +18,8 @@ from eap.pd.link import Channel, OutFrame
 from eap.pd.trigger import Schedule, Trigger
 
 _SELECTIONS_KEPT = 64
+NOWHERE = "00:00:00:00:00:00"
+"""In the buffers of a frame that waits for an address: those are never sent."""
 _put_u16 = struct.Struct("<H").pack_into
 
 
@@ -81,8 +83,11 @@ class TxFrame:
         pds: tuple[TxPd, ...],
         gate: tuple[int, int],
         channel: Channel,
+        destination: str,
     ) -> None:
         self.place = place
+        self.destination = destination
+        """Where it goes now; empty while that is not known, and then it does not go."""
         self.pds = pds
         self.gate = gate
         self.suppressed = False
@@ -95,20 +100,31 @@ class TxFrame:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the frame goes whole by its schedule and nothing is suppressed."""
+        """Whether the frame goes whole by its schedule and nothing holds it back."""
         return (
             self.schedule is not None
-            and not self.suppressed
+            and not self.is_held
             and not any(pd.trigger.suppressed for pd in self.pds)
         )
 
+    @property
+    def is_held(self) -> bool:
+        """Whether it does not go at all: suppressed, or nobody knows where to."""
+        return self.suppressed or not self.destination
+
+    def retarget(self, destination: str) -> None:
+        """Send to *destination* from now on; the buffers are built anew."""
+        self.destination = destination
+        self._selections.clear()
+        self.whole = self._select(self.pds)
+
     def select(self, cycle: int, now_ns: int) -> tuple[Selection | None, list[TxPd]]:
-        """Return what to send in this cycle, if anything, and what was due but suppressed."""
+        """Return what to send in this cycle, if anything, and what was due but held back."""
         divider, modulo = self.gate
         if divider and cycle % divider != modulo:
             return None, []
         due = [pd for pd in self.pds if pd.is_due(cycle, now_ns)]
-        if self.suppressed:
+        if self.is_held:
             return None, due
         skipped = [pd for pd in due if pd.trigger.suppressed]
         chosen = tuple(pd for pd in due if not pd.trigger.suppressed)
@@ -122,7 +138,7 @@ class TxFrame:
         return selection
 
     def _build(self, pds: tuple[TxPd, ...]) -> OutFrame:
-        return build_frame(self._publisher, pds, self._channel, self.place.destination)
+        return build_frame(self._publisher, pds, self._channel, self.destination or NOWHERE)
 
 
 def build_frame(

@@ -101,9 +101,11 @@ class FrameWord(IntEnum):
     STATE = 3
     """FrameState as its publisher sees it."""
     SENT_AT_NS = 4
-    PRESENCE = 5
+    ADDRESS = 5
+    """Where it goes now, as ``eap.pd.address`` puts it; 0 while that is not known."""
+    PRESENCE = 6
     """Whether the subscriber is there: a Presence (presence.py), written by its monitor."""
-    SIZE = 6
+    SIZE = 7
 
 
 class FrameState(IntFlag):

@@ -108,11 +108,18 @@ def test_destination_round_trip(address: str, port: int, tcp: bool) -> None:
         ("239.1.2.3", True),
         ("255.255.255.255", True),
         ("127.0.1.1", False),
+        ("5.23.91.23.1.1", False),
         ("tcp://127.0.1.1", False),
     ],
 )
 def test_destination_group(text: str, is_group: bool) -> None:
     assert Destination.parse(text).is_group is is_group
+
+
+def test_destination_may_be_a_net_id() -> None:
+    assert Destination.parse("5.023.91.23.1.1") == (DestinationKind.NET_ID, "5.23.91.23.1.1", 0)
+    with pytest.raises(ValueError, match="octet above 255"):
+        Destination.parse("5.23.91.256.1.1")
 
 
 def test_destination_mac_has_one_spelling() -> None:

@@ -47,6 +47,9 @@ def test_a_port_that_cannot_be_is_one_finding(findings, edits, finding):
     [
         ("ethernet://much-too-long-name", "", "'much-too-long-name' is no interface name"),
         ("ethernet://eth0", ", broadcast: true", "port eap0 listens to UDP broadcasts"),
+        ("ethernet://eth0", ", mac: 1", "mac is '1'; the address of one station's interface"),
+        ("ethernet://eth0", ", mac: 01-00-00-00-00-01", "mac is '01-00-00-00-00-01'; the address"),
+        ("udp://127.0.9.1", ", mac: 02-00-00-00-00-01", "port eap0 has a MAC address; it only on"),
         ("ethernet://eth0", ", tcp: true", "port eap0 takes type 4 from TCP"),
         ("ethernet://eth0", ", join: [239.1.1.1]", "'239.1.1.1' cannot be joined"),
         ("loop://line", ", join: [239.1.1.1]", "'239.1.1.1' cannot be joined"),

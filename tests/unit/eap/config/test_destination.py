@@ -35,6 +35,11 @@ def port(interface, **options):
         ("10.0.0.2", "ethernet://eth0", ValueError),
         ("02:00:00:00:00:01", "udp://10.0.0.1", ValueError),
         ("here", "udp://10.0.0.1", ValueError),
+        ("127.0.9.2.2.1", "udp://127.0.9.1", "127.0.9.2"),  # of a port
+        ("127.0.9.2.1.1", "udp://127.0.9.1", "127.0.9.2"),  # of a router
+        ("5.5.5.5.1.1", "udp://127.0.9.1", ValueError),
+        ("5.5.5.5.1.1", "ethernet://eth0", "5.5.5.5.1.1"),
+        ("0.0.0.0.0.0", "ethernet://eth0", ValueError),
     ],
 )
 def test_what_may_be_written_becomes_an_address(index, text, interface, destination):
@@ -51,11 +56,26 @@ def test_what_may_be_written_becomes_an_address(index, text, interface, destinat
         ("udp://127.0.9.2:4000", "udp://127.0.9.1", "127.0.9.2:4000"),
         ("tcp://127.0.9.2", "udp://127.0.9.1", "tcp://127.0.9.2"),
         ("loop://line", "loop://line", "01:01:05:04:00:00"),
+        ("ethernet://eth1", "ethernet://eth0", "127.0.9.2.2.1"),
     ],
 )
 def test_a_port_of_the_plant_has_an_address(index, interface, sender, destination):
     plant = index(('"udp://127.0.9.2"', f'"{interface}"'))
     assert str(resolve("right/eap0", InterfaceUri.parse(sender), plant)) == destination
+
+
+def test_a_router_with_several_ports_has_no_address(index):
+    plant = index(
+        (
+            "net_id: 127.0.9.2.2.1}",
+            """net_id: 127.0.9.2.2.1}
+      - {name: eap1, kind: eap, interface: "udp://127.0.9.3", net_id: 127.0.9.2.3.1}""",
+        )
+    )
+    uri = InterfaceUri.parse("udp://127.0.9.1")
+    assert str(resolve("127.0.9.2.3.1", uri, plant)) == "127.0.9.3"
+    with pytest.raises(ValueError, match="with several ports: right/eap0, right/eap1"):
+        resolve("127.0.9.2.1.1", uri, plant)
 
 
 def test_a_udp_port_that_takes_tcp_has_a_tcp_address(index):
@@ -67,6 +87,9 @@ def test_a_udp_port_that_takes_tcp_has_a_tcp_address(index):
 @pytest.mark.parametrize(
     ("destination", "sender", "receiver", "arrives"),
     [
+        ("1.1.1.1.1.1", port("ethernet://eth0"), port("ethernet://eth1"), True),
+        ("1.1.1.1.1.1", port("ethernet://eth0"), port("ethernet://eth1", vlan=Vlan(id=2)), False),
+        ("1.1.1.1.1.2", port("ethernet://eth0"), port("ethernet://eth1"), False),
         ("10.0.0.2", port("udp://10.0.0.1"), port("udp://10.0.0.2"), True),
         ("10.0.0.2", port("udp://10.0.0.1"), port("udp://10.0.0.3"), False),
         ("10.0.0.2", port("udp://10.0.0.1"), port("udp://0.0.0.0"), True),

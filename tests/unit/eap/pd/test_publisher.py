@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import pytest
+
 from eap.codec.pd import iter_pds
+from eap.errors import ConfigError
 from eap.ids import NetId
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
@@ -13,8 +16,8 @@ from tests.support.cyclic import PEER, Wire, image_of, station, written
 class Sender:
     """A publisher with what it needs around it, stepped by hand."""
 
-    def __init__(self, spec: StationSpec) -> None:
-        self.image: Image = image_of(spec)
+    def __init__(self, spec: StationSpec, image: Image | None = None) -> None:
+        self.image: Image = image or image_of(spec)
         self.inputs = Inputs(self.image)
         self.wire = Wire()
         layout = self.image.layout
@@ -35,6 +38,10 @@ class Sender:
         frames = self.publisher.frames_to_send(cycle, cycle * 1_000_000)
         self.publisher.sent(self.wire.send(frames, 0), cycle * 1_000_000)
         return [[pd.pd_id for pd, _ in iter_pds(bytes(frame.buffer))] for frame in frames]
+
+    @property
+    def frames(self) -> dict[str, dict]:
+        return {row["name"]: row for row in station_status(self.image, 0)["frames"]}
 
     @property
     def tx(self) -> list[dict]:
@@ -125,3 +132,124 @@ def test_a_refused_frame_is_skipped_and_the_others_are_not():
     sender.publisher.sent(frames[:1], 0)
     rows = {row["name"]: (row["sent"], row["skipped"], row["frame_state"]) for row in sender.tx}
     assert rows == {"p": (0, 1, 1), "q": (0, 1, 1), "r": (1, 0, 0), "s": (1, 0, 0)}
+
+
+THERE = "5.23.91.25.1.1"
+THEIR_MAC = "02:00:00:00:00:02"
+
+
+def by_net_id(*, mac: str = "") -> StationSpec:
+    """A frame of one cyclic PD and one that the application sends, and a frame to everybody."""
+    return station(
+        variables=written("x:UINT"),
+        frames=(
+            TxFrameSpec(
+                "f",
+                "eap0",
+                THERE,
+                (
+                    TxPdSpec("p", 1, ("x",)),
+                    TxPdSpec("e", 2, ("x",), trigger=TriggerSpec(event=True)),
+                ),
+                mac=mac,
+            ),
+            TxFrameSpec("g", "eap0", "01:01:05:04:00:00", (TxPdSpec("q", 3, ("x",)),)),
+        ),
+    )
+
+
+def test_frame_to_a_net_id_waits_for_its_address_and_the_others_do_not():
+    sender = Sender(by_net_id())
+    sender.put(e_VarCtrl=2)
+    for cycle in (1, 2, 3):
+        assert sender.cycle(cycle) == [[3]]
+    waiting = sender.frames["f"]
+    assert (waiting["address"], waiting["sent"], waiting["skipped"]) == (None, 0, 3)
+    assert waiting["frame_state"] == 1
+    assert sender.frames["g"]["sent"] == 3
+
+    sender.publisher.learn(NetId.parse(THERE), THEIR_MAC)
+    assert sorted(sender.cycle(4)) == [[1, 2], [3]]  # the event has waited, too
+    assert sender.frames["f"]["address"] == THEIR_MAC
+    assert sender.frames["f"]["frame_state"] == 0
+
+
+def test_address_behind_a_net_id_may_change():
+    sender = Sender(by_net_id())
+    for mac in (THEIR_MAC, THEIR_MAC, "02:00:00:00:00:03"):
+        sender.publisher.learn(NetId.parse(THERE), mac)
+        frames = sender.publisher.frames_to_send(1, 0)
+        sender.publisher.sent((), 0)
+        assert {frame.destination for frame in frames} == {mac, "01:01:05:04:00:00"}
+
+
+def test_restarted_engine_goes_on_with_the_address_that_was_learned():
+    before = Sender(by_net_id())
+    before.publisher.learn(NetId.parse(THERE), THEIR_MAC)
+    after = Sender(by_net_id(), before.image)
+    assert sorted(after.cycle(1)) == [[1], [3]]
+
+
+def test_configured_mac_is_used_and_nothing_is_learned():
+    sender = Sender(by_net_id(mac=THEIR_MAC))
+    assert sender.publisher.sought == {}
+    assert sender.frames["f"]["address"] == THEIR_MAC
+    assert sender.frames["f"]["destination"] == THERE
+    assert [3] in sender.cycle(1)
+
+
+def test_retargeting_one_frame_leaves_the_others_as_they_are():
+    sender = two_frames()
+    sender.cycle(1)
+    g_before = sender.publisher.frames[1].whole.out
+    sender.publisher.retarget("f", "10.0.0.7:4000")
+    assert sender.publisher.frames[1].whole.out is g_before
+    sent = sender.publisher.frames_to_send(2, 0)
+    sender.publisher.sent((), 0)
+    assert [frame.destination for frame in sent] == ["10.0.0.7:4000", "10.0.0.2"]
+    assert sender.frames["f"]["address"] == "10.0.0.7:4000"
+    assert sender.frames["f"]["sent"] == 2
+
+
+def test_retargeting_while_all_frames_go_in_each_cycle():
+    spec = station(
+        variables=written("x:UINT"),
+        frames=tuple(
+            TxFrameSpec(name, "eap0", f"10.0.0.{n}", (TxPdSpec(f"p{n}", n, ("x",)),))
+            for n, name in enumerate("abc", 1)
+        ),
+    )
+    sender = Sender(spec)
+    sender.cycle(1)
+    sender.publisher.retarget("b", "10.0.0.99")
+    sent = sender.publisher.frames_to_send(2, 0)
+    assert [frame.destination for frame in sent] == ["10.0.0.1", "10.0.0.99", "10.0.0.3"]
+
+
+def test_retargeting_between_mac_address_and_net_id():
+    sender = Sender(by_net_id())
+    sender.publisher.learn(NetId.parse(THERE), THEIR_MAC)
+    sender.publisher.retarget("f", "02:00:00:00:00:09")
+    assert sender.publisher.sought == {NetId.parse(THERE): []}
+    assert sender.frames["f"]["address"] == "02:00:00:00:00:09"
+    sender.publisher.retarget("f", "5.23.91.26.1.1")
+    assert sender.frames["f"]["address"] is None
+    assert sender.cycle(1) == [[3]]
+    sender.publisher.learn(NetId.parse("5.23.91.26.1.1"), THEIR_MAC)
+    assert sorted(sender.cycle(2)) == [[1], [3]]
+
+
+@pytest.mark.parametrize(
+    ("name", "destination", "match"),
+    [
+        ("h", "10.0.0.7", "no frame 'h'"),
+        ("f", "somewhere", "'somewhere' is not an IPv4 address"),
+        ("f", "tcp://10.0.0.7", "frames to 10.0.0.1 cannot be sent to tcp.*expected an IPv4 addr"),
+        ("f", "02:00:00:00:00:09", "expected an IPv4 address"),
+    ],
+)
+def test_retargeting_is_refused_where_no_frame_gets(name, destination, match):
+    sender = two_frames()
+    with pytest.raises(ConfigError, match=match):
+        sender.publisher.retarget(name, destination)
+    assert sender.frames["f"]["address"] == "10.0.0.1"

@@ -33,7 +33,7 @@ def build(*triggers: TriggerSpec, gate=(0, 0), wire: Wire | None = None) -> tupl
         for pd, place in zip(pds, image.layout.tx, strict=True)
     )
     place = image.layout.frames[0]
-    return TxFrame(place, NetId.parse(PEER), run_time, gate, wire or Wire()), image
+    return TxFrame(place, NetId.parse(PEER), run_time, gate, wire or Wire(), "10.0.0.9"), image
 
 
 def ids(selection) -> list[int]:
@@ -111,3 +111,25 @@ def test_a_selection_is_kept_but_not_without_limit():
         selection, _ = frame.select(3, 0)
         assert ids(selection) == [bit + 1 for bit in range(8) if not mask >> bit & 1]
         assert len(frame._selections) <= 64
+
+
+def test_retargeted_frame_is_built_anew_for_its_new_destination():
+    frame, _ = build(TriggerSpec(), TriggerSpec())
+    before = frame.whole.out
+    frame.retarget("10.0.0.10")
+    frame.whole.patch(7)
+    assert (before.destination, frame.whole.out.destination) == ("10.0.0.9", "10.0.0.10")
+    assert ids(frame.whole) == [1, 2]
+    assert frame.select(1, 0)[0] is frame.whole
+
+
+def test_frame_without_an_address_is_held_and_says_what_was_due():
+    frame, _ = build(TriggerSpec(), TriggerSpec(divider=2))
+    frame.retarget("")
+    assert frame.is_held
+    assert not frame.is_plain
+    chosen, held = frame.select(1, 0)
+    assert chosen is None
+    assert [pd.place.name for pd in held] == ["p1"]
+    frame.retarget("10.0.0.9")
+    assert not frame.is_held

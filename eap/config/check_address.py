@@ -1,0 +1,86 @@
+"""Checks of where frames go: will a NetID ever have an address, and who can be monitored."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+
+from eap.config.destination import find_net_id, reaches, resolve
+from eap.config.finding import Report
+from eap.config.index import Index
+from eap.config.structs import Frame, Port, Station
+from eap.ids import Destination, DestinationKind, InterfaceUri
+
+
+def check_address(
+    index: Index, report: Report, sent: tuple[Station, Frame], destination: Destination
+) -> None:
+    """Report a frame to a NetID that is its own, or whose MAC address nothing will tell."""
+    station, frame = sent
+    if destination.kind is not DestinationKind.NET_ID:
+        return
+    own = index.ports[station.name, frame.port]
+    for key in find_net_id(destination.host, index):
+        port = index.ports[key]
+        message = f"frame {frame.name!r} goes to the NetID of "
+        if port is own:
+            report.add(f"{frame.at}.to", f"{message}its own port", "another port")
+        elif not port.mac and not _is_heard(index, key, own, (station.name, own.name)):
+            line = report.line_of(port.at)
+            message += f"{'/'.join(key)}, whose MAC address nothing will tell: no frame from there "
+            message += "comes here by a MAC address or a group"
+            report.add(
+                f"{frame.at}.to", message, f"such a frame, or mac: on that port (line {line})"
+            )
+
+
+def _is_heard(index: Index, key: tuple[str, str], own: Port, own_key: tuple[str, str]) -> bool:
+    """Tell whether a frame of port *key* gets to *own* whatever NetIDs stand for."""
+    sender = index.ports[key], index.uris[key]
+    receiver = own, index.uris[own_key]
+    for (station, _), frame in index.frames.items():
+        if (station, frame.port) != key:
+            continue
+        try:
+            destination = resolve(frame.to, sender[1], index)
+        except ValueError:
+            continue  # a finding of its own
+        is_known = destination.kind is not DestinationKind.NET_ID or bool(own.mac)
+        if is_known and reaches(destination, sender, receiver):
+            return True
+    return False
+
+
+def check_monitoring(
+    report: Report, frame: Frame, destination: Destination, uri: InterfaceUri
+) -> None:
+    """Report monitoring of what cannot be monitored, and addresses that are none."""
+    path = f"{frame.at}.monitor_interval_ms"
+    message = f"frame {frame.name!r} is monitored but "
+    if frame.monitor_interval_ms is not None:
+        if destination.is_group:
+            report.add(path, f"{message}goes to many", "it only on a unicast frame")
+        elif destination.kind is DestinationKind.TCP or uri.scheme == "loop":
+            report.add(path, f"{message}goes to {destination} by {uri}", "Ethernet or UDP")
+    if not frame.monitor_ip:
+        return
+    path = f"{frame.at}.monitor_ip"
+    if uri.scheme != "ethernet":
+        message = (
+            f"frame {frame.name!r} has a monitor_ip, but its own address says whom to look for"
+        )
+        report.add(path, message, "monitor_ip only on Ethernet")
+    elif not _is_host(frame.monitor_ip):
+        report.add(path, f"monitor_ip is {frame.monitor_ip!r}", "the IPv4 address of one host")
+    elif frame.monitor_interval_ms is None:
+        message = f"frame {frame.name!r} has a monitor_ip but no monitor_interval_ms"
+        report.add(path, message, "both or none")
+
+
+def _is_host(text: str) -> bool:
+    try:
+        address = IPv4Address(text)
+    except ValueError:
+        return False
+    return not (address.is_multicast or address.is_loopback or address.is_unspecified) and (
+        text != "255.255.255.255"
+    )

@@ -1,0 +1,73 @@
+"""Destinations at run time: as one word of the process image, and what may take another's place.
+
+The word is the kind, then a MAC address, or an IPv4 address and the port.
+"""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+
+from eap.errors import ConfigError
+from eap.ids import Destination, DestinationKind, MacAddr, NetId
+
+_KIND_SHIFT = 48
+_KINDS = {DestinationKind.MAC: 1, DestinationKind.IP: 2, DestinationKind.TCP: 3}
+_BY_NUMBER = {number: kind for kind, number in _KINDS.items()}
+_TRANSPORT = {DestinationKind.NET_ID: DestinationKind.MAC}
+_FORMS = {
+    DestinationKind.MAC: "a MAC address or a NetID",
+    DestinationKind.NET_ID: "a MAC address or a NetID",
+    DestinationKind.IP: "an IPv4 address",
+    DestinationKind.TCP: "tcp:// and an IPv4 address",
+}
+_LOW = (1 << _KIND_SHIFT) - 1
+
+
+def to_word(destination: str) -> int:
+    """Return *destination* as a word, 0 for one that is no address of a network."""
+    try:
+        kind, host, port = Destination.parse(destination)
+    except ValueError:
+        return 0
+    if kind not in _KINDS:
+        return 0
+    if kind is DestinationKind.MAC:
+        address = int.from_bytes(MacAddr.parse(host))
+    else:
+        address = int(IPv4Address(host)) << 16 | port
+    return _KINDS[kind] << _KIND_SHIFT | address
+
+
+def from_word(word: int) -> Destination | None:
+    """Return what :func:`to_word` made a word of, None for 0."""
+    kind = _BY_NUMBER.get(word >> _KIND_SHIFT)
+    if kind is None:
+        return None
+    address = word & _LOW
+    if kind is DestinationKind.MAC:
+        return Destination(kind, str(MacAddr(address.to_bytes(6))))
+    return Destination(kind, str(IPv4Address(address >> 16)), address & 0xFFFF)
+
+
+def check_target(old: str, new: str) -> None:
+    """Check that frames to *old* can be sent to *new* as they are: by the same kind of network.
+
+    Raises:
+        ConfigError: it is no address, or one of another kind, which may have less room for a frame.
+    """
+    try:
+        kind = Destination.parse(new).kind
+    except ValueError as exc:
+        raise ConfigError(f"destination: {exc}") from None
+    wanted = Destination.parse(old).kind
+    if _TRANSPORT.get(kind, kind) is not _TRANSPORT.get(wanted, wanted):
+        raise ConfigError(f"frames to {old} cannot be sent to {new}, expected {_FORMS[wanted]}")
+
+
+def net_id_of(destination: str) -> NetId | None:
+    """Return the NetID that *destination* is, None if it is something else."""
+    try:
+        kind, host, _ = Destination.parse(destination)
+    except ValueError:
+        return None
+    return NetId.parse(host) if kind is DestinationKind.NET_ID else None
