@@ -68,7 +68,7 @@ class EnginePlant:
         for shared in handover.sockets:
             if shared.kind is SocketKind.PACKET:
                 self._open_interface(shared)
-            elif shared.kind is not SocketKind.TCP:
+            elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
                 self._open_datagrams(shared)
         self.buses = EngineBuses(handover, self._stations)
         self._resources.callback(self.buses.close)

@@ -28,6 +28,8 @@ class SocketKind(StrEnum):
     """A pair of AF_PACKET sockets on one Ethernet interface."""
     TCP = "tcp"
     """One listener, for services."""
+    ARP = "arp"
+    """One AF_PACKET socket for services, that asks for subscribers in one VLAN of an interface."""
 
 
 class PortName(Record, frozen=True, order=True):
@@ -47,6 +49,8 @@ class SharedSocket(Record, frozen=True):
     address: str
     port: int = 0
     group: str = ""
+    vlan_id: int = 0
+    """ARP only; 0 is untagged."""
     owners: tuple[PortName, ...] = ()
     """Whose frames arrive here; several share a group, a broadcast or an Ethernet interface."""
     engine_fd: int = NO_DESCRIPTOR

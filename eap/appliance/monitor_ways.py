@@ -1,7 +1,8 @@
-"""By which ways services can tell whether anybody is where a frame goes: what they ask, and hear."""
+"""How services can tell whether anybody is where a frame goes: what they ask and what they hear."""
 
 from __future__ import annotations
 
+import logging
 import socket
 from collections.abc import Iterable
 from contextlib import ExitStack
@@ -9,11 +10,14 @@ from typing import NamedTuple
 
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.codec.ethercat import EAP_PORT
+from eap.errors import EnvironmentalError
 from eap.ids import Destination
 from eap.net.arpprobe import ArpProber
 from eap.net.neighbour import NeighbourTable
 from eap.net.udperrors import enable_errors, take_errors
 from eap.pd.presence import Evidence
+
+logger = logging.getLogger(__name__)
 
 REFUSAL_NS = 3_000_000_000
 """How long a refusal holds while frames go on: hosts tell about one a second, whatever is sent."""
@@ -28,7 +32,7 @@ class UdpWay:
     """
 
     def __init__(
-        self, sockets: Iterable[socket.socket], table: NeighbourTable, own_address: str
+        self, sockets: Iterable[socket.socket], table: NeighbourTable | None, own_address: str
     ) -> None:
         self.sockets = tuple(sockets)
         self._table = table
@@ -38,7 +42,7 @@ class UdpWay:
 
     def watch(self, targets: Iterable[Destination]) -> None:
         """Take note of errors about *targets* from now on, and about no others."""
-        wanted = {_key(target) for target in targets}
+        wanted = {key_of(target) for target in targets}
         known = self._refused_at_ns
         self._refused_at_ns = {target: known.get(target, 0) for target in wanted}
         if wanted and not self._is_enabled:
@@ -48,7 +52,7 @@ class UdpWay:
 
     def hear(self, now_ns: int) -> set[tuple[str, int]]:
         """Take what ICMP told; return address and port of the targets that were not reached."""
-        found = set()
+        found: set[tuple[str, int]] = set()
         for sock in self.sockets if self._is_enabled else ():
             for _ in range(_CALLS_PER_TURN):
                 errors = take_errors(sock)
@@ -65,12 +69,14 @@ class UdpWay:
 
         A refusal holds until frames have been sent for a while without another one.
         """
-        key = _key(target)
+        key = key_of(target)
         refused_at_ns = self._refused_at_ns.get(key, 0)
         if refused_at_ns:
             if sent_at_ns - refused_at_ns < REFUSAL_NS:
                 return Evidence.ABSENT
             self._refused_at_ns[key] = 0
+        if self._table is None:
+            return Evidence.BLIND
         return self._table.look(target.host, self._source)
 
     def close(self) -> None:
@@ -87,22 +93,15 @@ class Ways(NamedTuple):
 
 
 def open_ways(handover: Handover, resources: ExitStack) -> Ways:
-    """Return the ways of all EAP ports; *resources* closes what they need.
-
-    Raises:
-        EnvironmentalError: the neighbour table cannot be read.
-    """
+    """Return the ways of all EAP ports; *resources* closes what they need."""
     ways = Ways({}, {})
-    datagrams = [each for each in handover.sockets if each.kind is SocketKind.UDP]
-    table = NeighbourTable() if datagrams else None
-    if table is not None:
-        resources.callback(table.close)
-        for shared in datagrams:
+    table = _open_table(resources)
+    for shared in handover.sockets:
+        if shared.kind is SocketKind.UDP:
             way = UdpWay(_both(shared), table, shared.address)
             resources.callback(way.close)
             ways.udp.update(dict.fromkeys(shared.owners, way))
-    for shared in handover.sockets:
-        if shared.kind is SocketKind.ARP:
+        elif shared.kind is SocketKind.ARP:
             spec = handover.port(shared.owners[0])
             sock = socket.socket(fileno=shared.services_fd)
             prober = ArpProber(sock, vlan_id=shared.vlan_id, priority=spec.vlan_priority)
@@ -111,10 +110,21 @@ def open_ways(handover: Handover, resources: ExitStack) -> Ways:
     return ways
 
 
+def _open_table(resources: ExitStack) -> NeighbourTable | None:
+    try:
+        table = NeighbourTable()
+    except EnvironmentalError as exc:
+        logger.warning("%s; subscribers on UDP are known to be missing by ICMP alone", exc)
+        return None
+    resources.callback(table.close)
+    return table
+
+
 def _both(shared: SharedSocket) -> list[socket.socket]:
     descriptors = shared.engine_fd, shared.services_fd
     return [socket.fromfd(fd, socket.AF_INET, socket.SOCK_DGRAM) for fd in descriptors]
 
 
-def _key(target: Destination) -> tuple[str, int]:
+def key_of(target: Destination) -> tuple[str, int]:
+    """Return address and port of *target*, as ICMP errors give them."""
     return target.host, target.port or EAP_PORT

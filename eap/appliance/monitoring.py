@@ -16,7 +16,7 @@ from time import monotonic_ns
 from typing import Protocol
 
 from eap.appliance.handover import PortName
-from eap.appliance.monitor_ways import UdpWay, Ways
+from eap.appliance.monitor_ways import UdpWay, Ways, key_of
 from eap.errors import EnvironmentalError, ImageError
 from eap.ids import Destination, DestinationKind, MacAddr
 from eap.net.arpprobe import ArpProber
@@ -164,13 +164,15 @@ class SubscriberWatch:
     def _hear(self, now_ns: int) -> None:
         for prober in set(self._ways.arp.values()):
             for heard in prober.drain():
-                receive = self._monitor.receive_claim if heard.is_claim else self._monitor.receive_reply
                 for name in self._asked.get((prober, heard.address), ()):
-                    receive(name, heard.mac, now_ns)
+                    if heard.is_claim:
+                        self._monitor.receive_claim(name, heard.mac, now_ns)
+                    else:
+                        self._monitor.receive_reply(name, heard.mac, now_ns)
         refused = {way: way.hear(now_ns) for way in set(self._ways.udp.values())}
         for row in self._rows_by_udp():
             target = _ip_of(row)
-            if target is not None and target.key in refused[self._ways.udp[row.port]]:
+            if target is not None and key_of(target) in refused[self._ways.udp[row.port]]:
                 self._monitor.receive_evidence(row.name, Evidence.ABSENT, now_ns)
 
     def _rows_by_udp(self) -> Iterator[_Row]:

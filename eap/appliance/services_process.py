@@ -34,6 +34,8 @@ from eap.appliance.handover import (
 )
 from eap.appliance.intake import FrameIntake, watch_channel
 from eap.appliance.methods import Methods
+from eap.appliance.monitor_ways import open_ways
+from eap.appliance.monitoring import SubscriberWatch
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.segment_link import SegmentLink
 from eap.appliance.sources import play_sources
@@ -85,6 +87,8 @@ class Services:
             tasks = [group.create_task(server.serve(self._listener))]
             tasks += [group.create_task(door.serve()) for door in self._doors()]
             tasks += [group.create_task(desk.serve()) for desk in self._desks.values()]
+            watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
+            tasks.append(group.create_task(watch.run()))
             tasks += [
                 group.create_task(play_sources(station, images[station.name]))
                 for station in self._handover.stations
@@ -151,7 +155,7 @@ class Services:
         for shared in self._handover.sockets:
             if shared.kind is SocketKind.PACKET:
                 self._watch_interface(shared, now_ns)
-            elif shared.kind is not SocketKind.TCP:
+            elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
                 intake = FrameIntake(_stations_of(shared), self._counters, now_ns)
                 channel = UdpChannel(
                     socket.socket(fileno=shared.services_fd), self._batch, [intake.take]

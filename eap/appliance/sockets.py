@@ -21,7 +21,7 @@ from eap.appliance.handover import NO_DESCRIPTOR, PortName, SharedSocket, Socket
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.packetsocket import open_packet_pair
+from eap.net.packetsocket import open_arp, open_packet_pair
 from eap.net.tcp import open_tcp_listener
 from eap.net.udpsocket import open_udp_group_pair, open_udp_pair
 from eap.pd.spec import PortKind, PortSpec, StationSpec
@@ -50,6 +50,7 @@ def _sockets_of(port: PortSpec) -> Iterator[SharedSocket]:
     number = uri.port or EAP_PORT
     if uri.scheme == "ethernet":
         yield SharedSocket(SocketKind.PACKET, uri.host)
+        yield SharedSocket(SocketKind.ARP, uri.host, vlan_id=port.vlan_id)
     if uri.scheme == "udp":
         yield SharedSocket(SocketKind.UDP, uri.host, number)
         for group in port.join:
@@ -94,6 +95,8 @@ class SharedSockets:
     def services_descriptors(self) -> list[int]:
         """Return what services inherits."""
         wanted = [shared.services_fd for shared in self.descriptions]
+        # Beside what it receives, what ICMP says of the frames that the engine sends:
+        wanted += [each.engine_fd for each in self.descriptions if each.kind is SocketKind.UDP]
         wanted += [bus.command_fd for bus in self.buses]
         return _existing(*wanted, self.services_link, self.services_bus, self.control)
 
@@ -121,6 +124,9 @@ def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:
     if planned.kind is SocketKind.TCP:
         listener = opened.enter_context(open_tcp_listener(planned.address, planned.port))
         return msgspec.structs.replace(planned, services_fd=listener.fileno())
+    if planned.kind is SocketKind.ARP:
+        sock = opened.enter_context(open_arp(planned.address))
+        return msgspec.structs.replace(planned, services_fd=sock.fileno())
     engine, services = _open_pair(planned)
     opened.enter_context(engine)
     opened.enter_context(services)

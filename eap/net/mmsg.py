@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic_ns, time_ns
 
+from eap.net.udperrors import ICMP_ERRNOS
 from eap.pd.link import OutFrame
 
 SO_TIMESTAMPNS = 35
@@ -50,11 +51,17 @@ def count_error(errors: dict[str, int], number: int | None) -> None:
     errors[name] = errors.get(name, 0) + 1
 
 
-def note_receive_error(errors: dict[str, int]) -> None:
-    """Count why the last receive call returned -1, unless there was just nothing to receive."""
+def note_receive_error(errors: dict[str, int]) -> bool:
+    """Count why the last receive call returned -1, unless there was just nothing to receive.
+
+    Return True if it was about something sent before: then what is to be received still waits.
+    """
     number = ctypes.get_errno()
+    if number in ICMP_ERRNOS:
+        return True
     if number not in (errno.EAGAIN, errno.EINTR):
         count_error(errors, number)
+    return False
 
 
 class ReceiveBatch:
@@ -211,6 +218,8 @@ class SendBatch:
                     known = known or self._resolve(frame.destination)
                     self._sock.sendto(frame.buffer, known[1])
             except OSError as error:
+                if error.errno in ICMP_ERRNOS:  # it may be about another frame, sent before
+                    return self._send_many(frames)
                 self._fail(frame, error.errno)
                 return frames
             return ()
@@ -230,8 +239,11 @@ class SendBatch:
         """Go on behind what *sent* says went out; each frame that fails is left out."""
         failed: list[OutFrame] = []
         done = 0
+        tried_again = -1
         while True:
-            if sent < 0:
+            if sent < 0 and ctypes.get_errno() in ICMP_ERRNOS and tried_again != done:
+                tried_again, sent = done, 0
+            elif sent < 0:
                 self._fail(frames[done], ctypes.get_errno())
                 failed.append(frames[done])
                 sent = 1

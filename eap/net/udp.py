@@ -48,7 +48,8 @@ class UdpChannel:
                     take(view, size, at_ns, self)
                 return total + 1
             if count < 0:
-                note_receive_error(self.errors)
+                if note_receive_error(self.errors):
+                    continue
                 break
             sizes, times = self._batch.arrivals(count)
             for view, size, at_ns in zip(self._batch.views, sizes, times, strict=False):

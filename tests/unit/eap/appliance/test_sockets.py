@@ -46,8 +46,11 @@ def test_stations_share_an_ethernet_interface():
         [left(eap_port(1, "ethernet://eth0", vlan_id=5)), right(eap_port(2, "ethernet://eth0"))]
     )
     assert [(s.kind, s.address, s.owners) for s in planned] == [
-        (SocketKind.PACKET, "eth0", (LEFT, RIGHT))
+        (SocketKind.PACKET, "eth0", (LEFT, RIGHT)),
+        (SocketKind.ARP, "eth0", (LEFT,)),
+        (SocketKind.ARP, "eth0", (RIGHT,)),
     ]
+    assert [s.vlan_id for s in planned] == [0, 5, 0]
 
 
 def test_what_stays_in_the_engine_needs_none():
@@ -89,7 +92,8 @@ def test_buses_add_theirs(tmp_path):
         engine, services = shared.engine_descriptors(), shared.services_descriptors()
         assert {described.engine_fd, shared.engine_bus} < set(engine)
         assert {described.command_fd, shared.services_bus} < set(services)
-        assert not set(engine) & set(services)
+        own_datagrams = {each.engine_fd for each in shared.descriptions} - {NO_DESCRIPTOR}
+        assert set(engine) & set(services) == own_datagrams
         segment = {described.segment_fd, described.segment_command_fd}
         assert len({*engine, *services, *segment}) == open_descriptors() - before
     assert open_descriptors() == before

@@ -19,6 +19,7 @@ from eap.net.mmsg import (
     note_receive_error,
 )
 from eap.net.udp import _socket_address
+from eap.net.udperrors import enable_errors, take_errors
 from eap.pd.link import OutFrame
 
 pytestmark = pytest.mark.net
@@ -180,15 +181,29 @@ def test_connected_socket_needs_no_address(pair):
     assert len(receive(batch, receiver)) == 3
 
 
-def test_refused_connection_is_counted_and_sending_goes_on(pair):
+def test_refusal_of_a_frame_is_not_held_against_the_next_one(pair):
     sender, receiver = pair
-    sender.connect(receiver.getsockname())
-    out = SendBatch(sender)
-    frames = frames_to(receiver, 2)
-    receiver.close()
-    for _ in range(3):
-        out.send(frames)
-    assert set(out.errors) == {"ECONNREFUSED"}
+    enable_errors(sender)
+    closed = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    closed.bind(("127.0.0.1", 0))
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    lost, taken = frames_to(closed, 1)[0], frames_to(receiver, 3)
+    closed.close()
+    for frames in ((lost, *taken), [lost], [taken[0]], (lost, lost, taken[1])):
+        assert out.send(frames) == ()
+    assert out.errors == {}
+    assert batch.reader(receiver.fileno())() == 5
+    assert len(take_errors(sender)) == 5
+
+
+def test_what_is_refused_for_its_own_sake_is_counted_after_a_second_try(pair):
+    sender, receiver = pair
+    out = SendBatch(sender, _socket_address)
+    small, other, large = frames_to(receiver, 3)
+    large = OutFrame(bytearray(70_000), 0, large.destination)
+    assert out.send((small, large, other)) == [large]
+    assert out.send([large]) == [large]
+    assert out.errors == {"EMSGSIZE": 2}
 
 
 def test_cache_of_batches_is_bounded(pair):
