@@ -22,8 +22,10 @@ Row = Mapping[str, Any]
 
 _GOOD, _BAD, _DIM = "green", "bold red", "dim"
 _STATE_STYLE = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
+_STATE_STYLE |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM}
 _HUNG_AFTER_US = 2_000_000
 _HUNG_AFTER_CYCLES = 10
+_NET_ID_DOTS = 5
 _NOT_ASKED = "other: not asked for"
 _REASONS = {
     "cycle": "cyclic",
@@ -46,6 +48,8 @@ def status_tables(document: Row) -> Iterator[RenderableType]:
     if any("bus" in port for station in stations for port in station["ports"]):
         yield _buses(stations)
     yield _process_data(stations)
+    if any(_is_special(row) for station in stations for row in station.get("frames", ())):
+        yield _frames(stations)
     remarks = [remark for appliance in document["appliances"] for remark in _of_engine(appliance)]
     remarks += [remark for station in stations for remark in _remarks(station)]
     if remarks:
@@ -176,6 +180,28 @@ def _received(row: Row) -> tuple[RenderableType, ...]:
     )
 
 
+def _is_special(row: Row) -> bool:
+    """Tell whether a frame has more to say than its PDs: a monitored subscriber, or a NetID."""
+    return bool(row["monitor_interval_ms"]) or row["destination"].count(".") == _NET_ID_DOTS
+
+
+def _frames(stations: Sequence[Row]) -> RenderableType:
+    table = _table("Frame", "Goes to", "Subscriber", "Frames", "Skipped")
+    for column in table.columns[3:]:
+        column.justify, column.no_wrap = "right", True
+    for station in stations:
+        for row in filter(_is_special, station.get("frames", ())):
+            name, address = row["destination"], row["address"]
+            table.add_row(
+                f"{station['name']}/{row['name']}",
+                name if name == address else f"{name} at {address or 'an unknown address'}",
+                _state(row["subscriber"] if row["monitor_interval_ms"] else ""),
+                str(row["sent"]),
+                str(row["skipped"]),
+            )
+    return table
+
+
 def _remarks(station: Row) -> Iterator[str]:
     name = station["name"]
     if own := "; ".join(_own_remarks(station)):
@@ -183,6 +209,10 @@ def _remarks(station: Row) -> Iterator[str]:
     for port in station["ports"]:
         if (bus := port.get("bus")) is not None:
             yield from _bus_remarks(f"{name}/{port['name']}", bus)
+    for row in filter(_is_special, station.get("frames", ())):
+        if row["address"] is None:
+            waits = f"waits for a frame of {row['destination']}, to learn its MAC address"
+            yield f"{name} → {row['name']}: {waits}"
     for row in station["pd"]["tx"]:
         if remark := "; ".join(_sent_remarks(row)):
             yield f"{name} → {row['name']}: {remark}"

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from ipaddress import IPv4Address
 
-from eap.config.destination import find_net_id, reaches, resolve
+from eap.config.destination import find_net_id, group_of, is_group, reaches, resolve
 from eap.config.finding import Report
 from eap.config.index import Index
 from eap.config.structs import Frame, Port, Station
-from eap.ids import Destination, DestinationKind, InterfaceUri
+from eap.ids import Destination, DestinationKind, InterfaceUri, MacAddr
+from eap.pd.spec import REQUESTER
 
 
 def check_address(
-    index: Index, report: Report, sent: tuple[Station, Frame], destination: Destination
+    index: Index, report: Report, sent: tuple[Station, Frame], destination: Destination | None
 ) -> None:
     """Report a frame to a NetID that is its own, or whose MAC address nothing will tell."""
     station, frame = sent
-    if destination.kind is not DestinationKind.NET_ID:
+    if destination is None or destination.kind is not DestinationKind.NET_ID:
         return
     own = index.ports[station.name, frame.port]
     for key in find_net_id(destination.host, index):
@@ -24,7 +25,7 @@ def check_address(
         message = f"frame {frame.name!r} goes to the NetID of "
         if port is own:
             report.add(f"{frame.at}.to", f"{message}its own port", "another port")
-        elif not port.mac and not _is_heard(index, key, own, (station.name, own.name)):
+        elif not port.mac and not _is_heard(index, key, station, own):
             line = report.line_of(port.at)
             message += f"{'/'.join(key)}, whose MAC address nothing will tell: no frame from there "
             message += "comes here by a MAC address or a group"
@@ -33,32 +34,46 @@ def check_address(
             )
 
 
-def _is_heard(index: Index, key: tuple[str, str], own: Port, own_key: tuple[str, str]) -> bool:
-    """Tell whether a frame of port *key* gets to *own* whatever NetIDs stand for."""
+def _is_heard(index: Index, key: tuple[str, str], station: Station, own: Port) -> bool:
+    """Tell whether a frame of port *key* gets to port *own* whatever NetIDs stand for."""
     sender = index.ports[key], index.uris[key]
-    receiver = own, index.uris[own_key]
-    for (station, _), frame in index.frames.items():
-        if (station, frame.port) != key:
+    receiver = own, index.uris[station.name, own.name]
+    subscribed = [
+        sent.frame
+        for subscription in station.subscribe
+        if subscription.port == own.name
+        for sent in index.publishers(subscription)
+    ]
+    joined = {str(MacAddr.parse(text)) for text in own.join if is_group(text, receiver[1])}
+    for (name, _), frame in index.frames.items():
+        if (name, frame.port) != key:
             continue
+        if frame.to == REQUESTER:
+            return True  # if this port asks
         try:
             destination = resolve(frame.to, sender[1], index)
         except ValueError:
             continue  # a finding of its own
         is_known = destination.kind is not DestinationKind.NET_ID or bool(own.mac)
-        if is_known and reaches(destination, sender, receiver):
+        is_taken = group_of(destination) in {None, *joined} or frame in subscribed
+        if is_known and is_taken and reaches(destination, sender, receiver):
             return True
     return False
 
 
 def check_monitoring(
-    report: Report, frame: Frame, destination: Destination, uri: InterfaceUri
+    report: Report, frame: Frame, destination: Destination | None, uri: InterfaceUri
 ) -> None:
-    """Report monitoring of what cannot be monitored, and addresses that are none."""
+    """Report monitoring of what cannot be monitored, and addresses that are none.
+
+    *destination* is None for frames to who asks.
+    """
     path = f"{frame.at}.monitor_interval_ms"
     message = f"frame {frame.name!r} is monitored but "
     if frame.monitor_interval_ms is not None:
-        if destination.is_group:
-            report.add(path, f"{message}goes to many", "it only on a unicast frame")
+        if destination is None or destination.is_group:
+            target = "many" if destination else "who asks"
+            report.add(path, f"{message}goes to {target}", "it only on a unicast frame")
         elif destination.kind is DestinationKind.TCP or uri.scheme == "loop":
             report.add(path, f"{message}goes to {destination} by {uri}", "Ethernet or UDP")
     if not frame.monitor_ip:

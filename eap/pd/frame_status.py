@@ -10,6 +10,7 @@ from eap.pd.layout import FramePlace
 from eap.pd.presence import Presence
 from eap.pd.words import FrameState, FrameWord
 
+
 def frame_state(image: Image, first_word: int) -> int:
     """Return the FrameState of the frame whose first word is at index *first_word*."""
     words = image.words

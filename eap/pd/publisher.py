@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
-from eap.errors import ConfigError
 from eap.ids import NetId
 from eap.pd.address import check_target, from_word, net_id_of, to_word
 from eap.pd.gather import Gather
@@ -100,21 +99,25 @@ class Publisher:
         """PDs whose VarState tells that they were not sent: rarely any, so sending asks first."""
         self.read_controls()
 
+    def has(self, name: str) -> bool:
+        """Whether the port sends frame *name*."""
+        return any(frame.place.name == name for frame in self.frames)
+
     def retarget(self, name: str, destination: str) -> None:
         """Send frame *name* to *destination* from the next cycle on, and leave all others alone.
 
         To a NetID nothing is sent until its address is learned.
 
         Raises:
-            ConfigError: the port sends no frame of that name, or cannot send it there.
+            ConfigError: the port cannot send it there.
         """
-        frame = next((frame for frame in self.frames if frame.place.name == name), None)
-        if frame is None:
-            raise ConfigError(f"there is no frame {name!r} to send elsewhere")
+        frame = next(frame for frame in self.frames if frame.place.name == name)
         check_target(frame.place.destination, destination)
-        for frames in self.sought.values():
+        for sought, frames in list(self.sought.items()):
             if frame in frames:
                 frames.remove(frame)
+            if not frames:
+                del self.sought[sought]
         net_id = net_id_of(destination)
         frame.retarget("" if net_id is not None else destination)
         self._note_target(frame, net_id)

@@ -10,17 +10,19 @@ that a reader sees inputs and what follows from them in one cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
 import msgspec
 
-from eap.ids import NetId
+from eap.errors import ConfigError
+from eap.ids import InterfaceUri, NetId
 from eap.pd.answerer import Answerer
 from eap.pd.device import Device, DeviceState, Request
 from eap.pd.generator import Generators
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
+from eap.pd.learner import Learner
 from eap.pd.link import Channel, CyclicBus, Taker
 from eap.pd.links import Links
 from eap.pd.poll import Question, questions_of, requests_at
@@ -99,6 +101,8 @@ class Station:
         self.takers: dict[str, Taker] = {
             name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
         }
+        self._learners = {port: Learner(self.takers[port]) for port in _learning_ports(spec)}
+        self.takers.update((port, learner.take) for port, learner in self._learners.items())
 
     def _subscriber(self, port: str, questions: dict[str, Question]) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
@@ -124,10 +128,24 @@ class Station:
         if pushed := _pds_of(frames, polled=False):
             publisher = Publisher(self.image, self._inputs, net_id, channel, pushed)
             self._publishers.append((publisher, channel))
+            if learner := self._learners.get(port):
+                learner.sought, learner.learn = publisher.sought, publisher.learn
         if polled := _pds_of(frames, polled=True):
             requests = self._requests[port]
             answerer = Answerer(self.image, self._inputs, net_id, channel, polled, requests)
             self._publishers.append((answerer, channel))
+
+    def retarget(self, frame: str, destination: str) -> None:
+        """Send TxFrame *frame* to *destination* from the next cycle on; the others are left alone.
+
+        Raises:
+            ConfigError: the station pushes no such frame, or its port cannot send it there.
+        """
+        for publisher, _ in self._publishers:
+            if isinstance(publisher, Publisher) and publisher.has(frame):
+                publisher.retarget(frame, destination)
+                return
+        raise ConfigError(f"station {self.spec.name} sends no frame {frame!r} of its own accord")
 
     def drain_also(self, channel: Channel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""
@@ -243,6 +261,15 @@ class Station:
             changed = self._inputs.refresh()
         words[_SEQUENCE] = sequence + 2
         return changed
+
+
+def _learning_ports(spec: StationSpec) -> Iterator[str]:
+    """Yield the ports where a frame may go to a NetID: those that send on Ethernet."""
+    sending = {frame.port for frame in spec.frames}
+    for port in spec.ports:
+        is_ethernet = InterfaceUri.parse(port.interface).scheme == "ethernet"
+        if port.name in sending and port.kind is PortKind.EAP and is_ethernet:
+            yield port.name
 
 
 def _supervise(bus: CyclicBus, now_ns: int) -> None:

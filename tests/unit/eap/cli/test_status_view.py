@@ -252,3 +252,48 @@ def test_buses() -> None:
 def test_no_table_of_buses_where_nothing_is_known_of_them() -> None:
     silent = {key: value for key, value in bus_port().items() if key != "bus"}
     assert "Counters" not in show(document(ports=[silent | {"link": "down"}]))
+
+
+def frame(name: str, **more: Any) -> dict[str, Any]:
+    row = {
+        "name": name,
+        "port": "eap0",
+        "destination": "10.0.0.2",
+        "address": "10.0.0.2",
+        "sent": 90,
+        "skipped": 0,
+        "frame_state": 0,
+        "monitor_interval_ms": None,
+        "subscriber": "unknown",
+    }
+    return row | more
+
+
+def test_frames_whose_subscriber_is_monitored() -> None:
+    frames = [
+        frame("to-all", destination="239.1.1.1", address="239.1.1.1"),
+        frame("to-panel", monitor_interval_ms=500, subscriber="present"),
+        frame("to-oven", monitor_interval_ms=500, subscriber="missing", address="10.0.0.3"),
+    ]
+    text = show(document(frames=frames))
+    assert row_of(text, "Subscriber") == "Frame Goes to Subscriber Frames Skipped"
+    assert row_of(text, "to-panel") == "mixer/to-panel 10.0.0.2 present 90 0"
+    assert row_of(text, "to-oven") == "mixer/to-oven 10.0.0.2 at 10.0.0.3 missing 90 0"
+    assert "to-all" not in text
+    assert "Worth a look" not in text
+
+
+def test_frames_to_a_net_id() -> None:
+    frames = [
+        frame("known", destination="5.2.2.2.2.1", address="02:00:00:00:00:02"),
+        frame("new", destination="5.3.3.3.2.1", address=None, sent=0, skipped=7, frame_state=1),
+    ]
+    text, _, remarks = show(document(frames=frames)).partition("Worth a look")
+    assert row_of(text, "known") == "mixer/known 5.2.2.2.2.1 at 02:00:00:00:00:02 90 0"
+    assert row_of(text, "mixer/new") == "mixer/new 5.3.3.3.2.1 at an unknown address 0 7"
+    expected = "mixer → new: waits for a frame of 5.3.3.3.2.1, to learn its MAC address"
+    assert remarks.strip() == expected
+
+
+def test_no_table_of_frames_that_have_nothing_more_to_say_than_their_pds() -> None:
+    assert "Subscriber" not in show(document(frames=[frame("to-panel")]))

@@ -41,6 +41,16 @@ def test_net_id_is_learned_from_what_its_port_sends(load_plant, target):
     assert (frame.destination, frame.mac) == ("127.0.9.2.2.1", "")
 
 
+def test_net_id_is_learned_only_from_groups_that_its_sender_has_joined(findings):
+    group = "01:01:05:04:00:07"
+    assert len(findings(*ETHERNET, to("right/eap0"), back(group))) == 1
+    join = "net_id: 127.0.9.1.2.1}", f'net_id: 127.0.9.1.2.1, join: ["{group}"]}}'
+    assert findings(*ETHERNET, to("right/eap0"), back(group), join) == []
+    publish = "    publish:\n      - {name: state,"
+    takes = publish, f"    subscribe: [{{name: b, port: eap0, from: right/back}}]\n{publish}"
+    assert findings(*ETHERNET, to("right/eap0"), back(group), takes) == []
+
+
 def test_net_id_on_udp_is_the_address_of_its_port(load_plant):
     result = load_plant(to("127.0.9.2.2.1"))
     assert result.plant.stations[0].frames[0].destination == "127.0.9.2"

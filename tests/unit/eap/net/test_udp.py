@@ -9,6 +9,7 @@ import pytest
 
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel, _destination, _socket_address
+from eap.net.udperrors import enable_errors
 from eap.net.udpsocket import open_udp_pair
 from eap.pd.link import OutFrame
 
@@ -66,6 +67,18 @@ def test_drain_is_bounded(channels):
     assert receiver.drain(0) == 256
     assert receiver.drain(0) == 44
     assert len(got) == 300
+
+
+def test_error_about_a_frame_sent_does_not_keep_one_that_waits(channels):
+    sender, receiver = channels
+    got = []
+    receiver.takers.append(lambda view, size, *_: got.append(bytes(view[:size])))
+    enable_errors(receiver._sock)
+    sender.send([process_data(4)], 0)
+    receiver.send([OutFrame(bytearray(3), 0, "127.0.3.14:9")], 0)
+    assert receiver.drain(0) == 1
+    assert got == [bytes([4, 0x40, 4])]
+    assert receiver.errors == {}
 
 
 def test_unreachable_destination_is_counted_not_raised(channels):

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
+import msgspec
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eap.codec.pd import iter_pds
+from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackChannel, LoopbackLines
 from eap.pd.engine import Engine
@@ -38,6 +40,7 @@ from tests.support.cyclic import (
     PEER,
     SECOND,
     FakeBus,
+    From,
     Wire,
     bus_port,
     eap_port,
@@ -578,3 +581,44 @@ class PairMachine(RuleBasedStateMachine):
 
 PairMachine.TestCase.settings = settings(max_examples=50, stateful_step_count=30)
 TestPairMachine = PairMachine.TestCase
+
+
+def addressed() -> StationSpec:
+    """Sends to a port whose address it learns, and to one address."""
+    port = msgspec.structs.replace(eap_port(), interface="ethernet://eth0")
+    pds = (TxPdSpec("p", 1, ("x",)), TxPdSpec("q", 2, ("x",)))
+    return station(
+        ports=(port,),
+        variables=written("x:UINT"),
+        frames=(
+            TxFrameSpec("by-id", "eap0", PEER, pds[:1]),
+            TxFrameSpec("by-mac", "eap0", "02:00:00:00:00:05", pds[1:]),
+        ),
+    )
+
+
+def test_frames_to_a_net_id_go_where_its_own_frames_come_from():
+    spec = addressed()
+    made, wire = assemble(spec)
+    made.start(0)
+    made.cycle(MS, MS)
+    assert [pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame)] == [2]
+    frame = octets([(9, b"\0\0")])
+    made.takers["eap0"](memoryview(frame), len(frame), 2 * MS, From("02:00:00:00:00:07"))
+    wire.sent.clear()
+    made.cycle(2 * MS, 2 * MS)
+    assert sorted(pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame)) == [1, 2]
+    by_id, by_mac = station_status(made.image, 0)["frames"]
+    assert (by_id["address"], by_mac["address"]) == ("02:00:00:00:00:07", "02:00:00:00:00:05")
+
+
+def test_a_frame_is_sent_elsewhere_while_the_station_runs():
+    made, _ = assemble(addressed())
+    made.start(0)
+    made.retarget("by-mac", "01:01:05:04:00:00")
+    made.cycle(MS, MS)
+    by_id, by_mac = station_status(made.image, 0)["frames"]
+    assert (by_mac["address"], by_mac["sent"]) == ("01:01:05:04:00:00", 1)
+    assert (by_id["address"], by_id["skipped"]) == (None, 1)
+    with pytest.raises(ConfigError, match="station a sends no frame 'other' of its own"):
+        made.retarget("other", "01:01:05:04:00:00")
