@@ -80,7 +80,7 @@ class SubscriberWatch:
         self._ways = ways
         self._images: dict[str, Image] = {}
         self._rows: dict[str, _Row] = {}
-        self._monitor = SubscriberMonitor(monotonic_ns())
+        self._monitor = SubscriberMonitor(0)
         self._asked: dict[tuple[ArpProber, IPv4Address], list[str]] = {}
 
     async def run(self) -> None:
