@@ -13,10 +13,12 @@ from eap.appliance.discards import DiscardCounters, Refusal, Tally
 from eap.appliance.engine_buses import EngineBuses
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.appliance.passing import PassedConnection
+from eap.appliance.rebuild import Rebuilds
 from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.successor import EngineStation
 from eap.ids import Destination, DestinationKind, InterfaceUri
 from eap.net.ethernet import EthernetInterface, packet_batch
-from eap.net.image_file import ImageFile, create_image
+from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines
 from eap.net.mmsg import ReceiveBatch
 from eap.net.tcp import TcpReceiver
@@ -42,6 +44,7 @@ class EnginePlant:
 
     Attributes:
         engine: Runs them.
+        rebuilds: Changes them while they run.
         buses: The slaves below them.
         arrivals: Descriptors to wake up for besides the cycle, and what to call then.
     """
@@ -51,8 +54,7 @@ class EnginePlant:
         self._resources = ExitStack()
         self._handover = handover
         folder = ApplianceFolder(Path(handover.folder))
-        self._files: dict[str, ImageFile] = {}
-        self._stations: dict[str, Station] = {}
+        self._stations: dict[str, EngineStation] = {}
         self._batch = ReceiveBatch()
         self._tallies: list[Tally] = []
         self._tcp_ports: dict[PortName, TcpPort] = {}
@@ -61,25 +63,27 @@ class EnginePlant:
         )
         for spec in handover.stations:
             file = create_image(folder.image(spec.name), plan_layout(spec))
-            self._resources.callback(file.close)
-            self._files[spec.name] = file
-            self._stations[spec.name] = Station(spec, file.image, file.wake_waiters)
+            station = Station(spec, file.image, file.wake_waiters)
+            self._stations[spec.name] = EngineStation(station, file)
         self._open_own()
         for shared in handover.sockets:
             if shared.kind is SocketKind.PACKET:
                 self._open_interface(shared)
             elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
                 self._open_datagrams(shared)
-        self.buses = EngineBuses(handover, self._stations)
+        self.engine = Engine([place.station for place in self._stations.values()])
+        self.rebuilds = Rebuilds(self.engine, self._stations)
+        self._resources.callback(self.rebuilds.close)
+        self.arrivals[self.rebuilds.fileno()] = self.rebuilds.collect
+        self.buses = EngineBuses(handover, self._stations, self.rebuilds.serve)
         self._resources.callback(self.buses.close)
         self.arrivals.update(self.buses.arrivals)
-        self.engine = Engine(list(self._stations.values()))
 
     def start(self, now_ns: int) -> None:
-        """Bring all stations to Op, and let programs that attach see who runs them."""
-        for file in self._files.values():
-            file.image.words[StationWord.ENGINE_PID] = os.getpid()
-        self.engine.start(now_ns)
+        """Bring all stations to their states, and let programs that attach see who runs them."""
+        for place in self._stations.values():
+            place.file.image.words[StationWord.ENGINE_PID] = os.getpid()
+        self.engine.start(now_ns, self._handover.states)
         self.buses.start(now_ns)
 
     def add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
@@ -109,13 +113,15 @@ class EnginePlant:
         """
         self.engine.stop()
         self.buses.rest()
-        for file in self._files.values():
-            file.image.words[StationWord.ENGINE_PID] = 0
-            file.wake_waiters()
+        for place in self._stations.values():
+            place.file.image.words[StationWord.ENGINE_PID] = 0
+            place.file.wake_waiters()
 
     def close(self) -> None:
         """Let go of all sockets and images."""
         self._resources.close()
+        for place in self._stations.values():
+            place.file.close()
 
     def _open_own(self) -> None:
         """Connect the ports that need no shared socket."""
@@ -129,7 +135,7 @@ class EnginePlant:
             elif uri.scheme == "loop":
                 channel = lines.open(uri)
                 channel.takers.append(self._taker(name))
-                self._stations[name.station].connect(port.name, channel)
+                self._station(name).connect(port.name, channel)
 
     def _open_datagrams(self, shared: SharedSocket) -> None:
         channel = UdpChannel(
@@ -142,13 +148,13 @@ class EnginePlant:
             if shared.kind is SocketKind.UDP:
                 self._connect(owner, channel)
             else:
-                self._stations[owner.station].drain_also(channel)
+                self._station(owner).drain_also(channel)
         self._wake_on_arrival(shared.owners, channel)
 
     def _connect(self, name: PortName, datagrams: Channel | None) -> None:
         """Connect a port to its datagrams, to TCP, or to both."""
         spec = self._handover.port(name)
-        station = self._stations[name.station]
+        station = self._station(name)
         sends_tcp = any(
             Destination.parse(frame.destination).kind is DestinationKind.TCP
             for frame in station.spec.frames
@@ -178,7 +184,7 @@ class EnginePlant:
                 priority=spec.vlan_priority,
                 join=spec.join,
             )
-            self._stations[owner.station].connect(owner.port, port)
+            self._station(owner).connect(owner.port, port)
         self._wake_on_arrival(shared.owners, port)
 
     def _wake_on_arrival(self, owners: Iterable[PortName], channel: SocketChannel) -> None:
@@ -186,7 +192,10 @@ class EnginePlant:
             self.arrivals[channel.fileno()] = channel.drain
 
     def _taker(self, name: PortName) -> Taker:
-        return self._stations[name.station].takers[name.port]
+        return self._station(name).takers[name.port]
+
+    def _station(self, name: PortName) -> Station:
+        return self._stations[name.station].station
 
     def _ports(self) -> Iterable[tuple[PortName, PortSpec]]:
         for station in self._handover.stations:

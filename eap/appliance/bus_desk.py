@@ -1,4 +1,4 @@
-"""Where services asks the engine for something on a bus, step by step.
+"""Where services asks the engine for something, on a bus step by step.
 
 Neither side waits for the other: a request that cannot be taken is refused at once, and an answer
 that services does not read is dropped.
@@ -10,7 +10,8 @@ import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 
@@ -25,16 +26,20 @@ from eap.appliance.bus_request import (
     AskMailbox,
     Bring,
     BusReport,
+    BusRequest,
     Cancel,
     Describe,
+    Failure,
     Hello,
     Outcome,
+    Ping,
     Request,
     Transfer,
 )
 from eap.appliance.bus_step import one_ask, one_step, to_accesses, to_ask
 from eap.appliance.bus_target import bring_all, bring_one
 from eap.appliance.engine_bus import EngineBus
+from eap.appliance.station_request import Configure, SetState, StationRequest
 from eap.errors import EapError
 
 T = TypeVar("T")
@@ -44,6 +49,7 @@ MAX_OUTSTANDING = 1024
 MAX_PER_SLAVE = 64
 _MAX_MESSAGE = 1 << 18
 _Place = tuple[int, int]
+ServeStation: TypeAlias = Callable[[StationRequest, int, Callable[[EapError | None], None]], None]
 
 
 class _Errand(NamedTuple):
@@ -57,16 +63,24 @@ class _Errand(NamedTuple):
 class BusDesk:
     """Takes requests from *sock* and answers them.
 
+    Args:
+        sock: The engine's end of the pair with services.
+        buses: By their numbers in requests.
+        serve_station: Does what is asked for with a station, and says when it is done.
+
     Attributes:
         malformed: Messages that were none.
         dropped: Answers that services did not take.
     """
 
-    def __init__(self, sock: socket.socket, buses: Sequence[EngineBus]) -> None:
+    def __init__(
+        self, sock: socket.socket, buses: Sequence[EngineBus], serve_station: ServeStation
+    ) -> None:
         self.malformed = 0
         self.dropped = 0
         self._sock = sock
         self._buses = buses
+        self._serve_station = serve_station
         self._decoder = msgspec.msgpack.Decoder(Request)
         self._errands: dict[int, _Errand] = {}
         self._places: Counter[_Place] = Counter()
@@ -98,12 +112,21 @@ class BusDesk:
             except msgspec.MsgspecError:
                 self.malformed += 1
                 continue
-            if isinstance(request, Cancel):
-                self._cancel(request.id)
-            else:
-                self._serve_one(request, now_ns)
+            match request:
+                case Cancel():
+                    self._cancel(request.id)
+                case Ping():
+                    self._send(Answer(id=request.id))
+                case Configure() | SetState():
+                    self._serve_station(request, now_ns, partial(self._reply, request.id))
+                case _:
+                    self._serve_bus(request, now_ns)
 
-    def _serve_one(self, request: Describe | AskMailbox | Transfer | Bring, now_ns: int) -> None:
+    def _reply(self, number: int, error: EapError | None) -> None:
+        failure = None if error is None else Failure(type(error).__name__, str(error))
+        self._send(Answer(id=number, failure=failure))
+
+    def _serve_bus(self, request: BusRequest, now_ns: int) -> None:
         self._cancel(request.id)  # whoever used the number before does not wait any more
         try:
             if not 0 <= request.bus < len(self._buses):

@@ -10,6 +10,8 @@ from typing import TypeAlias
 
 import msgspec
 
+from eap.appliance.station_request import StationRequest
+
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
     """Base of all requests; *bus* counts the bus ports of the appliance in the handover's order."""
@@ -69,11 +71,20 @@ class Bring(Message, frozen=True, kw_only=True, tag="bring"):
     target: int
 
 
-class Cancel(Message, frozen=True, tag="cancel"):
+class Ping(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="ping"):
+    """Say that there is an engine: answered without anything."""
+
+    id: int
+
+
+class Cancel(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="cancel"):
     """Whoever asked *id* does not wait any more: not answered."""
 
+    id: int
 
-Request: TypeAlias = Describe | AskMailbox | Transfer | Bring | Cancel
+
+BusRequest: TypeAlias = Describe | AskMailbox | Transfer | Bring
+Request: TypeAlias = BusRequest | Ping | Cancel | StationRequest
 
 
 class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):

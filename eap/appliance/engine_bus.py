@@ -11,16 +11,13 @@ from typing import Any
 
 from devicebus.errors import BusError, FrameLostError
 from devicebus.master.bus import MasterSettings
-from devicebus.master.image import BusImage
 from devicebus.master.master import Master
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_faults import SlaveFaults
-from eap.appliance.bus_plan import BusPlan, BusPlanner
-from eap.appliance.bus_states import BusStates
+from eap.appliance.bus_ties import BusTies
 from eap.errors import EnvironmentalError
 from eap.net.busport import BusPort
-from eap.pd.copyplan import CopyPlan
 from eap.pd.image import Image
 from eap.pd.spec import BusPortSpec, PortSpec, Writer
 
@@ -68,14 +65,8 @@ class EngineBus:
         self.send_errors = 0
         self._settings = settings
         self._is_slow = cycle_ns > _LONG_CYCLE_NS
-        self._planner = BusPlanner(self.spec.slaves, image.layout)
-        self._memory = memory_of(Writer.ENGINE)
-        self._memory_of = memory_of
+        self._ties = BusTies(spec, image, memory_of)
         self._port = port
-        self._states = BusStates(spec.name, self.spec.slaves, image)
-        self._bus_image: BusImage | None = None
-        self._plan: BusPlan | None = None
-        self._outputs: list[tuple[memoryview, CopyPlan]] = []
         self._starting: Task[None] | None = None
         self._start_fault = "it is being brought up"
         self._wire_fault = ""
@@ -85,8 +76,8 @@ class EngineBus:
     @property
     def fault(self) -> str:
         """Why the bus is not wholly as it should be, empty if it is."""
-        missing = self._plan.missing if self._plan is not None else ()
-        return "\n".join(filter(None, (self._wire_fault, self._start_fault, *missing)))
+        faults = (self._wire_fault, self._start_fault, *self._ties.missing)
+        return "\n".join(filter(None, faults))
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when a frame waits."""
@@ -117,11 +108,21 @@ class EngineBus:
             task.watch(self.tasks.discard)
         self._guarded(self._send, now_ns)
 
+    def prepare_ties(
+        self, port: PortSpec, image: Image, memory_of: Callable[[Writer], memoryview]
+    ) -> BusTies:
+        """Return what ties it to another *image* of its station, for :meth:`tie`."""
+        ties = BusTies(port, image, memory_of)
+        ties.lay_out(self.master.image)
+        return ties
+
+    def tie(self, ties: BusTies) -> None:
+        """Belong to another image from now on; it holds what the one before held."""
+        self._ties = ties
+
     def take_inputs(self) -> None:
         """Copy what the last exchange brought into the image, and where the slaves are."""
-        if self._plan is not None and self._bus_image is not None:
-            self._plan.inputs.run(memoryview(self._bus_image.inputs), self._memory)
-        self._states.show(self.master)
+        self._ties.take_inputs(self.master)
 
     def exchange(self, now_ns: int) -> None:
         """Copy the outputs out of the image and send them; do what is due."""
@@ -170,8 +171,8 @@ class EngineBus:
     def _begin_anew(self, exc: Exception, now_ns: int) -> None:
         """The master cannot go on: replace it."""
         self.master = Master(self._settings)
-        self._bus_image = self._plan = self._starting = None
-        self._outputs = []
+        self._ties.lay_out(None)
+        self._starting = None
         self.is_up = False
         self._start_fault = f"the master has failed: {type(exc).__name__}: {exc}"
         self._retry_ns = now_ns + RETRY_NS
@@ -182,27 +183,13 @@ class EngineBus:
         self.master.handle_timeout(now_ns)
         if self._retry_ns is not None and now_ns >= self._retry_ns:
             self._start(now_ns)
-        if self.master.image is not self._bus_image:
-            self._lay_out()
-        if self._bus_image is not None:
-            for memory, plan in self._outputs:
-                plan.run(memory, memoryview(self._bus_image.outputs))
+        if self.master.image is not self._ties.bus_image:
+            self._ties.lay_out(self.master.image)
+            self._ties.keep_inputs()
+        self._ties.put_outputs()
         self.master.start_cycle(now_ns)
         self._send(now_ns)
         self.faults.take_events(self.master)
-
-    def _lay_out(self) -> None:
-        """The process data lies somewhere else: plan anew what is copied."""
-        self._bus_image = image = self.master.image
-        self._plan = None
-        self._outputs = []
-        if image is None:
-            return
-        self._plan = self._planner.plan(image.layout)
-        self._plan.kept.run(self._memory, memoryview(image.inputs))
-        self._outputs = [
-            (self._memory_of(writer), plan) for writer, plan in self._plan.outputs.items()
-        ]
 
     def _handle_timeout(self, now_ns: int) -> None:
         self.master.handle_timeout(now_ns)

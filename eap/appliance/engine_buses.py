@@ -7,12 +7,12 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 
-from eap.appliance.bus_desk import BusDesk
+from eap.appliance.bus_desk import BusDesk, ServeStation
 from eap.appliance.bus_settings import master_settings
 from eap.appliance.engine_bus import EngineBus
 from eap.appliance.handover import NO_DESCRIPTOR, BusSocket, Handover
+from eap.appliance.successor import EngineStation
 from eap.net.busport import BusPort
-from eap.pd.station import Station
 
 REST_NS = 300_000_000
 """How long slaves may take to rest when the engine ends."""
@@ -25,11 +25,16 @@ class EngineBuses:
 
     Attributes:
         buses: By their numbers in requests.
-        desk: Where services asks for something, None without any bus.
+        desk: Where services asks for something; None in a test without services.
         arrivals: What to call when a descriptor is readable.
     """
 
-    def __init__(self, handover: Handover, stations: Mapping[str, Station]) -> None:
+    def __init__(
+        self,
+        handover: Handover,
+        stations: Mapping[str, EngineStation],
+        serve_station: ServeStation,
+    ) -> None:
         self._handover = handover
         self.buses = [self._make(given, stations[given.owner.station]) for given in handover.buses]
         self.desk: BusDesk | None = None
@@ -37,7 +42,7 @@ class EngineBuses:
             bus.fileno(): bus.drain for bus in self.buses
         }
         if handover.bus_fd != NO_DESCRIPTOR:
-            self.desk = BusDesk(socket.socket(fileno=handover.bus_fd), self.buses)
+            self.desk = BusDesk(socket.socket(fileno=handover.bus_fd), self.buses, serve_station)
             self.arrivals[self.desk.fileno()] = self.desk.serve
 
     def start(self, now_ns: int) -> None:
@@ -69,8 +74,9 @@ class EngineBuses:
         if self.desk is not None:
             self.desk.close()
 
-    def _make(self, given: BusSocket, station: Station) -> EngineBus:
+    def _make(self, given: BusSocket, place: EngineStation) -> EngineBus:
         port = self._handover.port(given.owner)
+        station = place.station
         epoch_offset_ns = time.time_ns() - time.monotonic_ns() - _EPOCH_S * 1_000_000_000
         bus = EngineBus(
             port,
@@ -81,4 +87,5 @@ class EngineBuses:
             BusPort(socket.socket(fileno=given.engine_fd)),
         )
         station.connect_bus(bus)
+        place.buses[port.name] = bus
         return bus

@@ -1,4 +1,4 @@
-"""Services' end of the pair on which the engine takes requests for its buses.
+"""Services' end of the pair on which the engine takes requests for its stations and buses.
 
 Answers are matched by number.  An engine that dies leaves the pair open and says nothing, so an
 answer has a time-out, and a request that waits for long asks now and then whether anybody is there.
@@ -16,7 +16,7 @@ from time import monotonic_ns
 import msgspec
 
 from eap.appliance.bus_failure import to_error
-from eap.appliance.bus_request import Answer, Cancel, Describe, FromEngine, Hello, Request
+from eap.appliance.bus_request import Answer, Cancel, FromEngine, Hello, Ping, Request
 from eap.errors import EngineGoneError
 
 LOOK_S = 1.0
@@ -64,10 +64,10 @@ class EngineLink:
         self._waiting[request.id] = future
         try:
             self.post(request)
-            answer = await self._wait(future, request.bus, self._loop.time() + timeout_s)
+            answer = await self._wait(future, self._loop.time() + timeout_s)
         except (asyncio.CancelledError, EngineGoneError):
             with suppress(EngineGoneError):
-                self.post(Cancel(id=request.id, bus=request.bus))
+                self.post(Cancel(id=request.id))
             raise
         finally:
             del self._waiting[request.id]
@@ -96,7 +96,7 @@ class EngineLink:
             self._loop.remove_reader(self._socket)
         self._socket.close()
 
-    async def _wait(self, future: asyncio.Future[Answer], bus: int, end_s: float) -> Answer:
+    async def _wait(self, future: asyncio.Future[Answer], end_s: float) -> Answer:
         looked_s: float | None = None
         while True:
             rest_s = min(self._look_s, end_s - self._loop.time())
@@ -107,7 +107,7 @@ class EngineLink:
             if now_s >= end_s or (looked_s is not None and self._heard_s < looked_s):
                 raise EngineGoneError("the engine does not answer")
             looked_s = now_s
-            self.tell(lambda number: Describe(id=number, bus=bus))
+            self.tell(lambda number: Ping(id=number))
 
     def _next_id(self) -> int:
         self._last_id += 1

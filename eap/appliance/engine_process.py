@@ -46,7 +46,7 @@ def run_cycles(
     plant: EnginePlant, link: socket.socket, stop: StopFlag, tell: Callable[[], None]
 ) -> None:
     """Run every cycle when it is due, until *stop* is set; *tell* once the stations run."""
-    engine = plant.engine
+    engine, rebuilds = plant.engine, plant.rebuilds
     look_ns = 0
     is_told = False
     ticker = Ticker()
@@ -60,10 +60,12 @@ def run_cycles(
                 continue
             now_ns = monotonic_ns()
             engine.handle_timeout(now_ns)
+            if rebuilds.is_ready:
+                rebuilds.swap()
             if now_ns >= look_ns:
                 look_ns = now_ns + LOOK_PERIOD_NS
                 plant.publish_discards()
-                if gc.get_count()[0] > GARBAGE:
+                if gc.get_count()[0] > GARBAGE and not rebuilds.is_building:
                     gc.collect()
                 if passed := take_connection(link):
                     plant.add_connection(*passed)

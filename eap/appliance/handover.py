@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import msgspec
 
+from eap.pd.device import DeviceState
 from eap.pd.spec import PortSpec, Record, StationSpec
 
 NO_DESCRIPTOR = -1
@@ -136,6 +137,8 @@ class Handover(Handed, frozen=True):
     bus_fd: int = NO_DESCRIPTOR
     """This side of the pair on which services asks the engine for something on a bus."""
     options: EngineOptions = EngineOptions()
+    states: dict[str, DeviceState] = msgspec.field(default_factory=dict)
+    """To which each station is brought, Op if it is not here."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

@@ -148,7 +148,7 @@ class Services:
                 segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
                 self._resources.callback(segments[bus.owner].close)
         client = BusClient(link, [bus.owner for bus in handover.buses])
-        return Buses(handover.stations, client, segments)
+        return Buses(handover.stations, client if handover.buses else None, segments)
 
     def _watch_sockets(self) -> None:
         now_ns = monotonic_ns()

@@ -69,7 +69,7 @@ class SharedSockets:
         buses: What belongs to each bus port.
         engine_link: The engine's side of its pair with services.
         services_link: The other side.
-        engine_bus: The engine's side of the pair for requests to buses, if there are any.
+        engine_bus: The engine's side of the pair for requests to stations and buses.
         services_bus: The other side.
         control: The listening control socket.
     """
@@ -80,9 +80,7 @@ class SharedSockets:
             self.descriptions = tuple(_open(planned, opened) for planned in plan_sockets(stations))
             self.buses = open_buses(stations, opened)
             self.engine_link, self.services_link = open_message_pair(opened)
-            self.engine_bus = self.services_bus = NO_DESCRIPTOR
-            if self.buses:
-                self.engine_bus, self.services_bus = open_message_pair(opened)
+            self.engine_bus, self.services_bus = open_message_pair(opened)
             self.control = _open_control(control_path, opened).fileno()
             self._opened = opened.pop_all()
 

@@ -27,6 +27,7 @@ from eap.appliance.plantfile import load_plant, require_own_buses
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
 from eap.appliance.sockets import SharedSockets
+from eap.appliance.what_runs import what_runs_now
 from eap.config.load import Plant
 from eap.errors import ConfigError
 from eap.pd.spec import StationSpec
@@ -159,6 +160,8 @@ class Supervisor:
     def _start(self, child: Child) -> None:
         self._restart_ns.pop(child, None)
         handover, descriptors = self._given[child]
+        if isinstance(handover, Handover):
+            handover = what_runs_now(handover)
         child.start(handover, descriptors, monotonic_ns())
         self._write_info()
 

@@ -1,8 +1,10 @@
 """A process image in a file that processes share, and the futex that wakes who waits for a cycle.
 
 The file is mapped, not read: a restarted engine finds its counters, and programs that attached stay
-attached.  A station whose layout changed gets a new file under the same name; the old one is marked
-as retired, which tells the programs that still map it to open the new one.
+attached.  A station whose layout changed gets a new file under the same name.  RETIRED is set in
+whatever file is not to be used: in the new one until it holds what the old one held, and in the old
+one from the moment in which the new one has its name.  Who sees it opens the path again, and who
+has just written looks: it may have come too late to be carried over.
 """
 
 from __future__ import annotations
@@ -22,12 +24,15 @@ from eap.errors import EnvironmentalError, ImageError, WriterConflictError
 from eap.pd.image import Image, format_image, read_header
 from eap.pd.layout import WORDS_OFFSET, ImageLayout
 from eap.pd.spec import Writer
+from eap.pd.succession import ImageSuccession
 from eap.pd.words import StationWord
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _SYS_FUTEX = {"x86_64": 202, "aarch64": 98, "armv7l": 240, "riscv64": 98}.get(os.uname().machine)
 _FUTEX_WAIT, _FUTEX_WAKE = 0, 1
 _EVERYBODY = 0x7FFFFFFF
+_REPLACING_PAUSES = 20_000
+"""Two seconds in all.  Replacing takes milliseconds; an engine that dies meanwhile comes back."""
 _FLOCK = struct.Struct("hhqqi4x")
 _PID_WORD = {
     Writer.ENGINE: StationWord.ENGINE_PID,
@@ -81,6 +86,30 @@ class ImageFile:
     def retired(self) -> bool:
         """Whether a file of a newer layout has taken this one's place."""
         return bool(self.image.words[StationWord.RETIRED])
+
+    def take_name(self, path: Path) -> None:
+        """Be the file at *path*; who opens it waits until :meth:`release`.
+
+        Raises:
+            EnvironmentalError: that is not possible; what was there still is.
+        """
+        try:
+            self.path = self.path.rename(path)
+        except OSError as exc:
+            raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
+
+    def retire(self) -> None:
+        """Send programs to the file that has taken the name of this one."""
+        self.image.words[StationWord.RETIRED] = 1
+
+    def release(self) -> None:
+        """Let programs use a file that was made by :func:`prepare_image`."""
+        self.image.words[StationWord.RETIRED] = 0
+
+    def discard(self) -> None:
+        """Remove a file that has taken nobody's place, and close it."""
+        self.path.unlink(missing_ok=True)
+        self.close()
 
     def acquire_writer(self, writer: Writer) -> None:
         """Become the one who writes the region of *writer*, until release or :meth:`close`.
@@ -145,26 +174,76 @@ def create_image(path: Path, layout: ImageLayout) -> ImageFile:
     Raises:
         EnvironmentalError: the folder cannot be written.
     """
+    for left_over in path.parent.glob(f".{path.name}.*"):
+        left_over.unlink()  # of an engine that was killed while it made one
     try:
-        existing = open_image(path)
+        existing = _open(path)
     except ImageError:
-        return _make_image(path, layout, 1)
+        return _replace(None, prepare_image(path, layout, 1), path)
     if existing.image.layout == layout:
+        existing.release()
         return existing
-    fresh = _make_image(path, layout, existing.generation + 1)
-    # Only now: whoever sees the mark opens the path again, and must find the new file there.
-    existing.image.words[StationWord.RETIRED] = 1
-    existing.wake_waiters()
-    existing.close()
+    fresh = prepare_image(path, layout, existing.generation + 1)
+    return _replace(existing, fresh, path)
+
+
+def _replace(existing: ImageFile | None, fresh: ImageFile, path: Path) -> ImageFile:
+    try:
+        fresh.take_name(path)
+    except EnvironmentalError:
+        fresh.discard()
+        raise
+    if existing is not None:
+        existing.retire()
+        succession = ImageSuccession(existing.image, fresh.image)
+        succession.carry_words()
+        succession.carry_values(existing.image.memory)
+    fresh.release()
+    if existing is not None:
+        existing.wake_waiters()
+        existing.close()
     return fresh
 
 
-def open_image(path: Path) -> ImageFile:
-    """Open an existing image.
+def prepare_image(path: Path, layout: ImageLayout, generation: int) -> ImageFile:
+    """Make a fresh image beside the file at *path*, whose place it is to take; it is retired yet.
 
     Raises:
-        ImageError: there is none, or it is no image of this release.
+        EnvironmentalError: the folder cannot be written.
     """
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    except OSError as exc:
+        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
+    try:
+        os.ftruncate(descriptor, layout.size)
+        with mmap.mmap(descriptor, 0) as memory, memoryview(memory) as view:
+            _format(view, layout, generation)
+    except OSError as exc:
+        os.close(descriptor)
+        fresh.unlink(missing_ok=True)
+        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
+    return ImageFile(fresh, descriptor)
+
+
+def open_image(path: Path) -> ImageFile:
+    """Open an existing image; wait a moment while it is being replaced.
+
+    Raises:
+        ImageError: there is none, or it is no image of this release, or its engine died while it
+            replaced it.
+    """
+    for _ in range(_REPLACING_PAUSES):
+        file = _open(path)
+        if not file.retired:
+            return file
+        file.close()
+        _pause()
+    raise ImageError(f"{path}: the process image is being replaced, and that does not end")
+
+
+def _open(path: Path) -> ImageFile:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except OSError as exc:
@@ -176,26 +255,9 @@ def open_image(path: Path) -> ImageFile:
         raise ImageError(f"{path}: {exc}") from None
 
 
-def _make_image(path: Path, layout: ImageLayout, generation: int) -> ImageFile:
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-    except OSError as exc:
-        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
-    try:
-        os.ftruncate(descriptor, layout.size)
-        with mmap.mmap(descriptor, 0) as memory, memoryview(memory) as view:
-            _format(view, layout, generation)
-        fresh.rename(path)
-    except OSError as exc:
-        os.close(descriptor)
-        fresh.unlink(missing_ok=True)
-        raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
-    return ImageFile(path, descriptor)
-
-
 def _format(view: memoryview, layout: ImageLayout, generation: int) -> None:
     image = format_image(view, layout, generation)
+    image.words[StationWord.RETIRED] = 1
     image.words.release()
     image.memory.release()
 

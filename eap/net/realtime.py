@@ -60,6 +60,18 @@ def die_with_parent(parent_pid: int, number: signal.Signals = signal.SIGKILL) ->
         os.kill(os.getpid(), number)
 
 
+def stand_behind() -> None:
+    """Let the calling thread give way to all others of its process, and to nobody else.
+
+    With SCHED_FIFO it goes one step down, for a thread of the same priority would not be
+    interrupted; other processes stay behind it, so that it does not sleep with what others need.
+    """
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        priority = os.sched_getparam(0).sched_priority
+        if priority > 1:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority - 1))
+
+
 def _set_scheduler(priority: int) -> str:
     if priority:
         try:

@@ -125,6 +125,11 @@ class Account:
         self._words[_LAST_CYCLE] = -1
         self._words[_HOLES] = 0
 
+    def pause(self) -> None:
+        """Nothing is taken for a while: what does not come meanwhile is neither late nor lost."""
+        self.forget_sender()
+        self._words[_STATE] = RxState.WAITING
+
     def follow(self, publisher: int) -> None:
         """Note who sent the frame to be entered next: another sender has another counter."""
         if self._words[_SENDER] != publisher:

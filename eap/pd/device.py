@@ -53,6 +53,14 @@ TRANSITIONS: dict[tuple[DeviceState, Request], DeviceState] = {
 }
 
 
+_UP = {
+    DeviceState.INIT: Request.START,
+    DeviceState.PREOP: Request.SAFEOP,
+    DeviceState.SAFEOP: Request.OP,
+}
+_DOWN = {DeviceState.PREOP: Request.PREOP, DeviceState.SAFEOP: Request.SAFEOP}
+
+
 class Device:
     """The state of one station's EAP device."""
 
@@ -70,3 +78,12 @@ class Device:
                 f"only {' or '.join(possible)}"
             ) from None
         return self.state
+
+    def go(self, state: DeviceState) -> None:
+        """Go to *state* by all states between; raise LocalProtocolError for Init."""
+        if state is DeviceState.INIT:
+            raise LocalProtocolError("INIT cannot be requested, only PREOP, SAFEOP or OP")
+        while self.state < state:
+            self.request(_UP[self.state])
+        if self.state > state:
+            self.request(_DOWN[state])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from heapq import heapify, heapreplace
+from types import MappingProxyType
 
+from eap.pd.device import DeviceState
 from eap.pd.link import Channel, CyclicBus
 from eap.pd.station import Station
 from eap.pd.words import StationWord
@@ -17,7 +19,7 @@ class Engine:
     """Runs each station when its cycle is due; a cycle it comes too late for is left out."""
 
     def __init__(self, stations: Sequence[Station]) -> None:
-        self._stations = stations
+        self._stations = list(stations)
         self._arrivals: list[Channel] = []
         self._buses: list[CyclicBus] = []
         self._due: list[tuple[int, int]] = []
@@ -26,16 +28,29 @@ class Engine:
         """Take what these channels receive as soon as :meth:`receive` is called."""
         self._arrivals.extend(channels)
 
-    def start(self, now_ns: int) -> None:
-        """Bring all stations, with the buses that they have now, to Op."""
+    def start(self, now_ns: int, states: Mapping[str, DeviceState] = MappingProxyType({})) -> None:
+        """Bring all stations, with the buses that they have now, to Op or what *states* says."""
         self._buses = [bus for station in self._stations for bus in station.buses]
-        self._due = [(station.start(now_ns), index) for index, station in enumerate(self._stations)]
+        self._due = [
+            (station.start(now_ns, states.get(station.spec.name, DeviceState.OP)), index)
+            for index, station in enumerate(self._stations)
+        ]
         heapify(self._due)
 
     @property
     def is_under_way(self) -> bool:
         """Whether every station has run a cycle since the start, or has one beyond SOON_NS."""
         return all(each.has_run or each.cycle_ns > SOON_NS for each in self._stations)
+
+    def replace(self, old: Station, new: Station) -> None:
+        """Run *new*, which has the buses of *old*, in its place; its cycle counter goes on."""
+        index = self._stations.index(old)
+        self._stations[index] = new
+        if new.cycle_ns != old.cycle_ns:
+            by_station = {number: due_ns for due_ns, number in self._due}
+            by_station[index] += new.cycle_ns - old.cycle_ns
+            self._due = [(due_ns, number) for number, due_ns in by_station.items()]
+            heapify(self._due)
 
     def stop(self) -> None:
         """Bring all stations out of Op."""

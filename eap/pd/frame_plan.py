@@ -10,7 +10,9 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
-from eap.codec.pd import PdHeader
+from eap.codec.ethercat import EtherCatHeader
+from eap.codec.pd import PD_FRAME_START, PdFrameHeader, PdHeader
+from eap.ids import NetId
 from eap.pd.account import Account
 from eap.pd.copyplan import CopyPlan
 from eap.pd.poll import Answer
@@ -113,6 +115,16 @@ class FramePlan:
         for account, source, alternate in self.alternates:
             if account.has_taken(cycle):
                 alternate.run(data[source:], memory)
+
+    def example(self) -> memoryview:
+        """Return a frame of this layout, without data."""
+        frame = bytearray(EtherCatHeader(self.end - PD_FRAME_START).encode())
+        publisher = NetId(self.publisher.to_bytes(6))
+        frame += PdFrameHeader(publisher, len(self.expected), 0).encode()
+        for header in self.expected:
+            frame += header + bytes(2)
+            frame += bytes(PdHeader.decode(header + bytes(2)).length)
+        return memoryview(frame.ljust(self.end, b"\0"))
 
 
 def _parts(taken: Iterable[Taken]) -> tuple[tuple[Account, tuple[Copy, ...]], ...]:

@@ -32,11 +32,17 @@ class Inputs:
             for writer, place in image.layout.regions.items()
             if writer is not Writer.ENGINE and place.size
         ]
-        self._seen = [-1] * len(self._regions)
+        self._seen: list[int] = []
         self._settled: tuple[int, ...] = ()
         """Both sequence words, when all that they guard has been copied."""
+        self.reload()
+
+    def reload(self) -> None:
+        """Begin with what is in the image, where nobody writes at the moment."""
+        self._seen = [-1] * len(self._regions)
+        self._settled = ()
         for _, region in self._regions:
-            self.memory[region] = image.memory[region]
+            self.memory[region] = self._image.memory[region]
 
     def refresh(self) -> bool:
         """Copy what changed; return whether anything did."""

@@ -47,6 +47,12 @@ class Requests:
         pending, self._pending = self._pending, {}
         return pending
 
+    def follow(self, before: Requests) -> None:
+        """Go on with what *before* has noted and this one takes too."""
+        for sender, names in before.take().items():
+            if known := names & self.names:
+                self.add(sender, known)
+
 
 class Question:
     """One TxPD of this station that asks others.
@@ -66,6 +72,14 @@ class Question:
         self._sent_at_ns = 0
         self._before_ns = 0
         self._waiting: dict[str, int] = {}
+        self._state = self._read_state()
+
+    def follow(self, before: Question) -> None:
+        """Go on where *before* was; the words of the image have been carried over."""
+        self._sent_at_ns, self._before_ns = before._sent_at_ns, before._before_ns
+        self._waiting = {
+            answer: at_ns for answer, at_ns in before._waiting.items() if answer in self._answers
+        }
         self._state = self._read_state()
 
     def look(self, now_ns: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 from eap.ids import NetId
@@ -165,6 +165,31 @@ class Publisher:
             self._always = self._groups[0]
             self._due = self._groups
             self._sending.clear()
+
+    def forget(self) -> None:
+        """Begin as at a start: what is sent on change is sent first, and no event is left over."""
+        for frame in self.frames:
+            for pd in frame.pds:
+                pd.trigger.forget()
+
+    def follow(self, before: Publisher) -> None:
+        """Go on with the triggers of the PDs that *before* sent too."""
+        then = dict(before.remembering())
+        for name, (content, trigger) in self.remembering():
+            if name in then:
+                sent, was = then[name]
+                trigger.follow(was, is_same=sent == content)
+        for name in self._controls.keys() & before._controls.keys():
+            self._controls[name] = before._controls[name]
+
+    def remembering(self) -> Iterator[tuple[str, tuple[tuple[object, ...], Trigger]]]:
+        """Yield the PDs that do not just follow the clock: what goes where, and the trigger."""
+        for frame in self.frames:
+            for pd in frame.pds:
+                if not pd.place.by_schedule:
+                    place = pd.place
+                    content = place.pd_id, place.version, place.variables, frame.place.destination
+                    yield place.name, (content, pd.trigger)
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the frames due in this cycle, patched; :meth:`sent` must follow."""

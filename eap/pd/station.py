@@ -18,14 +18,14 @@ import msgspec
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.answerer import Answerer
-from eap.pd.device import Device, DeviceState, Request
+from eap.pd.device import Device, DeviceState
 from eap.pd.generator import Generators
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
 from eap.pd.learner import Learner
 from eap.pd.link import Channel, CyclicBus, Taker
 from eap.pd.links import Links
-from eap.pd.poll import Question, questions_of, requests_at
+from eap.pd.poll import questions_of, requests_at
 from eap.pd.publisher import FrameRow, Publisher
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
 from eap.pd.subscriber import Subscriber
@@ -80,16 +80,19 @@ class Station:
         self._has_own_variables = self._computes
         self.buses: list[CyclicBus] = []
         self._publishers: list[tuple[Publisher | Answerer, Channel]] = []
+        self._sending: list[tuple[Publisher | Answerer, Channel]] = []
+        """The publishers, in states that send."""
+        self._ports: dict[str, tuple[Channel, Publisher | None]] = {}
         self._channels: list[Channel] = []
         self._drains: list[Callable[[int], object]] = []
         self._rarely: list[Callable[[int], int]] = []
         self._rarely_every = max(1, _UNREAD_FOR_US // spec.cycle_us)
         self._requests = {port.name: requests_at(spec, port.name) for port in spec.ports}
-        questions = questions_of(image)
-        self._closing: list[Callable[[int], None]] = [q.look for q in questions.values()]
+        self._questions = questions_of(image)
+        self._closing: list[Callable[[int], None]] = [q.look for q in self._questions.values()]
         """What ends a cycle, after everything has been sent to other stations."""
         self._subscribers = {
-            port.name: self._subscriber(port.name, questions)
+            port.name: self._subscriber(port.name)
             for port in spec.ports
             if port.kind is PortKind.EAP
         }
@@ -104,10 +107,10 @@ class Station:
         self._learners = {port: Learner(self.takers[port]) for port in _learning_ports(spec)}
         self.takers.update((port, learner.take) for port, learner in self._learners.items())
 
-    def _subscriber(self, port: str, questions: dict[str, Question]) -> Subscriber:
+    def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
         own = [(pd, place) for pd, place in rows if pd.port == port]
-        return Subscriber(self.image, own, self.cycle_ns, self._requests[port], questions)
+        return Subscriber(self.image, own, self.cycle_ns, self._requests[port], self._questions)
 
     def connect(self, port: str, channel: Channel) -> None:
         """Send the frames of *port* through *channel*, and drain it.
@@ -125,6 +128,7 @@ class Station:
         else:
             self._rarely.append(channel.drain)
         net_id = NetId.parse(next(p.net_id for p in self.spec.ports if p.name == port))
+        publisher = None
         if pushed := _pds_of(frames, polled=False):
             publisher = Publisher(self.image, self._inputs, net_id, channel, pushed)
             self._publishers.append((publisher, channel))
@@ -134,6 +138,7 @@ class Station:
             requests = self._requests[port]
             answerer = Answerer(self.image, self._inputs, net_id, channel, polled, requests)
             self._publishers.append((answerer, channel))
+        self._ports[port] = channel, publisher
 
     def retarget(self, frame: str, destination: str) -> None:
         """Send TxFrame *frame* to *destination* from the next cycle on; the others are left alone.
@@ -169,21 +174,18 @@ class Station:
         """
         return self.image.memory if writer is Writer.ENGINE else self._inputs.memory
 
-    def start(self, now_ns: int) -> int:
-        """Go to Op; return when the first cycle is due.
+    def start(self, now_ns: int, state: DeviceState = DeviceState.OP) -> int:
+        """Go to *state*; return when the first cycle is due.
 
         The cycle counter of an earlier engine goes on as if it had never stopped.
         """
         words = self._words
-        if self.device.state is DeviceState.INIT:
-            self.device.request(Request.START)
-        for request in (Request.SAFEOP, Request.OP):
-            self.device.request(request)
-        words[StationWord.STATE] = self.device.state
+        self._enter(state)
         words[_STARTED_AT_NS] = now_ns
         words[_SEQUENCE] += words[_SEQUENCE] % 2  # a killed engine may have left it odd
-        for subscriber in self._subscribers.values():
-            subscriber.open(now_ns)
+        if state.receives:
+            for subscriber in self._subscribers.values():
+                subscriber.open(now_ns)
         self._wake()  # who sleeps since before a restart would be too far behind to count
         previous_ns = words[_CYCLE_AT_NS]
         if 0 < previous_ns <= now_ns:
@@ -197,17 +199,80 @@ class Station:
         return grid_ns if grid_ns > now_ns else grid_ns + self.cycle_ns
 
     @property
+    def inputs(self) -> Inputs:
+        """The variables of others as its cycle sees them."""
+        return self._inputs
+
+    @property
     def has_run(self) -> bool:
         """Whether a cycle has run since :meth:`start`."""
         return bool(self._words[_CYCLE_AT_NS] > self._words[_STARTED_AT_NS])
 
+    def go(self, state: DeviceState, now_ns: int) -> None:
+        """Go to another state while cycles run; raise LocalProtocolError if there is no way."""
+        before = self.device.state
+        self._enter(state)
+        for subscriber in self._subscribers.values():
+            if before.receives and not state.receives:
+                subscriber.close()
+            elif state.receives and not before.receives:
+                subscriber.resume(now_ns)
+        for _, publisher in self._ports.values():
+            if publisher is not None and state.sends and not before.sends:
+                publisher.forget()
+
     def stop(self) -> None:
-        """Leave Op: nothing is taken or sent any more."""
-        self._words[StationWord.STATE] = self.device.request(Request.PREOP)
+        """Nothing is taken or sent any more."""
+        self._enter(DeviceState.PREOP)
         for subscriber in self._subscribers.values():
             subscriber.close()
-        for requests in self._requests.values():
-            requests.take()
+
+    def _enter(self, state: DeviceState) -> None:
+        self.device.go(state)
+        self._words[StationWord.STATE] = state
+        self._sending = self._publishers if state.sends else []
+        if not state.receives:
+            for requests in self._requests.values():
+                requests.take()
+
+    def prepare_to_follow(self, before: Station) -> None:
+        """Be connected as *before* is, and know the frames that it receives.
+
+        Whatever takes time is done here, while the other one runs; it is only looked at.
+        """
+        for port, (channel, _) in before._ports.items():
+            self.connect(port, channel)
+        fed = [channel for channel, _ in before._ports.values()]
+        for channel in before._channels:
+            if channel not in fed:
+                self.drain_also(channel)
+        for bus in before.buses:
+            self.connect_bus(bus)
+        for port, subscriber in self._subscribers.items():
+            subscriber.learn_from(before._subscribers[port])
+
+    def follow(self, before: Station) -> None:
+        """Take the place of *before* between two of its cycles.
+
+        The image holds already what was in the other's.  Frames go on being handed to its takers.
+        """
+        self._inputs.reload()
+        replaced = [subscriber.handle_timeout for subscriber in self._subscribers.values()]
+        self._supervisors = [each for each in self._supervisors if each not in replaced]
+        for port, subscriber in before._subscribers.items():
+            subscriber.become(self._subscribers[port])
+            if subscriber.has_timeouts:
+                self._supervisors.append(subscriber.handle_timeout)
+        self._subscribers, self.takers = before._subscribers, before.takers
+        for port, requests in self._requests.items():
+            requests.follow(before._requests[port])
+        for name in self._questions.keys() & before._questions.keys():
+            self._questions[name].follow(before._questions[name])
+        for port, (_, publisher) in self._ports.items():
+            was = before._ports[port][1]
+            if publisher is not None and was is not None:
+                publisher.follow(was)
+        self._enter(before.device.state)
 
     def cycle(self, due_ns: int, now_ns: int) -> None:
         """Run one cycle that was due at *due_ns*."""
@@ -222,7 +287,7 @@ class Station:
         if changed:
             for publisher, _ in self._publishers:
                 publisher.read_controls()
-        for publisher, channel in self._publishers:
+        for publisher, channel in self._sending:
             frames = publisher.frames_to_send(cycle, now_ns)
             if frames:
                 publisher.sent(channel.send(frames, now_ns), now_ns)

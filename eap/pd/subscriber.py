@@ -91,11 +91,33 @@ class Subscriber:
         self._closed_reason = Discard.STALE
         self._next_timeout_ns = from_ns
 
+    def resume(self, from_ns: int) -> None:
+        """Take what arrives from now on, after :meth:`close`; nothing was missed meanwhile."""
+        for account in {subscription.account for subscription in self._subscriptions}:
+            account.pause()
+        self.open(from_ns)
+
     def close(self) -> None:
         """Take nothing (the station left Op)."""
         self._open_from_ns = _NEVER
         self._closed_reason = Discard.SUPPRESSED
         self._next_timeout_ns = _NEVER
+
+    def learn_from(self, before: Subscriber) -> None:
+        """Plan for all layouts of frames that *before* knows, so that none is new."""
+        for plans in list(before._plans.values()):
+            for plan in list(plans):
+                self._learn(plan.example(), plan.end)
+
+    def become(self, after: Subscriber) -> None:
+        """Go on with the subscriptions, the image and the accounts of *after*.
+
+        Whoever hands frames to this one goes on doing so; whether it is open stays as it is.
+        """
+        is_open = self._open_from_ns, self._closed_reason
+        vars(self).update(vars(after))
+        self._open_from_ns, self._closed_reason = is_open
+        self._next_timeout_ns = _NEVER if self._open_from_ns == _NEVER else 0
 
     def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
         """Take one EtherCAT frame of *size* octets that arrived at *at_ns* from *origin*."""

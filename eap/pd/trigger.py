@@ -126,3 +126,18 @@ class Trigger:
         self._sent_data = data
         if reason == _CHANGE:
             self._sent_for_change_ns = now_ns
+
+    def forget(self) -> None:
+        """Begin as at a start: an event is gone, and a change is what comes first."""
+        self._event = False
+        self._sent_data = None
+
+    def follow(self, before: Trigger, *, is_same: bool) -> None:
+        """Go on where *before* was; *is_same* tells that the PD is still sent as it was.
+
+        If it is not, nobody has its data yet, and an on-change trigger sends it.
+        """
+        self._event = before._event and self.takes_events
+        self._sent_at_ns = before._sent_at_ns
+        self._sent_for_change_ns = before._sent_for_change_ns
+        self._sent_data = before._sent_data if is_same else None

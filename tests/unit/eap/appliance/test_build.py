@@ -101,7 +101,9 @@ def test_udp_ports_share_nothing_but_the_network(start, shared):
     stations = [left(), right(eap_port(2, wake=Wake.ARRIVAL))]
     running = start(stations, shared(*stations))
     running.run_cycles(3)
-    (take,) = running.plant.arrivals.values()
+    (take,) = [
+        take for fd, take in running.plant.arrivals.items() if fd != running.plant.rebuilds.fileno()
+    ]
     take(1)
     assert running.values("right")["ticks"] >= 2
 

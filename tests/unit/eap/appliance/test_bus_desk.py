@@ -19,11 +19,15 @@ from eap.appliance.bus_request import (
     Cancel,
     Datagram,
     Describe,
+    Failure,
     FromEngine,
     Hello,
+    Ping,
     Transfer,
 )
+from eap.appliance.station_request import Configure, SetState
 from eap.codec.mailbox import MailboxType
+from eap.errors import EngineRefusedError
 from tests.support.cyclic import MS
 from tests.support.enginebus import BusRig
 
@@ -41,8 +45,14 @@ class Office:
         self.rig = rig
         self.services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.services.setblocking(False)
-        self.desk = BusDesk(engine, [rig.bus])
+        self.desk = BusDesk(engine, [rig.bus], self.serve_station)
         self.heard = {}
+        self.asked = []
+
+    def serve_station(self, request, now_ns, reply):
+        """Refuse what concerns one station, and do everything else."""
+        self.asked.append((request, now_ns))
+        reply(EngineRefusedError("not now") if request.station == "two" else None)
 
     def post(self, *requests):
         for request in requests:
@@ -213,7 +223,7 @@ def test_all_together_have_an_end_too(office, monkeypatch):
 
 
 def test_who_cancels_hears_nothing_more(office):
-    office.post(ask(1, listen=True), ask(2), Cancel(id=1, bus=0), Cancel(id=99, bus=0))
+    office.post(ask(1, listen=True), ask(2), Cancel(id=1), Cancel(id=99))
     office.rig.wait(lambda: 2 in office.collect())
     office.rig.run(1500 * MS)
     assert list(office.collect()) == [2]
@@ -242,3 +252,14 @@ def test_without_services_nothing_happens(office):
     office.desk.serve(office.rig.now_ns)
     office.desk.greet()
     assert office.desk.dropped == 1
+
+
+def test_what_is_asked_of_a_station_is_passed_on_and_answered_when_it_is_done(office):
+    configure = Configure(id=1, station="one", path="/a.spec")
+    refused = SetState(id=2, station="two", state=4)
+    office.post(configure, refused, Ping(id=3))
+    assert office.asked == [(configure, office.rig.now_ns), (refused, office.rig.now_ns)]
+    answers = office.collect()
+    assert answers[1] == Answer(id=1)
+    assert answers[2].failure == Failure("EngineRefusedError", "not now")
+    assert answers[3] == Answer(id=3)

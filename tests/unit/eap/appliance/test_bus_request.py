@@ -17,10 +17,12 @@ from eap.appliance.bus_request import (
     FromEngine,
     Hello,
     Outcome,
+    Ping,
     Request,
     SlaveReport,
     Transfer,
 )
+from eap.appliance.station_request import Configure, SetState
 
 SLAVE = SlaveReport(
     station=1001, name="a", vendor=1, product=2, revision=3, serial=4, alias=5, state=8, target=8
@@ -35,7 +37,10 @@ SLAVE = SlaveReport(
         AskMailbox(id=3, bus=0, station=1, type=4, request=b"", timeout_ns=1, listen=True),
         Transfer(id=4, bus=0, datagrams=(Datagram(4, 1001, 0x130, bytes(6), 3),)),
         Bring(id=5, bus=0, station=0, target=8),
-        Cancel(id=2**62, bus=0),
+        Ping(id=6),
+        Cancel(id=2**62),
+        Configure(id=7, station="one", path="/run/a.spec"),
+        SetState(id=8, station="one", state=4),
     ],
 )
 def test_requests(request_):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from time import monotonic_ns
+from typing import cast
 
 import msgspec
 import pytest
@@ -15,6 +16,9 @@ from eap.appliance.bus_request import FromEngine, Hello
 from eap.appliance.busfile import load_or_raise
 from eap.appliance.engine_buses import REST_NS, EngineBuses
 from eap.appliance.handover import NO_DESCRIPTOR, BusSocket, Handover, PortName
+from eap.appliance.station_request import SetState
+from eap.appliance.successor import EngineStation
+from eap.net.image_file import ImageFile
 from eap.net.segmentsocket import SegmentSocket
 from eap.pd.station import Station
 from tests.support.cyclic import image_of
@@ -37,7 +41,9 @@ class Running:
         handover = Handover(
             1, str(folder), "p", "p.yaml", (spec,), (), buses=(given,), bus_fd=desk_end.detach()
         )
-        self.buses = EngineBuses(handover, {"one": self.station})
+        self.asked = []
+        place = EngineStation(self.station, cast("ImageFile", None))
+        self.buses = EngineBuses(handover, {"one": place}, lambda *asked: self.asked.append(asked))
         self.segment = load_or_raise(folder / "bus.yaml").build()
         self._end = SegmentSocket(slaves_end)
         self._stopping = threading.Event()
@@ -98,7 +104,9 @@ def test_slaves_get_to_op_and_rest_in_the_end(start):
     message = msgspec.msgpack.decode(running.services.recv(100), type=FromEngine)
     assert isinstance(message, Hello)
     assert len(running.buses.arrivals) == 2
+    running.services.send(msgspec.msgpack.encode(SetState(id=1, station="one", state=4)))
     running.run_until(lambda: running.station.image.read("bus0.state") == AlState.OP)
+    assert [asked[0] for asked in running.asked] == [SetState(id=1, station="one", state=4)]
     begun_ns = monotonic_ns()
     running.buses.rest()
     assert monotonic_ns() - begun_ns < REST_NS
@@ -122,8 +130,8 @@ def test_nobody_who_answers_is_not_waited_for(start):
     assert monotonic_ns() - begun_ns < REST_NS
 
 
-def test_without_buses_there_is_no_desk(tmp_path):
-    buses = EngineBuses(Handover(1, str(tmp_path), "p", "p.yaml", (), ()), {})
+def test_without_a_pair_there_is_no_desk(tmp_path):
+    buses = EngineBuses(Handover(1, str(tmp_path), "p", "p.yaml", (), ()), {}, print)
     assert buses.desk is None
     assert buses.arrivals == {}
     buses.start(0)

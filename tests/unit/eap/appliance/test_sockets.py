@@ -72,7 +72,6 @@ def test_all_are_opened_and_described(tmp_path):
         for described in shared.descriptions:
             assert (described.engine_fd == NO_DESCRIPTOR) == (described.kind is SocketKind.TCP)
             assert described.services_fd != NO_DESCRIPTOR
-        assert (shared.engine_bus, shared.services_bus) == (NO_DESCRIPTOR, NO_DESCRIPTOR)
         inherited = {*shared.engine_descriptors(), *shared.services_descriptors()}
         assert len(inherited) == open_descriptors() - before
         assert not any(os.get_inheritable(fd) for fd in inherited)

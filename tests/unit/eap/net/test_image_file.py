@@ -81,7 +81,7 @@ def test_a_new_layout_is_a_new_generation_and_retires_the_old_file(path, engine)
     engine.image.words[StationWord.CYCLE] = 42
     with create_image(path, WIDER) as wider:
         assert (wider.generation, wider.retired) == (2, False)
-        assert wider.image.words[StationWord.CYCLE] == 0
+        assert wider.image.words[StationWord.CYCLE] == 42
         assert engine.retired
         with open_image(path) as again:
             assert again.image.layout == WIDER

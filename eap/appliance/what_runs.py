@@ -1,0 +1,31 @@
+"""What a process of the appliance is to run when it is started: as configured last."""
+
+from __future__ import annotations
+
+import logging
+
+from msgspec.structs import replace
+
+from eap.appliance.change import needs_new_start
+from eap.appliance.handover import Handover
+from eap.appliance.store import effective
+
+logger = logging.getLogger(__name__)
+
+
+def what_runs_now(handover: Handover) -> Handover:
+    """Return *handover* with each station as it was configured last, since the plant file or now.
+
+    A configuration that needs other sockets than those that were opened is none of this start.
+    """
+    specs = []
+    states = {}
+    for given, found in zip(
+        handover.stations, effective(handover.plant, handover.stations), strict=True
+    ):
+        reasons = needs_new_start(given, found.spec)
+        for reason in reasons:
+            logger.warning("station %s: the plant file runs: %s", given.name, reason)
+        specs.append(given if reasons else found.spec)
+        states[given.name] = found.state
+    return replace(handover, stations=tuple(specs), states=states)

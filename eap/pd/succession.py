@@ -1,0 +1,254 @@
+"""What a process image takes over from the one before it: counters, accounts and values.
+
+Rule 1: what has the same name is the same thing.  Variables keep their value if their type is the
+same too; frames and PDs keep their counters.
+Rule 2: the account of a publisher goes on for all subscriptions that shared it, as long as they are
+judged alike.  A subscription that listens to somebody else now keeps its sums and forgets the
+sender that it knew.
+Rule 3: everything is planned beside running cycles; when the moment comes, only octets are copied.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from eap.codec import datatypes
+from eap.codec.pd import PdHeader
+from eap.pd.copyplan import CopyPlan, Move
+from eap.pd.image import Image
+from eap.pd.layout import ImageLayout, RxPlace
+from eap.pd.spec import Writer
+from eap.pd.words import (
+    ACCOUNT_START,
+    REASON_INDEX,
+    FrameWord,
+    Reason,
+    RxWord,
+    StationWord,
+    TxWord,
+)
+
+_OWN_WORDS = {
+    StationWord.ENGINE_SEQUENCE,
+    StationWord.SERVICES_SEQUENCE,
+    StationWord.APPLICATION_SEQUENCE,
+    StationWord.RETIRED,
+}
+"""What belongs to an image, and not to the station."""
+
+
+class _Run(NamedTuple):
+    """Words that are copied in one piece."""
+
+    source: int
+    target: int
+    size: int
+
+
+class ImageSuccession:
+    """Carries what one image holds over to the next one of the same station.
+
+    Args:
+        old: The image that is in use.
+        new: A fresh one that nobody uses yet.
+    """
+
+    def __init__(self, old: Image, new: Image) -> None:
+        self._old, self._new = old, new
+        station = [index for index in range(StationWord.SIZE) if index not in _OWN_WORDS]
+        self._runs = _joined(_Run(index, index, 1) for index in station)
+        self._sent = _Sent(old.layout, new.layout)
+        self._received = _Received(old, new)
+        self._from_engine, self._from_others = _plan_values(old, new)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether subscriptions still share accounts as they did when this was planned."""
+        return self._received.is_current
+
+    def carry_words(self) -> None:
+        """Copy the words of the station, of its frames, PDs and accounts."""
+        old, new = self._old.words, self._new.words
+        _copy(self._runs, old, new)
+        self._sent.carry(old, new)
+        self._received.carry(old, new)
+
+    def carry_values(self, others: memoryview) -> None:
+        """Copy the values of variables; in *others* lie those that the engine does not write.
+
+        It is laid out as the old image.
+        """
+        self._from_engine.run(self._old.memory, self._new.memory)
+        self._from_others.run(others, self._new.memory)
+
+    def settle(self) -> None:
+        """Note what the subscribers that were built on the new image have made of its accounts."""
+        self._received.settle()
+
+
+class _Sent:
+    """The words of TxFrames and TxPDs.
+
+    A frame that is no more what it was gives the count of its cycles as a whole to its old PDs.
+    """
+
+    def __init__(self, old: ImageLayout, new: ImageLayout) -> None:
+        frames = {frame.name: frame for frame in old.frames}
+        kept = [(frames[frame.name], frame) for frame in new.frames if frame.name in frames]
+        self._changed = [
+            b.words for a, b in kept if _schedules(old, a.name) != _schedules(new, b.name)
+        ]
+        whole = {b.name for _, b in kept if b.words not in self._changed}
+        before = {pd.name: pd for pd in old.tx}
+        pds = [(before[pd.name], pd) for pd in new.tx if pd.name in before]
+        self._parted = [
+            (was, pd.words)
+            for was, pd in pds
+            if was.by_schedule and not (was.frame == pd.frame and pd.frame in whole)
+        ]
+        self._runs = _joined(
+            [_Run(was.words, frame.words, FrameWord.SIZE) for was, frame in kept]
+            + [_Run(was.words, pd.words, TxWord.SIZE) for was, pd in pds]
+        )
+
+    def carry(self, old: memoryview, new: memoryview) -> None:
+        """Copy them."""
+        _copy(self._runs, old, new)
+        for first in self._changed:
+            new[first + FrameWord.PARTIAL] += new[first + FrameWord.WHOLE]
+            new[first + FrameWord.WHOLE] = 0
+        for was, first in self._parted:
+            count = old[was.frame_words + FrameWord.WHOLE]
+            if count:
+                reason = REASON_INDEX[Reason.CYCLE if was.cyclic else Reason.DIVIDER]
+                new[first + TxWord.REASON + reason] += count
+                new[first + TxWord.LAST_REASON] = reason
+                new[first + TxWord.SENT_AT_NS] = old[was.frame_words + FrameWord.SENT_AT_NS]
+
+
+class _Received:
+    """The words of RxPDs, and the accounts that they share."""
+
+    def __init__(self, old: Image, new: Image) -> None:
+        self._old, self._new = old.words, new.words
+        self._old_column, self._new_column = _column(old.layout), _column(new.layout)
+        self._shared: list[int] = old.words[self._old_column].tolist()
+        before = {
+            place.name: (place, account or place.words)
+            for place, account in zip(old.layout.rx, self._shared, strict=True)
+        }
+        self._heirs = [
+            (index, *before[place.name], place)
+            for index, place in enumerate(new.layout.rx)
+            if place.name in before
+        ]
+        self._runs = _joined(
+            _Run(was.words, place.words, RxWord.SIZE) for _, was, _, place in self._heirs
+        )
+        self._owners = array("q", [0] * len(new.layout.rx))
+        """By RxPD of the new image: where its account is, as in RxWord.ACCOUNT."""
+        first_of: dict[object, int] = {}
+        for index, was, account, place in self._heirs:
+            judged = account, _hears_another(was, place), _judged(place)
+            self._owners[index] = first_of.setdefault(judged, place.words)
+        self._plan_accounts()
+
+    @property
+    def is_current(self) -> bool:
+        return bool(self._old[self._old_column].tolist() == self._shared)
+
+    def settle(self) -> None:
+        self._owners = array("q", self._new[self._new_column].tolist())
+        self._plan_accounts()
+
+    def carry(self, old: memoryview, new: memoryview) -> None:
+        """Copy them."""
+        _copy(self._runs, old, new)
+        _copy(self._accounts, old, new)
+        new[self._new_column] = self._owners
+        for first in self._strangers:
+            new[first + RxWord.LAST_CYCLE] = -1
+            for word in (RxWord.BEHIND, RxWord.HOLES, RxWord.SENDER):
+                new[first + word] = 0
+
+    def _plan_accounts(self) -> None:
+        sources: dict[int, int] = {}
+        self._strangers: set[int] = set()
+        for index, was, account, place in self._heirs:
+            owner = self._owners[index]
+            sources[owner] = account
+            if _hears_another(was, place):
+                self._strangers.add(owner)
+        size = RxWord.SIZE - ACCOUNT_START
+        self._accounts = [
+            _Run(account + ACCOUNT_START, owner + ACCOUNT_START, size)
+            for owner, account in sources.items()
+        ]
+
+
+def _schedules(layout: ImageLayout, frame: str) -> set[tuple[str, bool, bool]]:
+    """Return what the count of a whole frame stands for."""
+    return {(pd.name, pd.by_schedule, pd.cyclic) for pd in layout.tx if pd.frame == frame}
+
+
+def _hears_another(was: RxPlace, place: RxPlace) -> bool:
+    return (was.publisher, was.port) != (place.publisher, place.port)
+
+
+def _judged(place: RxPlace) -> tuple[object, ...]:
+    """Return what must be the same for all subscriptions of an account."""
+    return (
+        place.port,
+        place.publisher,
+        place.step,
+        place.sender_cycle_us,
+        place.timeout_ms,
+        place.poll_request,
+    )
+
+
+def _column(layout: ImageLayout) -> slice:
+    """Return where RxWord.ACCOUNT of all RxPDs lies: their blocks lie side by side."""
+    if not layout.rx:
+        return slice(0, 0)
+    first = layout.rx[0].words + RxWord.ACCOUNT
+    return slice(first, first + len(layout.rx) * RxWord.SIZE, RxWord.SIZE)
+
+
+def _plan_values(old: Image, new: Image) -> tuple[CopyPlan, CopyPlan]:
+    """Return what is copied of what the engine writes, and of what others do."""
+    engine: list[Move] = []
+    others: list[Move] = []
+    for name, place in new.places.items():
+        was = old.places.get(name)
+        if was is None or datatypes.parse(was.type) != datatypes.parse(place.type):
+            continue
+        bits = datatypes.parse(place.type).bit_length
+        moves = engine if was.writer is Writer.ENGINE else others
+        moves.append(Move(was.bit_offset, place.bit_offset, bits))
+    before = {place.name: place for place in old.layout.rx}
+    for pd in new.layout.rx:
+        if pd.name in before:  # its header holds the quality
+            move = Move(8 * before[pd.name].offset, 8 * pd.offset, 8 * PdHeader.SIZE)
+            engine.append(move)
+    return CopyPlan(engine), CopyPlan(others)
+
+
+def _joined(runs: Iterable[_Run]) -> list[_Run]:
+    """Join what lies side by side on both sides."""
+    joined: list[_Run] = []
+    for run in runs:
+        if joined:
+            last = joined[-1]
+            if (last.source + last.size, last.target + last.size) == run[:2]:
+                joined[-1] = last._replace(size=last.size + run.size)
+                continue
+        joined.append(run)
+    return joined
+
+
+def _copy(runs: Iterable[_Run], old: memoryview, new: memoryview) -> None:
+    for source, target, size in runs:
+        new[target : target + size] = old[source : source + size]

@@ -1,0 +1,210 @@
+"""What the image of a changed station keeps: counters, accounts and values."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eap.pd.image import Image
+from eap.pd.layout import RxPlace, TxPlace
+from eap.pd.report import account_word, station_status
+from eap.pd.spec import (
+    OnChangeSpec,
+    RxPdSpec,
+    StationSpec,
+    TriggerSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
+from eap.pd.station import Station
+from eap.pd.succession import ImageSuccession
+from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
+from tests.support.cyclic import MS, PEER, SECOND, give, image_of, octets, received, station
+
+THIRD = "5.99.99.99.1.1"
+VALUES: dict[str, list[Any]] = {
+    "BOOL": [False, True],
+    "BIT3": [1, 5, 7],
+    "UINT": [1, 700, 65535],
+    "LREAL": [0.5, -1e300],
+    "STRING(3)": ["", "xyz"],
+    "INT[2]": [(1, -2), (-300, 400)],
+}
+TYPES = st.sampled_from(list(VALUES))
+TRIGGERS = st.sampled_from(
+    [
+        TriggerSpec(),
+        TriggerSpec(cycle_us=2000),
+        TriggerSpec(divider=3, modulo=1),
+        TriggerSpec(on_change=OnChangeSpec(5)),
+        TriggerSpec(event=True),
+    ]
+)
+
+
+@st.composite
+def specs(draw: st.DrawFn) -> StationSpec:
+    """A station of some frames, PDs and subscriptions, all from few names."""
+    variables: list[VariableSpec] = []
+
+    def pdo(owner: str, writer: Writer) -> tuple[str, ...]:
+        names = draw(st.lists(st.sampled_from("abc"), min_size=1, unique=True))
+        found = tuple(f"{owner}.{name}" for name in names)
+        variables.extend(VariableSpec(name, draw(TYPES), writer) for name in found)
+        return found
+
+    rest = draw(st.permutations(["p", "q", "r", "s"]))
+    frames = []
+    for frame in draw(st.lists(st.sampled_from(["f", "g"]), unique=True)):
+        own, rest = rest[:2], rest[2:]
+        pds = tuple(
+            TxPdSpec(name, 1 + ord(name), pdo(name, Writer.APPLICATION), 0, draw(TRIGGERS))
+            for name in own[: draw(st.integers(1, 2))]
+        )
+        frames.append(TxFrameSpec(frame, "eap0", "10.0.0.1", pds))
+    subscriptions = tuple(
+        RxPdSpec(
+            name,
+            "eap0",
+            draw(st.integers(1, 2)),
+            pdo(name, Writer.ENGINE),
+            draw(st.sampled_from([PEER, THIRD, ""])),
+            timeout_ms=draw(st.sampled_from([0, 50])),
+            step=draw(st.sampled_from([0, 1])),
+            sender_cycle_us=1000,
+        )
+        for name in draw(st.permutations(["u", "v", "w", "x"]))[: draw(st.integers(0, 4))]
+    )
+    return station(variables=tuple(variables), frames=tuple(frames), subscriptions=subscriptions)
+
+
+def used(image: Image, seed: int) -> Image:
+    """Fill an image with numbers as a station that has run leaves them."""
+    rest = random.Random(seed)
+    words = image.words
+    for index in range(StationWord.SIZE):
+        words[index] = 2 * rest.randint(1, 1000)
+    words[StationWord.STATE] = 8
+    words[StationWord.RETIRED] = 0
+    for tx in image.layout.tx:
+        for word in range(TxWord.SIZE):
+            words[tx.words + word] = rest.randint(1, 1000)
+        words[tx.words + TxWord.LAST_REASON] = rest.randrange(5)
+    for frame in image.layout.frames:
+        own = [tx for tx in image.layout.tx if tx.frame == frame.name]
+        words[frame.words + FrameWord.WHOLE] = rest.randint(0, 9) if all_scheduled(own) else 0
+        words[frame.words + FrameWord.PARTIAL] = rest.randint(1, 1000)
+    for rx in image.layout.rx:
+        for word in range(RxWord.MISMATCH, RxWord.SIZE):
+            words[rx.words + word] = rest.randint(1, 1000)
+        words[rx.words + RxWord.STATE] = 1
+    for place in image.layout.variables:
+        if place.type in VALUES:
+            image.write(place.name, rest.choice(VALUES[place.type]))
+    return image
+
+
+def all_scheduled(own: list[TxPlace]) -> bool:
+    return all(tx.by_schedule for tx in own)
+
+
+def shared(image: Image) -> dict[str, int]:
+    return {rx.name: account_word(image, rx) for rx in image.layout.rx}
+
+
+@settings(max_examples=200, deadline=None)
+@given(specs(), specs(), st.integers(0, 1 << 30))
+def test_what_has_the_same_name_goes_on(before, after, seed):
+    old, new = image_of(before), image_of(after)
+    Station(before, old, lambda: None)  # gives subscriptions their accounts
+    used(old, seed)
+    fresh = image_of(after)
+    succession = ImageSuccession(old, new)
+    assert succession.is_current
+    succession.carry_words()
+    succession.carry_values(old.memory)
+    Station(after, new, lambda: None)
+    succession.settle()
+    succession.carry_words()
+    then, now = station_status(old, SECOND), station_status(new, SECOND)
+    for key in now.keys() - {"pd"}:
+        assert now[key] == then[key], key
+    check_values(old, new, fresh)
+    unused = station_status(fresh, SECOND)["pd"]
+    changed = {"port", "frame", "frame_state", "subscriber"}
+    check_pds(then["pd"]["tx"], now["pd"]["tx"], unused["tx"], changed)
+    changed = {"port", "lost", "quality", "cycle_index"}
+    check_pds(then["pd"]["rx"], now["pd"]["rx"], unused["rx"], changed)
+    check_accounts(old, new)
+
+
+def check_values(old: Image, new: Image, fresh: Image) -> None:
+    then, now, first = old.read_all(), new.read_all(), fresh.read_all()
+    for name, place in new.places.items():
+        stays = name in old.places and old.places[name].type == place.type
+        assert now[name] == (then if stays else first)[name]
+
+
+def check_pds(
+    then: list[dict[str, Any]],
+    now: list[dict[str, Any]],
+    unused: list[dict[str, Any]],
+    changed: set[str],
+) -> None:
+    before = {pd["name"]: pd for pd in then}
+    for pd, first in zip(now, unused, strict=True):
+        was = before.get(pd["name"], first)
+        for key in pd.keys() - changed:
+            assert pd[key] == was[key], (pd["name"], key)
+
+
+def check_accounts(old: Image, new: Image) -> None:
+    """They are shared by those who shared them and are judged alike, and by nobody else."""
+    then, now = shared(old), shared(new)
+    before = {place.name: place for place in old.layout.rx}
+    for place in new.layout.rx:
+        for other in new.layout.rx:
+            if {place.name, other.name} <= before.keys():
+                together = (
+                    then[place.name] == then[other.name]
+                    and judged(place) == judged(other)
+                    and stays(before[place.name], place) == stays(before[other.name], other)
+                )
+                assert (now[place.name] == now[other.name]) == together
+            elif place.name in before:
+                assert now[place.name] != now[other.name]
+        if place.name in before:
+            last = new.words[now[place.name] + RxWord.LAST_CYCLE]
+            known = old.words[then[place.name] + RxWord.LAST_CYCLE]
+            assert last == (known if stays(before[place.name], place) else -1)
+
+
+def stays(was: RxPlace, place: RxPlace) -> bool:
+    return was.publisher == place.publisher
+
+
+def judged(place: RxPlace) -> tuple[object, ...]:
+    return place.publisher, place.step, place.sender_cycle_us, place.timeout_ms
+
+
+def test_accounts_that_have_parted_are_noticed():
+    spec = station(
+        variables=received("a:UINT", "b:UINT"),
+        subscriptions=(
+            RxPdSpec("a", "eap0", 1, ("a",), PEER),
+            RxPdSpec("b", "eap0", 2, ("b",), PEER),
+        ),
+    )
+    old, new = image_of(spec), image_of(spec)
+    made = Station(spec, old, lambda: None)
+    succession = ImageSuccession(old, new)
+    made.start(0)
+    give(made.takers["eap0"], octets([(1, b"\1\0"), (2, b"\2\0")], cycle=1), MS)
+    assert succession.is_current
+    give(made.takers["eap0"], octets([(1, b"\3\0")], cycle=2), 2 * MS)
+    assert not succession.is_current
