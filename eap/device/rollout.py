@@ -1,9 +1,11 @@
 """In which order stations change over, so that nobody ever receives what it does not expect.
 
 Rule 1: who receives a PD whose layout is about to change takes the old and the new one side by
-side.  A station that does not itself change what it sends has all else that is new at once.
+side.  If nobody depends on the rest of what is new for such a station, it has that at once, too.
 Rule 2: then the senders change over, those first that receive nothing old any more.
 Rule 3: at the end nobody takes an old layout any longer.
+Rule 4: where that leaves a choice, a new PD is taken before it is sent, and one that ends is taken
+until it is not sent any more.
 
 No station is ever asked to run anything but its old or its new specification, either of them with
 alternates; so three steps are the most that one needs.
@@ -12,6 +14,7 @@ alternates; so three steps are the most that one needs.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -67,15 +70,15 @@ class _Wire:
         """Return what *station* sends."""
         return self._sent.get(station, {})
 
-    def heard(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, PdLayout]]:
-        """Yield every other station that sends what *pd* of *station* is for, and the layout."""
+    def heard(self, station: str, pd: RxPdSpec) -> Iterator[tuple[str, PdKey, PdLayout]]:
+        """Yield what *pd* of *station* is for, and which other station sends it."""
         for sender in self._senders.get(pd.pd_id, {}):
             if sender == station:
                 continue
             sent = self._sent[sender]
             keys = [key for key in sent if key.pd_id == pd.pd_id]
             for key in [PdKey(pd.publisher, pd.pd_id)] if pd.publisher else keys:
-                yield from ((sender, layout) for layout in sent.get(key, ()))
+                yield from ((sender, key, layout) for layout in sent.get(key, ()))
 
 
 class _Rollout:
@@ -96,7 +99,7 @@ class _Rollout:
             prepared = self._tolerant(name, self._current[name], self._later)
             if prepared == self._current[name]:
                 waiting.append(name)
-            elif name in senders:
+            elif name in senders or self._ending(name):
                 self._step(name, prepared, "takes old and new layouts; sends as before")
                 waiting.append(name)
             else:
@@ -111,9 +114,14 @@ class _Rollout:
         """Change all of *waiting* over: who needs no alternates first, else a sender."""
         left = dict.fromkeys(waiting)
         old_senders = {name: self._senders_of_old(name) for name in waiting}
+        best_after = {name: old_senders[name] | self._ending(name) for name in waiting}
+        for name in waiting:
+            for sender in self._beginning(name) & best_after.keys():
+                best_after[sender].add(name)
         while left:
+            best = (name for name in left if not best_after[name] & left.keys())
             free = (name for name in left if not old_senders[name] & left.keys())
-            name = next(free, None) or next((s for s in left if s in senders), next(iter(left)))
+            name = next(chain(best, free, (name for name in left if name in senders), left))
             del left[name]
             self._change(name)
 
@@ -139,9 +147,17 @@ class _Rollout:
         return {
             sender
             for pd in spec.subscriptions
-            for sender, layout in self._now.heard(name, pd)
+            for sender, _, layout in self._now.heard(name, pd)
             if not _takes(_forms(pd, types), layout)
         }
+
+    def _ending(self, name: str) -> set[str]:
+        """Return who sends PDs to *name* that it will not send any more."""
+        return _only_in(self._now, self._later, self._current[name])
+
+    def _beginning(self, name: str) -> set[str]:
+        """Return who will send PDs to *name* that it does not send yet."""
+        return _only_in(self._later, self._now, self._new[name])
 
     def _tolerant(self, name: str, spec: StationSpec, wire: _Wire) -> StationSpec:
         """Return *spec* with alternates for what *wire* brings *name* beside what it takes."""
@@ -152,7 +168,7 @@ class _Rollout:
     def _with_alternates(
         self, name: str, pd: RxPdSpec, types: Mapping[str, str], wire: _Wire
     ) -> RxPdSpec:
-        for _, layout in wire.heard(name, pd):
+        for _, _, layout in wire.heard(name, pd):
             forms = _forms(pd, types)
             if not _takes(forms, layout):
                 ours = self._own_names(name, pd, forms)
@@ -169,11 +185,21 @@ class _Rollout:
         What nobody sends yet has no names, as there is nothing to keep up to date.
         """
         for wire in (self._now, self._later):
-            for _, layout in wire.heard(name, pd):
+            for _, _, layout in wire.heard(name, pd):
                 for form in forms:
                     if _takes([form], layout):
                         return _names(form, layout)
         return None if any(self._now.heard(name, pd)) else {}
+
+
+def _only_in(wire: _Wire, other: _Wire, spec: StationSpec) -> set[str]:
+    """Return who sends PDs to *spec* on *wire* that are not on the *other*."""
+    return {
+        sender
+        for pd in spec.subscriptions
+        for sender, key, _ in wire.heard(spec.name, pd)
+        if key not in other.of(sender)
+    }
 
 
 def _forms(pd: RxPdSpec, types: Mapping[str, str]) -> list[PdLayout]:

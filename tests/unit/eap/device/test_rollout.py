@@ -208,6 +208,26 @@ def test_who_receives_it_no_longer_goes_first():
     assert way[0].spec == new["b"]
 
 
+def test_new_pds_are_taken_before_they_are_sent_and_old_ones_until_they_are_not():
+    heard = {"a": [("b", 2)], "b": []}
+    old = plant({("b", 2): 0}, heard)
+    new = plant({("b", 2): 0, ("b", 3): 0}, {"a": [("b", 2), ("b", 3)]})
+    assert [step.station for step in steps(old, new)] == ["a", "b"]
+    assert [step.station for step in steps(new, old)] == ["b", "a"]
+
+
+def test_who_takes_both_while_one_pd_changes_and_another_ends_goes_last():
+    heard = {"a": [("b", 2), ("b", 3)]}
+    old = plant({("b", 2): 0, ("b", 3): 0}, heard)
+    new = plant({("b", 2): 1}, {"a": [("b", 2)]})
+    way, _ = follow(old, new)
+    assert shown(way) == [
+        "a takes old and new layouts; sends as before",
+        "b is as it is to be",
+        "a is as it is to be",
+    ]
+
+
 def test_stations_that_are_in_one_plant_only_have_no_step():
     old = plant({("a", 1): 0}, {"b": [("a", 1)]})
     new = plant({("a", 1): 1, ("c", 3): 0}, {"b": [("a", 1)]})
