@@ -57,9 +57,17 @@ def obey(segment: FaultySegment, command: object, now_ns: int) -> None:
             name = msgspec.convert(command, _ReleaseCommand).release
             segment.release(name.slave, name.entry, now_ns)
         else:
+            _check_keys(command)
             _switch(segment, msgspec.convert(command, FaultCommand), now_ns)
     except msgspec.MsgspecError as exc:
         raise ValueError(str(exc)) from None
+
+
+def _check_keys(command: dict[str, object]) -> None:
+    known = (*FaultSpec.__struct_fields__, "end")
+    for key in command:
+        if key not in known:
+            raise ValueError(f"a fault has no key {key!r} (one of {', '.join(known)})")
 
 
 def _switch(segment: FaultySegment, command: FaultCommand, now_ns: int) -> None:

@@ -174,6 +174,8 @@ def _value(row: Row) -> str:
     if value is None or value == row["data"]:
         more = f" … ({len(octets)} octets)" if len(octets) > _SHOWN_OCTETS else ""
         return f"[{octets[:_SHOWN_OCTETS].hex(' ')}{more}]"
-    if isinstance(value, int) and not isinstance(value, bool):
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
         return f"{value} (0x{int.from_bytes(octets, 'little'):0{2 * len(octets)}X})"
     return str(value)

@@ -77,11 +77,11 @@ def read(path: Path, report: Report) -> Node | None:
 def _text(path: Path) -> str:
     try:
         if path.is_dir():
-            raise _UnreadableError(0, "is a directory", "a plant file (YAML)")
+            raise _UnreadableError(0, "is a directory", "a YAML file")
         if not path.exists():
-            raise _UnreadableError(0, "does not exist", "a plant file (YAML)")
+            raise _UnreadableError(0, "does not exist", "a YAML file")
         if not path.is_file():
-            raise _UnreadableError(0, "is not a regular file", "a plant file (YAML)")
+            raise _UnreadableError(0, "is not a regular file", "a YAML file")
         with path.open("rb") as file:
             octets = file.read(MAX_FILE + 1)
     except (OSError, ValueError) as exc:  # ValueError: a NUL in the path

@@ -84,7 +84,7 @@ def test_eeprom():
     ("row", "text"),
     [
         ({"type": "UINT", "value": 5, "data": "0500"}, "UINT 5 (0x0005)"),
-        ({"type": "BOOL", "value": True, "data": "01"}, "BOOL True"),
+        ({"type": "BOOL", "value": True, "data": "01"}, "BOOL true"),
         ({"type": "REAL", "value": 0.5, "data": "0000003f"}, "REAL 0.5"),
         ({"type": "STRING(2)", "value": "ab", "data": "6162"}, "STRING(2) ab"),
         ({"type": None, "value": 1, "data": "01"}, "1 (0x01)"),
