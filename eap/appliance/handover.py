@@ -139,6 +139,8 @@ class Handover(Handed, frozen=True):
     options: EngineOptions = EngineOptions()
     states: dict[str, DeviceState] = msgspec.field(default_factory=dict)
     """To which each station is brought, Op if it is not here."""
+    first_state: DeviceState = DeviceState.OP
+    """Of stations that were never asked for another one."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

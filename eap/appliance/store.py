@@ -115,6 +115,35 @@ class Store:
                 f" set {VARIABLE} to a directory that you may write"
             ) from None
 
+    def set_aside(self, station: str) -> bool:
+        """Let *station* start as if it had never been configured; tell whether it had been.
+
+        Raises:
+            EnvironmentalError: the file cannot be renamed.
+        """
+        return self._rename(self.file(station), self._aside(station))
+
+    def bring_back(self, station: str) -> bool:
+        """Undo ``set_aside``, unless *station* was configured again; tell whether that was done.
+
+        Raises:
+            EnvironmentalError: the file cannot be renamed.
+        """
+        path = self.file(station)
+        return not path.exists() and self._rename(self._aside(station), path)
+
+    def _aside(self, station: str) -> Path:
+        return self.file(station).with_suffix(".before")
+
+    def _rename(self, path: Path, target: Path) -> bool:
+        try:
+            path.replace(target)
+        except FileNotFoundError:
+            return False
+        except OSError as exc:
+            raise EnvironmentalError(f"{path} cannot be renamed: {exc.strerror}") from None
+        return True
+
 
 def effective(
     plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP

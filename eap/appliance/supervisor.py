@@ -27,9 +27,11 @@ from eap.appliance.plantfile import load_plant, require_own_buses
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
 from eap.appliance.sockets import SharedSockets
+from eap.appliance.store import Store
 from eap.appliance.what_runs import what_runs_now
 from eap.config.load import Plant
 from eap.errors import ConfigError
+from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
 READY_TIMEOUT_NS = 20_000_000_000
@@ -61,24 +63,47 @@ def run(
     require_own_buses(chosen)
     subset = [station.name for station in chosen] if stations else []
     info = make_info(plant.name, str(plant_file.resolve()), chosen)
-    return _run(info, chosen, folder_name(plant.name, subset), options)
+    with _claim(folder_name(plant.name, subset)) as folder:
+        return _run(info, chosen, folder, options)
 
 
-def run_blank(plant: Plant, *, options: EngineOptions) -> int:
-    """Run *plant*, which no file describes, until told to stop; returns and raises as ``run``."""
+def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> int:
+    """Run *plant*, which no file describes, until told to stop.
+
+    Its stations start in PreOp, as *plant* has them or, with *resume*, as they were configured
+    last, in the state that was asked for then.  Returns and raises as ``run`` does.
+    """
     info = make_info(plant.name, "", plant.stations)
-    return _run(info, plant.stations, folder_name(plant.name), options)
+    with _claim(folder_name(plant.name)) as folder:
+        store = Store(plant.name)
+        for station in plant.stations:
+            if resume:
+                store.bring_back(station.name)
+            elif store.set_aside(station.name):
+                logger.warning(
+                    "station %s starts blank; --resume goes on with what it was configured to be",
+                    station.name,
+                )
+        return _run(info, plant.stations, folder, options, DeviceState.PREOP)
+
+
+def _claim(folder: str) -> ApplianceFolder:
+    logging.basicConfig(format="supervisor: %(message)s", level=logging.INFO)
+    return ApplianceFolder.claim(folder)
 
 
 def _run(
-    info: ApplianceInfo, stations: tuple[StationSpec, ...], folder: str, options: EngineOptions
+    info: ApplianceInfo,
+    stations: tuple[StationSpec, ...],
+    folder: ApplianceFolder,
+    options: EngineOptions,
+    first_state: DeviceState = DeviceState.OP,
 ) -> int:
-    logging.basicConfig(format="supervisor: %(message)s", level=logging.INFO)
-    with (
-        ApplianceFolder.claim(folder) as claimed,
-        SharedSockets(stations, claimed.control_socket) as sockets,
-    ):
-        return Supervisor(info, stations, claimed, sockets, options=options).run()
+    with SharedSockets(stations, folder.control_socket) as sockets:
+        supervisor = Supervisor(
+            info, stations, folder, sockets, options=options, first_state=first_state
+        )
+        return supervisor.run()
 
 
 def _load(plant_file: Path) -> Plant:
@@ -109,6 +134,7 @@ class Supervisor:
         sockets: SharedSockets,
         *,
         options: EngineOptions,
+        first_state: DeviceState = DeviceState.OP,
     ) -> None:
         self._info = info
         self._folder = folder
@@ -127,6 +153,7 @@ class Supervisor:
             sockets=sockets.descriptions,
             buses=sockets.buses,
             options=options,
+            first_state=first_state,
         )
         self._given = _given_to_segments(self._segments, common)
         self._given[self._engine] = (

@@ -20,9 +20,8 @@ def what_runs_now(handover: Handover) -> Handover:
     """
     specs = []
     states = {}
-    for given, found in zip(
-        handover.stations, effective(handover.plant, handover.stations), strict=True
-    ):
+    stored = effective(handover.plant, handover.stations, handover.first_state)
+    for given, found in zip(handover.stations, stored, strict=True):
         reasons = needs_new_start(given, found.spec)
         for reason in reasons:
             logger.warning("station %s: the plant file runs: %s", given.name, reason)

@@ -38,7 +38,12 @@ def _blank_options(command: CommandT) -> CommandT:
         metavar="MS",
         help="Device cycle of the blank station in milliseconds; 10 unless given.",
     )
-    return blank(interface(net_id(cycle(command))))
+    resume = click.option(
+        "--resume",
+        is_flag=True,
+        help="Let the blank station go on with what it was configured to be when it last ran.",
+    )
+    return blank(interface(net_id(cycle(resume(command)))))
 
 
 @click.command(short_help="Run a plant, or some of its stations.")
@@ -79,6 +84,7 @@ def run(
     interface: str | None,
     net_id: str | None,
     cycle_us: int | None,
+    resume: bool,
 ) -> None:
     """Run the stations of the plant file PLANT until Ctrl-C or SIGTERM.
 
@@ -97,7 +103,7 @@ def run(
     if plant is not None:
         ctx.exit(supervisor.run(plant, stations, options=options))
     station = _blank_plant(blank or "", interface or "", net_id or "", cycle_us or DEFAULT_CYCLE_US)
-    ctx.exit(supervisor.run_blank(station, options=options))
+    ctx.exit(supervisor.run_blank(station, options=options, resume=resume))
 
 
 def _check_form(ctx: click.Context) -> None:
@@ -105,8 +111,9 @@ def _check_form(ctx: click.Context) -> None:
     given = {name for name in _OF_A_BLANK if ctx.params[name] is not None}
     has_plant = ctx.params["plant"] is not None
     if ctx.params["blank"] is None:
-        if given:
-            raise click.UsageError("--interface, --net-id and --cycle go with --blank NAME", ctx)
+        if given or ctx.params["resume"]:
+            names = "--interface, --net-id, --cycle and --resume"
+            raise click.UsageError(f"{names} go with --blank NAME", ctx)
         if not has_plant:
             raise click.UsageError("say what to run: PLANT, or --blank NAME", ctx)
     elif has_plant or ctx.params["stations"]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Self
 from unittest import mock
 
-from eap.appliance.client import connect
+from eap.appliance.client import connect_those
 from eap.appliance.runtime import VARIABLE
 
 EAPCTL = [sys.executable, "-m", "eap"]
@@ -28,12 +28,13 @@ class Appliance:
     """A running appliance with a runtime directory of its own, wherever its network is."""
 
     def __init__(
-        self, plant: Path, *arguments: str, runtime: Path, prefix: Sequence[str] = ()
+        self, plant: Path | None, *arguments: str, runtime: Path, prefix: Sequence[str] = ()
     ) -> None:
         self.runtime = runtime
         self._prefix = prefix
+        words = [str(plant), *arguments] if plant else arguments
         self.process = subprocess.Popen(
-            [*prefix, *EAPCTL, "run", str(plant), *arguments],
+            [*prefix, *EAPCTL, "run", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env=self._environment(),
@@ -69,16 +70,16 @@ class Appliance:
 
     def command(self, *words: str) -> str:
         """Return what ``eapctl`` prints about this appliance."""
-        done = subprocess.run(
-            [*EAPCTL, *words], env=self._environment(), capture_output=True, text=True, check=False
-        )
+        done = run_eapctl(self.runtime, *words)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     def request(self, method: str, **params: Any) -> Any:
         """Ask over the control protocol: much cheaper than a command, for what is asked often."""
+        pid = self.process.pid
         with mock.patch.dict(os.environ, {VARIABLE: str(self.runtime)}):
-            (client,) = connect()
+            clients = connect_those(lambda info: bool(self._prefix) or info.supervisor == pid)
+        (client,) = clients
         with client:
             return client.request(method, **params)
 
@@ -118,6 +119,14 @@ class Appliance:
         return os.environ | {VARIABLE: str(self.runtime)}
 
 
+def run_eapctl(runtime: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command about what runs in *runtime*."""
+    environment = os.environ | {VARIABLE: str(runtime)}
+    return subprocess.run(
+        [*EAPCTL, *words], env=environment, capture_output=True, text=True, check=False
+    )
+
+
 class Plants:
     """A short-lived folder for plant files and runtime directories; ends what runs from it."""
 
@@ -132,12 +141,18 @@ class Plants:
         path.write_text(text)
         return path
 
-    def start(self, plant: Path, *arguments: str, prefix: Sequence[str] = ()) -> Appliance:
-        """Start an appliance and return at once."""
+    def start(
+        self,
+        plant: Path | None,
+        *arguments: str,
+        prefix: Sequence[str] = (),
+        runtime: Path | None = None,
+    ) -> Appliance:
+        """Start an appliance and return at once; it is alone unless *runtime* is shared."""
         self._count += 1
-        runtime = self.folder / f"run{self._count}"
+        folder = runtime or self.folder / f"run{self._count}"
         return self._stack.enter_context(
-            Appliance(plant, *arguments, runtime=runtime, prefix=prefix)
+            Appliance(plant, *arguments, runtime=folder, prefix=prefix)
         )
 
     def run(self, plant: Path, *arguments: str, prefix: Sequence[str] = ()) -> Appliance:

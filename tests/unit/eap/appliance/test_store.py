@@ -182,3 +182,28 @@ def test_a_kill_at_any_moment_leaves_one_whole_file(stations, caplog):
         assert found is not None, caplog.text
         assert found.spec == stored.spec
     assert re.fullmatch(r"([01])\1{63}", found.base)
+
+
+def test_a_configuration_is_set_aside_and_brought_back(stations):
+    left, _ = stations
+    store = Store("demo")
+    assert not store.set_aside("left")
+    assert not store.bring_back("left")
+    store.save("left", configured(left))
+    assert store.set_aside("left")
+    assert store.load("left") is None
+    assert store.bring_back("left")
+    assert store.load("left") == configured(left)
+    assert store.set_aside("left")
+    newer = configured(left, state=DeviceState.PREOP)
+    store.save("left", newer)
+    assert not store.bring_back("left")
+    assert store.load("left") == newer
+
+
+def test_folder_in_the_way_of_setting_aside(stations):
+    store = Store("demo")
+    store.save("left", configured(stations[0]))
+    (store.path / "left.before").mkdir()
+    with pytest.raises(EnvironmentalError, match=r"left\.json cannot be renamed"):
+        store.set_aside("left")

@@ -25,6 +25,12 @@ def test_without_any_configuration_the_plant_file_runs():
     assert found == replace(handover(), states={"left": DeviceState.OP, "right": DeviceState.OP})
 
 
+def test_stations_that_start_in_preop():
+    store(left(), DeviceState.SAFEOP)
+    found = what_runs_now(replace(handover(), first_state=DeviceState.PREOP))
+    assert found.states == {"left": DeviceState.SAFEOP, "right": DeviceState.PREOP}
+
+
 def test_what_was_configured_last_runs_in_the_state_asked_for():
     changed = replace(left(), frames=())
     store(changed, DeviceState.SAFEOP)

@@ -69,6 +69,7 @@ BLANK = ["--blank", "mixer", "--interface", "udp://127.9.7.1", "--net-id", "127.
         ([*BLANK, "--station", "mixer"], "takes the place of PLANT and --station"),
         (BLANK[:4], "needs --interface URI and --net-id N"),
         (["plant.yaml", "--cycle", "5"], "go with --blank NAME"),
+        (["plant.yaml", "--resume"], "go with --blank NAME"),
         ([*BLANK, "--cycle", "0"], "0.1 to 60000 milliseconds"),
     ],
 )
