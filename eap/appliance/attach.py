@@ -20,8 +20,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from eap.appliance.runtime import find_running, runtime_root
+from eap.appliance.station_image import StationImage
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
-from eap.net.image_file import open_image
 from eap.pd.image import Image
 from eap.pd.layout import VAR_CTRL
 from eap.pd.report import station_status
@@ -38,8 +38,8 @@ class AttachedStation:
     """The variables of one running station; made by :func:`attach`."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file = open_image(path)
+        self._station = StationImage(path)
+        self._file = self._station.file
         self._opened_ns = monotonic_ns()
         self._writes = False
 
@@ -56,7 +56,7 @@ class AttachedStation:
 
     def close(self) -> None:
         """Detach, and let others write."""
-        self._file.close()
+        self._station.close()
 
     @property
     def name(self) -> str:
@@ -102,11 +102,10 @@ class AttachedStation:
                     f"not by applications",
                     holder=place.writer,
                 )
-        self._become_writer()
-        checked = {name: image.encode(name, value) for name, value in values.items()}
-        with image.writing(Writer.APPLICATION):
-            for name, octets in checked.items():
-                image.store(name, octets)
+        if not self._writes:
+            self._station.acquire_writer(Writer.APPLICATION)
+            self._writes = True
+        self._station.write(Writer.APPLICATION, values)
 
     def fire(self, pd: str) -> None:
         """Send the TxPD *pd* in the next cycle.
@@ -135,8 +134,8 @@ class AttachedStation:
         """
         image = self._current()
         before = image.words[StationWord.CYCLE]
-        if not self._file.wait_cycle(before, self._patience_s()):
-            image = self._current()  # a new layout, or the engine is gone
+        while not self._file.wait_cycle(before, self._patience_s()):
+            image = self._current()  # a new layout, which counts on, or the engine is gone
         return int(image.words[StationWord.CYCLE])
 
     def status(self) -> dict[str, Any]:
@@ -145,11 +144,15 @@ class AttachedStation:
 
     def _current(self) -> Image:
         """Return the image, of the newest layout and with an engine behind it."""
-        if self._file.retired:
-            self._move()
-        image = self._file.image
+        file = self._station.file
+        if file is not self._file:
+            self._file = file
+            self._opened_ns = monotonic_ns()
+        image = file.image
         ran_at_ns = image.words[StationWord.CYCLE_AT_NS]
         silent_s = (monotonic_ns() - (ran_at_ns or self._opened_ns)) / 1e9
+        if silent_s > self._patience_s() and self._station.catch_up():
+            return self._current()
         if silent_s > self._patience_s():
             missed = "a cycle" if ran_at_ns else "its first cycle"
             raise EngineGoneError(
@@ -157,18 +160,6 @@ class AttachedStation:
                 f"start the plant again"
             )
         return image
-
-    def _move(self) -> None:
-        old, self._file = self._file, open_image(self._path)
-        self._opened_ns = monotonic_ns()
-        old.close()
-        if self._writes:
-            self._file.acquire_writer(Writer.APPLICATION)
-
-    def _become_writer(self) -> None:
-        if not self._writes:
-            self._file.acquire_writer(Writer.APPLICATION)
-            self._writes = True
 
     def _patience_s(self) -> float:
         return max(_GONE_AFTER_S, _GONE_AFTER_CYCLES * self.cycle_s)

@@ -76,6 +76,13 @@ class StationImage:
             if not file.retired:
                 return
 
+    def catch_up(self) -> bool:
+        """Look for a newer image where none was announced; return whether there is one."""
+        if not self._file.has_lost_its_name:
+            return False
+        self._move()
+        return True
+
     def _move(self) -> None:
         fresh = open_image(self._path)
         try:

@@ -100,7 +100,10 @@ class ImageFile:
 
     def retire(self) -> None:
         """Send programs to the file that has taken the name of this one."""
-        self.image.words[StationWord.RETIRED] = 1
+        words = self.image.words
+        words[StationWord.RETIRED] = 1
+        # Who has looked before, and is about to sleep on the futex, does not.
+        words[StationWord.FUTEX] = words[StationWord.FUTEX] + 1 & 0xFFFFFFFF
 
     def release(self) -> None:
         """Let programs use a file that was made by :func:`prepare_image`."""
@@ -110,6 +113,14 @@ class ImageFile:
         """Remove a file that has taken nobody's place, and close it."""
         self.path.unlink(missing_ok=True)
         self.close()
+
+    @property
+    def has_lost_its_name(self) -> bool:
+        """Whether another file has it, also if an engine died before it retired this one."""
+        try:
+            return not os.path.samestat(os.fstat(self._fd), self.path.stat())
+        except OSError:
+            return True
 
     def acquire_writer(self, writer: Writer) -> None:
         """Become the one who writes the region of *writer*, until release or :meth:`close`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from collections.abc import Iterator
@@ -14,8 +15,9 @@ import pytest
 import eap
 from eap.appliance import attach as attach_module
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
+from eap.appliance.successor import EngineStation, Successor
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
-from eap.net.image_file import ImageFile, create_image
+from eap.net.image_file import ImageFile, create_image, prepare_image
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
@@ -58,8 +60,10 @@ class Runner:
     """Runs an engine on an image until told to stop."""
 
     def __init__(self, path: Path, station: StationSpec) -> None:
-        self.file: ImageFile = create_image(path, plan_layout(station))
-        self._engine = Engine([Station(station, self.file.image, self.file.wake_waiters)])
+        file = create_image(path, plan_layout(station))
+        self._place = EngineStation(Station(station, file.image, file.wake_waiters), file)
+        self._engine = Engine([self._place.station])
+        self.successors: queue.SimpleQueue[Successor] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -70,6 +74,17 @@ class Runner:
         self._engine.start(time.monotonic_ns())
         while not self._stop.wait(0.0005):
             self._engine.handle_timeout(time.monotonic_ns())
+            if not self.successors.empty():
+                self.successors.get().take_over(self._engine)
+
+    @property
+    def file(self) -> ImageFile:
+        """The image in use."""
+        return self._place.file
+
+    def configure(self, station: StationSpec) -> None:
+        """Run another specification soon."""
+        self.successors.put(Successor(self._place, station))
 
     def stop(self) -> None:
         self._stop.set()
@@ -212,3 +227,35 @@ def test_moves_to_a_new_layout_and_stays_the_writer(path: Path) -> None:
             assert station["extra"] == -5
             station["extra"] = 12
             assert second.file.image.read("extra") == 12
+
+
+def test_no_write_and_no_cycle_is_lost_while_the_station_is_changed(path: Path) -> None:
+    layouts = [spec(), spec(VariableSpec("extra", "INT", default=-5))]
+    with running(path, layouts[0]) as runner, eap.attach("mixer") as station:
+        cycle = station.wait_cycle()
+        for number in range(1, 61):
+            if runner.successors.empty() and not number % 2:
+                runner.configure(layouts[number // 2 % 2])
+            station["setpoint"] = number
+            assert station["setpoint"] == number
+            following = station.wait_cycle()
+            assert following > cycle
+            cycle = following
+            assert station["setpoint"] == number
+        assert runner.file.generation > 20
+        assert runner.file.image.read("setpoint") == 60
+
+
+def test_an_image_whose_engine_died_while_it_was_replaced_is_found(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attach_module, "_GONE_AFTER_S", 0.1)
+    first = Runner(path, spec())
+    with eap.attach("mixer") as station:
+        first.stop()
+        fresh = prepare_image(path, plan_layout(spec(VariableSpec("extra", "INT"))), 2)
+        fresh.take_name(path)  # and then the engine was killed
+        fresh.close()
+        with running(path, spec(VariableSpec("extra", "INT"))):
+            time.sleep(0.2)
+            assert station["extra"] == 0
