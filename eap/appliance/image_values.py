@@ -15,6 +15,7 @@ from eap.codec.values import DataType
 from eap.errors import ImageError
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000keys import Live
+from eap.pd.frame_status import frame_state
 from eap.pd.image import Image
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, RxPlace, TxPlace
 from eap.pd.report import account_word, quality, tx_status, var_state
@@ -157,7 +158,7 @@ _OF_STATION: dict[str, int] = {
     if (key := f"station_discarded_{reason}") in _KINDS
 }
 _OF_FRAME: dict[str, Callable[[Image, FramePlace], int]] = {
-    Live.FRAME_STATE: _frame_word(FrameWord.STATE),
+    Live.FRAME_STATE: lambda image, place: frame_state(image, place.words),
     Live.FRAME_CTRL: _control(FRAME_CTRL),
     Live.FRAME_WHOLE: _frame_word(FrameWord.WHOLE),
     Live.FRAME_PARTIAL: _frame_word(FrameWord.PARTIAL),

@@ -45,6 +45,7 @@ _MODES = {
     DestinationKind.MAC: AddressMode.MAC,
     DestinationKind.IP: AddressMode.IP,
     DestinationKind.TCP: AddressMode.TCP,
+    DestinationKind.NET_ID: AddressMode.NETID,
 }
 
 
@@ -237,9 +238,11 @@ class _Filling:
             Frame.DIVIDER: frame.divider,
             Frame.MODULO: frame.modulo,
             Frame.CHANGEABLE: frame.changeable,
+            Frame.MONITORING_INTERVAL: frame.monitor_interval_ms,
+            Frame.MONITOR_IP: IPv4Address(frame.monitor_ip or 0).packed,
         }
         self._dictionary.make(profile.TX_FRAME, index)
-        self._set(index, values | _address(frame.destination))
+        self._set(index, values | _address(frame))
         self._set_list(index, Frame.TXPD, [tx[pd.name] for pd in frame.pds])
 
     def _set_list(self, index: int, first: int, values: Iterable[Any]) -> None:
@@ -261,14 +264,17 @@ class _Filling:
             self._dictionary.put(index, subindex, octets.rstrip(b"\0") if entry.is_text else octets)
 
 
-def _address(text: str) -> dict[int, Any]:
+def _address(frame: TxFrameSpec) -> dict[int, Any]:
     """Return the entries of a TxFrame that say where it goes."""
-    if text == REQUESTER:
+    if frame.destination == REQUESTER:
         return {Frame.ADDRESS_MODE: AddressMode.REQUESTER}
-    destination = Destination.parse(text)
+    destination = Destination.parse(frame.destination)
     values: dict[int, Any] = {Frame.ADDRESS_MODE: _MODES[destination.kind]}
     if destination.kind is DestinationKind.MAC:
         values[Frame.DESTINATION_MAC] = bytes(MacAddr.parse(destination.host))
+    elif destination.kind is DestinationKind.NET_ID:
+        values[Frame.DESTINATION_NETID] = bytes(NetId.parse(destination.host))
+        values[Frame.DESTINATION_MAC] = MacAddr.parse(frame.mac) if frame.mac else bytes(6)
     else:
         values[Frame.DESTINATION_IP] = IPv4Address(destination.host).packed
         values[Frame.PORT_NUMBER] = destination.port

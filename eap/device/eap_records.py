@@ -47,7 +47,7 @@ from eap.pd.spec import (
 _MODES = {
     "udp": (AddressMode.IP, AddressMode.TCP, AddressMode.REQUESTER),
     "tcp": (AddressMode.TCP, AddressMode.REQUESTER),
-    "ethernet": (AddressMode.MAC, AddressMode.REQUESTER),
+    "ethernet": (AddressMode.MAC, AddressMode.NETID, AddressMode.REQUESTER),
     "loop": (AddressMode.MAC, AddressMode.REQUESTER),
 }
 """How a port of each kind of interface can address."""
@@ -171,6 +171,9 @@ class PortReader:
             divider=value(Frame.DIVIDER),
             modulo=value(Frame.MODULO),
             changeable=value(Frame.CHANGEABLE),
+            mac=_known_mac(value(Frame.DESTINATION_MAC)) if mode == AddressMode.NETID else "",
+            monitor_interval_ms=value(Frame.MONITORING_INTERVAL),
+            monitor_ip=_text_of_ip(value(Frame.MONITOR_IP)),
         )
         self.sent += [(at, pd, frame) for at, pd in zip(enabled, pds, strict=True)]
         return frame
@@ -183,9 +186,13 @@ class PortReader:
         if mode is AddressMode.REQUESTER:
             return REQUESTER
         if mode is AddressMode.MAC:
-            address = MacAddr(value(Frame.DESTINATION_MAC))
+            address: bytes = MacAddr(value(Frame.DESTINATION_MAC))
             subindex = Frame.DESTINATION_MAC
             destination = Destination(DestinationKind.MAC, str(address))
+        elif mode is AddressMode.NETID:
+            address = NetId(value(Frame.DESTINATION_NETID))
+            subindex = Frame.DESTINATION_NETID
+            destination = Destination(DestinationKind.NET_ID, str(address))
         else:
             address = value(Frame.DESTINATION_IP)
             subindex = Frame.DESTINATION_IP
@@ -277,3 +284,13 @@ class PortReader:
 def _default(kind: DataType, value: Value) -> Any:
     """Return a default as a specification has it."""
     return kind.to_plain(value)
+
+
+def _known_mac(octets: bytes) -> str:
+    """Return the address behind a NetID; empty if it is to be learned, as a group is nobody's."""
+    address = MacAddr(octets)
+    return str(address) if any(address) and not address.is_group else ""
+
+
+def _text_of_ip(octets: bytes) -> str:
+    return str(IPv4Address(octets)) if any(octets) else ""

@@ -40,7 +40,7 @@ PORTS = (
 BLANK = StationSpec("station", "127.0.9.1.1.1", CYCLE_US, PORTS)
 DESTINATIONS = {
     "udp": ("10.0.0.2", "10.0.0.2:4000", "239.1.2.3", "255.255.255.255", "tcp://10.0.0.3:5"),
-    "ethernet": ("01:01:05:04:00:00", "02:00:00:00:00:07", "ff:ff:ff:ff:ff:ff"),
+    "ethernet": ("01:01:05:04:00:00", "02:00:00:00:00:07", "ff:ff:ff:ff:ff:ff", "5.5.5.5.2.1"),
 }
 
 
@@ -151,15 +151,20 @@ def stations(draw: st.DrawFn) -> StationSpec:
             )
             used += 1
         scheme = InterfaceUri.parse(port.interface).scheme
+        target = REQUESTER if answers else draw(st.sampled_from(DESTINATIONS[scheme]))
+        is_net_id = target.count(".") == 5
         frames.append(
             TxFrameSpec(
                 name=f"frame{number}",
                 port=port.name,
-                destination=REQUESTER if answers else draw(st.sampled_from(DESTINATIONS[scheme])),
+                destination=target,
                 pds=tuple(pds),
                 divider=4 if gate else 0,
                 modulo=draw(st.integers(0, 3)) if gate else 0,
                 changeable=draw(st.booleans()),
+                mac=draw(st.sampled_from(("", "02:00:00:00:00:08"))) if is_net_id else "",
+                monitor_interval_ms=draw(st.sampled_from((0, 1000))),
+                monitor_ip=draw(st.sampled_from(("", "10.0.0.9"))),
             )
         )
     return StationSpec(

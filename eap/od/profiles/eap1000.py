@@ -94,7 +94,8 @@ TX_FRAME = ObjectRange(
         config(1, "Enabled", "BOOL", "A frame that is not is left alone altogether."),
         config(2, "Address mode", "USINT", "0 MAC, 1 NetID, 2 IP by UDP, 3 IP by TCP, 4 whoever "
                "asked for its PDs.", maximum=4, changeable=True),
-        config(3, "Destination MAC", "BLOCK(6)", "Address mode 0.",
+        config(3, "Destination MAC", "BLOCK(6)", "Address mode 0; in mode 1 that of the NetID, and "
+               "all zero or a group if it is to be learned.",
                default=bytes.fromhex("010105040000"), form=Form.MAC, changeable=True),
         config(4, "Destination NetID", "BLOCK(6)", "Address mode 1.", form=Form.NET_ID,
                changeable=True),
@@ -109,7 +110,8 @@ TX_FRAME = ObjectRange(
         config(10, "Divider", "UINT", "Leaves only in cycles whose number, divided by this, leaves "
                "the modulo; 0 off."),
         config(11, "Modulo", "UINT", "Less than the divider."),
-        config(12, "Monitor IP", "BLOCK(4)", "Whom to probe for on Ethernet.", form=Form.IP),
+        config(12, "Monitor IP", "BLOCK(4)", "Whom to probe for on Ethernet; all "
+               "zero nobody.", form=Form.IP),
         config(13, "Changeable", "BOOL", "Whether the destination may be written in SafeOp and "
                "Op."),
         live(14, "Frame control", "UINT", Live.FRAME_CTRL, "Bit 0 suppresses the frame."),

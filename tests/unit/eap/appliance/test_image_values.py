@@ -109,6 +109,14 @@ def test_pds_that_are_received(values, files):
     assert number(right, Live.RX_DISCARDED_VERSION, "left-state") == 2
 
 
+def test_frame_state_tells_that_the_subscriber_is_missing(values, files):
+    image = files["left"].image
+    first = image.layout.frames[0].words
+    image.words[first + FrameWord.STATE] = 1
+    image.words[first + FrameWord.PRESENCE] = 2
+    assert number(values["left"], Live.FRAME_STATE, "out") == 5
+
+
 def test_what_does_not_run_shows_nothing(values):
     for key in (Live.FRAME_STATE, Live.TX_SKIPPED, Live.RX_LOST):
         assert values["left"].octets(key, "nobody") is None

@@ -85,7 +85,7 @@ def test_each_fault_names_its_object(udp, writes, fault):
         for interface, modes in {
             "udp://10.0.0.1": {AddressMode.IP, AddressMode.TCP, AddressMode.REQUESTER},
             "tcp://10.0.0.1": {AddressMode.TCP, AddressMode.REQUESTER},
-            "ethernet://eth0": {AddressMode.MAC, AddressMode.REQUESTER},
+            "ethernet://eth0": {AddressMode.MAC, AddressMode.NETID, AddressMode.REQUESTER},
             "loop://line": {AddressMode.MAC, AddressMode.REQUESTER},
         }.items()
         for mode in AddressMode
@@ -94,9 +94,20 @@ def test_each_fault_names_its_object(udp, writes, fault):
 def test_a_port_addresses_as_its_interface_can(interface, mode, is_way):
     dictionary = _on(interface)
     write(dictionary, 0x8000, Frame.ADDRESS_MODE, mode)
+    write(dictionary, 0x8000, Frame.DESTINATION_NETID, bytes(range(1, 7)))
     if is_way:
         ((_, read),) = PortReader(dictionary).frames()
-        assert read.destination in {"10.0.0.2", "tcp://10.0.0.2", "01:01:05:04:00:00", "requester"}
+        assert (
+            read.destination
+            == {
+                AddressMode.IP: "10.0.0.2",
+                AddressMode.TCP: "tcp://10.0.0.2",
+                AddressMode.MAC: "01:01:05:04:00:00",
+                AddressMode.NETID: "1.2.3.4.5.6",
+                AddressMode.REQUESTER: "requester",
+            }[mode]
+        )
+        assert (read.mac, read.monitor_interval_ms, read.monitor_ip) == ("", 0, "")
     else:
         assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, Frame.ADDRESS_MODE)
 
@@ -172,3 +183,27 @@ def test_times_of_on_change_switch_it_on(udp):
         ((_, read),) = PortReader(udp).frames()
         assert read.pds[0].trigger == TriggerSpec(on_change=spec)
         write(udp, 0xD000, subindex, 0)
+
+
+def test_a_net_id_may_come_with_its_mac_address():
+    dictionary = _on("ethernet://eth0")
+    write(dictionary, 0x8000, Frame.ADDRESS_MODE, AddressMode.NETID)
+    assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, Frame.DESTINATION_NETID)
+    write(dictionary, 0x8000, Frame.DESTINATION_NETID, b"\5\5\5\5\2\1")
+    for octets, mac in (
+        (b"\x02\0\0\0\0\x09", "02:00:00:00:00:09"),
+        (bytes(6), ""),
+        (b"\x01\0\0\0\0\x09", ""),
+    ):
+        write(dictionary, 0x8000, Frame.DESTINATION_MAC, octets)
+        ((_, read),) = PortReader(dictionary).frames()
+        assert (read.destination, read.mac) == ("5.5.5.5.2.1", mac)
+
+
+def test_subscribers_are_monitored_as_the_object_says():
+    dictionary = _on("ethernet://eth0")
+    write(dictionary, 0x8000, Frame.ADDRESS_MODE, AddressMode.MAC)
+    write(dictionary, 0x8000, Frame.MONITORING_INTERVAL, 2500)
+    write(dictionary, 0x8000, Frame.MONITOR_IP, b"\x0a\0\0\x09")
+    ((_, read),) = PortReader(dictionary).frames()
+    assert (read.monitor_interval_ms, read.monitor_ip) == (2500, "10.0.0.9")
