@@ -22,7 +22,7 @@ class Learner:
 
     def __init__(self, taker: Taker) -> None:
         self.sought: Container[bytes] = ()
-        self.learn: Callable[[bytes, str], None] = _forget
+        self.learn: Callable[[bytes, str], None] = forget
         self._taker = taker
         self._looked_at_ns: dict[bytes, int] = {}
 
@@ -42,6 +42,6 @@ class Learner:
                 self.learn(publisher, sender)
 
 
-def _forget(net_id: bytes, sender: str) -> None:
+def forget(net_id: bytes, sender: str) -> None:
     """Nobody wants to know."""
     del net_id, sender

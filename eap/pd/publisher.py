@@ -128,13 +128,16 @@ class Publisher:
         changed = [frame for frame in self.sought[net_id] if frame.destination != destination]
         for frame in changed:
             frame.retarget(destination)
-            self._words[frame.place.words + FrameWord.ADDRESS] = to_word(destination)
+            self._note_address(frame)
         if changed:
             self._group_frames()
 
     def _note_target(self, frame: TxFrame, net_id: NetId | None) -> None:
         if net_id is not None:
             self.sought.setdefault(net_id, []).append(frame)
+        self._note_address(frame)
+
+    def _note_address(self, frame: TxFrame) -> None:
         self._words[frame.place.words + FrameWord.ADDRESS] = to_word(frame.destination)
 
     def read_controls(self) -> None:
@@ -181,6 +184,15 @@ class Publisher:
                 trigger.follow(was, is_same=sent == content)
         for name in self._controls.keys() & before._controls.keys():
             self._controls[name] = before._controls[name]
+        self.learn_from(before)
+        for frame in self.frames:
+            self._note_address(frame)
+
+    def learn_from(self, before: Publisher) -> None:
+        """Know the addresses behind NetIDs that *before* has learned."""
+        for net_id in self.sought.keys() & before.sought.keys():
+            if destination := before.sought[net_id][0].destination:
+                self.learn(net_id, destination)
 
     def remembering(self) -> Iterator[tuple[str, tuple[tuple[object, ...], Trigger]]]:
         """Yield the PDs that do not just follow the clock: what goes where, and the trigger."""

@@ -22,7 +22,7 @@ from eap.pd.device import Device, DeviceState
 from eap.pd.generator import Generators
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
-from eap.pd.learner import Learner
+from eap.pd.learner import Learner, forget
 from eap.pd.link import Channel, CyclicBus, Taker
 from eap.pd.links import Links
 from eap.pd.poll import questions_of, requests_at
@@ -132,13 +132,19 @@ class Station:
         if pushed := _pds_of(frames, polled=False):
             publisher = Publisher(self.image, self._inputs, net_id, channel, pushed)
             self._publishers.append((publisher, channel))
-            if learner := self._learners.get(port):
-                learner.sought, learner.learn = publisher.sought, publisher.learn
         if polled := _pds_of(frames, polled=True):
             requests = self._requests[port]
             answerer = Answerer(self.image, self._inputs, net_id, channel, polled, requests)
             self._publishers.append((answerer, channel))
         self._ports[port] = channel, publisher
+        self._teach(port)
+
+    def _teach(self, port: str) -> None:
+        """Have the publisher of *port* told which addresses its NetIDs have."""
+        publisher = self._ports[port][1]
+        if learner := self._learners.get(port):
+            learner.sought = () if publisher is None else publisher.sought
+            learner.learn = forget if publisher is None else publisher.learn
 
     def retarget(self, frame: str, destination: str) -> None:
         """Send TxFrame *frame* to *destination* from the next cycle on; the others are left alone.
@@ -240,8 +246,11 @@ class Station:
 
         Whatever takes time is done here, while the other one runs; it is only looked at.
         """
-        for port, (channel, _) in before._ports.items():
+        for port, (channel, was) in before._ports.items():
             self.connect(port, channel)
+            publisher = self._ports[port][1]
+            if publisher is not None and was is not None:
+                publisher.learn_from(was)
         fed = [channel for channel, _ in before._ports.values()]
         for channel in before._channels:
             if channel not in fed:
@@ -264,6 +273,7 @@ class Station:
             if subscriber.has_timeouts:
                 self._supervisors.append(subscriber.handle_timeout)
         self._subscribers, self.takers = before._subscribers, before.takers
+        self._learners = before._learners
         for port, requests in self._requests.items():
             requests.follow(before._requests[port])
         for name in self._questions.keys() & before._questions.keys():
@@ -272,6 +282,7 @@ class Station:
             was = before._ports[port][1]
             if publisher is not None and was is not None:
                 publisher.follow(was)
+            self._teach(port)
         self._enter(before.device.state)
 
     def cycle(self, due_ns: int, now_ns: int) -> None:
@@ -329,11 +340,10 @@ class Station:
 
 
 def _learning_ports(spec: StationSpec) -> Iterator[str]:
-    """Yield the ports where a frame may go to a NetID: those that send on Ethernet."""
-    sending = {frame.port for frame in spec.frames}
+    """Yield the ports where a frame may go to a NetID, now or when it is configured anew."""
     for port in spec.ports:
         is_ethernet = InterfaceUri.parse(port.interface).scheme == "ethernet"
-        if port.name in sending and port.kind is PortKind.EAP and is_ethernet:
+        if port.kind is PortKind.EAP and is_ethernet:
             yield port.name
 
 

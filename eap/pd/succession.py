@@ -19,6 +19,7 @@ from eap.codec.pd import PdHeader
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxPlace
+from eap.pd.presence import Presence
 from eap.pd.spec import Writer
 from eap.pd.words import (
     ACCOUNT_START,
@@ -91,7 +92,8 @@ class ImageSuccession:
 class _Sent:
     """The words of TxFrames and TxPDs.
 
-    A frame that is no more what it was gives the count of its cycles as a whole to its old PDs.
+    Where a frame goes, and who is there, is forgotten when it is sent elsewhere.  One that is no more
+    what it was gives the count of its cycles as a whole to its old PDs.
     """
 
     def __init__(self, old: ImageLayout, new: ImageLayout) -> None:
@@ -100,6 +102,7 @@ class _Sent:
         self._changed = [
             b.words for a, b in kept if _schedules(old, a.name) != _schedules(new, b.name)
         ]
+        self._moved = [b.words for a, b in kept if a.destination != b.destination]
         whole = {b.name for _, b in kept if b.words not in self._changed}
         before = {pd.name: pd for pd in old.tx}
         pds = [(before[pd.name], pd) for pd in new.tx if pd.name in before]
@@ -116,6 +119,9 @@ class _Sent:
     def carry(self, old: memoryview, new: memoryview) -> None:
         """Copy them."""
         _copy(self._runs, old, new)
+        for first in self._moved:
+            new[first + FrameWord.ADDRESS] = 0
+            new[first + FrameWord.PRESENCE] = Presence.UNKNOWN
         for first in self._changed:
             new[first + FrameWord.PARTIAL] += new[first + FrameWord.WHOLE]
             new[first + FrameWord.WHOLE] = 0

@@ -18,6 +18,7 @@ from eap.net.loopback import LoopbackChannel, LoopbackLines
 from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.link import OutFrame
+from eap.pd.presence import Presence
 from eap.pd.report import station_status
 from eap.pd.spec import (
     CounterSource,
@@ -33,7 +34,8 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import WAKE_FOR_CYCLES, Station
-from eap.pd.words import StationWord
+from eap.pd.succession import ImageSuccession
+from eap.pd.words import FrameWord, StationWord
 from tests.support.cyclic import (
     MS,
     OWN,
@@ -622,3 +624,53 @@ def test_a_frame_is_sent_elsewhere_while_the_station_runs():
     assert (by_id["address"], by_id["skipped"]) == (None, 1)
     with pytest.raises(ConfigError, match="station a sends no frame 'other' of its own"):
         made.retarget("other", "01:01:05:04:00:00")
+
+
+def succeed(before: Station, spec: StationSpec) -> Station:
+    """Configure a station anew between two cycles, as the engine does."""
+    images = ImageSuccession(before.image, image_of(spec))
+    images.carry_words()
+    after = Station(spec, images._new, lambda: None)
+    after.prepare_to_follow(before)
+    images.settle()
+    images.carry_words()
+    after.follow(before)
+    return after
+
+
+def test_a_station_configured_anew_keeps_the_addresses_that_it_learned():
+    made, wire = assemble(addressed())
+    made.start(0)
+    take, frame = made.takers["eap0"], octets([(9, b"\0\0")])
+    take(memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
+    by_id, by_mac = made.spec.frames
+    moved = msgspec.structs.replace(by_mac, destination="02:00:00:00:00:06")
+    after = succeed(made, msgspec.structs.replace(made.spec, frames=(by_id, moved)))
+    wire.sent.clear()
+    after.cycle(2 * MS, 2 * MS)
+    assert len(wire.sent) == 2
+    addresses = [row["address"] for row in station_status(after.image, 0)["frames"]]
+    assert addresses == ["02:00:00:00:00:07", "02:00:00:00:00:06"]
+
+    take(memoryview(frame), len(frame), SECOND, From("02:00:00:00:00:08"))
+    assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:08"
+
+
+def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
+    made, _ = assemble(addressed())
+    made.start(0)
+    frame = octets([(9, b"\0\0")])
+    made.takers["eap0"](memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
+    made.image.words[made.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
+    by_id, by_mac = made.spec.frames
+    moved = msgspec.structs.replace(by_id, destination=THIRD)
+    after = succeed(made, msgspec.structs.replace(made.spec, frames=(moved, by_mac)))
+    (row, _) = station_status(after.image, 0)["frames"]
+    assert (row["address"], row["subscriber"]) == (None, "unknown")
+    other = octets([(9, b"\0\0")], publisher=THIRD)
+    after.takers["eap0"](memoryview(other), len(other), MS, From("02:00:00:00:00:09"))
+    assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:09"
+
+    empty = succeed(after, msgspec.structs.replace(made.spec, frames=()))
+    empty.takers["eap0"](memoryview(other), len(other), 2 * SECOND, From("02:00:00:00:00:0a"))
+    assert station_status(empty.image, 0)["frames"] == []

@@ -132,8 +132,11 @@ def test_what_has_the_same_name_goes_on(before, after, seed):
     succession.settle()
     succession.carry_words()
     then, now = station_status(old, SECOND), station_status(new, SECOND)
-    for key in now.keys() - {"pd"}:
+    for key in now.keys() - {"pd", "frames"}:
         assert now[key] == then[key], key
+    sent = {row["name"]: (row["sent"], row["skipped"]) for row in then["frames"]}
+    for row in now["frames"]:
+        assert (row["sent"], row["skipped"]) == sent.get(row["name"], (0, 0))
     check_values(old, new, fresh)
     unused = station_status(fresh, SECOND)["pd"]
     changed = {"port", "frame", "frame_state", "subscriber"}
