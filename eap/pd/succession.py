@@ -92,8 +92,8 @@ class ImageSuccession:
 class _Sent:
     """The words of TxFrames and TxPDs.
 
-    Where a frame goes, and who is there, is forgotten when it is sent elsewhere.  One that is no more
-    what it was gives the count of its cycles as a whole to its old PDs.
+    Where a frame goes, and who is there, is forgotten when it is sent elsewhere.  A frame that is
+    no more what it was gives the count of its cycles as a whole to its old PDs.
     """
 
     def __init__(self, old: ImageLayout, new: ImageLayout) -> None:
