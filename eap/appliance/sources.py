@@ -15,9 +15,35 @@ from eap.codec.values import DataType
 from eap.errors import EnvironmentalError, ImageError
 from eap.net.csv_replay import open_replay
 from eap.net.host import Host
-from eap.pd.spec import CsvSource, HostSource, StationSpec, Writer
+from eap.pd.spec import CsvSource, HostSource, Source, StationSpec, Writer
 
 logger = logging.getLogger(__name__)
+
+
+class SourcePlayer:
+    """The sources of one station, which may get others while it runs."""
+
+    def __init__(self, station: StationSpec, image: StationImage) -> None:
+        self._station = station
+        self._image = image
+        self._changed = asyncio.Event()
+
+    def change(self, station: StationSpec) -> None:
+        """Play those of *station* from now on; the same ones just go on."""
+        is_same = _sources(station) == _sources(self._station)
+        self._station = station
+        if not is_same:
+            self._changed.set()
+
+    async def serve(self) -> None:
+        """Play until cancelled; raises as :func:`play_sources` does."""
+        async with asyncio.TaskGroup() as group:
+            while True:
+                playing = group.create_task(play_sources(self._station, self._image))
+                await self._changed.wait()
+                self._changed.clear()
+                playing.cancel()
+                await asyncio.wait([playing])
 
 
 async def play_sources(station: StationSpec, image: StationImage) -> None:
@@ -64,6 +90,13 @@ async def _play(
                 logger.warning("%s keeps its value: %s", label, exc)
         due = max(due + period_ms / 1000, clock())
         await asyncio.sleep(due - clock())
+
+
+def _sources(station: StationSpec) -> list[tuple[Source, str]]:
+    """Return what services plays, with the types that it is written as."""
+    types = {variable.name: variable.type for variable in station.variables}
+    played = (each for each in station.sources if isinstance(each, (HostSource, CsvSource)))
+    return [(each, types[each.variable]) for each in played]
 
 
 def _measure(source: HostSource, host: Host, kind: DataType) -> Callable[[], Any]:

@@ -10,10 +10,10 @@ from contextlib import suppress
 import msgspec
 import pytest
 
-from eap.appliance.sources import fit, play_sources
+from eap.appliance.sources import SourcePlayer, fit, play_sources
 from eap.codec import datatypes
 from eap.errors import WriterConflictError
-from eap.pd.spec import CsvSource, HostSource, Measure
+from eap.pd.spec import CsvSource, HostSource, Measure, Writer
 from tests.unit.eap.appliance.conftest import left
 
 
@@ -91,3 +91,40 @@ def test_without_sources_nothing_is_claimed(images):
         with pytest.raises(WriterConflictError, match=str(other.pid)):
             play(images["left"], HostSource("load", Measure.LOAD1))
         other.stdin.close()
+
+
+def test_other_sources_take_over_and_the_same_ones_go_on(images, tmp_path):
+    for name, numbers in (("a", range(1, 200)), ("b", [7])):
+        lines = "\n".join(["load", *map(str, numbers)])
+        (tmp_path / f"{name}.csv").write_text(lines + "\n")
+
+    def playing(name: str, **more):
+        source = CsvSource("load", str(tmp_path / f"{name}.csv"), "load", period_ms=10)
+        return msgspec.structs.replace(left(), sources=(source,), **more)
+
+    image = images["left"]
+
+    async def wait_for(matches):
+        async with asyncio.timeout(5):
+            while not matches(image.image.read("load")):  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+
+    async def run():
+        player = SourcePlayer(playing("a"), image)
+        async with asyncio.TaskGroup() as group:
+            task = group.create_task(player.serve())
+            await wait_for(lambda value: value >= 10)
+            player.change(playing("a", cycle_us=20_000))
+            await asyncio.sleep(0.05)
+            assert image.image.read("load") >= 10  # not from the start again
+            player.change(playing("b"))
+            await wait_for(lambda value: value == 7)
+            player.change(msgspec.structs.replace(left(), sources=()))
+            await asyncio.sleep(0.02)
+            with image.image.writing(Writer.SERVICES):
+                image.image.write("load", 0)
+            await asyncio.sleep(0.05)
+            assert image.image.read("load") == 0
+            task.cancel()
+
+    asyncio.run(run())
