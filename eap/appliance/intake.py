@@ -1,15 +1,15 @@
-"""Frames that the kernel sorted to services: counted under the reason for which they are not taken.
+"""Frames that the kernel sorted to services: type 5, and what belongs nowhere.
 
-Type 5 belongs here; nothing in this release answers it.  What had waited in a socket since before
-this process started is stale, whatever it is: its sender has long given up.
+What is not taken is counted under the reason.  What had waited in a socket since before this
+process started is stale, whatever it is: its sender has long given up.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from time import monotonic_ns
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.codec.ethercat import EtherCatHeader, FrameType
@@ -26,20 +26,45 @@ class DrainedChannel(Protocol):
         """Return the descriptor to watch."""
 
 
-class FrameIntake:
-    """Takes the frames of one socket for the *stations* that listen there."""
+MailboxTaker: TypeAlias = Callable[[memoryview, int, int, Origin], Refusal | None]
+"""Takes a frame of type 5 as a Taker does; returns why not if it does not."""
 
-    def __init__(self, stations: Sequence[str], counters: DiscardCounters, from_ns: int) -> None:
+
+class FrameIntake:
+    """Takes the frames of one socket for the *stations* that listen there.
+
+    Args:
+        stations: At which is counted what is not taken.
+        counters: Where.
+        from_ns: Since when this process runs, on the monotonic clock.
+        mailbox: Takes type 5.
+    """
+
+    def __init__(
+        self,
+        stations: Sequence[str],
+        counters: DiscardCounters,
+        from_ns: int,
+        mailbox: MailboxTaker,
+    ) -> None:
         self._stations = stations
         self._counters = counters
         self._from_ns = from_ns
+        self._mailbox = mailbox
 
     def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
-        """Count one frame that arrived at *at_ns* on the monotonic clock, whoever sent it."""
-        del origin
-        reason = Refusal.STALE if at_ns < self._from_ns else _reason(data, size)
-        for station in self._stations:
-            self._counters.count(station, reason)
+        """Take, or count, one frame that arrived at *at_ns* on the monotonic clock."""
+        if at_ns < self._from_ns:
+            reason: Refusal | None = Refusal.STALE
+        elif size < EtherCatHeader.SIZE:
+            reason = Refusal.TRUNCATED
+        elif EtherCatHeader.decode(data).type == FrameType.MAILBOX:
+            reason = self._mailbox(data, size, at_ns, origin)
+        else:
+            reason = Refusal.WRONG_TYPE
+        if reason is not None:
+            for station in self._stations:
+                self._counters.count(station, reason)
 
 
 def watch_channel(channel: DrainedChannel) -> None:
@@ -50,11 +75,3 @@ def watch_channel(channel: DrainedChannel) -> None:
 
     asyncio.get_running_loop().add_reader(channel.fileno(), drain)
     drain()
-
-
-def _reason(data: memoryview, size: int) -> Refusal:
-    if size < EtherCatHeader.SIZE:
-        return Refusal.TRUNCATED
-    if EtherCatHeader.decode(data).type == FrameType.MAILBOX:
-        return Refusal.MAILBOX
-    return Refusal.WRONG_TYPE

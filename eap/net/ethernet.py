@@ -123,6 +123,11 @@ class EthernetInterface:
         source = MacAddr(self._batch.octets[start : start + 6])
         return "" if source.is_group else str(source)
 
+    def is_for_many(self, data: memoryview) -> bool:
+        """Tell whether the frame in *data* was addressed to a group or to all."""
+        position = self._batch.position(data)
+        return position is not None and bool(self._batch.octets[position * BUFFER_SIZE] & 1)
+
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when a frame waits."""
         return self._sock.fileno()
