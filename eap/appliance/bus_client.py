@@ -55,7 +55,7 @@ class BusClient:
         self._numbers = {port: number for number, port in enumerate(ports)}
         self._turns = Turns()
         self._up: set[PortName] = set()
-        link.on_restart = self._up.clear
+        link.on_restart.append(self._up.clear)
 
     async def describe(self, port: PortName, timeout_s: float = DESCRIBE_S) -> BusReport:
         """Return how a bus is now; raises EngineGoneError."""

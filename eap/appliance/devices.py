@@ -49,6 +49,7 @@ class Devices:
         self.by_station: dict[str, StationDevice] = {}
         self.desks: dict[str, AoeDesk] = {}
         self._players: list[SourcePlayer] = []
+        self._has_restarted = asyncio.Event()
         for station in stations:
             name, image = station.name, images[station.name]
             keeper = StationKeeper(station, states.get(name, DeviceState.OP), store, engine)
@@ -77,11 +78,18 @@ class Devices:
                 group.create_task(desk.serve())
             for player in self._players:
                 group.create_task(player.serve())
+            group.create_task(self._follow_restarts())
 
-    async def tell_again(self) -> None:
-        """Tell an engine that was started again what it may not know."""
-        for device in self.by_station.values():
-            await device.tell_again()
+    def engine_has_restarted(self) -> None:
+        """Tell the new engine, soon, what it may not know."""
+        self._has_restarted.set()
+
+    async def _follow_restarts(self) -> None:
+        while True:
+            await self._has_restarted.wait()
+            self._has_restarted.clear()
+            for device in self.by_station.values():
+                await device.tell_again()
 
 
 def _desk(station: StationSpec, device: StationDevice) -> AoeDesk:

@@ -23,7 +23,7 @@ class Refusal(StrEnum):
     WRONG_TYPE = auto()
     """Neither type 4 nor type 5."""
     TRUNCATED = auto()
-    """Shorter than a frame header."""
+    """Shorter than its headers say."""
     TCP_OFF = auto()
     """A type-4 connection to a station none of whose ports says ``tcp: true``."""
     TCP_SILENT = auto()

@@ -34,6 +34,9 @@ class EngineLink:
     Args:
         sock: This end of the pair; closed by :meth:`close`.
         look_s: As LOOK_S.
+
+    Attributes:
+        on_restart: Called when another engine has taken its end of the pair.
     """
 
     def __init__(self, sock: socket.socket, *, look_s: float = LOOK_S) -> None:
@@ -48,7 +51,7 @@ class EngineLink:
         # Numbers of a process before this one do not come again: late answers to it match nothing.
         self._last_id = monotonic_ns()
         self._heard_s = 0.0
-        self.on_restart: Callable[[], None] | None = None
+        self.on_restart: list[Callable[[], None]] = []
 
     async def ask(self, make: Callable[[int], Request], timeout_s: float) -> Answer:
         """Send the request that *make* returns for its number, and wait for the answer.
@@ -140,5 +143,5 @@ class EngineLink:
         for future in self._waiting.values():
             if not future.done():
                 future.set_exception(EngineGoneError("the engine was started again"))
-        if self.on_restart is not None:
-            self.on_restart()
+        for call in self.on_restart:
+            call()

@@ -50,7 +50,7 @@ class FrameIntake:
         self._stations = stations
         self._counters = counters
         self._from_ns = from_ns
-        self._mailbox = mailbox
+        self.mailbox = mailbox
 
     def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
         """Take, or count, one frame that arrived at *at_ns* on the monotonic clock."""
@@ -59,7 +59,7 @@ class FrameIntake:
         elif size < EtherCatHeader.SIZE:
             reason = Refusal.TRUNCATED
         elif EtherCatHeader.decode(data).type == FrameType.MAILBOX:
-            reason = self._mailbox(data, size, at_ns, origin)
+            reason = self.mailbox(data, size, at_ns, origin)
         else:
             reason = Refusal.WRONG_TYPE
         if reason is not None:

@@ -18,41 +18,34 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
-from eap.appliance.aoe_desk import AoeDesk
 from eap.appliance.bus_client import BusClient
 from eap.appliance.bus_methods import Buses
 from eap.appliance.control_server import ControlServer
-from eap.appliance.discards import DiscardCounters, Refusal
+from eap.appliance.device_methods import DeviceMethods
+from eap.appliance.devices import Devices
+from eap.appliance.discards import DiscardCounters
+from eap.appliance.engine_client import EngineClient
 from eap.appliance.engine_link import EngineLink
 from eap.appliance.handover import (
     NO_DESCRIPTOR,
     Handover,
-    PortName,
-    SharedSocket,
-    SocketKind,
     tell_ready,
 )
-from eap.appliance.intake import FrameIntake, watch_channel
 from eap.appliance.methods import Methods
 from eap.appliance.monitor_ways import open_ways
 from eap.appliance.monitoring import SubscriberWatch
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.segment_link import SegmentLink
-from eap.appliance.sources import play_sources
+from eap.appliance.services_sockets import open_doors
 from eap.appliance.station_image import StationImage
 from eap.appliance.status import ProcessMeter, appliance_status
-from eap.appliance.tcp_door import TcpDoor
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
-from eap.ids import InterfaceUri, NetId
 from eap.net import realtime
-from eap.net.ethernet import EthernetInterface, packet_batch
-from eap.net.mmsg import ReceiveBatch
-from eap.net.udp import UdpChannel
-from eap.pd.spec import StationSpec
 
 IMAGE_PATIENCE_S = 15.0
 STATUS_PATIENCE_S = 0.3
 """How long ``status`` waits for what the engine says of its buses."""
+RELEASE = version("eap-appliance")
 _IMAGE_PAUSE_S = 0.01
 
 
@@ -69,30 +62,28 @@ class Services:
         )
         self._link = resources.enter_context(socket.socket(fileno=handover.link_fd))
         self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
-        self._batch = ReceiveBatch()
         self._stopping = asyncio.Event()
-        self._desks = {
-            station.name: AoeDesk({}, _net_ids(station)) for station in handover.stations
-        }
 
     async def run(self) -> None:
         """Serve until SIGTERM."""
         images = {name: await self._open_image(name) for name in self._names}
         # Not before: whoever waits for images of an engine that failed just ends.
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
-        self._watch_sockets()
-        buses = self._buses()
-        server = ControlServer(self._methods(images, buses), buses)
+        link = EngineLink(socket.socket(fileno=self._handover.bus_fd))
+        self._resources.callback(link.close)
+        devices = self._devices(images, link)
+        doors = open_doors(
+            self._handover, devices.desks, self._counters, self._link, self._resources
+        )
+        buses = self._buses(link)
+        methods = self._methods(images, buses, devices)
+        server = ControlServer(methods, buses)
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(server.serve(self._listener))]
-            tasks += [group.create_task(door.serve()) for door in self._doors()]
-            tasks += [group.create_task(desk.serve()) for desk in self._desks.values()]
+            tasks += [group.create_task(door.serve()) for door in doors]
+            tasks.append(group.create_task(devices.serve()))
             watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
             tasks.append(group.create_task(watch.run()))
-            tasks += [
-                group.create_task(play_sources(station, images[station.name]))
-                for station in self._handover.stations
-            ]
             tell_ready(self._handover.ready_fd, {})
             await self._stopping.wait()
             for task in tasks:
@@ -112,13 +103,21 @@ class Services:
                 return image
             await asyncio.sleep(_IMAGE_PAUSE_S)
 
-    def _methods(self, images: dict[str, StationImage], buses: Buses) -> Methods:
+    def _devices(self, images: dict[str, StationImage], link: EngineLink) -> Devices:
+        handover = self._handover
+        engine = EngineClient(link, Path(handover.folder))
+        devices = Devices(
+            handover.plant, handover.stations, handover.states, images, engine, RELEASE
+        )
+        link.on_restart.append(devices.engine_has_restarted)
+        return devices
+
+    def _methods(self, images: dict[str, StationImage], buses: Buses, devices: Devices) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
             DiscardCounters(self._folder.discards("engine"), self._names)
         )
-        release = version("eap-appliance")
-        identity = {"release": release, "plant": self._handover.plant, "pid": os.getpid()}
+        identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
 
         async def status() -> dict[str, Any]:
             return appliance_status(
@@ -134,14 +133,11 @@ class Services:
             images,
             status=status,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
+            more=DeviceMethods(devices.by_station).table(),
         )
 
-    def _buses(self) -> Buses:
+    def _buses(self, link: EngineLink) -> Buses:
         handover = self._handover
-        if handover.bus_fd == NO_DESCRIPTOR:
-            return Buses(handover.stations, None, {})
-        link = EngineLink(socket.socket(fileno=handover.bus_fd))
-        self._resources.callback(link.close)
         segments = {}
         for bus in handover.buses:
             if bus.command_fd != NO_DESCRIPTOR:
@@ -149,65 +145,6 @@ class Services:
                 self._resources.callback(segments[bus.owner].close)
         client = BusClient(link, [bus.owner for bus in handover.buses])
         return Buses(handover.stations, client if handover.buses else None, segments)
-
-    def _watch_sockets(self) -> None:
-        now_ns = monotonic_ns()
-        for shared in self._handover.sockets:
-            if shared.kind is SocketKind.PACKET:
-                self._watch_interface(shared, now_ns)
-            elif shared.kind in {SocketKind.UDP, SocketKind.GROUP}:
-                intake = FrameIntake(_stations_of(shared), self._counters, now_ns)
-                channel = UdpChannel(
-                    socket.socket(fileno=shared.services_fd), self._batch, [intake.take]
-                )
-                self._resources.callback(channel.close)
-                watch_channel(channel)
-
-    def _watch_interface(self, shared: SharedSocket, now_ns: int) -> None:
-        interface = EthernetInterface(socket.socket(fileno=shared.services_fd), packet_batch())
-        self._resources.callback(interface.close)
-        for owner in shared.owners:
-            intake = FrameIntake([owner.station], self._counters, now_ns)
-            spec = self._handover.port(owner)
-            port = interface.port(intake.take, vlan_id=spec.vlan_id, join=spec.join)
-        watch_channel(port)
-
-    def _doors(self) -> list[TcpDoor]:
-        return [
-            TcpDoor(
-                self._resources.enter_context(socket.socket(fileno=shared.services_fd)),
-                tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
-                self._link,
-                _Refusals(self._counters, _stations_of(shared)).count,
-                [self._desks[station] for station in _stations_of(shared)],
-            )
-            for shared in self._handover.sockets
-            if shared.kind is SocketKind.TCP
-        ]
-
-    def _takes_tcp(self, name: PortName) -> bool:
-        port = self._handover.port(name)
-        return port.tcp or InterfaceUri.parse(port.interface).scheme == "tcp"
-
-
-class _Refusals:
-    """Counts connections that were closed, at every station behind the listener."""
-
-    def __init__(self, counters: DiscardCounters, stations: list[str]) -> None:
-        self._counters = counters
-        self._stations = stations
-
-    def count(self, reason: Refusal) -> None:
-        for station in self._stations:
-            self._counters.count(station, reason)
-
-
-def _net_ids(station: StationSpec) -> list[NetId]:
-    return [NetId.parse(text) for text in (station.net_id, *(p.net_id for p in station.ports))]
-
-
-def _stations_of(shared: SharedSocket) -> list[str]:
-    return list(dict.fromkeys(owner.station for owner in shared.owners))
 
 
 def main() -> int:

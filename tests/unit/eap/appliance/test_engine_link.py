@@ -104,7 +104,7 @@ def test_time_out_of_its_own():
 def test_new_engine_fails_what_waits():
     async def scene(engine, link):
         restarts = []
-        link.on_restart = lambda: restarts.append(True)
+        link.on_restart.append(lambda: restarts.append(True))
         engine.holds = True
         asked = asyncio.ensure_future(link.ask(describe(), 60))
         await settle()

@@ -9,7 +9,7 @@ from time import monotonic_ns
 
 import pytest
 
-from eap.appliance.discards import DiscardCounters
+from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.intake import FrameIntake, watch_channel
 from eap.codec.ethercat import EtherCatHeader
 from eap.net.mmsg import ReceiveBatch
@@ -28,8 +28,12 @@ def counters(tmp_path):
         yield counters
 
 
+def refuse(data, size, at_ns, origin) -> Refusal | None:
+    return Refusal.MAILBOX
+
+
 def test_each_frame_is_counted_once_at_every_station(counters):
-    intake = FrameIntake(["a", "b"], counters, from_ns=100)
+    intake = FrameIntake(["a", "b"], counters, 100, refuse)
     intake.take(MAILBOX, 8, 99, NOBODY)
     intake.take(MAILBOX, 8, 100, NOBODY)
     intake.take(MAILBOX, 8, 101, NOBODY)
@@ -37,6 +41,16 @@ def test_each_frame_is_counted_once_at_every_station(counters):
     intake.take(UNKNOWN, 1, 100, NOBODY)
     expected = {"mailbox": 2, "stale": 1, "wrong_type": 1, "truncated": 1}
     assert counters.stats() == {"a": expected, "b": expected}
+
+
+def test_what_is_taken_is_not_counted(counters):
+    taken = []
+    intake = FrameIntake(["a", "b"], counters, 100, lambda *frame: taken.append(frame))
+    intake.take(MAILBOX, 8, 99, NOBODY)
+    intake.take(MAILBOX, 8, 100, NOBODY)
+    intake.take(UNKNOWN, 2, 100, NOBODY)
+    assert taken == [(MAILBOX, 8, 100, NOBODY)]
+    assert counters.stats()["a"] == {"stale": 1, "wrong_type": 1}
 
 
 @pytest.mark.net
@@ -54,7 +68,7 @@ def test_a_socket_is_drained_at_once_and_on_arrival(counters):
         async def serve():
             # The kernel stamps on another clock, and the two are compared to microseconds only.
             await asyncio.sleep(0.01)
-            intake = FrameIntake(["a"], counters, monotonic_ns())
+            intake = FrameIntake(["a"], counters, monotonic_ns(), refuse)
             watch_channel(UdpChannel(receiver, ReceiveBatch(), [intake.take]))
             assert counters.stats()["a"] == {"stale": 1}
             sender.send(MAILBOX)

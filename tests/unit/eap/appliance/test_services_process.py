@@ -80,7 +80,7 @@ def test_it_answers_counts_and_ends_when_asked(tmp_path, stations):
             assert client.request("hello")["stations"] == ["left", "right"]
             assert msgspec.json.decode(os.read(services.ready, 100)) == {}
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-                sender.sendto(EtherCatHeader(0, 0, 5).encode(), ("127.9.2.1", 34980))
+                sender.sendto(EtherCatHeader(6, 0, 5).encode() + bytes(6), ("127.9.2.1", 34980))
             for _ in range(1000):
                 left, right = client.request("status")["stations"]
                 if left["discarded"]:
