@@ -81,6 +81,20 @@ def begin(works, *words):
     )
 
 
+def begin_writing(works, path):
+    """Start to write a file to the drive, and wait until it is well under way."""
+
+    def frames_beside_cycles():
+        report = works.request("bus_describe", station="press", port="bus1")
+        return report["frames_sent"] - report["cycles"]
+
+    before = frames_beside_cycles()
+    writing = begin(works, "foe", "put", "press/bus1", "drive", str(path), "firmware.bin")
+    wait_until(lambda: frames_beside_cycles() > before + 500)
+    assert writing.poll() is None
+    return writing
+
+
 def ask(works, *words):
     """Return the JSON lines that a command prints."""
     done = eapctl(works, *words, "--json")
@@ -211,15 +225,7 @@ def test_client_that_ends_in_the_middle_of_a_file(works, content, tmp_path, numb
     ask(works, "foe", "put", "press/bus1", "drive", str(content), "firmware.bin")
     large = tmp_path / "large.bin"
     large.write_bytes(bytes(4_000_000))
-    before = works.request("bus_describe", station="press", port="bus1")["frames_sent"]
-    writing = begin(works, "foe", "put", "press/bus1", "drive", str(large), "firmware.bin")
-
-    def has_begun():
-        report = works.request("bus_describe", station="press", port="bus1")
-        return report["frames_sent"] > before + 500
-
-    wait_until(has_begun)
-    assert writing.poll() is None
+    writing = begin_writing(works, large)
     writing.send_signal(number)
     _, err = writing.communicate(timeout=20)
     assert writing.returncode == (1 if number == signal.SIGINT else -number)
@@ -281,8 +287,7 @@ def test_engine_that_hangs_is_said_to(works):
 def test_engine_that_starts_again_fails_what_was_under_way(works, tmp_path):
     large = tmp_path / "large.bin"
     large.write_bytes(bytes(4_000_000))
-    writing = begin(works, "foe", "put", "press/bus1", "drive", str(large), "firmware.bin")
-    time.sleep(1)
+    writing = begin_writing(works, large)
     os.kill(works.pid("engine"), signal.SIGKILL)
     _, err = writing.communicate(timeout=20)
     assert writing.returncode == 1
