@@ -35,6 +35,9 @@ class Stored(Configuration, frozen=True, kw_only=True):
 
     state: DeviceState = DeviceState.OP
     """Asked for last."""
+    applied: str = ""
+    """``digest_of`` the station in the plant file that was applied last while it ran; empty if none
+    was."""
     previous: Configuration | None = None
     """For a rollback."""
 

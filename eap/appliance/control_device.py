@@ -76,7 +76,7 @@ class RequestStateParameters(TargetParameters, frozen=True, kw_only=True):
 
 
 class StationParameters(Parameters, frozen=True, kw_only=True):
-    """``export`` and ``rollback``."""
+    """``export``."""
 
     station: str
 
@@ -85,6 +85,12 @@ class SpecParameters(StationParameters, frozen=True, kw_only=True):
     """``plan`` and ``apply``."""
 
     spec: StationSpec
+
+
+class RollbackParameters(StationParameters, frozen=True, kw_only=True):
+    """``rollback``: to what ran before, which is *spec*, alternates aside."""
+
+    spec: StationSpec | None = None
 
 
 def object_row(item: OdObject) -> dict[str, Any]:

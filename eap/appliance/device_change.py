@@ -16,6 +16,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
 from eap.device.eap_read import read_back
 from eap.device.fault import DeviceFault
+from eap.device.rollout import without_alternates
 from eap.device.stored import StoredError
 from eap.pd.spec import PortKind, StationSpec
 
@@ -103,10 +104,13 @@ def make_plan(
 
 
 def plan_rollback(
-    now: StationSpec, dictionaries: Mapping[str, EapDictionary], previous: Configuration | None
-) -> Plan:
-    """Return what it takes to run again what ran before."""
+    now: StationSpec, dictionaries: Mapping[str, EapDictionary], previous: Configuration | None,
+    wanted: StationSpec | None = None,
+) -> Plan:  # fmt: skip
+    """Return what it takes to run again what ran before: *wanted*, which may have alternates."""
     if previous is None:
         reason = "there is nothing to go back to: it has run nothing else"
         return Plan(now, [], [], [reason], {})
-    return make_plan(now, dictionaries, previous.spec, previous.objects)
+    if wanted is not None and without_alternates(wanted) != previous.spec:
+        return Plan(now, [], [], ["meanwhile it would go back to something else"], {})
+    return make_plan(now, dictionaries, wanted or previous.spec, previous.objects)

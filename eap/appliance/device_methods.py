@@ -107,7 +107,8 @@ class DeviceMethods:
 
     def _export(self, params: dict[str, Any]) -> dict[str, Any]:
         device = self._device(parameters(params, words.StationParameters).station)
-        return {"spec": words.spec_document(device.spec)}
+        previous = device.previous and words.spec_document(device.previous.spec)
+        return {"spec": words.spec_document(device.spec), "previous": previous}
 
     def _plan(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.SpecParameters)
@@ -118,8 +119,8 @@ class DeviceMethods:
         return words.outcome_document(*await self._device(wanted.station).apply(wanted.spec))
 
     async def _roll_back(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.StationParameters)
-        return words.outcome_document(*await self._device(wanted.station).roll_back())
+        wanted = parameters(params, words.RollbackParameters)
+        return words.outcome_document(*await self._device(wanted.station).roll_back(wanted.spec))
 
     def _device(self, station: str) -> StationDevice:
         try:

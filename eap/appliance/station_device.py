@@ -14,6 +14,7 @@ from typing import TypeVar
 from devicebus.mailbox.ads_services import AdsServices
 from devicebus.mailbox.aoe_server import AmsAnswer
 from eap.appliance.ads_result import ads_result
+from eap.appliance.configuration import Configuration
 from eap.appliance.device_change import Plan, dump_all, eap_ports, fill_all, make_plan
 from eap.appliance.device_change import plan_rollback as make_rollback
 from eap.appliance.device_plan import find_refusals
@@ -89,6 +90,11 @@ class StationDevice:
         return self._keeper.spec
 
     @property
+    def previous(self) -> Configuration | None:
+        """What ran before, None if nothing else."""
+        return self._keeper.previous
+
+    @property
     def status(self) -> StateResult:
         """State, and why it is not another one."""
         return self._machine.status
@@ -147,21 +153,27 @@ class StationDevice:
 
     async def apply(self, spec: StationSpec) -> tuple[Plan, DeviceFault | None]:
         """Run *spec*, in the state that there is; return what that changes, or why it does not."""
-        return await self._jobs.do(lambda: self._change(lambda: self.plan(spec)))
+        return await self._jobs.do(lambda: self._change(lambda: self.plan(spec), applied=True))
 
-    async def roll_back(self) -> tuple[Plan, DeviceFault | None]:
-        """Run again what ran before; returns as :meth:`apply` does."""
-        return await self._jobs.do(lambda: self._change(self._plan_rollback))
+    async def roll_back(self, spec: StationSpec | None = None) -> tuple[Plan, DeviceFault | None]:
+        """Run again what ran before; returns as :meth:`apply` does.
 
-    def _plan_rollback(self) -> Plan:
-        return make_rollback(self.spec, self.dictionaries, self._keeper.previous)
+        *spec* is the same with alternates, where a change of layouts is under way.
+        """
 
-    async def _change(self, make: Callable[[], Plan]) -> tuple[Plan, DeviceFault | None]:
+        def plan() -> Plan:
+            return make_rollback(self.spec, self.dictionaries, self.previous, spec)
+
+        return await self._jobs.do(lambda: self._change(plan, applied=False))
+
+    async def _change(
+        self, make: Callable[[], Plan], *, applied: bool
+    ) -> tuple[Plan, DeviceFault | None]:
         plan = make()
         if plan.refused or (plan.is_empty and plan.spec == self.spec):
             return plan, None
         try:
-            await self._keeper.change(plan.spec, plan.objects())
+            await self._keeper.change(plan.spec, plan.objects(), applied=applied)
         except DeviceFault as exc:
             return plan, exc
         for name, dictionary in self.dictionaries.items():

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from eap.appliance.configuration import Configuration, Stored, digest_of
 from eap.appliance.store import Store
 from eap.device.fault import DeviceFault, FaultCode
+from eap.device.rollout import without_alternates
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -64,25 +65,40 @@ class StationKeeper:
         self._store = store
         self._engine = engine
         self._base = digest_of(spec)
+        self._applied = ""
         self._is_unsure = False
         stored = store.load(spec.name)
         if stored is not None:
-            self._base = stored.base
+            self._base, self._applied = stored.base, stored.applied
             self.previous = stored.previous
             if stored.spec == spec:
                 self.objects = stored.objects
 
-    async def change(self, spec: StationSpec, objects: dict[str, Any]) -> None:
+    async def change(
+        self, spec: StationSpec, objects: dict[str, Any], *, applied: bool = False
+    ) -> None:
         """Run *spec*, with what the dictionaries hold then.
+
+        Args:
+            spec: What is to run.
+            objects: The content of its dictionaries.
+            applied: Whether *spec* is what a plant file says, alternates aside.
 
         Raises:
             DeviceFault: it does not run, and what ran before goes on.
         """
-        before = Configuration(base=self._base, spec=self.spec, objects=self.objects)
-        is_same = spec == self.spec and objects == self.objects
+        bare = without_alternates(self.spec)
+        # A step of a change that is under way is no configuration to go back to.
+        is_same = without_alternates(spec) == bare and objects == self.objects
+        before = Configuration(base=self._base, spec=bare, objects=self.objects)
         previous = self.previous if is_same else before
         record = Stored(
-            base=self._base, spec=spec, objects=objects, state=self.state, previous=previous
+            base=self._base,
+            spec=spec,
+            objects=objects,
+            state=self.state,
+            previous=previous,
+            applied=digest_of(without_alternates(spec)) if applied else self._applied,
         )
         try:
             await self._save(record)
@@ -93,7 +109,7 @@ class StationKeeper:
             await self._save_back()
             raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
         self._is_unsure = False
-        self.objects, self.previous = objects, previous
+        self.objects, self.previous, self._applied = objects, previous, record.applied
         if spec != self.spec:
             self.spec = spec
             if self.on_change is not None:
@@ -139,6 +155,7 @@ class StationKeeper:
             objects=self.objects,
             state=self.state,
             previous=self.previous,
+            applied=self._applied,
         )
 
     async def _save(self, record: Stored) -> None:

@@ -4,7 +4,7 @@ Rule 1: a station that was never configured while it ran has no file.
 Rule 2: a file is written beside the old one, synced and renamed, so that whatever happens one of
 the two is there, and whole.
 Rule 3: who edits the plant file has the last word: what was stored before that does not run, and
-is kept for a rollback.
+is kept for a rollback.  A file that was applied while the station ran is not edited since.
 """
 
 from __future__ import annotations
@@ -145,6 +145,28 @@ class Store:
         return True
 
 
+def settle(
+    plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP
+) -> None:
+    """Make up what is stored for a start of the appliance with *stations* of the plant file.
+
+    While it runs, what counts is the file that it was started with, and what was applied on top;
+    now what was applied last is that file, or there is another one.  Arguments as for *effective*.
+    """
+    store = Store(plant)
+    for spec in stations:
+        stored = store.load(spec.name)
+        if stored is None or not stored.applied:
+            continue
+        base = digest_of(spec)
+        if stored.applied == base:
+            made_up = replace(stored, base=base)
+        else:
+            made_up = _settled(stored, spec, base, state)
+        if made_up != stored:
+            _keep(store, spec.name, made_up)
+
+
 def effective(
     plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP
 ) -> tuple[Effective, ...]:
@@ -166,24 +188,27 @@ def _effective(store: Store, spec: StationSpec, state: DeviceState) -> Effective
     base = digest_of(spec)
     if stored.base == base:
         return Effective(stored.spec, stored.state)
-    rebased = _rebase(stored, spec, base, state)
-    if rebased.spec is not stored.spec:
-        logger.warning(
-            "station %s: the plant file was edited since it was configured; the file runs, and"
-            " what ran before is kept for a rollback",
-            spec.name,
-        )
+    settled = _settled(stored, spec, base, state)
+    _keep(store, spec.name, settled)
+    return Effective(settled.spec, settled.state)
+
+
+def _keep(store: Store, station: str, stored: Stored) -> None:
     try:
-        store.save(spec.name, rebased)
+        store.save(station, stored)
     except EnvironmentalError as exc:
         logger.warning("%s", exc)
-    return Effective(rebased.spec, rebased.state)
 
 
-def _rebase(stored: Stored, spec: StationSpec, base: str, state: DeviceState) -> Stored:
+def _settled(stored: Stored, spec: StationSpec, base: str, state: DeviceState) -> Stored:
     """Return *stored* with the plant file's *spec* in force."""
-    if stored.spec == spec:  # the file has caught up with what was applied
-        return replace(stored, base=base)
+    if stored.spec == spec:  # the file has caught up with what was configured
+        return replace(stored, base=base, applied="")
+    logger.warning(
+        "station %s: the plant file was edited since it was configured; the file runs, and what ran"
+        " before is kept for a rollback",
+        spec.name,
+    )
     previous = Configuration(base=stored.base, spec=stored.spec, objects=stored.objects)
     return Stored(base=base, spec=spec, state=state, previous=previous)
 

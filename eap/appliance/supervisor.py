@@ -27,7 +27,7 @@ from eap.appliance.plantfile import load_plant, require_own_buses
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
 from eap.appliance.sockets import SharedSockets
-from eap.appliance.store import Store
+from eap.appliance.store import Store, settle
 from eap.appliance.what_runs import what_runs_now
 from eap.config.load import Plant
 from eap.errors import ConfigError
@@ -99,6 +99,7 @@ def _run(
     options: EngineOptions,
     first_state: DeviceState = DeviceState.OP,
 ) -> int:
+    settle(info.plant, stations, first_state)
     with SharedSockets(stations, folder.control_socket) as sockets:
         supervisor = Supervisor(
             info, stations, folder, sockets, options=options, first_state=first_state

@@ -9,7 +9,13 @@ from eap.appliance.configuration import Configuration
 from eap.appliance.device_change import dump_all, eap_ports, fill_all, make_plan, plan_rollback
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import dump
-from eap.pd.spec import CounterSource, PortKind, PortSpec
+from eap.pd.spec import (
+    CounterSource,
+    PortKind,
+    PortSpec,
+    RxAlternateSpec,
+    TakenVariableSpec,
+)
 
 
 @pytest.fixture
@@ -73,3 +79,18 @@ def test_rollback_takes_the_objects_of_then(spec, dictionaries):
     assert plan.spec == before
     assert plan.objects() == objects
     assert len(plan.changes) == 1
+
+
+def test_rollback_with_alternates(stations):
+    right = stations[1]
+    (pd,) = right.subscriptions
+    alternate = RxAlternateSpec(9, (TakenVariableSpec("ticks", "UINT"),))
+    both = replace(right, subscriptions=(replace(pd, alternates=(alternate,)),))
+    dictionaries = {"eap0": EapDictionary(right, "eap0")}
+    fill_all(dictionaries, {})
+    previous = Configuration(base="", spec=right, objects={})
+    assert plan_rollback(right, dictionaries, previous, both).spec == both
+    other = replace(right, cycle_us=20_000)
+    assert plan_rollback(right, dictionaries, previous, other).refused == [
+        "meanwhile it would go back to something else"
+    ]

@@ -159,7 +159,8 @@ def test_states(call, device):
 
 
 def test_export_plan_apply_and_rollback(call, stations, device):
-    exported = call("export", station="left")["spec"]
+    exported, nothing = call("export", station="left").values()
+    assert nothing is None
     assert msgspec.convert(exported, StationSpec) == stations[0]
     exported["frames"][0]["pds"][0]["version"] = 5
     changed = {
@@ -179,10 +180,16 @@ def test_export_plan_apply_and_rollback(call, stations, device):
         "station": [],
         "refused": [],
     }
+    before = call("export", station="left")["previous"]
+    assert msgspec.convert(before, StationSpec) == stations[0]
     assert call("export", station="left")["spec"] == exported
     assert call("plan", station="left", spec=exported)["changes"] == []
     back = call("rollback", station="left")
     assert [(row["old"], row["new"], row["ok"]) for row in back["results"]] == [("5", "0", True)]
+    assert call("rollback", station="left", spec=exported)["ok"] is True
+    assert call("rollback", station="left", spec=exported)["refused"] == [
+        "meanwhile it would go back to something else"
+    ]
 
 
 def test_refused_apply(call, stations, device):

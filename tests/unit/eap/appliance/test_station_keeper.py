@@ -7,13 +7,15 @@ import asyncio
 import pytest
 from msgspec.structs import replace
 
-from eap.appliance.configuration import digest_of
+from eap.appliance.configuration import Configuration, digest_of
 from eap.appliance.station_keeper import StationKeeper
 from eap.appliance.store import Store, effective, state_root
 from eap.device.fault import DeviceFault, FaultCode
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
 from eap.pd.device import DeviceState
+from eap.pd.spec import RxAlternateSpec, TakenVariableSpec
 from tests.support.stationengine import StationEngine
+from tests.unit.eap.appliance.conftest import right
 
 OLD, NEW = {"eap0": "old"}, {"eap0": "new"}
 
@@ -168,3 +170,23 @@ def test_state_that_cannot_be_kept_is_told(keeper, engine, monkeypatch, caplog):
     engine.failure = EngineRefusedError("no")
     with pytest.raises(DeviceFault, match="disk full"):
         asyncio.run(keeper.change(replace(keeper.spec, cycle_us=30_000), NEW))
+
+
+def test_steps_of_a_change_under_way_are_no_way_back(engine):
+    old = right()
+    (pd,) = old.subscriptions
+    alternate = RxAlternateSpec(9, (TakenVariableSpec("ticks", "UINT"),))
+    both = replace(old, subscriptions=(replace(pd, alternates=(alternate,)),))
+    new = replace(old, subscriptions=(replace(pd, version=9),))
+    keeper = StationKeeper(old, DeviceState.OP, Store("demo"), engine)
+    asyncio.run(keeper.change(both, {}, applied=True))
+    assert keeper.previous is None
+    asyncio.run(keeper.change(new, NEW, applied=True))
+    assert keeper.previous == Configuration(base=digest_of(old), spec=old, objects={})
+    assert Store("demo").load("right").applied == digest_of(new)
+    asyncio.run(keeper.change(old, OLD))
+    assert keeper.previous == Configuration(base=digest_of(old), spec=new, objects=NEW)
+    assert Store("demo").load("right").applied == digest_of(new)
+    again = StationKeeper(old, DeviceState.OP, Store("demo"), engine)
+    asyncio.run(again.change_state(DeviceState.PREOP))
+    assert Store("demo").load("right").applied == digest_of(new)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from eap.appliance import store as module
 from eap.appliance.configuration import Stored, digest_of
-from eap.appliance.store import Effective, Store, effective, state_root
+from eap.appliance.store import Effective, Store, effective, settle, state_root
 from eap.errors import EnvironmentalError
 from eap.pd.device import DeviceState
 
@@ -207,3 +207,40 @@ def test_folder_in_the_way_of_setting_aside(stations):
     (store.path / "left.before").mkdir()
     with pytest.raises(EnvironmentalError, match=r"left\.json cannot be renamed"):
         store.set_aside("left")
+
+
+def test_file_that_was_applied_is_not_edited_since(stations):
+    left, _ = stations
+    store = Store("demo")
+    applied = changed(left, "new file")
+    stored = replace(configured(left), applied=digest_of(applied))
+    store.save("left", stored)
+    # While the appliance runs, its processes start with the file that it was started with.
+    assert effective("demo", (left,))[0].spec == stored.spec
+    assert store.load("left") == stored
+    # Its next start is with the file that was applied, though something else runs: a rollback.
+    settle("demo", (applied,))
+    assert effective("demo", (applied,))[0].spec == stored.spec
+    assert store.load("left") == replace(stored, base=digest_of(applied))
+
+
+def test_file_before_the_one_that_was_applied_is_an_edited_one(stations, caplog):
+    left, _ = stations
+    store = Store("demo")
+    stored = replace(configured(left), applied=digest_of(changed(left)))
+    store.save("left", stored)
+    settle("demo", (left,), DeviceState.PREOP)
+    assert "the plant file was edited" in caplog.text
+    assert effective("demo", (left,)) == (Effective(left, DeviceState.PREOP),)
+    assert store.load("left").previous.spec == changed(left)
+    assert store.load("left").applied == ""
+
+
+def test_nothing_to_settle(stations):
+    left, right = stations
+    settle("demo", stations)
+    assert not state_root().exists()
+    Store("demo").save("left", configured(left))
+    before = Store("demo").file("left").stat()
+    settle("demo", (changed(left, "edited"), right))
+    assert Store("demo").file("left").stat() == before
