@@ -15,6 +15,7 @@ from eap.codec.values import DataType
 from eap.errors import ImageError
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000keys import Live
+from eap.pd import outcome
 from eap.pd.frame_status import frame_state
 from eap.pd.image import Image
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, RxPlace, TxPlace
@@ -165,6 +166,7 @@ _OF_FRAME: dict[str, Callable[[Image, FramePlace], int]] = {
     Live.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
 }
 _OF_TX: dict[str, Callable[[Image, TxPlace], int]] = {
+    Live.TX_VAR_STATE: lambda image, place: outcome.var_state(image.words, place),
     Live.TX_VAR_CTRL: _control(VAR_CTRL),
     Live.TX_LAST_REASON: _last_reason,
     Live.TX_SKIPPED: _tx_word(TxWord.SKIPPED),

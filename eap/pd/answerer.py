@@ -8,14 +8,15 @@ from eap.ids import NetId
 from eap.pd.gather import Gather
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
-from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace
+from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, TxPlace
 from eap.pd.link import Channel, OutFrame
+from eap.pd.outcome import enter_refused, enter_sent, enter_skipped, enter_suppressed
 from eap.pd.poll import Requests
-from eap.pd.publisher import NOT_SENT, FrameRow, read_control, refused_state
+from eap.pd.publisher import FrameRow, read_control
 from eap.pd.spec import TriggerSpec
 from eap.pd.trigger import SUPPRESS_BIT, Trigger
 from eap.pd.txframe import Selection, TxPd, build_frame
-from eap.pd.words import REASON_INDEX, FrameWord, Reason, TxWord
+from eap.pd.words import REASON_INDEX, FrameWord, Reason
 
 ANSWERS_KEPT = 64
 """Buffers of a frame for those who asked last; another requester costs building one."""
@@ -97,14 +98,13 @@ class Answerer:
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the answers to all that was asked, patched; :meth:`sent` must follow."""
-        del now_ns
         self._sending.clear()
         for sender, names in self._requests.take().items():
             for frame in self._frames:
                 due = [pd for pd in frame.pds if pd.place.poll_request in names]
                 chosen = tuple(p for p in due if not (frame.suppressed or p.trigger.suppressed))
                 if len(chosen) < len(due):
-                    self._skip(frame, [pd for pd in due if pd not in chosen])
+                    self._skip(frame, [pd.place for pd in due if pd not in chosen], now_ns)
                 if chosen:
                     selection = frame.select(sender, chosen, self._publisher, self._channel)
                     selection.patch(cycle)
@@ -115,31 +115,16 @@ class Answerer:
         """Count what was sent since :meth:`frames_to_send`, all but *failed*."""
         words = self._image.words
         for frame, selection in self._sending:
-            first = frame.place.words
             if failed and selection.out in failed:
-                words[first + FrameWord.STATE] = refused_state(selection.out)
-                words[first + FrameWord.SKIPPED] += 1
-                self._enter_unsent(selection.pds)
+                enter_refused(words, frame.place, selection.out, now_ns)
+                enter_skipped(words, (pd.place for pd in selection.pds), now_ns)
                 continue
-            words[first + FrameWord.STATE] = 0
-            words[first + FrameWord.SENT_AT_NS] = now_ns
-            words[first + FrameWord.PARTIAL] += 1
+            words[frame.place.words + FrameWord.SENT_AT_NS] = now_ns
+            words[frame.place.words + FrameWord.PARTIAL] += 1
             for pd in selection.pds:
-                first = pd.place.words
-                words[first + TxWord.REASON + _POLL] += 1
-                words[first + TxWord.LAST_REASON] = _POLL
-                words[first + TxWord.SENT_AT_NS] = now_ns
-                words[first + TxWord.STATE] = 0
+                enter_sent(words, pd.place, _POLL, now_ns)
 
-    def _skip(self, frame: _AnswerFrame, pds: Iterable[TxPd]) -> None:
-        words = self._image.words
+    def _skip(self, frame: _AnswerFrame, pds: Iterable[TxPlace], now_ns: int) -> None:
         if frame.suppressed:
-            words[frame.place.words + FrameWord.STATE] = NOT_SENT
-            words[frame.place.words + FrameWord.SKIPPED] += 1
-        self._enter_unsent(pds)
-
-    def _enter_unsent(self, pds: Iterable[TxPd]) -> None:
-        words = self._image.words
-        for pd in pds:
-            words[pd.place.words + TxWord.SKIPPED] += 1
-            words[pd.place.words + TxWord.STATE] = NOT_SENT
+            enter_suppressed(self._image.words, frame.place, now_ns)
+        enter_skipped(self._image.words, pds, now_ns)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from eap.pd import outcome
 from eap.pd.address import from_word
 from eap.pd.image import Image
 from eap.pd.layout import FramePlace
@@ -13,10 +14,9 @@ from eap.pd.words import FrameState, FrameWord
 
 def frame_state(image: Image, first_word: int) -> int:
     """Return the FrameState of the frame whose first word is at index *first_word*."""
-    words = image.words
-    is_missing = words[first_word + FrameWord.PRESENCE] == Presence.MISSING
+    is_missing = image.words[first_word + FrameWord.PRESENCE] == Presence.MISSING
     missing = FrameState.SUBSCRIBER_MISSING if is_missing else 0
-    return int(words[first_word + FrameWord.STATE] | missing)
+    return int(outcome.frame_state(image.words, first_word) | missing)
 
 
 def presence(image: Image, first_word: int) -> str:

@@ -12,16 +12,14 @@ from eap.pd.image import Image
 from eap.pd.inputs import Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, TxPlace
 from eap.pd.link import Channel, OutFrame
+from eap.pd.outcome import enter_refused, enter_sent, enter_skipped, enter_suppressed
 from eap.pd.spec import TxFrameSpec
 from eap.pd.trigger import EVENT_BIT, SUPPRESS_BIT, Schedule, Trigger, plan_schedule
 from eap.pd.txframe import Selection, TxFrame, TxPd
-from eap.pd.words import FrameState, FrameWord, TxWord
+from eap.pd.words import FrameWord
 
-NOT_SENT = int(FrameState.NOT_SENT)
-"""The bit of FrameState, and of VarState."""
 FrameRow: TypeAlias = tuple[TxFrameSpec, FramePlace, tuple[TxPlace, ...]]
 """A TxFrame with its place and the places of its PDs."""
-_COUNTED_WHOLE = (FrameWord.WHOLE, FrameWord.STATE, FrameWord.SENT_AT_NS)
 
 
 class _Group:
@@ -36,7 +34,8 @@ class _Group:
         self.out = [frame.whole.out for frame in frames]
         self.patches = [frame.whole.patch for frame in frames]
         self.counters = [
-            tuple(frame.place.words + word for word in _COUNTED_WHOLE) for frame in frames
+            (frame.place.words + FrameWord.WHOLE, frame.place.words + FrameWord.SENT_AT_NS)
+            for frame in frames
         ]
 
 
@@ -90,13 +89,6 @@ class Publisher:
         self._due: list[_Group] = []
         self._others: list[TxFrame] = []
         self._sending: list[tuple[TxFrame, Selection]] = []
-        self._unsent = {
-            pd
-            for frame in self.frames
-            for pd in frame.pds
-            if self._words[pd.place.words + TxWord.STATE]
-        }
-        """PDs whose VarState tells that they were not sent: rarely any, so sending asks first."""
         self.read_controls()
 
     def has(self, name: str) -> bool:
@@ -226,30 +218,30 @@ class Publisher:
         for frame in self._others:
             chosen, skipped = frame.select(cycle, now_ns)
             if skipped:
-                self._skip(frame, skipped)
+                self._skip(frame, skipped, now_ns)
             if chosen is not None:
                 chosen.patch(cycle)
                 self._sending.append((frame, chosen))
 
     def sent(self, failed: Sequence[OutFrame], now_ns: int) -> None:
-        """Count what was sent since :meth:`frames_to_send`, all but *failed*."""
+        """Count what was sent since :meth:`frames_to_send`, all but *failed*.
+
+        Change and event triggers of what the network refused try again in the next cycle.
+        """
         words, due, sending = self._words, self._due, self._sending
         if failed:  # then each frame has to be looked at by itself
             sending = sending + [(frame, frame.whole) for group in due for frame in group.frames]
             due = []
-        if self._unsent:
-            self._clear_unsent(due, [each for _, each in sending if each.out not in failed])
         for group in due:
-            for whole, state, sent_at in group.counters:
+            for whole, sent_at in group.counters:
                 words[whole] += 1
-                words[state] = 0  # one by one: pack_into would show readers a time of 0 in between
                 words[sent_at] = now_ns
         for frame, selection in sending:
             if failed and selection.out in failed:
-                self._fail(frame, selection)
+                enter_refused(words, frame.place, selection.out, now_ns)
+                enter_skipped(words, (pd.place for pd in selection.pds), now_ns)
                 continue
             first = frame.place.words
-            words[first + FrameWord.STATE] = 0
             words[first + FrameWord.SENT_AT_NS] = now_ns
             if frame.schedule is not None and selection is frame.whole:
                 words[first + FrameWord.WHOLE] += 1
@@ -258,49 +250,17 @@ class Publisher:
                 self._count(selection, now_ns)
 
     def _count(self, selection: Selection, now_ns: int) -> None:
-        words = self._words
         for pd in selection.pds:
-            first = pd.place.words
-            words[first + TxWord.REASON + pd.reason] += 1
-            words[first + TxWord.LAST_REASON] = pd.reason
-            words[first + TxWord.SENT_AT_NS] = now_ns
+            enter_sent(self._words, pd.place, pd.reason, now_ns)
             pd.trigger.sent(pd.reason, now_ns, pd.data)
 
-    def _fail(self, frame: TxFrame, selection: Selection) -> None:
-        """The network refused a frame: change and event triggers try again in the next cycle."""
-        words, first = self._words, frame.place.words
-        words[first + FrameWord.STATE] = refused_state(selection.out)
-        words[first + FrameWord.SKIPPED] += 1
-        self._enter_unsent(selection.pds)
-
-    def _skip(self, frame: TxFrame, pds: Sequence[TxPd]) -> None:
-        words = self._words
+    def _skip(self, frame: TxFrame, pds: Sequence[TxPd], now_ns: int) -> None:
         if frame.is_held:
-            words[frame.place.words + FrameWord.STATE] = NOT_SENT
-            words[frame.place.words + FrameWord.SKIPPED] += 1
-        self._enter_unsent(pds)
+            enter_suppressed(self._words, frame.place, now_ns)
+        enter_skipped(self._words, (pd.place for pd in pds), now_ns)
         for pd in pds:
             if frame.suppressed or pd.trigger.suppressed:  # else it waits for the address
                 pd.trigger.use_up_event()
-
-    def _enter_unsent(self, pds: Iterable[TxPd]) -> None:
-        words = self._words
-        for pd in pds:
-            words[pd.place.words + TxWord.SKIPPED] += 1
-            words[pd.place.words + TxWord.STATE] = NOT_SENT
-            self._unsent.add(pd)
-
-    def _clear_unsent(self, groups: Iterable[_Group], selections: Iterable[Selection]) -> None:
-        sent = {pd for group in groups for frame in group.frames for pd in frame.pds}
-        sent.update(pd for selection in selections for pd in selection.pds)
-        for pd in self._unsent & sent:
-            self._words[pd.place.words + TxWord.STATE] = 0
-            self._unsent.remove(pd)
-
-
-def refused_state(frame: OutFrame) -> int:
-    """Return the FrameState of *frame* after a channel refused it."""
-    return int(NOT_SENT | FrameState.OVERSIZED if frame.oversized else NOT_SENT)
 
 
 def read_control(image: Image, inputs: Inputs, name: str) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from eap.codec.pd import PdHeader
+from eap.pd import outcome
 from eap.pd.device import DeviceState
 from eap.pd.frame_status import frame_state, frame_status, presence
 from eap.pd.image import Image
@@ -162,7 +163,7 @@ def tx_status(image: Image, place: TxPlace) -> dict[str, Any]:
         "skipped": words[place.words + TxWord.SKIPPED],
         "reason": {r.value: n for r, n in zip(REASONS, counts, strict=True) if n},
         "last_reason": REASONS[last].value if sum(counts) else None,
-        "var_state": words[place.words + TxWord.STATE],
+        "var_state": outcome.var_state(words, place),
         "frame_state": frame_state(image, place.frame_words),
         "subscriber": presence(image, place.frame_words),
     }

@@ -131,7 +131,9 @@ class _Sent:
                 reason = REASON_INDEX[Reason.CYCLE if was.cyclic else Reason.DIVIDER]
                 new[first + TxWord.REASON + reason] += count
                 new[first + TxWord.LAST_REASON] = reason
-                new[first + TxWord.SENT_AT_NS] = old[was.frame_words + FrameWord.SENT_AT_NS]
+                own_ns = new[first + TxWord.SENT_AT_NS]
+                frame_ns = old[was.frame_words + FrameWord.SENT_AT_NS]
+                new[first + TxWord.SENT_AT_NS] = max(own_ns, frame_ns)
 
 
 class _Received:

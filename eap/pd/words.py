@@ -98,18 +98,20 @@ class FrameWord(IntEnum):
     """Sent otherwise."""
     SKIPPED = 2
     """Due, but suppressed or refused by the network."""
-    STATE = 3
-    """FrameState as its publisher sees it."""
-    SENT_AT_NS = 4
-    ADDRESS = 5
+    SENT_AT_NS = 3
+    UNSENT_AT_NS = 4
+    """When it was due last and not sent; at or after SENT_AT_NS that is how it is."""
+    UNSENT = 5
+    """FrameState of that time."""
+    ADDRESS = 6
     """Where it goes now, as ``eap.pd.address`` puts it; 0 while that is not known."""
-    PRESENCE = 6
+    PRESENCE = 7
     """Whether the subscriber is there: a Presence (presence.py), written by its monitor."""
-    SIZE = 7
+    SIZE = 8
 
 
 class FrameState(IntFlag):
-    """FrameState of ETG.1005, as a reader puts it together from STATE and PRESENCE."""
+    """FrameState of ETG.1005."""
 
     NOT_SENT = 1
     """When it was due last."""
@@ -126,8 +128,8 @@ class TxWord(IntEnum):
     LAST_REASON = 1
     """Index into REASONS of the last time it was sent on its own account."""
     SENT_AT_NS = 2
-    STATE = 3
-    """VarState: bit 0 not sent when it was due last."""
+    UNSENT_AT_NS = 3
+    """When it was due last and not sent; VarState follows from it (outcome.py)."""
     REASON = 4
     SIZE = REASON + len(REASONS)
 

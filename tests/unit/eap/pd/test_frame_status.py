@@ -40,7 +40,7 @@ def put(image: Image, **words: int) -> None:
 def test_bit_2_of_the_state_is_subscriber_missing(
     image: Image, state: int, presence: Presence, expected: int
 ) -> None:
-    put(image, STATE=state, PRESENCE=presence)
+    put(image, UNSENT=state, PRESENCE=presence)
     assert frame_state(image, image.layout.frames[0].words) == expected
 
 

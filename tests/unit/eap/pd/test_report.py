@@ -202,7 +202,7 @@ def test_the_state_of_a_frame_has_what_its_publisher_and_its_monitor_know():
     first = image.layout.frames[0].words
     seen = []
     for state, presence in ((0, Presence.UNKNOWN), (3, Presence.MISSING), (1, Presence.PRESENT)):
-        image.words[first + FrameWord.STATE] = state
+        image.words[first + FrameWord.UNSENT] = state
         image.words[first + FrameWord.PRESENCE] = presence
         (row,) = station_status(image, 0)["pd"]["tx"]
         seen.append((row["frame_state"], row["subscriber"]))
