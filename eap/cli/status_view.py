@@ -33,7 +33,7 @@ _REASONS = {
     "change": "on change",
     "change_timeout": "resend",
     "event": "event",
-    "poll": "on request",
+    "poll": "polled",
 }
 _FRAME_STATES = {2: "larger than its network carries", 4: "nobody is there"}
 """What the bits of FrameState say beyond that a frame was not sent."""

@@ -113,7 +113,7 @@ def test_two_servers_answer_on_loopback(farm: Plants) -> None:
     plant.command("pd", "set", "desk", "job", "7")
     wait_until(lambda: plant.values("mill")["asked.job"] == plant.values("lathe")["asked.job"] == 7)
     shown = plant.command("status")
-    assert "on request" in shown
+    assert "polled" in shown
     listed = plant.command("pd", "list", "--station", "mill")
     assert "part  id 71, version 0, eap0 to requester, polled by asked" in listed
 

@@ -145,7 +145,7 @@ def test_polled_pds_show_how_long_answers_took() -> None:
             rx=[rx("answer", lost=None, quality=17, jitter_us=none, response_us=times)],
         )
     )
-    assert row_of(text, "part") == "→ part on request 9"
+    assert row_of(text, "part") == "→ part polled 9"
     assert (
         row_of(text, "answer") == "← answer running 123400 unknown 1.7 ms 4.2 ms 1791 / 1877 / 1900"
     )
