@@ -112,7 +112,7 @@ def test_pds_that_are_received(values, files):
 def test_frame_state_tells_that_the_subscriber_is_missing(values, files):
     image = files["left"].image
     first = image.layout.frames[0].words
-    image.words[first + FrameWord.STATE] = 1
+    image.words[first + FrameWord.UNSENT] = 1
     image.words[first + FrameWord.PRESENCE] = 2
     assert number(values["left"], Live.FRAME_STATE, "out") == 5
 
