@@ -8,30 +8,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import msgspec
-
+from eap.appliance.change import needs_new_start
 from eap.device.eap_content import bus_variables
-from eap.pd.spec import LinkSpec, PortSpec, Source, StationSpec, VariableSpec
-
-RESTART = "needs a new start of the appliance"
+from eap.pd.spec import LinkSpec, Source, StationSpec, VariableSpec
 
 
 def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
     """Return what cannot change while the station runs; nothing else may be done then."""
-    found = [
-        f"{field} {getattr(old, field)} would become {getattr(new, field)}: it {RESTART}"
-        for field in ("name", "net_id")
-        if getattr(old, field) != getattr(new, field)
+    before = {port.name: port.net_id for port in old.ports}
+    net_ids = [("the station's router", old.net_id, new.net_id)]
+    net_ids += [
+        (f"port {port.name}", before[port.name], port.net_id)
+        for port in new.ports
+        if port.name in before
     ]
-    before = {port.name: port for port in old.ports}
-    after = {port.name: port for port in new.ports}
-    found += [f"port {name} would go: it {RESTART}" for name in before if name not in after]
-    for name, port in after.items():
-        if name not in before:
-            found.append(f"port {name} would be new: it {RESTART}")
-        else:
-            found += _port_differences(before[name], port)
-    return found
+    return needs_new_start(old, new) + [
+        f"{what}: net_id {was} -> {becomes}: this needs a new start of the appliance"
+        for what, was, becomes in net_ids
+        if was != becomes
+    ]
 
 
 def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
@@ -42,24 +37,6 @@ def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
         *_differences("link", _link_name, old.links, new.links),
         *_differences("variable", _variable_name, _chosen(old, on_bus), _chosen(new, on_bus)),
     ]
-
-
-def _port_differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
-    for field in msgspec.structs.fields(PortSpec):
-        before, after = getattr(old, field.name), getattr(new, field.name)
-        if before == after:
-            continue
-        if field.name == "bus":
-            yield f"port {old.name}: its bus would change: that {RESTART}"
-        else:
-            told = f"{field.name} {_text(before)} would become {_text(after)}"
-            yield f"port {old.name}: {told}: that {RESTART}"
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, tuple):
-        return ", ".join(map(str, value)) or "none"
-    return str(value)
 
 
 def _chosen(spec: StationSpec, names: set[str]) -> tuple[VariableSpec, ...]:

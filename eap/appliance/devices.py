@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import platform
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 
 from eap.appliance.aoe_desk import AoeDesk
@@ -15,6 +16,7 @@ from eap.appliance.station_image import StationImage
 from eap.appliance.station_keeper import StationEngine, StationKeeper
 from eap.appliance.store import Store
 from eap.device.eap_content import Identity
+from eap.errors import ImageError
 from eap.ids import NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -49,6 +51,7 @@ class Devices:
         self.by_station: dict[str, StationDevice] = {}
         self.desks: dict[str, AoeDesk] = {}
         self._players: list[SourcePlayer] = []
+        self._images = images
         self._has_restarted = asyncio.Event()
         for station in stations:
             name, image = station.name, images[station.name]
@@ -88,6 +91,9 @@ class Devices:
         while True:
             await self._has_restarted.wait()
             self._has_restarted.clear()
+            for image in self._images.values():
+                with suppress(ImageError):  # whoever reads it is told
+                    image.catch_up()  # an engine that died may have retired nothing
             for device in self.by_station.values():
                 await device.tell_again()
 

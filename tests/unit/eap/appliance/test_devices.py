@@ -11,8 +11,11 @@ from eap.appliance.aoe_desk import AoeDoor
 from eap.appliance.devices import Devices
 from eap.codec.ams import AmsHeader, decode_packet
 from eap.errors import EngineGoneError
+from eap.net.image_file import create_image
 from eap.pd.device import DeviceState
-from eap.pd.spec import HostSource, Measure
+from eap.pd.layout import plan_layout
+from eap.pd.spec import HostSource, Measure, VariableSpec
+from eap.pd.words import StationWord
 from tests.support import aoe
 from tests.support.stationengine import StationEngine
 
@@ -93,3 +96,20 @@ def test_engine_that_was_started_again_is_told(devices, engine, stations):
 
     play(devices, script)
     assert engine.spec == stations[0]
+
+
+def test_image_that_a_dead_engine_did_not_retire_is_left(devices, files, stations, tmp_path):
+    spec = replace(stations[0], variables=(*stations[0].variables, VariableSpec("more", "UINT")))
+    with create_image(tmp_path / "fresh.image", plan_layout(spec)) as fresh:
+        fresh.image.words[StationWord.CYCLE] = 9
+        fresh.path.replace(files["left"].path)
+        left = devices.by_station["left"]
+        assert left.upload("eap0", 0xF110, 1) == bytes(8)
+
+        async def script():
+            devices.engine_has_restarted()
+            async with asyncio.timeout(5):
+                while left.upload("eap0", 0xF110, 1) == bytes(8):  # noqa: ASYNC110
+                    await asyncio.sleep(0.001)
+
+        play(devices, script)

@@ -141,18 +141,14 @@ def test_image_that_is_gone_shows_nothing(stations, files):
     image.close()
 
 
-def test_every_live_entry_of_the_profile_is_served(values, stations):
+def test_every_live_entry_of_the_profile_is_served(values):
+    names = ("out", "state", "left-state")
     unserved = {
         row.live
         for each in profile.ALL
         for row in each.entries
-        if row.live
-        and row.kind
-        and all(
-            each.octets(row.live, name) is None
-            for each in values.values()
-            for name in ("out", "state", "left-state")
-        )
+        if row.live and row.kind
+        if all(one.octets(row.live, name) is None for one in values.values() for name in names)
     }
     assert unserved == set()
 

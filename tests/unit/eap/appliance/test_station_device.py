@@ -172,7 +172,7 @@ def test_port_that_the_supervisor_opened_cannot_be_changed_by_downloads(spec):
         await write(device, 0xF810, 7, 1, 1)
         refused = await device.request_state(4)
         assert refused.fault.code == FaultCode.PORT
-        assert "port eap0: tcp False would become True" in refused.fault.text
+        assert "port eap0: tcp False -> True" in refused.fault.text
 
     while_serving(device, script)
 
@@ -323,3 +323,48 @@ def test_what_does_not_fit_into_dictionaries_runs_but_is_not_changed_by_download
 
     while_serving(device, script)
     assert engine.spec == spec
+
+
+def changeable(spec):
+    (frame,) = spec.frames
+    (pd,) = frame.pds
+    return replace(spec, frames=(replace(frame, pds=(replace(pd, changeable=True),)),))
+
+
+def test_entry_that_may_be_changed_while_it_runs(spec):
+    device, engine = make_device(changeable(spec))
+
+    async def script():
+        await write(device, TXPD, Tx.PD_ID, 77)
+        assert engine.calls == ["configure left"]
+        assert engine.spec.frames[0].pds[0].pd_id == 77
+        assert device.spec == engine.spec
+        engine.failure = EngineRefusedError("no memory")
+        with pytest.raises(SdoAbortError, match="no memory"):
+            await write(device, TXPD, Tx.PD_ID, 78)
+        assert word(device, TXPD, Tx.PD_ID) == 77
+        with pytest.raises(SdoAbortError) as caught:
+            await write(device, TXPD, Tx.VERSION, 1)
+        assert caught.value.code == AbortCode.DEVICE_STATE
+
+    while_serving(device, script)
+    assert engine.spec.frames[0].pds[0].pd_id == 77
+    assert effective("demo", (changeable(spec),))[0].spec == engine.spec
+
+
+def test_change_while_it_runs_that_cannot_be_is_refused_by_the_dictionary(spec):
+    device, engine = make_device(changeable(spec))
+    other = replace(spec.frames[0].pds[0], name="other", pd_id=8)
+    (frame,) = changeable(spec).frames
+    both = replace(spec, frames=(replace(frame, pds=(*frame.pds, other)),))
+
+    async def script():
+        await device.apply(both)
+        engine.calls.clear()
+        with pytest.raises(SdoAbortError, match="PD ID is used twice") as caught:
+            await write(device, TXPD, Tx.PD_ID, 8)
+        assert caught.value.code == AbortCode.PARAMETER
+        assert word(device, TXPD, Tx.PD_ID) == 7
+
+    while_serving(device, script)
+    assert engine.calls == []
