@@ -183,6 +183,8 @@ class _Comparison:
     def _mapping(self, index: int) -> Iterator[Change]:
         after = self._new.get(index, {})
         for subindex in sorted(after)[1:]:
+            if not any(after[subindex]):
+                continue  # a hole in one that is being written; nobody can write it
             is_same = self._old.get(index, {}).get(subindex) == after[subindex]
             yield self._change(index, subindex, interim=is_same)
         if after and after[0] != _NONE:

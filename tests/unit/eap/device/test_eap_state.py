@@ -3,17 +3,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
+from eap.device.difference import compare
 from eap.device.eap_read import read_back
 from eap.device.eap_state import EapStateMachine
 from eap.device.fault import DeviceFault, FaultCode
+from eap.device.stored import configuration, decode, encode
+from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
+from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
-from tests.support.downloads import PREOP, sender, write
-from tests.support.stations import BLANK, empty
+from tests.support.downloads import PREOP, receiver, sender, write
+from tests.support.stations import BLANK, empty, filled
 
 INIT, PRE, SAFE, OPER = DeviceState.INIT, DeviceState.PREOP, DeviceState.SAFEOP, DeviceState.OP
 
@@ -179,3 +184,113 @@ def test_sending_and_receiving_are_on_in_their_states_whatever_is_asked(requests
         assert is_on("sending") == result.state.sends
         assert is_on("receiving") == result.state.receives
         assert (result.fault is None) == (result.state == wanted)
+
+
+_NUMBERS = st.integers(0, 2)
+_WORDS = st.sampled_from([0x6000_0110, 0x6001_0101, 0x7000_0110, 0x0000_0007, 0x6002_01FF, 0x1234])
+_NAMES = st.sampled_from(["a", "b", "c", "two words"])
+_TYPES = st.sampled_from(["UINT", "BOOL", "BLOCK(900)", "REAL", "nonsense"])
+
+
+@st.composite
+def _downloads(draw: st.DrawFn) -> tuple[int, int, object]:
+    """Most of them sensible by themselves; whether they fit together is left to chance."""
+    base, subindex, value = draw(
+        st.one_of(
+            st.tuples(st.sampled_from([0x6000, 0x7000]), st.just(Var.NAME), _NAMES),
+            st.tuples(st.sampled_from([0x6000, 0x7000]), st.just(Var.TYPE_NAME), _TYPES),
+            st.tuples(st.sampled_from([0x1A00, 0x1600]), st.integers(0, 3), _WORDS),
+            st.tuples(st.sampled_from([0x1A00, 0x1600]), st.just(0), st.integers(0, 3)),
+            st.tuples(st.just(0xD000), st.just(Tx.PDO_INDEX), _NUMBERS.map(0x1A00.__add__)),
+            st.tuples(st.just(0xD000), st.sampled_from(list(Tx)), st.integers(0, 20)),
+            st.tuples(st.just(0xE000), st.just(Rx.PDO_INDEX), _NUMBERS.map(0x1600.__add__)),
+            st.tuples(st.just(0xE000), st.just(Rx.FLAGS), st.sampled_from([0x80, 0x85, 0])),
+            st.tuples(st.just(0xE000), st.sampled_from(list(Rx)), st.integers(0, 20)),
+            st.tuples(st.just(0x8000), st.integers(16, 18), _NUMBERS.map(0xD000.__add__)),
+            st.tuples(st.just(0x8000), st.sampled_from(list(Frame)), st.integers(0, 5)),
+            st.tuples(
+                st.sampled_from([0x6000, 0x7000, 0x8000, 0xD000, 0xE000]), st.just(0), st.just(0)
+            ),
+            st.tuples(st.just(0xF810), st.integers(1, 10), st.integers(0, 3)),
+            st.tuples(
+                st.just(0xF811), st.integers(0, 3), st.sampled_from(["239.1.2.3", "x", "", b"\0"])
+            ),
+        )
+    )
+    number = draw(_NUMBERS) if base < 0xF000 else 0
+    return base + number, subindex, value
+
+
+class DeviceMachine(RuleBasedStateMachine):
+    """A device with two ports and an engine that believes what it is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ports = empty()
+        sender(self.ports["eap0"])
+        receiver(self.ports["eap0"])
+        self.engine = Actions()
+        self.start(PRE)
+
+    def start(self, state: DeviceState) -> None:
+        self.machine = EapStateMachine(self.read, self.engine)
+        for each in self.ports.values():
+            self.machine.serve(each)
+            each.on_change = self.change
+        self.machine.start()
+        assert self.machine.request(state).state is state
+
+    def read(self) -> StationSpec:
+        return read_back(BLANK, self.ports)
+
+    def change(self, _index: int, _subindex: int) -> None:
+        self.engine.spec = self.read()
+
+    @rule(port=st.sampled_from(["eap0", "eap1"]), where=_downloads())
+    def download(self, port: str, where: tuple[int, int, object]) -> None:
+        dictionary = self.ports[port]
+        before = configuration(dictionary)
+        try:
+            write(dictionary, *where, self.machine.od_state)
+        except (SdoAbortError, OverflowError, KeyError):
+            assert configuration(dictionary) == before
+
+    @rule(wanted=st.sampled_from([PRE, SAFE, OPER, 1]))
+    def request(self, wanted: int) -> None:
+        before = {name: configuration(each) for name, each in self.ports.items()}
+        result = self.machine.request(wanted)
+        assert (result.fault is None) == (result.state == wanted)
+        assert before == {name: configuration(each) for name, each in self.ports.items()}
+
+    @rule()
+    def restart(self) -> None:
+        kept = {name: encode(each) for name, each in self.ports.items()}
+        self.ports = empty()
+        for name, each in self.ports.items():
+            decode(each, kept[name])
+            assert encode(each) == kept[name]
+        before = self.engine
+        self.engine = Actions()
+        self.start(self.machine.status.state)
+        if self.machine.status.state.sends:
+            assert self.engine.spec == before.spec
+
+    @rule()
+    def write_it_all_again(self) -> None:
+        """What differs from nothing makes another dictionary that runs the same."""
+        others = empty()
+        for name, each in others.items():
+            for change in compare(each, self.ports[name]):
+                each.download(change.index, change.subindex, change.data, PREOP)
+            assert compare(each, self.ports[name]) == []
+
+    @invariant()
+    def what_runs_is_what_the_dictionaries_say(self) -> None:
+        if self.machine.status.state.sends:
+            assert self.engine.spec == self.read()
+            again = filled(self.engine.spec, self.ports)
+            assert read_back(self.engine.spec, again) == self.engine.spec
+
+
+TestDevice = DeviceMachine.TestCase
+TestDevice.settings = settings(max_examples=20, stateful_step_count=25)
