@@ -14,7 +14,7 @@ from eap.errors import EnvironmentalError
 from eap.ids import Destination
 from eap.net.arpprobe import ArpProber
 from eap.net.neighbour import NeighbourTable
-from eap.net.udperrors import enable_errors, take_errors
+from eap.net.udperrors import ERRORS_PER_CALL, enable_errors, take_errors
 from eap.pd.presence import Evidence
 
 logger = logging.getLogger(__name__)
@@ -38,6 +38,7 @@ class UdpWay:
         self._table = table
         self._source = "" if own_address == "0.0.0.0" else own_address  # noqa: S104  a comparison
         self._refused_at_ns: dict[tuple[str, int], int] = {}
+        self._refused: set[tuple[str, int]] = set()
         self._is_enabled = False
 
     def watch(self, targets: Iterable[Destination]) -> None:
@@ -50,19 +51,27 @@ class UdpWay:
                 enable_errors(sock)
             self._is_enabled = True
 
-    def hear(self, now_ns: int) -> set[tuple[str, int]]:
-        """Take what ICMP told; return address and port of the targets that were not reached."""
-        found: set[tuple[str, int]] = set()
+    def collect(self, now_ns: int) -> None:
+        """Take what ICMP told, for :meth:`hear`.
+
+        While errors wait, whoever waits for frames at these sockets is woken again and again.
+        """
         for sock in self.sockets if self._is_enabled else ():
             for _ in range(_CALLS_PER_TURN):
                 errors = take_errors(sock)
-                found.update((each.address, each.port) for each in errors if each.unreachable)
-                if not errors:
+                for each in errors:
+                    target = each.address, each.port
+                    if each.unreachable and target in self._refused_at_ns:
+                        self._refused_at_ns[target] = now_ns
+                        self._refused.add(target)
+                if len(errors) < ERRORS_PER_CALL:
                     break
-        found.intersection_update(self._refused_at_ns)
-        for target in found:
-            self._refused_at_ns[target] = now_ns
-        return found
+
+    def hear(self, now_ns: int) -> set[tuple[str, int]]:
+        """Return address and port of the targets that were not reached since the last call."""
+        self.collect(now_ns)
+        found, self._refused = self._refused, set()
+        return found & self._refused_at_ns.keys()
 
     def look(self, target: Destination, sent_at_ns: int) -> Evidence:
         """Return what is known of *target*, to which a frame was sent last at *sent_at_ns*.

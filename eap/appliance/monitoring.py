@@ -10,7 +10,6 @@ import asyncio
 import logging
 import select
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import Protocol
@@ -85,20 +84,22 @@ class SubscriberWatch:
 
     async def run(self) -> None:
         """Go on until cancelled."""
-        loop, wake = asyncio.get_running_loop(), asyncio.Event()
+        loop = asyncio.get_running_loop()
+        owners = {sock.fileno(): way for way in self._ways.udp.values() for sock in way.sockets}
         with select.epoll() as errors:
-            for way in set(self._ways.udp.values()):
-                for sock in way.sockets:
-                    # Errors alone, and each once: the frames that arrive there are for others.
-                    errors.register(sock.fileno(), select.EPOLLET)
-            loop.add_reader(errors.fileno(), wake.set)
+            for fd in owners:
+                # Errors alone, and each once: the frames that arrive there are for others.
+                errors.register(fd, select.EPOLLET)
+
+            def collect() -> None:
+                for fd, _ in errors.poll(0):
+                    owners[fd].collect(monotonic_ns())
+
+            loop.add_reader(errors.fileno(), collect)
             try:
                 while True:
                     pause_ns = self.step(monotonic_ns()) - monotonic_ns()
-                    with suppress(TimeoutError):
-                        await asyncio.wait_for(wake.wait(), max(pause_ns, 0) / 1e9)
-                    wake.clear()
-                    errors.poll(0)
+                    await asyncio.sleep(max(pause_ns, 0) / 1e9)
             finally:
                 loop.remove_reader(errors.fileno())
 
