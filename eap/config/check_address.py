@@ -11,6 +11,8 @@ from eap.config.structs import Frame, Port, Station
 from eap.ids import Destination, DestinationKind, InterfaceUri, MacAddr
 from eap.pd.spec import REQUESTER
 
+MIN_INTERVAL_MS = 100
+
 
 def check_address(
     index: Index, report: Report, sent: tuple[Station, Frame], destination: Destination | None
@@ -70,7 +72,10 @@ def check_monitoring(
     """
     path = f"{frame.at}.monitor_interval_ms"
     message = f"frame {frame.name!r} is monitored but "
-    if frame.monitor_interval_ms is not None:
+    if 0 < frame.monitor_interval_ms < MIN_INTERVAL_MS:
+        expected = f"at least {MIN_INTERVAL_MS}, or 0 for never"
+        report.add(path, f"monitor_interval_ms is {frame.monitor_interval_ms}", expected)
+    elif frame.monitor_interval_ms:
         if destination is None or destination.is_group:
             target = "many" if destination else "who asks"
             report.add(path, f"{message}goes to {target}", "it only on a unicast frame")
@@ -86,7 +91,7 @@ def check_monitoring(
         report.add(path, message, "monitor_ip only on Ethernet")
     elif not _is_host(frame.monitor_ip):
         report.add(path, f"monitor_ip is {frame.monitor_ip!r}", "the IPv4 address of one host")
-    elif frame.monitor_interval_ms is None:
+    elif not frame.monitor_interval_ms:
         message = f"frame {frame.name!r} has a monitor_ip but no monitor_interval_ms"
         report.add(path, message, "both or none")
 

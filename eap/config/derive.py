@@ -159,7 +159,7 @@ def _frames(index: Index, station: Station) -> Iterator[TxFrameSpec]:
             port=frame.port,
             destination=destination,
             mac=_mac(index, destination),
-            monitor_interval_ms=frame.monitor_interval_ms or 0,
+            monitor_interval_ms=frame.monitor_interval_ms,
             monitor_ip=frame.monitor_ip,
             pds=tuple(_pd(pd) for pd in station.publish if pd.frame == frame.name),
             divider=frame.divider or 0,

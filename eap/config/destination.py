@@ -113,7 +113,7 @@ def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
     if target.scheme == uri.scheme == "udp":
         return Destination.parse(address)
     if target.scheme == uri.scheme == "ethernet" and port.kind is PortKind.EAP:
-        return Destination.parse(port.net_id)
+        return Destination(DestinationKind.NET_ID, str(NetId.parse(port.net_id)))
     if uri.scheme in {"udp", "tcp"} and takes_tcp(port, target):
         return Destination.parse(f"tcp://{address}")
     raise ValueError(f"{text} ({target}) has no address that is known for frames from {uri}")

@@ -16,7 +16,6 @@ from eap.pd.spec import BusTarget, OnChangeSpec, PortKind, Source, Substitute, W
 U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
 Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
 Milliseconds = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
-MonitorInterval = Annotated[int, Meta(ge=100, le=0xFFFF_FFFF)]
 DeviceCycle = Annotated[int, Meta(ge=100, le=60_000_000)]
 Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
 MAX_BITS = 8 * 0xFFFF
@@ -86,7 +85,7 @@ class Frame(Section, frozen=True):
     to: str
     divider: Divider | None = None
     modulo: U16 | None = None
-    monitor_interval_ms: MonitorInterval | None = None
+    monitor_interval_ms: Milliseconds = 0
     monitor_ip: str = ""
 
 

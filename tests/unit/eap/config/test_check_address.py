@@ -90,7 +90,8 @@ def test_monitoring(load_plant):
     text = "02:00:00:00:00:01, monitor_interval_ms: 2000, monitor_ip: 10.0.0.2"
     frame = load_plant(*ETHERNET, to(text)).plant.stations[0].frames[0]
     assert (frame.monitor_interval_ms, frame.monitor_ip) == (2000, "10.0.0.2")
-    assert load_plant().plant.stations[0].frames[0].monitor_interval_ms == 0
+    for edits in ([], [to("255.255.255.255, monitor_interval_ms: 0")]):
+        assert load_plant(*edits).plant.stations[0].frames[0].monitor_interval_ms == 0
 
 
 @pytest.mark.parametrize(
@@ -110,7 +111,7 @@ def test_monitoring(load_plant):
         ),
         (
             [to("127.0.9.2, monitor_interval_ms: 99")],
-            "13: monitor_interval_ms is 99; ",
+            "13: monitor_interval_ms is 99; at least 100, or 0 for never",
         ),
         (
             [to("127.0.9.2, monitor_interval_ms: 500, monitor_ip: 127.0.9.2")],
