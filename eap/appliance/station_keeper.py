@@ -87,10 +87,10 @@ class StationKeeper:
         Raises:
             DeviceFault: it does not run, and what ran before goes on.
         """
-        bare = without_alternates(self.spec)
+        bare, bare_before = without_alternates(spec), without_alternates(self.spec)
         # A step of a change that is under way is no configuration to go back to.
-        is_same = without_alternates(spec) == bare and objects == self.objects
-        before = Configuration(base=self._base, spec=bare, objects=self.objects)
+        is_same = bare == bare_before and objects == self.objects
+        before = Configuration(base=self._base, spec=bare_before, objects=self.objects)
         previous = self.previous if is_same else before
         record = Stored(
             base=self._base,
@@ -98,7 +98,7 @@ class StationKeeper:
             objects=objects,
             state=self.state,
             previous=previous,
-            applied=digest_of(without_alternates(spec)) if applied else self._applied,
+            applied=digest_of(bare) if applied and not is_same else self._applied,
         )
         try:
             await self._save(record)

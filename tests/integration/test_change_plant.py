@@ -1,0 +1,197 @@
+"""The solar line changes while it runs: ``plan``, ``apply``, ``rollback``, and kills in between."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from eap.appliance.plant_change import load_or_raise
+from eap.device.rollout import without_alternates
+from eap.pd.spec import StationSpec
+from tests.support.appliance import EAPCTL, Appliance, Plants, run_eapctl, troubles, wait_until
+
+pytestmark = pytest.mark.net
+
+SOLAR_LINE = Path(__file__).parents[2] / "config/solar-line.yaml"
+CHANGED, RECEIVER = "island-05", "island-06"
+VARIABLES = """\
+    variables:
+      pieces: {type: UDINT, comment: cells that passed}
+      temperature: {type: REAL, unit: degC}
+      belt: {type: BLOCK(592), comment: one octet for each place on the belt}
+      position: {type: REAL, unit: mm}
+      camera: {type: BLOCK(1012), comment: a line of the inspection camera}
+      rejected: {type: UDINT, comment: cells that did not}
+"""
+NEW_PD = (
+    "{name: to-right, frame: right, id: 2, version: 2,"
+    " variables: [pieces, temperature, belt, rejected]}"
+)
+
+
+def old_text() -> str:
+    """Return the solar line on addresses of this test's own."""
+    return SOLAR_LINE.read_text().replace("127.0.1.", "127.9.14.")
+
+
+def new_text() -> str:
+    """Return the same with one variable more in one PD of one station."""
+    head, mark, rest = old_text().partition(f"    name: {CHANGED}\n")
+    rest = rest.replace("publish: [*to-left, *to-right,", f"publish: [*to-left, {NEW_PD},", 1)
+    return f"{head}{mark}{VARIABLES}{rest}"
+
+
+class Line:
+    """The running solar line and the file that it is to follow."""
+
+    def __init__(self, farm: Plants) -> None:
+        self.file = farm.write(old_text(), "line.yaml")
+        self.old = specs(self.file)
+        self.file.write_text(new_text())
+        self.new = specs(self.file)
+        self.file.write_text(old_text())
+        self._farm = farm
+        self.appliance = self.start()
+
+    def start(self) -> Appliance:
+        appliance = self._farm.start(self.file, runtime=self._farm.folder / "run")
+        appliance.wait_ready()
+        return appliance
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return run_eapctl(self.appliance.runtime, *words)
+
+    def command(self, *words: str) -> str:
+        done = self.run(*words, str(self.file))
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def exported(self) -> dict[str, StationSpec]:
+        """Return what each station runs."""
+        return {
+            name: msgspec.convert(
+                self.appliance.request("export", station=name)["spec"], StationSpec
+            )
+            for name in self.old
+        }
+
+    def subscriptions(self) -> dict[tuple[str, str], dict[str, Any]]:
+        return {
+            (station["name"], rx["name"]): rx
+            for station in self.appliance.status()["stations"]
+            for rx in station["pd"]["rx"]
+        }
+
+
+def specs(file: Path) -> dict[str, StationSpec]:
+    return {station.name: station for station in load_or_raise(file).stations}
+
+
+@pytest.fixture
+def line(farm: Plants) -> Line:
+    line = Line(farm)
+    wait_until(lambda: all(rx["received"] > 10 for rx in line.subscriptions().values()))
+    return line
+
+
+def assert_nothing_lost(before: dict[tuple[str, str], dict[str, Any]], line: Line) -> None:
+    """Assert that all PDs came in, of the changed station and of all others."""
+    time.sleep(0.3)
+    after = line.subscriptions()
+    assert after.keys() == before.keys()
+    for key, rx in after.items():
+        assert troubles(rx) == troubles(before[key]), key
+        assert rx["discarded"] == before[key]["discarded"], key
+        assert rx["received"] >= before[key]["received"] + 20, key
+        assert rx["state"] == "running", key
+    assert {station["state"] for station in line.appliance.status()["stations"]} == {"OP"}
+
+
+def test_one_variable_more_in_one_pd(line: Line) -> None:
+    assert line.command("plan") == "nothing differs: all 15 stations are as the file says\n"
+    line.file.write_text(new_text())
+    before = line.subscriptions()
+    plan = line.command("plan").splitlines()
+    assert [text for text in plan if text.startswith("island")] == [CHANGED, RECEIVER]
+    assert any("Version" in text and "1 -> 2" in text for text in plan)
+    assert "2 stations of 15 to change" in "\n".join(plan)
+    assert line.exported() == line.old
+
+    done = line.command("apply").splitlines()
+    assert done[-1] == "2 stations changed, 13 as before"
+    assert not any("refused" in text for text in done)
+    assert line.exported() == line.new
+    line.appliance.command("pd", "set", CHANGED, "rejected", "7")
+    wait_until(lambda: line.appliance.values(RECEIVER)["left.rejected"] == 7)
+    assert_nothing_lost(before, line)
+    stations = line.appliance.status()["stations"]
+    assert all(station["discarded"] == {} for station in stations)
+    assert line.command("plan") == "nothing differs: all 15 stations are as the file says\n"
+
+    before = line.subscriptions()
+    assert line.command("rollback").splitlines()[-1] == "2 stations changed, 13 as before"
+    assert line.exported() == line.old
+    assert_nothing_lost(before, line)
+
+
+def test_what_was_applied_survives_a_restart(line: Line) -> None:
+    line.file.write_text(new_text())
+    line.command("apply")
+    line.command("rollback")
+    assert line.appliance.stop() == (0, "", "")
+    line.appliance = line.start()
+    assert line.exported() == line.old  # although the file says otherwise
+    line.command("rollback")
+    assert line.exported() == line.new
+    line.appliance.process.kill()
+    line.appliance.process.wait()
+    line.appliance = line.start()
+    assert line.exported() == line.new
+
+
+@pytest.mark.parametrize("victim", ["eapctl", "engine", "services", "supervisor"])
+@pytest.mark.parametrize("delay_ms", [0, 40])
+def test_a_kill_in_the_middle(line: Line, victim: str, delay_ms: int) -> None:
+    line.file.write_text(new_text())
+    pids = {name: line.appliance.pid(name) for name in ("engine", "services", "supervisor")}
+    command = [*EAPCTL, "apply", str(line.file)]
+    environment = os.environ | {"EAP_RUNTIME_DIR": str(line.appliance.runtime)}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as apply:
+        assert apply.stdout is not None
+        apply.stdout.readline()  # one step is done, the next begins
+        time.sleep(delay_ms / 1000)
+        os.kill(apply.pid if victim == "eapctl" else pids[victim], signal.SIGKILL)
+        apply.communicate(timeout=70)
+    if victim == "supervisor":
+        line.appliance.process.wait()
+        line.appliance = line.start()
+    wait_until(lambda: all_run(line), timeout_s=20)
+    for name, spec in line.exported().items():
+        assert without_alternates(spec) in (line.old[name], line.new[name]), name
+    line.file.write_text(new_text())
+    line.command("apply")
+    assert line.exported() == line.new
+    before = line.subscriptions()
+    assert_nothing_lost(before, line)
+
+
+def all_run(line: Line) -> bool:
+    """Tell whether all processes are there again and all PDs come in."""
+    done = line.run("status", "--json")
+    if done.returncode:
+        return False
+    document = json.loads(done.stdout)
+    stations = document["stations"]
+    return len(stations) == 15 and all(
+        rx["state"] == "running" for station in stations for rx in station["pd"]["rx"]
+    )
