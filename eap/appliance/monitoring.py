@@ -135,13 +135,18 @@ class SubscriberWatch:
             self._listen()
 
     def _replace(self, station: str, image: Image) -> None:
-        for name in [name for name, row in self._rows.items() if row.port.station == station]:
-            del self._rows[name]
-            self._monitor.remove(name)
+        """Follow the frames of *image*; what is known of those that stay as they were is kept."""
+        own = [name for name, row in self._rows.items() if row.port.station == station]
+        before = {name: self._rows.pop(name) for name in own}
         for place in image.layout.frames:
             if place.monitor_interval_ms:
                 row = _Row(PortName(station, place.port), place, image)
+                was = before.get(row.name)
+                if was is not None and was.place.target == place.target:
+                    row.address, row.destination = was.address, was.destination
                 self._rows[row.name] = row
+        for name in before.keys() - self._rows.keys():
+            self._monitor.remove(name)
 
     def _listen(self) -> None:
         """Have each way listen to what is said of its targets."""

@@ -82,6 +82,11 @@ class FramePlace(Record, frozen=True):
     monitor_interval_ms: int = 0
     monitor_ip: str = ""
 
+    @property
+    def target(self) -> tuple[str, str, int, str]:
+        """Whose presence is monitored, and how."""
+        return self.port, self.destination, self.monitor_interval_ms, self.monitor_ip
+
 
 class TxPlace(Record, frozen=True):
     """A TxPD; *frame_words* is the index of its frame's first word, *size* the data's octets."""

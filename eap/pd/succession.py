@@ -92,7 +92,8 @@ class ImageSuccession:
 class _Sent:
     """The words of TxFrames and TxPDs.
 
-    Where a frame goes, and who is there, is forgotten when it is sent elsewhere.  A frame that is
+    Where a frame goes is forgotten when it is sent elsewhere, and then, or when it is monitored in
+    another way, who is there.  A frame that is
     no more what it was gives the count of its cycles as a whole to its old PDs.
     """
 
@@ -103,6 +104,7 @@ class _Sent:
             b.words for a, b in kept if _schedules(old, a.name) != _schedules(new, b.name)
         ]
         self._moved = [b.words for a, b in kept if a.destination != b.destination]
+        self._unseen = [b.words for a, b in kept if a.target != b.target]
         whole = {b.name for _, b in kept if b.words not in self._changed}
         before = {pd.name: pd for pd in old.tx}
         pds = [(before[pd.name], pd) for pd in new.tx if pd.name in before]
@@ -121,6 +123,7 @@ class _Sent:
         _copy(self._runs, old, new)
         for first in self._moved:
             new[first + FrameWord.ADDRESS] = 0
+        for first in self._unseen:
             new[first + FrameWord.PRESENCE] = Presence.UNKNOWN
         for first in self._changed:
             new[first + FrameWord.PARTIAL] += new[first + FrameWord.WHOLE]

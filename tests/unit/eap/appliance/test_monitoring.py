@@ -162,6 +162,17 @@ def test_a_station_may_be_configured_anew(way, closed):
     assert (holder.status(0), holder.status(1)) == ("unknown", "unknown")
 
 
+def test_what_is_known_of_a_frame_that_stays_is_kept(way, closed):
+    holder = Holder(frame(closed))
+    watch = SubscriberWatch({"a": holder}, Ways({}, {PORT: way}))
+    watch.step(SECOND)
+    send(way, holder, closed, 2 * SECOND)
+    watch.step(2 * SECOND)
+    holder.replace(frame("127.9.2.7", "g"), frame(closed))
+    watch.step(2 * SECOND + 1)
+    assert (holder.status(0), holder.status(1)) == ("unknown", "missing")
+
+
 def test_nothing_to_monitor_is_looked_for_now_and_then(way):
     watch = SubscriberWatch({"a": Holder()}, Ways({}, {PORT: way}))
     assert watch.step(SECOND) == SECOND + LOOK_NS

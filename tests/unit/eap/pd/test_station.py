@@ -671,6 +671,14 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     after.takers["eap0"](memoryview(other), len(other), MS, From("02:00:00:00:00:09"))
     assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:09"
 
+    after.image.words[after.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
+    same = succeed(after, after.spec)
+    assert station_status(same.image, 0)["frames"][0]["subscriber"] == "missing"
+    watched = msgspec.structs.replace(moved, monitor_interval_ms=1000)
+    after = succeed(same, msgspec.structs.replace(made.spec, frames=(watched, by_mac)))
+    row = station_status(after.image, 0)["frames"][0]
+    assert (row["address"], row["subscriber"]) == ("02:00:00:00:00:09", "unknown")
+
     empty = succeed(after, msgspec.structs.replace(made.spec, frames=()))
     empty.takers["eap0"](memoryview(other), len(other), 2 * SECOND, From("02:00:00:00:00:0a"))
     assert station_status(empty.image, 0)["frames"] == []
