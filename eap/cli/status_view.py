@@ -149,7 +149,7 @@ def _bus_remarks(name: str, bus: Row) -> Iterator[str]:
 
 def _process_data(stations: Sequence[Row]) -> RenderableType:
     table = _table("", "Process data", "State", "Frames", "Lost", "Quality", "Age")
-    table.add_column("Jitter, response µs\np50 / p99 / max")
+    table.add_column("Jitter or\nresponse µs\np50 / p99 / max")
     for column in table.columns[3:]:
         column.justify, column.no_wrap = "right", True
     for station in stations:
