@@ -62,6 +62,10 @@ def is_op(appliance, *ports):
     return all(values[f"{port}.state"] == OP and values[f"{port}.wkc_ok"] for port in ports)
 
 
+def describe(appliance, port="bus0"):
+    return appliance.request("bus_describe", station="one", port=port)
+
+
 def segments(appliance):
     """Process ids by port."""
     (info,) = appliance.runtime.glob("*/appliance.json")
@@ -113,26 +117,31 @@ def test_engine_that_is_killed(running):
 
 
 def test_segment_that_is_killed(running):
-    before = segments(running)
+    before, wrong = segments(running), describe(running, "bus1")["wkc_errors"]
     os.kill(before["bus0"], signal.SIGKILL)
     wait_until(lambda: running.values("one")["bus0.state"] == 0)
     values = running.values("one")
     assert (values["bus0.wkc_ok"], values["bus0.sensor.state"]) == (False, 0)
-    assert (values["bus1.state"], values["bus1.wkc_ok"]) == (OP, True)
-    wait_until(lambda: is_op(running, "bus0"))
+    assert values["bus1.state"] == OP
+    wait_until(
+        lambda: is_op(running, "bus0", "bus1")
+    )  # busy machines lose an exchange now and then
+    assert describe(running, "bus1")["wkc_errors"] == wrong
     assert segments(running)["bus0"] != before["bus0"]
     assert segments(running)["bus1"] == before["bus1"]
     assert running.station("one")["restarts"] == 0
 
 
 def test_services_that_are_killed_disturb_no_bus(running):
-    before = running.request("bus_describe", station="one", port="bus0")
+    before = describe(running)
     os.kill(running.pid("services"), signal.SIGKILL)
     wait_until(lambda: running.status()["processes"]["services"]["restarts"] == 1)
-    after = running.request("bus_describe", station="one", port="bus0")
+    after = describe(running)
     assert after["cycles_good"] > before["cycles_good"]
     assert after["wkc_errors"] == before["wkc_errors"]
-    assert is_op(running, "bus0", "bus1")
+    values = running.values("one")
+    assert (values["bus0.state"], values["bus1.state"]) == (OP, OP)
+    wait_until(lambda: is_op(running, "bus0", "bus1"))
 
 
 def test_nothing_is_left_in_time(running):
@@ -175,10 +184,6 @@ def test_wrong_bus_file_ends_the_start(farm, folder):
     code, _, err = farm.start(plant).finish()
     assert code == 2
     assert "coe.yaml" in err
-
-
-def describe(appliance):
-    return appliance.request("bus_describe", station="one", port="bus0")
 
 
 @pytest.mark.root
