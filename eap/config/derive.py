@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -135,11 +136,16 @@ def _type(index: Index, station: Station, name: str) -> datatypes.DataType:
 
 
 def _variable(name: str, variable: Variable, writer: Writer) -> VariableSpec:
+    kind = datatypes.parse(variable.type)
+    # As the type holds it, so that a dictionary gives back the same.
+    default: Any = None
+    if variable.default is not None:
+        default = kind.to_plain(kind.from_plain(variable.default))
     return VariableSpec(
         name=name,
-        type=datatypes.parse(variable.type).text,
+        type=kind.text,
         writer=writer,
-        default=variable.default,
+        default=default,
         unit=variable.unit,
         comment=variable.comment,
     )

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from eap.device.fault import DeviceFault, FaultCode
+from eap.ids import Destination, DestinationKind, InterfaceUri
 from eap.od.profiles.eap1000keys import Frame, Rx, Tx
 from eap.pd.spec import (
     REQUESTER,
@@ -20,6 +21,8 @@ from eap.pd.spec import (
     TxPdSpec,
     Writer,
 )
+
+MIN_MONITOR_INTERVAL_MS = 100
 
 
 class Found(NamedTuple):
@@ -58,8 +61,10 @@ def check_station(
     _check_unique(frames, Frame.NAME, "frame")
     _check_unique(pds, Tx.NAME, "sent PD")
     _check_unique(subscriptions, Rx.NAME, "received PD")
+    schemes = {port.name: InterfaceUri.parse(port.interface).scheme for port in spec.ports}
     for found in frames:
         _check_frame(found)
+        _check_monitoring(found, schemes[found.port])
     for found in pds:
         _check_triggers(found, spec.cycle_us)
     _check_ids(pds)
@@ -94,6 +99,22 @@ def _check_frame(found: Found) -> None:
             where = "who asks" if answers else frame.destination
             detail = f"{pd.name} {who}, the frame goes to {where}"
             raise found.fault(FaultCode.POLL, detail, Frame.ADDRESS_MODE)
+
+
+def _check_monitoring(found: Found, scheme: str) -> None:
+    frame: TxFrameSpec = found.record
+    if frame.monitor_ip and (scheme != "ethernet" or not frame.monitor_interval_ms):
+        detail = "an IP is for a monitored frame on Ethernet"
+        raise found.fault(FaultCode.MONITORING, detail, Frame.MONITOR_IP)
+    if not frame.monitor_interval_ms:
+        return
+    if frame.monitor_interval_ms < MIN_MONITOR_INTERVAL_MS:
+        detail = f"every {frame.monitor_interval_ms} ms, at least {MIN_MONITOR_INTERVAL_MS}"
+        raise found.fault(FaultCode.MONITORING, detail, Frame.MONITORING_INTERVAL)
+    where = None if frame.destination == REQUESTER else Destination.parse(frame.destination)
+    if where is None or where.is_group or where.kind is DestinationKind.TCP or scheme == "loop":
+        detail = f"at {frame.destination}; only at one station, on Ethernet or UDP"
+        raise found.fault(FaultCode.MONITORING, detail, Frame.MONITORING_INTERVAL)
 
 
 def _check_triggers(found: Found, cycle_us: int) -> None:

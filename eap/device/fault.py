@@ -42,6 +42,7 @@ class FaultCode(IntEnum):
     IN_USE = 0x8016
     POLL = 0x8017
     NO_ROOM = 0x8018
+    MONITORING = 0x8019
 
 
 FAULT_TEXTS = {
@@ -73,6 +74,7 @@ FAULT_TEXTS = {
     FaultCode.IN_USE: "station uses what is not there any more",
     FaultCode.POLL: "request and answer do not fit together",
     FaultCode.NO_ROOM: "does not fit into the dictionary",
+    FaultCode.MONITORING: "nobody can be looked for",
 }
 
 

@@ -40,8 +40,14 @@ PORTS = (
 BLANK = StationSpec("station", "127.0.9.1.1.1", CYCLE_US, PORTS)
 DESTINATIONS = {
     "udp": ("10.0.0.2", "10.0.0.2:4000", "239.1.2.3", "255.255.255.255", "tcp://10.0.0.3:5"),
-    "ethernet": ("01:01:05:04:00:00", "02:00:00:00:00:07", "ff:ff:ff:ff:ff:ff", "5.5.5.5.2.1"),
+    "ethernet": (
+        "01:01:05:04:00:00",
+        "02:00:00:00:00:07",
+        "ff:ff:ff:ff:ff:ff",
+        "5.5.5.5.2.1",
+    ),
 }
+UNICAST = {"10.0.0.2", "10.0.0.2:4000", "02:00:00:00:00:07", "5.5.5.5.2.1"}
 
 
 def empty(station: StationSpec = BLANK) -> dict[str, EapDictionary]:
@@ -153,6 +159,8 @@ def stations(draw: st.DrawFn) -> StationSpec:
         scheme = InterfaceUri.parse(port.interface).scheme
         target = REQUESTER if answers else draw(st.sampled_from(DESTINATIONS[scheme]))
         is_net_id = target.count(".") == 5
+        is_monitored = target in UNICAST and draw(st.booleans())
+        has_ip = is_monitored and scheme == "ethernet" and draw(st.booleans())
         frames.append(
             TxFrameSpec(
                 name=f"frame{number}",
@@ -163,8 +171,8 @@ def stations(draw: st.DrawFn) -> StationSpec:
                 modulo=draw(st.integers(0, 3)) if gate else 0,
                 changeable=draw(st.booleans()),
                 mac=draw(st.sampled_from(("", "02:00:00:00:00:08"))) if is_net_id else "",
-                monitor_interval_ms=draw(st.sampled_from((0, 1000))),
-                monitor_ip=draw(st.sampled_from(("", "10.0.0.9"))),
+                monitor_interval_ms=draw(st.sampled_from([100, 5000])) if is_monitored else 0,
+                monitor_ip="10.0.0.9" if has_ip else "",
             )
         )
     return StationSpec(

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 
 from eap.device.difference import compare
 from eap.device.stored import configuration, copy
@@ -17,6 +17,7 @@ def _kept(dictionary):
     }
 
 
+@settings(max_examples=30)
 @given(stations(), stations())
 def test_changes_written_in_their_order_make_the_new_dictionary(
     before: StationSpec, after: StationSpec
@@ -30,6 +31,7 @@ def test_changes_written_in_their_order_make_the_new_dictionary(
             assert compare(old, new[name]) == []
 
 
+@settings(max_examples=30)
 @given(stations())
 def test_a_blank_station_is_filled_by_downloads_alone(station: StationSpec):
     for name, new in filled(station).items():
@@ -40,6 +42,7 @@ def test_a_blank_station_is_filled_by_downloads_alone(station: StationSpec):
         assert configuration(old) == configuration(new)
 
 
+@settings(max_examples=30)
 @given(stations())
 def test_a_copy_does_not_differ(station: StationSpec):
     for each in filled(station).values():

@@ -58,6 +58,25 @@ def ports():
             [(0x8000, Frame.DIVIDER, 2), (0x8000, Frame.MODULO, 1), (0xD000, Tx.DIVIDER, 4)],
             (FaultCode.GATE, 0xD000, Tx.DIVIDER),
         ),
+        (
+            [(0x8000, Frame.MONITOR_IP, b"\x0a\0\0\2")],
+            (FaultCode.MONITORING, 0x8000, Frame.MONITOR_IP),
+        ),
+        (
+            [(0x8000, Frame.MONITORING_INTERVAL, 99)],
+            (FaultCode.MONITORING, 0x8000, Frame.MONITORING_INTERVAL),
+        ),
+        (
+            [(0x8000, Frame.MONITORING_INTERVAL, 100), (0x8000, Frame.ADDRESS_MODE, 3)],
+            (FaultCode.MONITORING, 0x8000, Frame.MONITORING_INTERVAL),
+        ),
+        (
+            [
+                (0x8000, Frame.MONITORING_INTERVAL, 100),
+                (0x8000, Frame.DESTINATION_IP, b"\xef\1\1\1"),
+            ],
+            (FaultCode.MONITORING, 0x8000, Frame.MONITORING_INTERVAL),
+        ),
         ([(0xE001, Rx.PD_ID, 1)], (FaultCode.RECEIVED_TWICE, 0xE001, Rx.PD_ID)),
         ([(0xE001, Rx.PDO_INDEX, 0x1600)], (FaultCode.RECEIVED_TWICE, 0xE001, Rx.PDO_INDEX)),
         (

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from msgspec.structs import replace
 
 from eap.device.eap_read import read_back
@@ -23,11 +23,13 @@ from tests.support.downloads import receiver, sender, variable, write
 from tests.support.stations import BLANK, empty, filled, stations
 
 
+@settings(max_examples=30)
 @given(stations())
 def test_what_was_filled_from_a_station_reads_back_as_that_station(station: StationSpec):
     assert read_back(station, filled(station)) == station
 
 
+@settings(max_examples=30)
 @given(stations())
 def test_what_was_filled_reads_back_alike_into_a_blank_station(station: StationSpec):
     bare = replace(station, variables=(), frames=(), subscriptions=(), sources=(), links=())

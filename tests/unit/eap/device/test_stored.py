@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import (
@@ -22,6 +22,7 @@ from tests.support.downloads import OP, receiver, sender, variable, write
 from tests.support.stations import BLANK, empty, filled, stations
 
 
+@settings(max_examples=30)
 @given(stations())
 def test_what_is_encoded_comes_back_whole(station: StationSpec):
     for name, each in filled(station).items():
