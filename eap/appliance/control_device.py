@@ -16,6 +16,7 @@ from eap.device.difference import Change
 from eap.device.eap_state import StateResult
 from eap.device.fault import DeviceFault
 from eap.od.model import Access, Entry, OdObject
+from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.table import UNITS
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -146,7 +147,13 @@ def change_row(port: str, change: Change) -> dict[str, Any]:
         "change": change.kind,
         "old": change.old,
         "new": change.new,
+        "unit": _unit(change),
     }
+
+
+def _unit(change: Change) -> str:
+    row = profile.row_of(change.index).row(change.subindex)
+    return "" if row is None else row.unit
 
 
 def plan_document(plan: Plan) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Changes of a plant as lines for people.
 
 island-02
-  ~ 0xD000:07 TxPD 0 (state): Cycle time  10000 us -> 20000 us
+  ~ 0xD000:07 TxPD 0 (state): Cycle time  10000 -> 20000 us
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from eap.device.rollout import Step
 
 _SIGNS = {"added": "+", "removed": "-", "changed": "~"}
+_EMPTY = '""'
 
 
 def plan_lines(plans: Sequence[StationPlan], order: Sequence[Step]) -> Iterator[str]:
@@ -25,7 +26,7 @@ def plan_lines(plans: Sequence[StationPlan], order: Sequence[Step]) -> Iterator[
     for each in plans:
         if each.differs:
             yield each.station
-            yield from (f"  {change_line(change)}" for change in each.changes)
+            yield from (f"  {line}" for line in map(change_line, _with_ports(each.changes)))
             yield from (f"  * {note}" for note in each.notes)
             yield from (f"  ! {reason}" for reason in each.refused)
     refusing = [each.station for each in plans if each.refused]
@@ -55,16 +56,17 @@ def change_line(change: dict[str, Any]) -> str:
     """Return one change of an object."""
     kind = change["change"]
     old, new = change["old"], change["new"]
-    values = f"{old} -> {new}" if kind == "changed" else new if kind == "added" else old
+    values = f"{old or _EMPTY} -> {new or _EMPTY}" if kind == "changed" else new
+    unit = f" {change['unit']}" if values and change["unit"] else ""
     what = f"{_SIGNS[kind]} {entry_name(change['index'], change['subindex'])} {change['name']}"
-    return f"{what}  {values}".rstrip()
+    return f"{what}  {values}{unit}".rstrip()
 
 
 def done_lines(done: Done) -> Iterator[str]:
     """Yield what one step did."""
     outcome = done.outcome
     yield f"{done.station} {done.why}: {'ok' if outcome.ok else 'refused'}"
-    for result in outcome.results:
+    for result in _with_ports(outcome.results):
         verdict = "ok" if result["ok"] else result["reason"]
         yield f"  {change_line(result)}  {verdict}"
     yield from (f"  ! {reason}" for reason in outcome.refused)
@@ -93,6 +95,13 @@ def end_lines(
 def _are(names: Iterable[str]) -> str:
     listed = list(names)
     return f"{'is' if len(listed) == 1 else 'are'} {', '.join(listed)}"
+
+
+def _with_ports(changes: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yield *changes*, each with its port in front of its name if there is more than one port."""
+    several = len({change["port"] for change in changes}) > 1
+    for change in changes:
+        yield change | {"name": f"{change['port']}: {change['name']}"} if several else change
 
 
 def _stations(plans: Iterable[StationPlan]) -> str:

@@ -85,4 +85,4 @@ class PlantStub:
         old, new = self.specs[name].cycle_us, spec.cycle_us
         row = {"port": "eap0", "index": 0xF800, "subindex": 8, "change": "changed",
                "name": "Configured objects: Device cycle time"}  # fmt: skip
-        return [] if old == new else [row | {"old": f"{old} us", "new": f"{new} us"}]
+        return [] if old == new else [row | {"old": str(old), "new": str(new), "unit": "us"}]

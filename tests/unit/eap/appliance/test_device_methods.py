@@ -171,6 +171,7 @@ def test_export_plan_apply_and_rollback(call, stations, device):
         "change": "changed",
         "old": "0",
         "new": "5",
+        "unit": "",
     }
     plan = {"changes": [changed], "station": [], "refused": []}
     assert call("plan", station="left", spec=exported) == plan

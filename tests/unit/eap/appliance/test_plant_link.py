@@ -57,7 +57,7 @@ def test_requests(stack):
         )
         plan = link.plan(faster)
         assert plan.differs
-        assert [change["new"] for change in plan.changes] == ["5000 us"]
+        assert [change["new"] for change in plan.changes] == ["5000"]
         assert link.apply(faster).ok
         assert link.export("mixer").previous == station("mixer")
         assert stub.specs["mixer"] == faster

@@ -45,7 +45,7 @@ def test_apply_and_back(stub, file):
             for number in (1, 2, 3)
             for line in (
                 f"station-0{number} is as it is to be: ok",
-                f"  {CHANGE}  20000 us -> 10000 us  ok",
+                f"  {CHANGE}  20000 -> 10000 us  ok",
             )
         ),
         "3 stations changed",
@@ -54,7 +54,7 @@ def test_apply_and_back(stub, file):
     result = run("rollback", file, "--station", "station-02")
     assert result.output.splitlines() == [
         "station-02 is as it is to be: ok",
-        f"  {CHANGE}  10000 us -> 20000 us  ok",
+        f"  {CHANGE}  10000 -> 20000 us  ok",
         "1 station changed, 2 as before",
     ]
     assert {spec.cycle_us for spec in stub.specs.values()} == {10_000, 20_000}
@@ -75,7 +75,7 @@ def test_refusal_in_the_middle(stub, file):
     assert result.exit_code == 1
     assert result.output.splitlines()[2:] == [
         "station-02 is as it is to be: refused",
-        f"  {CHANGE}  20000 us -> 10000 us  not today",
+        f"  {CHANGE}  20000 -> 10000 us  not today",
         "  ! not today",
         "1 station changed, 2 as before",
         "station-02 refused: changed until then is station-01",

@@ -45,7 +45,7 @@ def test_differences(stub, file):
     )
     assert plan(file).output.splitlines()[:3] == [
         "station-02",
-        "  ~ 0xF800:08 Configured objects: Device cycle time  10000 us -> 5000 us",
+        "  ~ 0xF800:08 Configured objects: Device cycle time  10000 -> 5000 us",
         "1 station of 3 to change (1 changed), 2 as the file says",
     ]
     document = json.loads(plan(file, "--json").output)

@@ -10,9 +10,9 @@ from eap.device.rollout import Step
 from tests.support.fakeappliance import station
 
 
-def change(kind, old="", new="", subindex=0):
+def change(kind, old="", new="", subindex=0, unit=""):
     return {"port": "eap0", "index": 0x6003, "subindex": subindex, "name": "Tx variable 3 (speed)",
-            "change": kind, "old": old, "new": new}  # fmt: skip
+            "change": kind, "old": old, "new": new, "unit": unit}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,9 @@ def change(kind, old="", new="", subindex=0):
     [
         (change("added"), "+ 0x6003:00 Tx variable 3 (speed)"),
         (change("added", new="REAL", subindex=4), "+ 0x6003:04 Tx variable 3 (speed)  REAL"),
-        (change("removed"), "- 0x6003:00 Tx variable 3 (speed)"),
+        (change("removed", "10"), "- 0x6003:00 Tx variable 3 (speed)"),
+        (change("changed", "", "bar", 6), '~ 0x6003:06 Tx variable 3 (speed)  "" -> bar'),
+        (change("changed", "1", "2", 7, "us"), "~ 0x6003:07 Tx variable 3 (speed)  1 -> 2 us"),
         (change("changed", "1", "2", 16), "~ 0x6003:0x10 Tx variable 3 (speed)  1 -> 2"),
     ],
 )
@@ -56,4 +58,13 @@ def test_refusals():
         "  ! port eap1 would be new",
         "1 station of 1 to change",
         "cannot be applied: mixer refused",
+    ]
+
+
+def test_several_ports():
+    changes = [change("added"), change("added") | {"port": "eap1"}]
+    lines = list(plan_lines([StationPlan("mixer", changes, [], [])], []))
+    assert lines[1:3] == [
+        "  + 0x6003:00 eap0: Tx variable 3 (speed)",
+        "  + 0x6003:00 eap1: Tx variable 3 (speed)",
     ]
