@@ -7,6 +7,7 @@ file that was damaged, or edited by hand, from one that was written whole.
 from __future__ import annotations
 
 import hashlib
+import time
 from typing import Any
 
 import msgspec
@@ -40,6 +41,10 @@ class Stored(Configuration, frozen=True, kw_only=True):
     was."""
     previous: Configuration | None = None
     """For a rollback."""
+    cause: str = ""
+    """Which change brought it; the same at all stations that one ``apply`` changed."""
+    undone: bool = False
+    """Whether *cause* was rolled back: *previous* is what it had brought."""
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -48,6 +53,11 @@ class _File(msgspec.Struct, frozen=True):
     version: int
     digest: str
     content: msgspec.Raw
+
+
+def new_cause() -> str:
+    """Return a name for a change; those of later changes sort behind it."""
+    return f"{time.time_ns():020d}"
 
 
 def digest_of(spec: StationSpec) -> str:

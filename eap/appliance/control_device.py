@@ -10,11 +10,13 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from eap.appliance.configuration import Configuration
 from eap.appliance.control import Parameters
 from eap.appliance.device_change import Plan
 from eap.device.difference import Change
 from eap.device.eap_state import StateResult
 from eap.device.fault import DeviceFault
+from eap.device.rollout import without_alternates
 from eap.od.model import Access, Entry, OdObject
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.table import UNITS
@@ -83,13 +85,22 @@ class StationParameters(Parameters, frozen=True, kw_only=True):
 
 
 class SpecParameters(StationParameters, frozen=True, kw_only=True):
-    """``plan`` and ``apply``."""
+    """``plan``."""
 
     spec: StationSpec
 
 
+class ApplyParameters(SpecParameters, frozen=True, kw_only=True):
+    """``apply``: all steps of one change of a plant have the same *cause*, later ones a greater."""
+
+    cause: Annotated[str, Meta(max_length=64)] = ""
+
+
 class RollbackParameters(StationParameters, frozen=True, kw_only=True):
-    """``rollback``: to what ran before, which is *spec*, alternates aside."""
+    """``rollback``: to what ran before the last change; *spec* is that, or what runs now.
+
+    Either may have other alternates.
+    """
 
     spec: StationSpec | None = None
 
@@ -179,6 +190,18 @@ def spec_document(spec: StationSpec) -> dict[str, Any]:
     """Return a specification as JSON has it."""
     document: dict[str, Any] = msgspec.to_builtins(spec)
     return document
+
+
+def export_document(
+    spec: StationSpec, previous: Configuration | None, cause: str, undone: bool
+) -> dict[str, Any]:
+    """Return what a station runs, what it ran before the last change, and which that was."""
+    return {
+        "spec": spec_document(spec),
+        "previous": previous and spec_document(without_alternates(previous.spec)),
+        "cause": cause,
+        "undone": undone,
+    }
 
 
 def state_of(word: str) -> int:

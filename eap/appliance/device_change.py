@@ -107,10 +107,15 @@ def plan_rollback(
     now: StationSpec, dictionaries: Mapping[str, EapDictionary], previous: Configuration | None,
     wanted: StationSpec | None = None,
 ) -> Plan:  # fmt: skip
-    """Return what it takes to run again what ran before: *wanted*, which may have alternates."""
+    """Return what it takes to run again what ran before.
+
+    That is *wanted* if there are alternates to it, or else *wanted* is what runs now, with others.
+    """
+    if wanted is not None and without_alternates(wanted) == without_alternates(now):
+        return make_plan(now, dictionaries, wanted, dump_all(dictionaries))
     if previous is None:
         reason = "there is nothing to go back to: it has run nothing else"
         return Plan(now, [], [], [reason], {})
-    if wanted is not None and without_alternates(wanted) != previous.spec:
+    if wanted is not None and without_alternates(wanted) != without_alternates(previous.spec):
         return Plan(now, [], [], ["meanwhile it would go back to something else"], {})
     return make_plan(now, dictionaries, wanted or previous.spec, previous.objects)

@@ -107,16 +107,16 @@ class DeviceMethods:
 
     def _export(self, params: dict[str, Any]) -> dict[str, Any]:
         device = self._device(parameters(params, words.StationParameters).station)
-        previous = device.previous and words.spec_document(device.previous.spec)
-        return {"spec": words.spec_document(device.spec), "previous": previous}
+        return words.export_document(device.spec, *device.last_change)
 
     def _plan(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.SpecParameters)
         return words.plan_document(self._device(wanted.station).plan(wanted.spec))
 
     async def _apply(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.SpecParameters)
-        return words.outcome_document(*await self._device(wanted.station).apply(wanted.spec))
+        wanted = parameters(params, words.ApplyParameters)
+        device = self._device(wanted.station)
+        return words.outcome_document(*await device.apply(wanted.spec, wanted.cause))
 
     async def _roll_back(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.RollbackParameters)

@@ -10,6 +10,7 @@ from typing import Any
 
 from eap.appliance.change import needs_new_start
 from eap.device.eap_content import bus_variables
+from eap.device.version import kept_versions
 from eap.pd.spec import LinkSpec, Source, StationSpec, VariableSpec
 
 
@@ -33,6 +34,7 @@ def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
     """Return what changes beside the objects of the dictionaries, a line for each thing."""
     on_bus = bus_variables(old) | bus_variables(new)
     return [
+        *kept_versions(old, new),
         *_differences("source of", _source_name, old.sources, new.sources),
         *_differences("link", _link_name, old.links, new.links),
         *_differences("variable", _variable_name, _chosen(old, on_bus), _chosen(new, on_bus)),

@@ -9,11 +9,13 @@ Rule 3: what a station refuses ends it, unless told to go on with the other stat
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
 import msgspec
 
+from eap.appliance.configuration import new_cause
 from eap.appliance.control import near
 from eap.appliance.plant_link import Outcome, PlantLink, StationPlan
 from eap.appliance.plantfile import load_plant
@@ -73,44 +75,43 @@ def apply_steps(
 ) -> Iterator[Done]:
     """Take *order* step by step, and yield what became of each.
 
-    A station that refused one is asked for nothing more.
+    A station that refused one is asked for nothing more.  What goes on with a change that was
+    broken off belongs to it, so that a rollback takes back both.
     """
-    return _walk(((step, link.apply) for step in order), keep_going=keep_going)
+    running = [link.export(name) for name in link.stations]
+    under_way = [each.cause for each in running if _is_under_way(each.spec)]
+    cause = max(under_way, default="") or new_cause()
+    yield from _walk(order, partial(link.apply, cause=cause), keep_going=keep_going)
 
 
 def roll_back(
     link: PlantLink, stations: Iterable[str], *, keep_going: bool = False
 ) -> Iterator[Done]:
-    """Bring *stations* back to what they were before, and yield what became of each step.
+    """Take the last change of *stations* back, and yield what became of each step.
 
-    Those that were never changed are left alone.
+    Those that it did not change are left alone.  If it was taken back everywhere, and nothing is
+    left to do, it is made again.
     """
     running = {name: link.export(name) for name in link.stations}
     now = {name: each.spec for name, each in running.items()}
-    before = {name: running[name].previous or now[name] for name in stations}
-    order = steps(now, {**now, **before})
-    return _walk(_back(link, order, before), keep_going=keep_going)
+    goal = {name: without_alternates(now[name]) for name in stations}
+    known = {name: running[name] for name in goal if running[name].previous is not None}
+    last = max((each.cause for each in known.values()), default="")
+    part = {name: each for name, each in known.items() if each.cause == last}
+    left = {n: each for n, each in part.items() if not each.undone and each.previous != goal[n]}
+    if not left and not any(_is_under_way(each.spec) for each in part.values()):
+        left = part
+    goal |= {name: each.previous for name, each in left.items() if each.previous is not None}
+    return _walk(steps(now, {**now, **goal}), link.rollback, keep_going=keep_going)
 
 
-def _back(
-    link: PlantLink, order: Iterable[Step], before: Mapping[str, StationSpec]
-) -> Iterator[tuple[Step, Do]]:
-    """Yield each step with what takes it: ``rollback`` for the one that goes back.
-
-    It brings back the objects of the dictionary too; what comes after it only takes away what was
-    received beside.
-    """
-    is_back: set[str] = set()
-    for step in order:
-        goes_back = without_alternates(step.spec) == before[step.station]
-        yield step, link.rollback if goes_back and step.station not in is_back else link.apply
-        if goes_back:
-            is_back.add(step.station)
+def _is_under_way(spec: StationSpec) -> bool:
+    return any(pd.alternates for pd in spec.subscriptions)
 
 
-def _walk(walk: Iterable[tuple[Step, Do]], *, keep_going: bool) -> Iterator[Done]:
+def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[Done]:
     refused: set[str] = set()
-    for step, do in walk:
+    for step in order:
         if step.station in refused:
             continue
         outcome = do(step.spec)

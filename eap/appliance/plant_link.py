@@ -50,6 +50,11 @@ class Running(msgspec.Struct, frozen=True):
 
     spec: StationSpec
     previous: StationSpec | None = None
+    """Before the last change, alternates aside."""
+    cause: str = ""
+    """Which change that was; those of later ones sort behind."""
+    undone: bool = False
+    """Whether it was taken back."""
 
 
 class PlantLink:
@@ -80,13 +85,13 @@ class PlantLink:
         answer = self._ask("plan", spec.name, spec=msgspec.to_builtins(spec))
         return StationPlan(spec.name, answer["changes"], answer["station"], answer["refused"])
 
-    def apply(self, spec: StationSpec) -> Outcome:
-        """Let the station of its name be as *spec* says."""
-        answer = self._ask("apply", spec.name, spec=msgspec.to_builtins(spec))
+    def apply(self, spec: StationSpec, cause: str) -> Outcome:
+        """Let the station of its name be as *spec* says, as a step of the change named *cause*."""
+        answer = self._ask("apply", spec.name, spec=msgspec.to_builtins(spec), cause=cause)
         return msgspec.convert(answer, Outcome)
 
     def rollback(self, spec: StationSpec) -> Outcome:
-        """Let the station of its name be what it was before, which is *spec*, alternates aside."""
+        """Let the station of its name be *spec*: what it was before, or is, alternates aside."""
         answer = self._ask("rollback", spec.name, spec=msgspec.to_builtins(spec))
         return msgspec.convert(answer, Outcome)
 

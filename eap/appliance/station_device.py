@@ -8,8 +8,9 @@ Rule 3: in any state but PreOp the dictionaries say what runs.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, TypeAlias, TypeVar
 
 from devicebus.mailbox.ads_services import AdsServices
 from devicebus.mailbox.aoe_server import AmsAnswer
@@ -38,6 +39,7 @@ _WRITES = frozenset((AmsCommand.WRITE, AmsCommand.READ_WRITE))
 _STATES = frozenset((DeviceState.PREOP, DeviceState.SAFEOP, DeviceState.OP))
 
 ResultT = TypeVar("ResultT")
+Run: TypeAlias = Callable[[StationSpec, dict[str, Any]], Awaitable[None]]
 
 logger = logging.getLogger(__name__)
 
@@ -90,9 +92,9 @@ class StationDevice:
         return self._keeper.spec
 
     @property
-    def previous(self) -> Configuration | None:
-        """What ran before, None if nothing else."""
-        return self._keeper.previous
+    def last_change(self) -> tuple[Configuration | None, str, bool]:
+        """What ran before the last change, if anything, which change that was, and if undone."""
+        return self._keeper.previous, self._keeper.cause, self._keeper.undone
 
     @property
     def status(self) -> StateResult:
@@ -151,29 +153,31 @@ class StationDevice:
         """Return what it takes to run *spec*."""
         return make_plan(self.spec, self.dictionaries, spec, {})
 
-    async def apply(self, spec: StationSpec) -> tuple[Plan, DeviceFault | None]:
-        """Run *spec*, in the state that there is; return what that changes, or why it does not."""
-        return await self._jobs.do(lambda: self._change(lambda: self.plan(spec), applied=True))
+    async def apply(self, spec: StationSpec, cause: str = "") -> tuple[Plan, DeviceFault | None]:
+        """Run *spec*, in the state that there is; return what that changes, or why it does not.
+
+        A change of several stations in several steps has one *cause*.
+        """
+        run = partial(self._keeper.change, cause=cause, applied=True)
+        return await self._jobs.do(lambda: self._change(lambda: self.plan(spec), run))
 
     async def roll_back(self, spec: StationSpec | None = None) -> tuple[Plan, DeviceFault | None]:
-        """Run again what ran before; returns as :meth:`apply` does.
+        """Run again what ran before the last change; returns as :meth:`apply` does.
 
-        *spec* is the same with alternates, where a change of layouts is under way.
+        *spec* is that, or what runs now, with alternates where layouts change with other stations.
         """
 
         def plan() -> Plan:
-            return make_rollback(self.spec, self.dictionaries, self.previous, spec)
+            return make_rollback(self.spec, self.dictionaries, self._keeper.previous, spec)
 
-        return await self._jobs.do(lambda: self._change(plan, applied=False))
+        return await self._jobs.do(lambda: self._change(plan, self._keeper.take_back))
 
-    async def _change(
-        self, make: Callable[[], Plan], *, applied: bool
-    ) -> tuple[Plan, DeviceFault | None]:
+    async def _change(self, make: Callable[[], Plan], run: Run) -> tuple[Plan, DeviceFault | None]:
         plan = make()
         if plan.refused or (plan.is_empty and plan.spec == self.spec):
             return plan, None
         try:
-            await self._keeper.change(plan.spec, plan.objects(), applied=applied)
+            await run(plan.spec, plan.objects())
         except DeviceFault as exc:
             return plan, exc
         for name, dictionary in self.dictionaries.items():

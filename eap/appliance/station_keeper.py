@@ -13,7 +13,9 @@ import logging
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from eap.appliance.configuration import Configuration, Stored, digest_of
+from msgspec.structs import replace
+
+from eap.appliance.configuration import Configuration, Stored, digest_of, new_cause
 from eap.appliance.store import Store
 from eap.device.fault import DeviceFault, FaultCode
 from eap.device.rollout import without_alternates
@@ -50,7 +52,9 @@ class StationKeeper:
         spec: What it runs.
         state: In which state.
         objects: The content of its dictionaries, where that was kept.
-        previous: What it ran before, None if nothing else.
+        previous: What it ran before the last change, None if nothing else.
+        cause: Which change that was.
+        undone: Whether it was taken back.
         on_change: Called with a new specification once it runs.
     """
 
@@ -61,6 +65,8 @@ class StationKeeper:
         self.state = state
         self.objects: dict[str, Any] = {}
         self.previous: Configuration | None = None
+        self.cause = ""
+        self.undone = False
         self.on_change: Callable[[StationSpec], None] | None = None
         self._store = store
         self._engine = engine
@@ -70,36 +76,53 @@ class StationKeeper:
         stored = store.load(spec.name)
         if stored is not None:
             self._base, self._applied = stored.base, stored.applied
-            self.previous = stored.previous
+            self.previous, self.cause = stored.previous, stored.cause
+            self.undone = stored.undone
             if stored.spec == spec:
                 self.objects = stored.objects
 
     async def change(
-        self, spec: StationSpec, objects: dict[str, Any], *, applied: bool = False
+        self, spec: StationSpec, objects: dict[str, Any], *, cause: str = "", applied: bool = False
     ) -> None:
         """Run *spec*, with what the dictionaries hold then.
 
         Args:
             spec: What is to run.
             objects: The content of its dictionaries.
-            applied: Whether *spec* is what a plant file says, alternates aside.
+            cause: What brings it; all steps of one change have the same.  Empty is a new one.
+            applied: Whether *spec* is what a plant file says, or a step on the way to that.
 
         Raises:
             DeviceFault: it does not run, and what ran before goes on.
         """
-        bare, bare_before = without_alternates(spec), without_alternates(self.spec)
-        # A step of a change that is under way is no configuration to go back to.
-        is_same = bare == bare_before and objects == self.objects
-        before = Configuration(base=self._base, spec=bare_before, objects=self.objects)
-        previous = self.previous if is_same else before
-        record = Stored(
-            base=self._base,
-            spec=spec,
-            objects=objects,
-            state=self.state,
-            previous=previous,
-            applied=digest_of(bare) if applied and not is_same else self._applied,
-        )
+        record = replace(self._record(), spec=spec, objects=objects)
+        # Where nothing was kept of the dictionaries yet they hold what follows from what runs.
+        is_other = spec != self.spec or objects != (self.objects or objects)
+        if is_other and (not cause or cause != self.cause or self.undone):
+            cause = cause or new_cause()
+            record = replace(record, previous=self._before(), cause=cause, undone=False)
+        bare = without_alternates(spec)
+        if applied and (bare == spec or bare != without_alternates(self.spec)):
+            record = replace(record, applied=digest_of(bare))
+        await self._run(record)
+
+    async def take_back(self, spec: StationSpec, objects: dict[str, Any]) -> None:
+        """Run *spec*: what ran before the last change, or a step on the way there or from there.
+
+        What ran until now is what another :meth:`take_back` brings.  Raises as :meth:`change`.
+        """
+        record = replace(self._record(), spec=spec, objects=objects)
+        if without_alternates(spec) != without_alternates(self.spec):
+            record = replace(record, previous=self._before(), undone=not self.undone)
+        await self._run(record)
+
+    def _before(self) -> Configuration:
+        """Return what runs, as something to go back to."""
+        spec = without_alternates(self.spec)
+        return Configuration(base=self._base, spec=spec, objects=self.objects)
+
+    async def _run(self, record: Stored) -> None:
+        spec = record.spec
         try:
             await self._save(record)
             if spec != self.spec or self._is_unsure:
@@ -109,7 +132,8 @@ class StationKeeper:
             await self._save_back()
             raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
         self._is_unsure = False
-        self.objects, self.previous, self._applied = objects, previous, record.applied
+        self.objects, self.previous, self._applied = record.objects, record.previous, record.applied
+        self.cause, self.undone = record.cause, record.undone
         if spec != self.spec:
             self.spec = spec
             if self.on_change is not None:
@@ -154,8 +178,10 @@ class StationKeeper:
             spec=self.spec,
             objects=self.objects,
             state=self.state,
-            previous=self.previous,
             applied=self._applied,
+            previous=self.previous,
+            cause=self.cause,
+            undone=self.undone,
         )
 
     async def _save(self, record: Stored) -> None:

@@ -56,7 +56,7 @@ def rollback(
 ) -> None:
     """Bring the stations of PLANT that run here back to what they ran before the last change.
 
-    Stations that were never changed stay as they are.  A second rollback undoes the first one.
+    Stations that it left alone stay as they are.  A second rollback undoes the first one.
 
     Exits with 1 when a station refused.
     """

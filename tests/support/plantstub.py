@@ -19,7 +19,9 @@ class PlantStub:
 
     Attributes:
         specs: What each station runs.
-        previous: What each ran before.
+        previous: What each ran before the last change.
+        causes: Which change that was.
+        undone: Where it was taken back.
         unable: Stations that say so when they are planned.
         refuses: Tells whether a station refuses a specification when it is applied.
         taken: Everything that was applied, in order.
@@ -29,6 +31,8 @@ class PlantStub:
                  plant_file: str = "plant.yaml") -> None:  # fmt: skip
         self.specs = {spec.name: spec for spec in specs}
         self.previous: dict[str, StationSpec] = {}
+        self.causes: dict[str, str] = {}
+        self.undone: set[str] = set()
         self.unable: set[str] = set()
         self.refuses: Callable[[StationSpec], bool] = lambda _: False
         self.taken: list[StationSpec] = []
@@ -39,7 +43,12 @@ class PlantStub:
 
     def export(self, params: dict[str, Any]) -> Any:
         name = params["station"]
-        return {"spec": self.specs[name], "previous": self.previous.get(name)}
+        return {
+            "spec": self.specs[name],
+            "previous": self.previous.get(name),
+            "cause": self.causes.get(name, ""),
+            "undone": name in self.undone,
+        }
 
     def plan(self, params: dict[str, Any]) -> Any:
         name, spec = self._asked(params)
@@ -51,19 +60,21 @@ class PlantStub:
         name, spec = self._asked(params)
         before = self.specs[name]
         answer = self._take(name, spec)
-        if answer["ok"] and without_alternates(before) != without_alternates(spec):
+        if answer["ok"] and (params["cause"] != self.causes.get(name) or name in self.undone):
             self.previous[name] = without_alternates(before)
+            self.causes[name] = params["cause"]
+            self.undone.discard(name)
         return answer
 
     def rollback(self, params: dict[str, Any]) -> Any:
         name, spec = self._asked(params)
-        if name not in self.previous:
-            raise ControlError(f"station {name} has nothing to go back to")
-        assert without_alternates(spec) == self.previous[name]
-        before = without_alternates(self.specs[name])
+        before, after = (without_alternates(each) for each in (self.specs[name], spec))
+        if after != before and after != self.previous.get(name):
+            raise ControlError(f"station {name} has not that to go back to")
         answer = self._take(name, spec)
-        if answer["ok"]:
+        if answer["ok"] and after != before:
             self.previous[name] = before
+            self.undone ^= {name}
         return answer
 
     def _asked(self, params: dict[str, Any]) -> tuple[str, StationSpec]:

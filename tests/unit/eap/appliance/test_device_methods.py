@@ -159,8 +159,8 @@ def test_states(call, device):
 
 
 def test_export_plan_apply_and_rollback(call, stations, device):
-    exported, nothing = call("export", station="left").values()
-    assert nothing is None
+    exported, *rest = call("export", station="left").values()
+    assert rest == [None, "", False]
     assert msgspec.convert(exported, StationSpec) == stations[0]
     exported["frames"][0]["pds"][0]["version"] = 5
     changed = {
@@ -188,6 +188,10 @@ def test_export_plan_apply_and_rollback(call, stations, device):
     back = call("rollback", station="left")
     assert [(row["old"], row["new"], row["ok"]) for row in back["results"]] == [("5", "0", True)]
     assert call("rollback", station="left", spec=exported)["ok"] is True
+    assert call("rollback", station="left", spec=exported)["results"] == []
+    after = call("export", station="left")
+    assert (after["spec"], after["undone"]) == (exported, False)
+    exported["frames"][0]["pds"][0]["version"] = 6
     assert call("rollback", station="left", spec=exported)["refused"] == [
         "meanwhile it would go back to something else"
     ]

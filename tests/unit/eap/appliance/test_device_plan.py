@@ -40,6 +40,14 @@ def test_what_the_dictionaries_hold_is_not_told_here(spec):
     assert describe_rest(spec, changed) == []
 
 
+def test_layout_that_changes_under_its_version_is_told(spec):
+    frame = spec.frames[0]
+    shorter = replace(frame.pds[0], variables=frame.pds[0].variables[1:])
+    changed = replace(spec, frames=(replace(frame, pds=(shorter,)),))
+    (line,) = describe_rest(spec, changed)
+    assert "PD 'state' (id 7) changes from 19 to 17 octets" in line
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

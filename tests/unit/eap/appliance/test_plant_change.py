@@ -18,7 +18,6 @@ from eap.appliance.plant_change import (
 from eap.appliance.plant_link import link_to
 from eap.config.load import Plant
 from eap.config.new_plant import Shape, plant_text
-from eap.device.rollout import without_alternates
 from eap.errors import ConfigError
 from eap.pd.spec import StationSpec
 from tests.support.plantstub import PlantStub
@@ -106,8 +105,7 @@ def test_new_layout_is_taken_before_it_is_sent(plant, link, stub):
     assert [each.station for each in back] == ["station-02", "station-01", "station-02"]
     assert [method for method, _ in stub.stub.requests if method in {"apply", "rollback"}] == [
         *["apply"] * 3,
-        *["rollback"] * 2,
-        "apply",
+        *["rollback"] * 3,
     ]
     assert stub.specs == {spec.name: spec for spec in plant.stations}
     list(roll_back(link, NAMES))
@@ -162,14 +160,58 @@ def test_what_is_half_done_is_finished(plant, link, stub):
     assert stub.specs == wanted
 
 
-def test_what_is_half_done_is_taken_back(plant, link, stub):
+@pytest.mark.parametrize("steps_done", [1, 2, 3])
+def test_what_is_half_done_is_taken_back(plant, link, stub, steps_done):
     half = iter(apply_steps(link, steps_to(link, changed(plant, "station-01"))))
-    next(half)
-    next(half)
+    for _ in range(steps_done):
+        next(half)
     list(roll_back(link, NAMES))
-    assert {name: without_alternates(spec) for name, spec in stub.specs.items()} == {
-        spec.name: spec for spec in plant.stations
+    assert stub.specs == {spec.name: spec for spec in plant.stations}
+    list(roll_back(link, NAMES))
+
+
+@pytest.mark.parametrize("steps_done", [1, 2, 3])
+def test_what_was_finished_later_is_taken_back_with_what_began_it(plant, link, stub, steps_done):
+    wanted = changed(plant, "station-01")
+    half = iter(apply_steps(link, steps_to(link, wanted)))
+    for _ in range(steps_done):
+        next(half)
+    list(apply_steps(link, steps_to(link, wanted)))
+    assert stub.specs == wanted
+    list(roll_back(link, NAMES))
+    assert stub.specs == {spec.name: spec for spec in plant.stations}
+
+
+def test_only_the_last_change_is_taken_back(plant, link, stub):
+    slower = {spec.name: replace(spec, cycle_us=20_000) for spec in plant.stations}
+    list(apply_steps(link, steps_to(link, slower)))
+    wanted = {
+        name: replace(spec, cycle_us=20_000) for name, spec in changed(plant, "station-01").items()
     }
+    list(apply_steps(link, steps_to(link, wanted)))
+    for now in (slower, wanted, slower):
+        list(roll_back(link, NAMES))
+        assert stub.specs == now
+
+
+@pytest.mark.parametrize("steps_done", [1, 2, 3])
+def test_a_rollback_that_was_broken_off_goes_on_or_is_turned_round(plant, link, stub, steps_done):
+    before = {spec.name: spec for spec in plant.stations}
+    wanted = changed(plant, "station-01")
+    list(apply_steps(link, steps_to(link, wanted)))
+    half = iter(roll_back(link, NAMES))
+    for _ in range(steps_done):
+        next(half)
+    if steps_done < 3:
+        list(roll_back(link, NAMES))
+    assert stub.specs == before
+    half = iter(roll_back(link, NAMES))
+    for _ in range(steps_done):
+        next(half)
+    list(apply_steps(link, steps_to(link, wanted)))
+    assert stub.specs == wanted
+    list(roll_back(link, NAMES))
+    assert stub.specs == before
 
 
 def test_nothing_to_go_back_to(link):

@@ -58,13 +58,14 @@ def test_requests(stack):
         plan = link.plan(faster)
         assert plan.differs
         assert [change["new"] for change in plan.changes] == ["5000"]
-        assert link.apply(faster).ok
+        assert link.apply(faster, "1").ok
+        assert (link.export("mixer").cause, link.export("mixer").undone) == ("1", False)
         assert link.export("mixer").previous == station("mixer")
         assert stub.specs["mixer"] == faster
         assert link.rollback(station("mixer")).ok
         assert stub.specs["mixer"] == station("mixer")
-        with pytest.raises(ControlError, match="nothing to go back to"):
-            link.rollback(station("oven"))
+        with pytest.raises(ControlError, match="has not that to go back to"):
+            link.rollback(replace(station("oven"), cycle_us=7000))
 
 
 @pytest.mark.parametrize("field", ["changes", "notes", "refused"])

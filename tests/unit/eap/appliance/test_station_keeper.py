@@ -13,7 +13,7 @@ from eap.appliance.store import Store, effective, state_root
 from eap.device.fault import DeviceFault, FaultCode
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
 from eap.pd.device import DeviceState
-from eap.pd.spec import RxAlternateSpec, TakenVariableSpec
+from eap.pd.spec import RxAlternateSpec, StationSpec, TakenVariableSpec
 from tests.support.stationengine import StationEngine
 from tests.unit.eap.appliance.conftest import right
 
@@ -172,23 +172,68 @@ def test_state_that_cannot_be_kept_is_told(keeper, engine, monkeypatch, caplog):
         asyncio.run(keeper.change(replace(keeper.spec, cycle_us=30_000), NEW))
 
 
-def test_steps_of_a_change_under_way_are_no_way_back(engine):
+def versions() -> tuple[StationSpec, StationSpec]:
+    """A station before and after its PD changes."""
     old = right()
-    (pd,) = old.subscriptions
-    alternate = RxAlternateSpec(9, (TakenVariableSpec("ticks", "UINT"),))
-    both = replace(old, subscriptions=(replace(pd, alternates=(alternate,)),))
-    new = replace(old, subscriptions=(replace(pd, version=9),))
-    keeper = StationKeeper(old, DeviceState.OP, Store("demo"), engine)
-    asyncio.run(keeper.change(both, {}, applied=True))
-    assert keeper.previous is None
-    asyncio.run(keeper.change(new, NEW, applied=True))
-    assert keeper.previous == Configuration(base=digest_of(old), spec=old, objects={})
-    assert Store("demo").load("right").applied == digest_of(new)
+    return old, replace(old, subscriptions=(replace(old.subscriptions[0], version=9),))
+
+
+def tolerant(spec: StationSpec) -> StationSpec:
+    """The same with an alternate."""
+    alternate = RxAlternateSpec(77, (TakenVariableSpec("ticks", "UINT"),))
+    return replace(spec, subscriptions=(replace(spec.subscriptions[0], alternates=(alternate,)),))
+
+
+def going(old: StationSpec, engine: StationEngine) -> StationKeeper:
+    return StationKeeper(old, DeviceState.OP, Store("demo"), engine)
+
+
+def test_steps_of_one_change_have_one_way_back(engine):
+    old, new = versions()
+    keeper = going(old, engine)
+    applied = []
+    for spec, objects in ((tolerant(old), OLD), (tolerant(new), NEW), (new, NEW)):
+        asyncio.run(keeper.change(spec, objects, cause="1", applied=True))
+        assert keeper.previous == Configuration(base=digest_of(old), spec=old)
+        assert (keeper.cause, keeper.undone) == ("1", False)
+        applied.append(Store("demo").load("right").applied)
+    assert applied == ["", digest_of(new), digest_of(new)]
+
+
+def test_way_back_and_forth(engine):
+    old, new = versions()
+    keeper = going(old, engine)
+    asyncio.run(keeper.change(new, NEW, cause="1"))
+    for goal, objects, undone in ((old, OLD, True), (new, NEW, False), (old, OLD, True)):
+        before = Configuration(base=digest_of(old), spec=keeper.spec, objects=keeper.objects)
+        asyncio.run(keeper.take_back(tolerant(keeper.spec), keeper.objects))
+        asyncio.run(keeper.take_back(tolerant(goal), objects))
+        asyncio.run(keeper.take_back(goal, objects))
+        assert keeper.previous == before
+        assert (keeper.cause, keeper.undone) == ("1", undone)
+        again = going(keeper.spec, engine)
+        assert (again.previous, again.cause, again.undone) == (before, "1", undone)
+
+
+def test_change_that_was_taken_back_is_made_again(engine):
+    old, new = versions()
+    keeper = going(old, engine)
+    asyncio.run(keeper.change(new, NEW, cause="1"))
+    asyncio.run(keeper.take_back(old, OLD))
+    asyncio.run(keeper.change(new, NEW, cause="1"))
+    assert (keeper.previous.spec, keeper.undone) == (old, False)
+
+
+def test_changes_of_a_tool_are_changes_of_their_own(engine):
+    old, new = versions()
+    keeper = going(old, engine)
     asyncio.run(keeper.change(old, OLD))
-    assert keeper.previous == Configuration(base=digest_of(old), spec=new, objects=NEW)
-    assert Store("demo").load("right").applied == digest_of(new)
-    asyncio.run(keeper.change(both, OLD, applied=True))
-    assert Store("demo").load("right").applied == digest_of(new)
-    again = StationKeeper(both, DeviceState.OP, Store("demo"), engine)
-    asyncio.run(again.change_state(DeviceState.PREOP))
-    assert Store("demo").load("right").applied == digest_of(new)
+    assert (keeper.previous, keeper.cause) == (None, "")  # all that is new is that it is kept
+    asyncio.run(keeper.change(new, NEW))
+    first = keeper.cause
+    assert first
+    asyncio.run(keeper.change(new, NEW))
+    assert keeper.cause == first
+    asyncio.run(keeper.change(new, OLD))
+    assert keeper.cause > first
+    assert (keeper.previous.spec, keeper.previous.objects) == (new, NEW)
