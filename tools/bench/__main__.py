@@ -29,7 +29,7 @@ from tools.bench.network import ROOT
 from tools.bench.settings import Settings, quick
 
 NAMES = (
-    "throughput", "latency", "poll", "lateness", "solar", "limits", "receive", "startup",
+    "throughput", "latency", "poll", "lateness", "solar", "limits", "receive", "objects", "startup",
     "acyclic", "cycle", "plantbus", "recovery", "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
