@@ -5,7 +5,8 @@ side.  If nobody depends on the rest of what is new for such a station, it has t
 Rule 2: then the senders change over, those first that receive nothing old any more.
 Rule 3: at the end nobody takes an old layout any longer.
 Rule 4: where that leaves a choice, a new PD is taken before it is sent, and one that ends is taken
-until it is not sent any more.
+until it is not sent any more.  Who receives a PD expects the smaller of two rates while it changes:
+that counts no PD as lost that never was to be sent.
 
 No station is ever asked to run anything but its old or its new specification, either of them with
 alternates; so three steps are the most that one needs.
@@ -13,8 +14,9 @@ alternates; so three steps are the most that one needs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
+from math import inf
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -99,7 +101,7 @@ class _Rollout:
             prepared = self._tolerant(name, self._current[name], self._later)
             if prepared == self._current[name]:
                 waiting.append(name)
-            elif name in senders or self._ending(name):
+            elif name in senders or self._ending(name) or self._faster(name):
                 self._step(name, prepared, "takes old and new layouts; sends as before")
                 waiting.append(name)
             else:
@@ -114,9 +116,11 @@ class _Rollout:
         """Change all of *waiting* over: who needs no alternates first, else a sender."""
         left = dict.fromkeys(waiting)
         old_senders = {name: self._senders_of_old(name) for name in waiting}
-        best_after = {name: old_senders[name] | self._ending(name) for name in waiting}
+        best_after = {
+            name: old_senders[name] | self._ending(name) | self._faster(name) for name in waiting
+        }
         for name in waiting:
-            for sender in self._beginning(name) & best_after.keys():
+            for sender in (self._beginning(name) | self._slower(name)) & best_after.keys():
                 best_after[sender].add(name)
         while left:
             best = (name for name in left if not best_after[name] & left.keys())
@@ -158,6 +162,23 @@ class _Rollout:
     def _beginning(self, name: str) -> set[str]:
         """Return who will send PDs to *name* that it does not send yet."""
         return _only_in(self._later, self._now, self._new[name])
+
+    def _slower(self, name: str) -> set[str]:
+        """Return who will send PDs to *name* in larger steps, or in none that is fixed."""
+        return self._repaced(name, lambda old, new: old < new)
+
+    def _faster(self, name: str) -> set[str]:
+        """Return who will send PDs to *name* in smaller steps."""
+        return self._repaced(name, lambda old, new: old > new)
+
+    def _repaced(self, name: str, compare: Callable[[float, float], bool]) -> set[str]:
+        old = {pd.name: pd.step or inf for pd in self._current[name].subscriptions}
+        return {
+            sender
+            for pd in self._new[name].subscriptions
+            if pd.name in old and compare(old[pd.name], pd.step or inf)
+            for sender, _, _ in self._now.heard(name, pd)
+        }
 
     def _tolerant(self, name: str, spec: StationSpec, wire: _Wire) -> StationSpec:
         """Return *spec* with alternates for what *wire* brings *name* beside what it takes."""

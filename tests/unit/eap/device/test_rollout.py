@@ -15,6 +15,7 @@ from eap.pd.spec import (
     RxPdSpec,
     StationSpec,
     TakenVariableSpec,
+    TriggerSpec,
     TxFrameSpec,
     TxPdSpec,
     VariableSpec,
@@ -226,6 +227,35 @@ def test_who_takes_both_while_one_pd_changes_and_another_ends_goes_last():
         "b is as it is to be",
         "a is as it is to be",
     ]
+
+
+def paced(old: Plant, step: int, version: int = 0) -> Plant:
+    """Return *old* with station a sending PD 1 every *step* cycles, in a layout."""
+    fresh = plant({("a", 1): version}, {"b": [("a", 1)]})
+    (frame,) = fresh["a"].frames
+    pd = replace(frame.pds[0], trigger=TriggerSpec(divider=step))
+    taken = replace(fresh["b"].subscriptions[0], step=step)
+    return {
+        "a": replace(fresh["a"], frames=(replace(frame, pds=(pd,)),)),
+        "b": replace(fresh["b"], subscriptions=(taken,)),
+    }
+
+
+def test_who_receives_expects_the_smaller_of_two_rates():
+    line = plant({("a", 1): 0}, {"b": [("a", 1)]})
+    often, seldom, unknown = paced(line, 1), paced(line, 2), paced(line, 0)
+    for faster, slower in ((often, seldom), (seldom, unknown), (often, unknown)):
+        assert [step.station for step in steps(faster, slower)] == ["b", "a"]
+        assert [step.station for step in steps(slower, faster)] == ["a", "b"]
+    assert [step.station for step in steps(paced(line, 1), paced(line, 2, version=1))] == [
+        *["b", "a", "b"]
+    ]
+    back = steps(paced(line, 2, version=1), paced(line, 1))
+    assert [(step.station, step.spec.subscriptions[0].step) for step in back[::2]] == [
+        ("b", 2),
+        ("b", 1),
+    ]
+    assert back[1].station == "a"
 
 
 def test_stations_that_are_in_one_plant_only_have_no_step():
