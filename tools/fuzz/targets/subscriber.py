@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
-from eap.pd.poll import Requests
+from eap.pd.poll import REQUESTERS_PER_CYCLE, Requests, questions_of
 from eap.pd.spec import (
     PortKind,
     PortSpec,
@@ -12,14 +12,20 @@ from eap.pd.spec import (
     RxPdSpec,
     StationSpec,
     TakenVariableSpec,
+    TxFrameSpec,
+    TxPdSpec,
     VariableSpec,
     Writer,
 )
 from eap.pd.subscriber import Subscriber
-from eap.pd.words import DISCARDS, RxWord, StationWord
+from eap.pd.words import DISCARDS, FrameWord, RxWord, StationWord
 
 _SIZES = {1: 1, 2: 2, 0x03E9: 1, 0x1234: 4}
 """PDs to subscribe to, those of the golden vectors among them, and their octets."""
+_REQUEST, _ANSWER = 1, 2
+"""Those that ask the station for something, and that it asks for."""
+_CYCLE_INPUTS = 40
+"""Inputs between two cycles."""
 
 
 def _shifted(name: str, size: int) -> tuple[RxAlternateSpec, ...]:
@@ -29,9 +35,16 @@ def _shifted(name: str, size: int) -> tuple[RxAlternateSpec, ...]:
 
 
 def _block(name: str, pd_id: int, size: int) -> RxPdSpec:
-    alternates = _shifted(name, size)
+    asked_by = "question" if pd_id == _ANSWER else ""
     return RxPdSpec(
-        name, "eap0", pd_id, (name,), sender_cycle_us=1000, step=1, alternates=alternates
+        name,
+        "eap0",
+        pd_id,
+        (name,),
+        sender_cycle_us=1000,
+        step=0 if asked_by else 1,
+        poll_request=asked_by,
+        alternates=_shifted(name, size),
     )
 
 
@@ -49,7 +62,9 @@ _SPEC = StationSpec(
         *(VariableSpec(f"v{n}", f"BLOCK({size})", Writer.ENGINE) for n, size in _SIZES.items()),
         VariableSpec("on", "BOOL", Writer.ENGINE),
         VariableSpec("level", "BIT8", Writer.ENGINE),
+        VariableSpec("x", "UINT"),
     ),
+    frames=(TxFrameSpec("ask", "eap0", "10.0.0.1", (TxPdSpec("question", 9, ("x",)),)),),
     subscriptions=(
         *(_block(f"v{pd_id}", pd_id, size) for pd_id, size in _SIZES.items()),
         RxPdSpec(
@@ -60,28 +75,29 @@ _SPEC = StationSpec(
 _LAYOUT = plan_layout(_SPEC)
 _IMAGE = format_image(memoryview(bytearray(_LAYOUT.size)), _LAYOUT, 1)
 _DIRECTORY = bytes(_IMAGE.memory[_LAYOUT.directory_offset :])
-_REQUESTS = Requests(["v1"])
+_REQUESTS = Requests([f"v{_REQUEST}"])
+_QUESTIONS = questions_of(_IMAGE)
 _SUBSCRIBER = Subscriber(
-    _IMAGE, zip(_SPEC.subscriptions, _LAYOUT.rx, strict=True), 1_000_000, _REQUESTS
+    _IMAGE, zip(_SPEC.subscriptions, _LAYOUT.rx, strict=True), 1_000_000, _REQUESTS, _QUESTIONS
 )
 _SUBSCRIBER.open(0)
 
 
-class _Somebody:
-    """The sender of every frame."""
+class _Anybody:
+    """The sender of a frame: any of 256, as its last octet says, the first of them without name."""
 
     def sender_of(self, data: memoryview) -> str:
         """Return a destination for answers."""
-        del data
-        return "somebody"
+        number = data[len(data) - 17]
+        return f"10.0.0.{number}" if number else ""
 
 
 def fuzz_one(data: bytes) -> None:
     """Take the frame at a time that its own octets give."""
     before = _counted()
     at_ns = len(data) * 300_000
-    _SUBSCRIBER.receive_frame(memoryview(data + bytes(16)), len(data), at_ns, _Somebody())
-    _REQUESTS.take()
+    _SUBSCRIBER.receive_frame(memoryview(data + bytes(16)), len(data), at_ns, _Anybody())
+    _run_cycle(at_ns)
     if _IMAGE.memory[_LAYOUT.directory_offset :] != _DIRECTORY:
         raise AssertionError("what lies behind the variables was overwritten")
     if _IMAGE.words[StationWord.ENGINE_SEQUENCE] % 2:
@@ -89,6 +105,22 @@ def fuzz_one(data: bytes) -> None:
     carries_none = len(data) >= 14 and data[8:10] == b"\0\0"
     if _counted() == before and not carries_none:
         raise AssertionError("neither taken nor counted")
+
+
+def _run_cycle(now_ns: int) -> None:
+    """Now and then take the requests, and ask."""
+    words = _IMAGE.words
+    words[StationWord.CYCLE] += 1
+    if words[StationWord.CYCLE] % _CYCLE_INPUTS:
+        return
+    if len(_REQUESTS.take()) > REQUESTERS_PER_CYCLE:
+        raise AssertionError("more requests were noted than are answered")
+    words[_LAYOUT.frames[0].words + FrameWord.WHOLE] += 1
+    for question in _QUESTIONS.values():
+        question.look(now_ns)
+    for place in _LAYOUT.rx:
+        if words[place.words + RxWord.RESPONSE_NS] < 0:
+            raise AssertionError("an answer came before its request")
 
 
 def _counted() -> int:

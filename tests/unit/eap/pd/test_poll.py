@@ -114,6 +114,36 @@ def test_waiting_begins_with_the_first_request_that_has_no_answer():
     assert question.waiting_since("a") is question.waiting_since("b") is None
 
 
+def test_an_answer_that_comes_twice_changes_nothing_for_who_waits():
+    asked = Asked(TriggerSpec(event=True))
+    asked.send(10 * MS)
+    asked.send(20 * MS)
+    assert asked.question.answered("a", 21 * MS) == 1 * MS
+    assert asked.question.answered("a", 19 * MS) == 9 * MS  # late, and of another way
+    assert asked.question.waiting_since("a") is None
+
+
+def test_a_question_goes_on_when_the_station_is_configured_anew():
+    before, after = Asked(TriggerSpec(event=True)), Asked(TriggerSpec(event=True))
+    before.send(10 * MS)
+    before.question.answered("b", 11 * MS)
+    words, first = after.image.words, after.place.words
+    words[first + TxWord.SENT_AT_NS] = 10 * MS  # carried over with all other words
+    after.question.follow(before.question)
+    after.question.look(12 * MS)  # nothing was sent in that cycle
+    assert after.question.waiting_since("a") == 10 * MS
+    assert after.question.waiting_since("b") is None
+    assert after.question.answered("a", 13 * MS) == 3 * MS
+
+
+def test_requests_that_wait_are_answered_by_the_station_as_it_is_configured_then():
+    before, after = Requests(["old", "both"]), Requests(["both", "new"])
+    before.add("left", ["old", "both"])
+    before.add("right", ["old"])
+    after.follow(before)
+    assert after.take() == {"left": {"both"}}
+
+
 def test_what_asks_and_is_asked_for_is_found_by_port():
     spec = server("mill", MILL, 71, pds=2)
     assert requests_at(spec, "eap0").names == {"asked"}
