@@ -37,8 +37,8 @@ class Stored(Configuration, frozen=True, kw_only=True):
     state: DeviceState = DeviceState.OP
     """Asked for last."""
     applied: str = ""
-    """``digest_of`` the station in the plant file that was applied last while it ran; empty if none
-    was."""
+    """``digest_of`` the station in the appliance's own plant file, if that was applied while it ran
+    (and edited before); empty if it was not."""
     previous: Configuration | None = None
     """For a rollback."""
     cause: str = ""

@@ -91,9 +91,14 @@ class SpecParameters(StationParameters, frozen=True, kw_only=True):
 
 
 class ApplyParameters(SpecParameters, frozen=True, kw_only=True):
-    """``apply``: all steps of one change of a plant have the same *cause*, later ones a greater."""
+    """``apply``.
+
+    All steps of one change of a plant have the same *cause*, later ones a greater.  *file* is the
+    plant file, as an absolute path, if that is where *spec* is from.
+    """
 
     cause: Annotated[str, Meta(max_length=64)] = ""
+    file: str = ""
 
 
 class RollbackParameters(StationParameters, frozen=True, kw_only=True):

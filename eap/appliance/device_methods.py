@@ -25,10 +25,16 @@ _FLAGS = {
 
 
 class DeviceMethods:
-    """Answers for the devices of all stations of the appliance."""
+    """Answers for the devices of all stations of the appliance.
 
-    def __init__(self, devices: Mapping[str, StationDevice]) -> None:
+    Args:
+        devices: By station.
+        plant_file: With which the appliance was started.
+    """
+
+    def __init__(self, devices: Mapping[str, StationDevice], plant_file: str) -> None:
         self._devices = devices
+        self._plant_file = plant_file
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name; results may have to be waited for.
@@ -115,8 +121,11 @@ class DeviceMethods:
 
     async def _apply(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.ApplyParameters)
-        device = self._device(wanted.station)
-        return words.outcome_document(*await device.apply(wanted.spec, wanted.cause))
+        is_own = bool(wanted.file) and wanted.file == self._plant_file
+        change = self._device(wanted.station).apply(
+            wanted.spec, wanted.cause, of_plant_file=is_own
+        )
+        return words.outcome_document(*await change)
 
     async def _roll_back(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.RollbackParameters)

@@ -62,10 +62,12 @@ class PlantLink:
 
     Args:
         clients: The appliance of each station.
+        file: The plant file.
     """
 
-    def __init__(self, clients: Mapping[str, Client]) -> None:
+    def __init__(self, clients: Mapping[str, Client], file: Path) -> None:
         self._clients = clients
+        self._file = str(file.resolve())
 
     @property
     def stations(self) -> tuple[str, ...]:
@@ -87,7 +89,8 @@ class PlantLink:
 
     def apply(self, spec: StationSpec, cause: str) -> Outcome:
         """Let the station of its name be as *spec* says, as a step of the change named *cause*."""
-        answer = self._ask("apply", spec.name, spec=msgspec.to_builtins(spec), cause=cause)
+        where = {"cause": cause, "file": self._file}
+        answer = self._ask("apply", spec.name, spec=msgspec.to_builtins(spec), **where)
         return msgspec.convert(answer, Outcome)
 
     def rollback(self, spec: StationSpec) -> Outcome:
@@ -122,7 +125,8 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
                 f"no station of plant {plant.name} runs here: start them with 'eapctl run {file}'",
                 code=ErrorCode.UNAVAILABLE,
             )
-        yield PlantLink({name: found[name] for s in plant.stations if (name := s.name) in found})
+        here = {name: found[name] for s in plant.stations if (name := s.name) in found}
+        yield PlantLink(here, file)
     finally:
         for client in clients:
             client.close()

@@ -133,7 +133,7 @@ class Services:
             images,
             status=status,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
-            more=DeviceMethods(devices.by_station).table(),
+            more=DeviceMethods(devices.by_station, self._handover.plant_file).table(),
         )
 
     def _buses(self, link: EngineLink) -> Buses:

@@ -153,12 +153,15 @@ class StationDevice:
         """Return what it takes to run *spec*."""
         return make_plan(self.spec, self.dictionaries, spec, {})
 
-    async def apply(self, spec: StationSpec, cause: str = "") -> tuple[Plan, DeviceFault | None]:
+    async def apply(
+        self, spec: StationSpec, cause: str = "", *, of_plant_file: bool = False
+    ) -> tuple[Plan, DeviceFault | None]:
         """Run *spec*, in the state that there is; return what that changes, or why it does not.
 
-        A change of several stations in several steps has one *cause*.
+        A change of several stations in several steps has one *cause*; *of_plant_file* says that it
+        is to what the plant file of the appliance says now.
         """
-        run = partial(self._keeper.change, cause=cause, applied=True)
+        run = partial(self._keeper.change, cause=cause, applied=of_plant_file)
         return await self._jobs.do(lambda: self._change(lambda: self.plan(spec), run))
 
     async def roll_back(self, spec: StationSpec | None = None) -> tuple[Plan, DeviceFault | None]:

@@ -90,7 +90,7 @@ class StationKeeper:
             spec: What is to run.
             objects: The content of its dictionaries.
             cause: What brings it; all steps of one change have the same.  Empty is a new one.
-            applied: Whether *spec* is what a plant file says, or a step on the way to that.
+            applied: Whether *spec* is what the appliance's plant file says, or a step towards it.
 
         Raises:
             DeviceFault: it does not run, and what ran before goes on.

@@ -10,8 +10,10 @@ import pytest
 from msgspec.structs import replace
 
 from eap.appliance import control_device
+from eap.appliance.configuration import digest_of
 from eap.appliance.control import ErrorCode
 from eap.appliance.device_methods import DeviceMethods
+from eap.appliance.store import Store
 from eap.errors import ControlError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000keys import Frame, Tx
@@ -31,7 +33,7 @@ def device(stations):
 @pytest.fixture
 def methods(device, stations):
     devices = [device[0], make_device(stations[1])[0], make_device(BUS_ONLY)[0]]
-    return DeviceMethods({each.name: each for each in devices}).table()
+    return DeviceMethods({each.name: each for each in devices}, "/x/plant.yaml").table()
 
 
 @pytest.fixture
@@ -195,6 +197,17 @@ def test_export_plan_apply_and_rollback(call, stations, device):
     assert call("rollback", station="left", spec=exported)["refused"] == [
         "meanwhile it would go back to something else"
     ]
+
+
+@pytest.mark.parametrize(
+    ("file", "is_own"), [("", False), ("/y/plant.yaml", False), ("/x/plant.yaml", True)]
+)
+def test_apply_of_the_own_plant_file_is_noted(call, stations, file, is_own):
+    spec = replace(stations[0], cycle_us=20_000)
+    assert call("apply", station="left", spec=msgspec.to_builtins(spec), file=file)["ok"]
+    stored = Store("demo").load("left")
+    assert stored is not None
+    assert stored.applied == (digest_of(spec) if is_own else "")
 
 
 def test_refused_apply(call, stations, device):
