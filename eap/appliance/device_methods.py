@@ -122,9 +122,7 @@ class DeviceMethods:
     async def _apply(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.ApplyParameters)
         is_own = bool(wanted.file) and wanted.file == self._plant_file
-        change = self._device(wanted.station).apply(
-            wanted.spec, wanted.cause, of_plant_file=is_own
-        )
+        change = self._device(wanted.station).apply(wanted.spec, wanted.cause, of_plant_file=is_own)
         return words.outcome_document(*await change)
 
     async def _roll_back(self, params: dict[str, Any]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from scapy.layers.inet import IP, UDP
 from scapy.layers.l2 import Ether
 
 from eap.appliance.store import Store
+from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
 from eap.od.profiles.eap1000keys import AddressMode, Frame, Rx, RxFlag, Tx, Var
 from tests.support import aoe
@@ -30,7 +31,7 @@ from tests.support.tshark import dissect, write_pcap
 
 pytestmark = pytest.mark.net
 
-LEFT, RIGHT, BLANK = "127.9.7.1", "127.9.7.2", "127.9.7.3"
+LEFT, RIGHT, BLANK = "127.9.41.1", "127.9.41.2", "127.9.41.3"
 PLANT = f"""\
 plant: devices
 defaults: {{cycle_us: 10000}}
@@ -56,6 +57,26 @@ stations:
       - {{name: left-state, port: eap0, from: left/state}}
 """
 PREOP, OP = 2, 8
+
+
+def is_free(address: str) -> bool:
+    """Tell whether nobody has the EAP port of *address*."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        try:
+            trial.bind((address, EAP_PORT))
+        except OSError:
+            return False
+    return True
+
+
+def wait_free() -> None:
+    """Wait for the end of processes whose supervisor was killed: they follow it a moment later."""
+    wait_until(lambda: all(map(is_free, (LEFT, RIGHT, BLANK))))
+
+
+@pytest.fixture(autouse=True)
+def _alone() -> None:
+    wait_free()
 
 
 @pytest.fixture
@@ -296,6 +317,7 @@ def test_blank_station_configured_by_aoe_alone_exchanges_data_with_one_of_a_plan
 
     blank.process.kill()
     blank.finish()
+    wait_until(lambda: is_free(BLANK))
     again = farm.start(None, *words, "--resume")
     again.wait_ready()
     assert again.station("blank")["state"] == "OP"
@@ -349,6 +371,7 @@ def test_applied_configuration_outlives_engine_services_and_supervisor(
         wait_until(lambda: holds(appliance))
     os.kill(appliance.process.pid, signal.SIGKILL)
     appliance.finish()
+    wait_free()
     again = farm.run(plant)
     assert holds(again)
     assert again.request("rollback", station="left")["ok"]
@@ -387,6 +410,7 @@ def test_kill_in_the_middle_of_apply_leaves_a_whole_configuration(
         applying.join()
         if victim == "supervisor":
             appliance.finish()
+            wait_free()
             appliance = farm.start(plant, runtime=runtime)
             appliance.wait_ready()
         else:
