@@ -44,6 +44,8 @@ FIRST_PD = PD_FRAME_START + PdFrameHeader.SIZE
 """Offset of the first PD in a frame."""
 CYCLE_OFFSET = PD_FRAME_START + 8
 """Offset of the cycle counter in a frame."""
+EAP_SM_OFFSET = PD_FRAME_START + 11
+"""Offset of the EAP SM octet in a frame."""
 
 
 def decode_frame_header(data: Buffer) -> PdFrameHeader:

@@ -170,6 +170,7 @@ def _frames(index: Index, station: Station) -> Iterator[TxFrameSpec]:
             pds=tuple(_pd(pd) for pd in station.publish if pd.frame == frame.name),
             divider=frame.divider or 0,
             modulo=frame.modulo or 0,
+            changeable=frame.changeable,
         )
 
 
@@ -196,7 +197,7 @@ def _pd(pd: Publish) -> TxPdSpec:
         on_change=pd.on_change,
         event=pd.event,
     )
-    return TxPdSpec(pd.name, pd.id, pd.variables, pd.version, trigger, pd.poll)
+    return TxPdSpec(pd.name, pd.id, pd.variables, pd.version, trigger, pd.poll, pd.changeable)
 
 
 def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
@@ -224,6 +225,7 @@ def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
         sender_cycle_us=sender_cycle_us,
         step=step,
         poll_request=subscription.poll,
+        changeable=subscription.changeable,
     )
 
 
@@ -249,6 +251,7 @@ def _port(index: Index, station: Station, port: Port) -> PortSpec:
         broadcast=port.broadcast or any(each.host == IP_BROADCAST for each in destinations),
         tcp=port.tcp,
         wake=port.wake,
+        eap_sm=port.eap_sm,
     )
 
 

@@ -57,12 +57,21 @@ class Port(Section, frozen=True):
     broadcast: bool = False
     tcp: bool = False
     wake: Wake = Wake.CYCLE
+    eap_sm: bool = False
     mac: str = ""
     bus: str = ""
     target: BusTarget = BusTarget.OP
     clocks: bool = False
 
-    EAP_KEYS: ClassVar[tuple[str, ...]] = ("vlan", "join", "broadcast", "tcp", "wake", "mac")
+    EAP_KEYS: ClassVar[tuple[str, ...]] = (
+        "vlan",
+        "join",
+        "broadcast",
+        "tcp",
+        "wake",
+        "eap_sm",
+        "mac",
+    )
     BUS_KEYS: ClassVar[tuple[str, ...]] = ("bus", "target", "clocks")
 
 
@@ -87,6 +96,7 @@ class Frame(Section, frozen=True):
     modulo: U16 | None = None
     monitor_interval_ms: Milliseconds = 0
     monitor_ip: str = ""
+    changeable: bool = False
 
 
 class Publish(Section, frozen=True):
@@ -103,6 +113,7 @@ class Publish(Section, frozen=True):
     on_change: OnChangeSpec | None = None
     event: bool = False
     poll: str = ""
+    changeable: bool = False
 
 
 class From(Section, frozen=True):
@@ -127,6 +138,7 @@ class Subscribe(Section, frozen=True):
     substitute: Substitute = Substitute.HOLD
     foreign: bool = False
     poll: str = ""
+    changeable: bool = False
 
 
 class Link(Section, frozen=True):

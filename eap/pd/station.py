@@ -28,6 +28,7 @@ from eap.pd.links import Links
 from eap.pd.poll import questions_of, requests_at
 from eap.pd.publisher import FrameRow, Publisher
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
+from eap.pd.statechannel import StateChannel
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
 
@@ -127,15 +128,17 @@ class Station:
             self.drain_also(channel)
         else:
             self._rarely.append(channel.drain)
-        net_id = NetId.parse(next(p.net_id for p in self.spec.ports if p.name == port))
+        own = next(p for p in self.spec.ports if p.name == port)
+        net_id = NetId.parse(own.net_id)
+        out = StateChannel(channel, self._words) if own.eap_sm else channel
         publisher = None
         if pushed := _pds_of(frames, polled=False):
-            publisher = Publisher(self.image, self._inputs, net_id, channel, pushed)
-            self._publishers.append((publisher, channel))
+            publisher = Publisher(self.image, self._inputs, net_id, out, pushed)
+            self._publishers.append((publisher, out))
         if polled := _pds_of(frames, polled=True):
             requests = self._requests[port]
-            answerer = Answerer(self.image, self._inputs, net_id, channel, polled, requests)
-            self._publishers.append((answerer, channel))
+            answerer = Answerer(self.image, self._inputs, net_id, out, polled, requests)
+            self._publishers.append((answerer, out))
         self._ports[port] = channel, publisher
         self._teach(port)
 
