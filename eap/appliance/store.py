@@ -23,8 +23,10 @@ from eap.appliance.configuration import (
     decode_stored,
     digest_of,
     encode_stored,
+    new_cause,
 )
 from eap.appliance.runtime import folder_name
+from eap.device.rollout import without_alternates
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -153,7 +155,7 @@ def settle(
     While it runs, what counts is the file that it was started with, and what was applied on top;
     now what was applied last is that file, or there is another one.  Arguments as for *effective*.
     """
-    store = Store(plant)
+    store, cause = Store(plant), new_cause()
     for spec in stations:
         stored = store.load(spec.name)
         if stored is None or not stored.applied:
@@ -162,7 +164,7 @@ def settle(
         if stored.applied == base:
             made_up = replace(stored, base=base)
         else:
-            made_up = _settled(stored, spec, base, state)
+            made_up = _settled(stored, Stored(base=base, spec=spec, state=state, cause=cause))
         if made_up != stored:
             _keep(store, spec.name, made_up)
 
@@ -177,18 +179,18 @@ def effective(
         stations: As the plant file has them.
         state: Of stations that were never asked for another.
     """
-    store = Store(plant)
-    return tuple(_effective(store, spec, state) for spec in stations)
+    store, cause = Store(plant), new_cause()
+    return tuple(_effective(store, spec, state, cause) for spec in stations)
 
 
-def _effective(store: Store, spec: StationSpec, state: DeviceState) -> Effective:
+def _effective(store: Store, spec: StationSpec, state: DeviceState, cause: str) -> Effective:
     stored = store.load(spec.name)
     if stored is None:
         return Effective(spec, state)
     base = digest_of(spec)
     if stored.base == base:
         return Effective(stored.spec, stored.state)
-    settled = _settled(stored, spec, base, state)
+    settled = _settled(stored, Stored(base=base, spec=spec, state=state, cause=cause))
     _keep(store, spec.name, settled)
     return Effective(settled.spec, settled.state)
 
@@ -200,17 +202,20 @@ def _keep(store: Store, station: str, stored: Stored) -> None:
         logger.warning("%s", exc)
 
 
-def _settled(stored: Stored, spec: StationSpec, base: str, state: DeviceState) -> Stored:
-    """Return *stored* with the plant file's *spec* in force."""
-    if stored.spec == spec:  # the file has caught up with what was configured
-        return replace(stored, base=base, applied="")
+def _settled(stored: Stored, file: Stored) -> Stored:
+    """Return *stored* with what the plant file says in force."""
+    bare = without_alternates(stored.spec)
+    if bare == file.spec:  # the file has caught up with what was configured
+        return replace(stored, base=file.base, spec=bare, applied="")
     logger.warning(
         "station %s: the plant file was edited since it was configured; the file runs, and what ran"
         " before is kept for a rollback",
-        spec.name,
+        file.spec.name,
     )
-    previous = Configuration(base=stored.base, spec=stored.spec, objects=stored.objects)
-    return Stored(base=base, spec=spec, state=state, previous=previous)
+    if bare != stored.spec and not stored.undone:  # it ends a change that was broken off
+        return replace(file, previous=stored.previous, cause=stored.cause)
+    previous = Configuration(base=stored.base, spec=bare, objects=stored.objects)
+    return replace(file, previous=previous)
 
 
 def _replace(path: Path, data: bytes) -> None:

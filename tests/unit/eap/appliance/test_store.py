@@ -13,10 +13,11 @@ import pytest
 from msgspec.structs import replace
 
 from eap.appliance import store as module
-from eap.appliance.configuration import Stored, digest_of
+from eap.appliance.configuration import Configuration, Stored, digest_of
 from eap.appliance.store import Effective, Store, effective, settle, state_root
 from eap.errors import EnvironmentalError
 from eap.pd.device import DeviceState
+from eap.pd.spec import RxAlternateSpec, TakenVariableSpec
 
 
 def changed(spec, comment: str = "changed"):
@@ -234,6 +235,41 @@ def test_file_before_the_one_that_was_applied_is_an_edited_one(stations, caplog)
     assert effective("demo", (left,)) == (Effective(left, DeviceState.PREOP),)
     assert store.load("left").previous.spec == changed(left)
     assert store.load("left").applied == ""
+
+
+def tolerant(spec):
+    """The same, taking another layout as well."""
+    alternate = RxAlternateSpec(9, (TakenVariableSpec("ticks", "UINT"),))
+    return replace(spec, subscriptions=(replace(spec.subscriptions[0], alternates=(alternate,)),))
+
+
+def test_a_start_ends_a_change_that_was_broken_off(stations, caplog):
+    _, right = stations
+    store = Store("demo")
+    file = changed(right, "new file")
+    before = Configuration(base="", spec=right, objects={"eap0": 1})
+    stored = Stored(base="", spec=tolerant(right), previous=before, cause="1")
+    store.save("right", stored)
+    assert effective("demo", (file,)) == (Effective(file, DeviceState.OP),)
+    assert "the plant file was edited" in caplog.text
+    ended = store.load("right")
+    assert (ended.previous, ended.cause) == (before, "1")
+    caplog.clear()
+    store.save("right", replace(stored, spec=tolerant(file)))
+    assert effective("demo", (file,)) == (Effective(file, DeviceState.OP),)
+    assert store.load("right") == ended
+    assert not caplog.text
+
+
+def test_another_file_is_one_change_of_all_stations(stations):
+    store = Store("demo")
+    for spec in stations:
+        store.save(spec.name, replace(configured(spec), cause="0", undone=True))
+    effective("demo", [changed(spec, "edited") for spec in stations])
+    left, right = (store.load(spec.name) for spec in stations)
+    assert left.cause == right.cause > "0"
+    assert not left.undone
+    assert left.previous.spec == changed(stations[0])
 
 
 def test_nothing_to_settle(stations):
