@@ -58,7 +58,10 @@ class OdDevice(Protocol):
         """Return one object with its entries; refuse as ``read`` does."""
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
-        """Return what is known of an entry, also of one that a download would make."""
+        """Return what is known of an entry, also of one that a download would make.
+
+        None if the device does not tell; raises if it does, and there can be no such entry.
+        """
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Return the octets of an entry or, with *complete*, of an object; raise if refused."""

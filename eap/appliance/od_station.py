@@ -8,13 +8,11 @@ from typing import Any
 from msgspec.structs import replace
 
 from eap.appliance.client import Client
+from eap.appliance.control import ErrorCode
 from eap.appliance.od_device import Content, EntryInfo, ObjectInfo
 from eap.codec import datatypes
 from eap.errors import ControlError
-from eap.od.abort import AbortCode
-
-ABORT = "abort"
-"""Code of a refusal by the dictionary."""
+from eap.od.abort import AbortCode, SdoAbortError
 
 
 class StationOd:
@@ -23,6 +21,7 @@ class StationOd:
     Raises:
         ControlError: (every method) the station refuses, with code ``abort`` where the dictionary
             did, or the appliance does not answer.
+        SdoAbortError: (``entry``) there is no such entry, and none can be made.
     """
 
     def __init__(self, client: Client, target: str) -> None:
@@ -37,15 +36,13 @@ class StationOd:
         """Return one object with its entries."""
         return _described(self._request("od_describe", index=index))
 
-    def entry(self, index: int, subindex: int) -> EntryInfo | None:
+    def entry(self, index: int, subindex: int) -> EntryInfo:
         """Return what is known of an entry, also of one that a download would make."""
-        try:
-            found = _described(self._request("od_describe", index=index, subindex=subindex))
-        except ControlError as exc:
-            if exc.code != ABORT:
-                raise
-            return None
-        return next((each for each in found.entries if each.subindex == subindex), None)
+        found = _described(self._request("od_describe", index=index, subindex=subindex))
+        for each in found.entries:
+            if each.subindex == subindex:
+                return each
+        raise SdoAbortError(AbortCode.NO_SUBINDEX, index, subindex)
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Return the octets of an entry or of an object."""
@@ -58,7 +55,7 @@ class StationOd:
         try:
             self._request("od_write", **where, data=octets.hex())
         except ControlError as exc:
-            if exc.code == ABORT and f"0x{AbortCode.DEVICE_STATE:08X}" in str(exc):
+            if exc.code == ErrorCode.ABORT and f"0x{AbortCode.DEVICE_STATE:08X}" in str(exc):
                 hint = f"bring it to PREOP first: eapctl state {self._target} PREOP"
                 raise ControlError(f"{exc}; {hint}", code=exc.code) from None
             raise

@@ -9,6 +9,7 @@ import pytest
 from eap.appliance.client import connect_station
 from eap.appliance.od_station import StationOd
 from eap.errors import ControlError
+from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from tests.support.controlstub import ControlStub
 from tests.support.oddevice import MemoryDevice, methods, mixer
@@ -39,8 +40,10 @@ def test_descriptions(station, device):
     assert station.objects() == device.objects()
     assert station.describe(0x8000) == device.describe(0x8000)
     assert station.entry(0xD000, 7) == device.entry(0xD000, 7)
-    assert station.entry(0xD000, 8) is None
-    assert station.entry(0xD001, 7) is None
+    with pytest.raises(SdoAbortError, match="0xD000:08: subindex does not exist"):
+        station.entry(0xD000, 8)
+    with pytest.raises(ControlError, match="object does not exist"):
+        station.entry(0xD001, 7)
 
 
 def test_read_and_write(station, device):
