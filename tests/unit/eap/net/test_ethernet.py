@@ -27,12 +27,14 @@ class Listener:
         self.got = []
         self.times = []
         self.senders = []
+        self.for_many = []
         self.port = interface.port(self.take, **options)
 
     def take(self, data, size, at_ns, origin):
         self.got.append(bytes(data[: min(size, 3)]))
         self.times.append(at_ns)
         self.senders.append(origin.sender_of(data))
+        self.for_many.append(origin.is_for_many(data))
 
     def drain(self, count):
         """Drain until *count* frames have been taken: under load they come a little later."""
@@ -106,6 +108,7 @@ def test_unicast_broadcast_and_joined_groups_are_taken(ends, raw):
         raw.send(raw_frame(99, mac))
     raw.send(raw_frame(3))
     assert receiver.drain(4) == [expect(n) for n in range(4)]
+    assert receiver.for_many == [False, True, True, True]
 
 
 def test_group_of_one_port_is_not_heard_by_another(ends, raw):
