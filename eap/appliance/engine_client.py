@@ -6,12 +6,11 @@ import itertools
 import os
 from pathlib import Path
 
-import msgspec
-
 from devicebus.errors import BusError
 from eap.appliance.engine_link import EngineLink
 from eap.appliance.station_request import Configure, SetState
 from eap.errors import EngineRefusedError, EnvironmentalError
+from eap.pd import pieces
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
@@ -43,7 +42,7 @@ class EngineClient:
         """
         path = self._folder / f".{os.getpid()}-{next(self._numbers)}.spec"
         try:
-            path.write_bytes(msgspec.json.encode(spec))
+            path.write_bytes(pieces.to_lines(spec))
         except OSError as exc:
             path.unlink(missing_ok=True)
             raise EnvironmentalError(f"{path}: {exc.strerror}") from None

@@ -61,7 +61,7 @@ def run_cycles(
             now_ns = monotonic_ns()
             engine.handle_timeout(now_ns)
             if rebuilds.is_ready:
-                rebuilds.swap()
+                rebuilds.swap(now_ns)
             if now_ns >= look_ns:
                 look_ns = now_ns + LOOK_PERIOD_NS
                 plant.publish_discards()

@@ -19,7 +19,7 @@ class Configure(StationMessage, frozen=True, tag="configure"):
     """Run another specification: answered when its first cycle is the next one."""
 
     path: str
-    """A file with the StationSpec as JSON, which the engine may read until it answers."""
+    """A file with the StationSpec in lines (``pieces.to_lines``), there until the answer."""
 
 
 class SetState(StationMessage, frozen=True, tag="set_state"):

@@ -64,7 +64,7 @@ class Successor:
         """Whether it still fits what it is to follow."""
         return self._images.is_current
 
-    def take_over(self, engine: Engine) -> Station:
+    def take_over(self, engine: Engine, now_ns: int) -> Station:
         """Take the place, between two cycles; return who had it.
 
         Raises:
@@ -79,7 +79,7 @@ class Successor:
         # Who writes from now on sees that the image is retired, and writes in the new one again.
         if before.inputs.refresh():
             self._images.carry_values(before.inputs.memory)
-        station.follow(before)
+        station.follow(before, now_ns)
         for bus, ties in self._ties:
             bus.tie(ties)
         engine.replace(before, station)

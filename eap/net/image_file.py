@@ -21,7 +21,7 @@ from types import TracebackType
 from typing import Self
 
 from eap.errors import EnvironmentalError, ImageError, WriterConflictError
-from eap.pd.image import Image, format_image, read_header
+from eap.pd.image import Image, format_image, read_generation, read_header
 from eap.pd.layout import WORDS_OFFSET, ImageLayout
 from eap.pd.spec import Writer
 from eap.pd.succession import ImageSuccession
@@ -49,12 +49,16 @@ class ImageFile:
         generation: Counts the layouts that the station has had.
     """
 
-    def __init__(self, path: Path, descriptor: int) -> None:
+    def __init__(self, path: Path, descriptor: int, layout: ImageLayout | None = None) -> None:
+        """Map a formatted image; its directory is not read if *layout* is known."""
         self.path = path
         self._fd = descriptor
         self._map = mmap.mmap(descriptor, 0)
         self._view = memoryview(self._map)
-        layout, self.generation = read_header(self._view)
+        if layout is None:
+            layout, self.generation = read_header(self._view)
+        else:
+            self.generation = read_generation(self._view)
         self.image = Image(self._view, layout, pause=_pause)
         self._futex = ctypes.c_uint32.from_buffer(self._map, WORDS_OFFSET + 8 * StationWord.FUTEX)
 
@@ -235,7 +239,7 @@ def prepare_image(path: Path, layout: ImageLayout, generation: int) -> ImageFile
         os.close(descriptor)
         fresh.unlink(missing_ok=True)
         raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
-    return ImageFile(fresh, descriptor)
+    return ImageFile(fresh, descriptor, layout)
 
 
 def open_image(path: Path) -> ImageFile:

@@ -91,15 +91,7 @@ class Image:
     def store(self, name: str, octets: bytes) -> None:
         """Put encoded octets in a variable's place; the caller stands inside :meth:`writing`."""
         place = self._place(name)
-        offset, bit = divmod(place.bit_offset, 8)
-        length = datatypes.parse(place.type).bit_length
-        end = _end_octet(place)
-        if not bit and not length % 8:
-            self.memory[offset:end] = octets
-            return
-        mask = (1 << length) - 1 << bit
-        word = int.from_bytes(self.memory[offset:end], "little") & ~mask | octets[0] << bit
-        self.memory[offset:end] = word.to_bytes(end - offset, "little")
+        put(self.memory, place.bit_offset, datatypes.parse(place.type).bit_length, octets)
 
     def storer(self, name: str) -> Callable[[Any], None]:
         """Return what stores numbers that are known to fit in one variable, again and again."""
@@ -123,6 +115,11 @@ class Image:
             yield
         finally:
             self.words[sequence] += 1
+
+    def dissolve(self) -> None:
+        """Let go of the places, one by one; nothing can be read or written any more."""
+        while self.places:
+            self.places.popitem()
 
     def set_defaults(self) -> None:
         """Store the default of every variable that has one; for a fresh image."""
@@ -152,6 +149,18 @@ class Image:
         )
 
 
+def put(memory: memoryview, bit_offset: int, bit_length: int, octets: bytes) -> None:
+    """Store an encoded value without touching the bits beside it."""
+    offset, bit = divmod(bit_offset, 8)
+    end = -(-(bit_offset + bit_length) // 8)
+    if not bit and not bit_length % 8:
+        memory[offset:end] = octets
+        return
+    mask = (1 << bit_length) - 1 << bit
+    word = int.from_bytes(memory[offset:end], "little") & ~mask | octets[0] << bit
+    memory[offset:end] = word.to_bytes(end - offset, "little")
+
+
 def format_image(memory: memoryview, layout: ImageLayout, generation: int) -> Image:
     """Write header, directory and default values into zeroed *memory*."""
     directory = layout.encode()
@@ -160,9 +169,8 @@ def format_image(memory: memoryview, layout: ImageLayout, generation: int) -> Im
     image = Image(memory, layout)
     image.set_defaults()
     # The header comes last: a file without magic is one whose making was interrupted.
-    HEADER.pack_into(
-        memory, 0, MAGIC, LAYOUT_VERSION, generation, offset, len(directory), layout.size
-    )
+    size = offset + len(directory)
+    HEADER.pack_into(memory, 0, MAGIC, LAYOUT_VERSION, generation, offset, len(directory), size)
     return image
 
 
@@ -191,6 +199,11 @@ def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
     if layout.directory_offset != offset or WORDS_OFFSET + 8 * layout.word_count > offset:
         raise ImageError("process image has a damaged directory: it contradicts the header")
     return layout, generation
+
+
+def read_generation(memory: memoryview) -> int:
+    """Return the generation of an image that is known to be formatted."""
+    return int(HEADER.unpack_from(memory)[2])
 
 
 def default_value(place: VariablePlace) -> Any:

@@ -26,23 +26,26 @@ class Inputs:
     def __init__(self, image: Image) -> None:
         self._image = image
         self._words = image.words
-        self.memory = memoryview(bytearray(image.layout.size))
+        self.memory = memoryview(bytearray(len(image.memory)))
         self._regions = [
             (place.sequence, slice(place.offset, place.offset + place.size))
             for writer, place in image.layout.regions.items()
             if writer is not Writer.ENGINE and place.size
         ]
-        self._seen: list[int] = []
+        self._seen = [-1] * len(self._regions)
         self._settled: tuple[int, ...] = ()
         """Both sequence words, when all that they guard has been copied."""
-        self.reload()
+        for _, region in self._regions:
+            self.memory[region] = image.memory[region]
 
     def reload(self) -> None:
-        """Begin with what is in the image, where nobody writes at the moment."""
-        self._seen = [-1] * len(self._regions)
-        self._settled = ()
-        for _, region in self._regions:
-            self.memory[region] = self._image.memory[region]
+        """Take what has been put into the image before anybody writes there."""
+        for index, (sequence, region) in enumerate(self._regions):
+            if self.memory[region] == self._image.memory[region]:
+                self._seen[index] = self._words[sequence]
+            else:
+                self.memory[region] = self._image.memory[region]
+                self._seen[index] = -1
 
     def refresh(self) -> bool:
         """Copy what changed; return whether anything did."""

@@ -14,10 +14,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable
 
-import msgspec
-
 from eap.codec import datatypes, pdo
 from eap.codec.pd import PdHeader
+from eap.pd import pieces
 from eap.pd.alternate import AlternatePlace, place_alternates
 from eap.pd.busplace import mirror
 from eap.pd.spec import (
@@ -148,7 +147,7 @@ class ImageLayout(Record, frozen=True):
 
     def encode(self) -> bytes:
         """Return the directory as it stands in the image."""
-        return msgspec.json.encode(self)
+        return pieces.encode(self)
 
     @property
     def size(self) -> int:

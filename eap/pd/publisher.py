@@ -195,6 +195,15 @@ class Publisher:
                     content = place.pd_id, place.version, place.variables, frame.place.destination
                     yield place.name, (content, pd.trigger)
 
+    def dissolve(self) -> None:
+        """Let go of all frames, one by one: freeing many at once keeps others from running."""
+        for container in (self._groups, self._due, self._others, self._sending):
+            container.clear()
+        self._always = None
+        self._unsent.clear()
+        while self.frames:
+            self.frames.pop()
+
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the frames due in this cycle, patched; :meth:`sent` must follow."""
         if (always := self._always) is not None:

@@ -263,7 +263,7 @@ class Station:
         for port, subscriber in self._subscribers.items():
             subscriber.learn_from(before._subscribers[port])
 
-    def follow(self, before: Station) -> None:
+    def follow(self, before: Station, now_ns: int) -> None:
         """Take the place of *before* between two of its cycles.
 
         The image holds already what was in the other's.  Frames go on being handed to its takers.
@@ -272,10 +272,11 @@ class Station:
         replaced = [subscriber.handle_timeout for subscriber in self._subscribers.values()]
         self._supervisors = [each for each in self._supervisors if each not in replaced]
         for port, subscriber in before._subscribers.items():
-            subscriber.become(self._subscribers[port])
+            subscriber.become(self._subscribers[port], now_ns)
             if subscriber.has_timeouts:
                 self._supervisors.append(subscriber.handle_timeout)
-        self._subscribers, self.takers = before._subscribers, before.takers
+        self._subscribers, before._subscribers = before._subscribers, self._subscribers
+        self.takers = before.takers
         self._learners = before._learners
         for port, requests in self._requests.items():
             requests.follow(before._requests[port])
@@ -287,6 +288,15 @@ class Station:
                 publisher.follow(was)
             self._teach(port)
         self._enter(before.device.state)
+
+    def dissolve(self) -> None:
+        """Let go of all that it is made of, bit by bit; it has been followed by another one."""
+        for _, publisher in self._ports.values():
+            if publisher is not None:
+                publisher.dissolve()
+        for subscriber in self._subscribers.values():
+            subscriber.dissolve()
+        self.image.dissolve()
 
     def cycle(self, due_ns: int, now_ns: int) -> None:
         """Run one cycle that was due at *due_ns*."""

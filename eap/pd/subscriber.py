@@ -78,6 +78,8 @@ class Subscriber:
             publisher = NetId.parse(place.publisher) if place.publisher else b""
             self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
             self._by_id.setdefault(place.pd_id, []).append(subscription)
+        timeouts = [s.timeout_ns for s in self._subscriptions if s.timeout_ns]
+        self._shortest_timeout_ns = min(timeouts, default=_NEVER)
         self._plans: dict[tuple[bytes, bytes], list[FramePlan]] = {}
         self._pds_planned = 0
         self._open_from_ns = _NEVER
@@ -109,15 +111,27 @@ class Subscriber:
             for plan in list(plans):
                 self._learn(plan.example(), plan.end)
 
-    def become(self, after: Subscriber) -> None:
-        """Go on with the subscriptions, the image and the accounts of *after*.
+    def become(self, after: Subscriber, now_ns: int) -> None:
+        """Exchange subscriptions, image and accounts with *after*.
 
         Whoever hands frames to this one goes on doing so; whether it is open stays as it is.
         """
-        is_open = self._open_from_ns, self._closed_reason
+        mine = dict(vars(self))
         vars(self).update(vars(after))
-        self._open_from_ns, self._closed_reason = is_open
-        self._next_timeout_ns = _NEVER if self._open_from_ns == _NEVER else 0
+        vars(after).update(mine)
+        self._open_from_ns, self._closed_reason = after._open_from_ns, after._closed_reason
+        if self._open_from_ns != _NEVER:
+            # What is new, or has another time-out now, has at least that long.
+            following_ns = now_ns + self._shortest_timeout_ns
+            self._next_timeout_ns = min(after._next_timeout_ns, following_ns)
+
+    def dissolve(self) -> None:
+        """Let go of all subscriptions, one by one: freeing many keeps others from running."""
+        for container in (self._by_key, self._by_id, self._plans):
+            while container:
+                container.popitem()
+        while self._subscriptions:
+            self._subscriptions.pop()
 
     def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
         """Take one EtherCAT frame of *size* octets that arrived at *at_ns* from *origin*."""
@@ -151,7 +165,7 @@ class Subscriber:
     @property
     def has_timeouts(self) -> bool:
         """Whether any subscription has one: otherwise handle_timeout() need not be called."""
-        return any(subscription.timeout_ns for subscription in self._subscriptions)
+        return self._shortest_timeout_ns != _NEVER
 
     def next_timeout(self) -> int | None:
         """Return when handle_timeout() has to be called, None for never."""

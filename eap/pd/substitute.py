@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from eap.codec import datatypes
 from eap.codec.pd import PdHeader
-from eap.pd.image import Image, default_value
+from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxPlace
 from eap.pd.spec import Substitute
 
@@ -28,8 +29,11 @@ def _octets(image: Image, place: RxPlace) -> bytes | None:
         return None
     if place.substitute is Substitute.ZERO:
         return bytes(place.size)
-    scratch = Image(memoryview(bytearray(image.layout.size)), image.layout)
+    octets = memoryview(bytearray(place.size))
+    start = 8 * (place.offset + PdHeader.SIZE)
     for name in place.variables:
-        scratch.write(name, default_value(scratch.places[name]))
-    start = place.offset + PdHeader.SIZE
-    return bytes(scratch.memory[start : start + place.size])
+        variable = image.places[name]
+        kind = datatypes.parse(variable.type)
+        value = kind.encode(default_value(variable))
+        put(octets, variable.bit_offset - start, kind.bit_length, value)
+    return bytes(octets)

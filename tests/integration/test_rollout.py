@@ -111,7 +111,7 @@ class Line:
         images.settle()
         images.carry_words()
         images.carry_values(before.inputs.memory)
-        station.follow(before)
+        station.follow(before, self.now)
         self.engine.replace(before, station)
         self.stations[name] = station
 

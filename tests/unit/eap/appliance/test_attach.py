@@ -75,7 +75,7 @@ class Runner:
         while not self._stop.wait(0.0005):
             self._engine.handle_timeout(time.monotonic_ns())
             if not self.successors.empty():
-                self.successors.get().take_over(self._engine)
+                self.successors.get().take_over(self._engine, time.monotonic_ns())
 
     @property
     def file(self) -> ImageFile:

@@ -14,6 +14,7 @@ from eap.appliance.engine_client import EngineClient
 from eap.appliance.engine_link import EngineLink
 from eap.appliance.station_request import Configure, SetState
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
+from eap.pd import pieces
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 from tests.unit.eap.appliance.conftest import left
@@ -40,8 +41,7 @@ class Engine:
         request = msgspec.msgpack.decode(self._sock.recv(1 << 16), type=Request)
         self.asked.append(request)
         if isinstance(request, Configure):
-            with Path(request.path).open("rb") as file:
-                self.specs.append(msgspec.json.decode(file.read(), type=StationSpec))
+            self.specs.append(pieces.from_lines(Path(request.path).read_bytes(), StationSpec))
         self._sock.send(msgspec.msgpack.encode(self._answer(request)))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import select
 
-import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -15,6 +14,7 @@ from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.station_request import Configure, SetState
 from eap.errors import EngineRefusedError, EnvironmentalError
 from eap.net.image_file import ImageFile, open_image
+from eap.pd import pieces
 from eap.pd.device import DeviceState
 from eap.pd.report import station_status
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, VariableSpec, Writer
@@ -43,13 +43,13 @@ class Running:
         for _ in range(2 * count):
             self.plant.engine.handle_timeout(self.plant.engine.next_timeout())
             if self.plant.rebuilds.is_ready:
-                self.plant.rebuilds.swap()
+                self.plant.rebuilds.swap(self.plant.engine.next_timeout() - 1)
 
     def post(self, spec, name=None):
         """Ask for *spec*; return the number of the request."""
         self.count += 1
         path = self.folder.path / f"{self.count}.spec"
-        path.write_bytes(msgspec.json.encode(spec))
+        path.write_bytes(pieces.to_lines(spec))
         request = Configure(id=self.count, station=name or spec.name, path=str(path))
         return self.serve(request)
 
@@ -235,6 +235,9 @@ def test_the_swap_waits_for_the_next_cycle_when_that_is_near(running):
     assert number not in running.answers
     running.cycles()
     assert running.answers[number] is None
+    while running.plant.rebuilds.is_building:  # it clears up what has been replaced
+        select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
+        running.plant.rebuilds.collect(due_ns)
     number = running.post(running.left)
     select.select([running.plant.rebuilds], [], [], PATIENCE_MS / 1000)
     running.plant.rebuilds.collect(running.plant.engine.next_timeout() - 2_000_000)

@@ -37,7 +37,7 @@ def test_nothing_that_is_written_at_the_moment_is_lost(place, tmp_path):
     with program.image.writing(Writer.APPLICATION):
         program.image.write("running", True)
     assert not program.retired
-    successor.take_over(engine)
+    successor.take_over(engine, 20 * MS)
     assert program.retired
     assert place.file.image.read("running") is True
     assert place.file.image.words[0] == 1
@@ -56,7 +56,9 @@ def test_a_program_that_stopped_in_the_middle_of_writing_leaves_what_it_had_writ
         engine.handle_timeout(20 * MS)
         with program.image.writing(Writer.APPLICATION):
             program.image.write("running", False)
-            before = Successor(place, replace(place.station.spec, frames=())).take_over(engine)
+            before = Successor(place, replace(place.station.spec, frames=())).take_over(
+                engine, 20 * MS
+            )
         assert before.inputs is not place.station.inputs
     assert (
         place.file.image.read("running") is True
