@@ -200,7 +200,6 @@ class Publisher:
         for container in (self._groups, self._due, self._others, self._sending):
             container.clear()
         self._always = None
-        self._unsent.clear()
         while self.frames:
             self.frames.pop()
 

@@ -634,7 +634,7 @@ def succeed(before: Station, spec: StationSpec) -> Station:
     after.prepare_to_follow(before)
     images.settle()
     images.carry_words()
-    after.follow(before)
+    after.follow(before, 0)
     return after
 
 
