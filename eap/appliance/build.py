@@ -16,18 +16,18 @@ from eap.appliance.passing import PassedConnection
 from eap.appliance.rebuild import Rebuilds
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.successor import EngineStation
-from eap.ids import Destination, DestinationKind, InterfaceUri
+from eap.appliance.tcp_ports import has_tcp, open_tcp_port
+from eap.ids import InterfaceUri
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines
 from eap.net.mmsg import ReceiveBatch
 from eap.net.tcp import TcpReceiver
-from eap.net.tcpport import TcpPort
 from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
 from eap.pd.link import Channel, Taker
-from eap.pd.spec import REQUESTER, PortKind, PortSpec, Wake
+from eap.pd.spec import PortKind, PortSpec, Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 
@@ -57,7 +57,6 @@ class EnginePlant:
         self._stations: dict[str, EngineStation] = {}
         self._batch = ReceiveBatch()
         self._tallies: list[Tally] = []
-        self._tcp_ports: dict[PortName, TcpPort] = {}
         self._counters = self._resources.enter_context(
             DiscardCounters(folder.discards("engine"), [s.name for s in handover.stations])
         )
@@ -88,7 +87,8 @@ class EnginePlant:
 
     def add_connection(self, connection: socket.socket, passed: PassedConnection) -> None:
         """Take frames from a connection that services accepted, for all ports behind it."""
-        port = self._tcp_ports[passed.owners[0]]
+        first = passed.owners[0]
+        port = self._stations[first.station].tcp_ports[first.port]
         if port.is_full:
             connection.close()
             for station in {owner.station for owner in passed.owners}:
@@ -121,7 +121,7 @@ class EnginePlant:
         """Let go of all sockets and images."""
         self._resources.close()
         for place in self._stations.values():
-            place.file.close()
+            place.close()
 
     def _open_own(self) -> None:
         """Connect the ports that need no shared socket."""
@@ -155,21 +155,15 @@ class EnginePlant:
         """Connect a port to its datagrams, to TCP, or to both."""
         spec = self._handover.port(name)
         station = self._station(name)
-        sends_tcp = any(
-            Destination.parse(frame.destination).kind is DestinationKind.TCP
-            for frame in station.spec.frames
-            if frame.port == name.port and frame.destination != REQUESTER
-        )
-        if datagrams is not None and not spec.tcp and not sends_tcp:
+        if datagrams is not None and not has_tcp(station.spec, spec):
             station.connect(name.port, datagrams)
             return
-        asks = any(pd.poll_request and pd.port == name.port for pd in station.spec.subscriptions)
-        answers = [self._taker(name)] if asks else []
-        port = TcpPort(InterfaceUri.parse(spec.interface).host, datagrams, answers)
-        self._resources.callback(port.close)
-        self._tcp_ports[name] = port
+        port = open_tcp_port(spec, datagrams)
+        place = self._stations[name.station]
+        place.tcp_ports[name.port] = port
         self._tallies.append(Tally(self._counters, [name.station], port.closed, _tcp_reason))
         station.connect(name.port, port)
+        place.settle_tcp()
 
     def _open_interface(self, shared: SharedSocket) -> None:
         interface = EthernetInterface(socket.socket(fileno=shared.engine_fd), packet_batch())

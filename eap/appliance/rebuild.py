@@ -80,6 +80,7 @@ class _Job:
                 successor.discard()  # PDs that shared an account have parted meanwhile
             else:
                 self._put(successor, engine, now_ns)
+        self.place.settle_tcp()
         self._taken.release()
 
     def give_up(self) -> None:

@@ -6,11 +6,13 @@ reads.  It belongs to nobody until it takes over, which copies numbers and littl
 
 from __future__ import annotations
 
+from eap.appliance import tcp_ports
 from eap.appliance.bus_ties import BusTies
 from eap.appliance.change import needs_new_start
 from eap.appliance.engine_bus import EngineBus
 from eap.errors import EngineRefusedError
 from eap.net.image_file import ImageFile, prepare_image
+from eap.net.tcpport import TcpPort
 from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec
@@ -26,6 +28,18 @@ class EngineStation:
         self.file = file
         self.buses: dict[str, EngineBus] = {}
         """By port."""
+        self.tcp_ports: dict[str, TcpPort] = {}
+
+    def settle_tcp(self) -> None:
+        """Have connections only to where the station sends now."""
+        for name, port in self.tcp_ports.items():
+            tcp_ports.follow(port, self.station, name)
+
+    def close(self) -> None:
+        """Let go of the image and of all connections."""
+        self.file.close()
+        for port in self.tcp_ports.values():
+            port.close()
 
 
 class Successor:
@@ -48,7 +62,8 @@ class Successor:
             self._images.carry_words()
             self._images.carry_values(before.inputs.memory)
             self._station = Station(spec, image, self._file.wake_waiters)
-            self._station.prepare_to_follow(before)
+            self._tcp_ports = _new_tcp_ports(place, spec)
+            self._station.prepare_to_follow(before, self._tcp_ports)
             self._images.settle()
             memory_of = self._station.memory_of
             self._ties: list[tuple[EngineBus, BusTies]] = []
@@ -87,8 +102,18 @@ class Successor:
         place.file.wake_waiters()
         place.file.close()
         place.file, place.station = self._file, station
+        place.tcp_ports.update(self._tcp_ports)
         return before
 
     def discard(self) -> None:
         """Give it up."""
         self._file.discard()
+
+
+def _new_tcp_ports(place: EngineStation, spec: StationSpec) -> dict[str, TcpPort]:
+    """Return the channels of ports that have not had any TCP so far."""
+    return {
+        port.name: tcp_ports.open_tcp_port(port, place.station.channel(port.name))
+        for port in spec.ports
+        if port.name not in place.tcp_ports and tcp_ports.has_tcp(spec, port)
+    }

@@ -165,6 +165,8 @@ class TcpSender:
 
     def _receive(self, sock: socket.socket, now_ns: int) -> int:
         """Take what the peer says; raise OSError if it is lost."""
+        if self._receiver is None and self._takers:  # it asks for something since
+            self._listen(sock, now_ns)
         if self._receiver is not None:
             count = self._receiver.drain(now_ns)
             if self._receiver.closed:

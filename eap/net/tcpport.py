@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from eap.ids import Destination, DestinationKind
 from eap.net.tcp import CONNECTION, TcpReceiver, TcpSender
@@ -30,7 +30,7 @@ class TcpPort:
     def __init__(
         self, address: str, datagrams: Channel | None = None, answers: Sequence[Taker] = ()
     ) -> None:
-        self._answers = answers
+        self._answers = list(answers)
         self.errors: dict[str, int] = {}
         self.closed: dict[str, int] = {}
         self._address = address
@@ -44,10 +44,16 @@ class TcpPort:
             return b""
         is_tcp = Destination.parse(destination).kind is DestinationKind.TCP
         if is_tcp and destination not in self._senders:
-            self._senders[destination] = TcpSender(
-                destination, self._address, self.errors, self._answers
-            )
+            sender = TcpSender(destination, self._address, self.errors, self._answers)
+            # Another one, for this may be called while the cycle's thread goes through the old.
+            self._senders = {**self._senders, destination: sender}
         return b""
+
+    def follow(self, destinations: Collection[str], answers: Iterable[Taker]) -> None:
+        """Keep connections to *destinations* only, and hand what comes back to *answers*."""
+        self._answers[:] = answers
+        for gone in self._senders.keys() - destinations:
+            self._senders.pop(gone).close()
 
     @property
     def is_full(self) -> bool:

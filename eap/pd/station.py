@@ -10,8 +10,9 @@ that a reader sees inputs and what follows from them in one cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from types import MappingProxyType
 
 import msgspec
 
@@ -244,17 +245,23 @@ class Station:
             for requests in self._requests.values():
                 requests.take()
 
-    def prepare_to_follow(self, before: Station) -> None:
-        """Be connected as *before* is, and know the frames that it receives.
+    def channel(self, port: str) -> Channel:
+        """Return what *port* is connected to."""
+        return self._ports[port][0]
+
+    def prepare_to_follow(
+        self, before: Station, channels: Mapping[str, Channel] = MappingProxyType({})
+    ) -> None:
+        """Be connected as *before* is, or to *channels*, and know the frames that it receives.
 
         Whatever takes time is done here, while the other one runs; it is only looked at.
         """
         for port, (channel, was) in before._ports.items():
-            self.connect(port, channel)
+            self.connect(port, channels.get(port, channel))
             publisher = self._ports[port][1]
             if publisher is not None and was is not None:
                 publisher.learn_from(was)
-        fed = [channel for channel, _ in before._ports.values()]
+        fed = [channel for channel, _ in (*before._ports.values(), *self._ports.values())]
         for channel in before._channels:
             if channel not in fed:
                 self.drain_also(channel)
