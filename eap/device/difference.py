@@ -201,40 +201,30 @@ class _Comparison:
         if goes:
             kind = ChangeKind.REMOVED
         octets = after if data is None else data
+        later = self._new_dictionary if index in self._new else self._old_dictionary
         shown = after if data is None or not interim else data
         return Change(
             kind,
             index,
             subindex,
-            self._name(index, subindex),
-            self._text(self._old_dictionary, index, subindex, before),
-            "" if goes else self._text(self._new_dictionary, index, subindex, shown),
+            self._title(index) if goes else self._name(index, subindex),
+            _text(self._old_dictionary, index, subindex, before),
+            "" if goes else _text(later, index, subindex, shown),
             octets or b"",
             interim,
         )
 
+    def _title(self, index: int) -> str:
+        """Return the names of an object and of what it is about, such as ``TxPD 0 (state)``."""
+        dictionary = self._new_dictionary if index in self._new else self._old_dictionary
+        title, own = profile.row_of(index).title(index), dictionary.name_of(index)
+        return f"{title} ({own})" if own else title
+
     def _name(self, index: int, subindex: int) -> str:
         """Return the names of object and entry, such as ``TxPD 0 (state): Cycle time``."""
-        row = profile.row_of(index)
-        dictionary = self._new_dictionary if index in self._new else self._old_dictionary
-        own = dictionary.name_of(index)
-        title = f"{row.title(index)} ({own})" if own else row.title(index)
-        if subindex == 0:
-            return title if row.dynamic and not row.list_row else f"{title}: number of entries"
-        entry = row.row(subindex)
-        return title if entry is None else f"{title}: {entry.numbered(subindex)}"
-
-    def _text(
-        self, dictionary: EapDictionary, index: int, subindex: int, octets: bytes | None
-    ) -> str:
-        if octets is None:
-            return ""
-        for each in (dictionary, self._old_dictionary, self._new_dictionary):
-            entry = each[index].entries.get(subindex) if index in each else None
-            if entry is not None and len(octets) <= entry.kind.size:
-                row = profile.row_of(index).row(subindex)
-                return to_text(row.form if row is not None else Form.PLAIN, entry.kind, octets)
-        return octets.hex(" ")
+        row = profile.row_of(index).row(subindex) if subindex else None
+        entry = "number of entries" if row is None else row.numbered(subindex)
+        return f"{self._title(index)}: {entry}"
 
 
 def _kept(dictionary: EapDictionary) -> Configuration:
@@ -244,3 +234,11 @@ def _kept(dictionary: EapDictionary) -> Configuration:
         for index, entries in configuration(dictionary).items()
         if not (profile.row_of(index).mapping and len(entries) == 1)
     }
+
+
+def _text(dictionary: EapDictionary, index: int, subindex: int, octets: bytes | None) -> str:
+    if octets is None:
+        return ""
+    row = profile.row_of(index).row(subindex)
+    kind = dictionary[index].entries[subindex].kind
+    return to_text(row.form if row is not None else Form.PLAIN, kind, octets)

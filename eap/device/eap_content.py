@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.device.eap_mapping import Mapped, mapped_bits
-from eap.device.eap_objects import NAME_AT, EapObjects
+from eap.device.eap_objects import NAME_AT, EapObjects, Views
 from eap.device.live import LiveValues, NothingRuns
 from eap.ids import InterfaceUri, NetId
 from eap.od.profiles import eap1000 as profile
@@ -56,7 +56,7 @@ class EapContent(EapObjects):
         identity: Identity = Identity(),  # noqa: B008  immutable
     ) -> None:
         self.port: PortSpec = next(each for each in station.ports if each.name == port)
-        super().__init__(NetId.parse(self.port.net_id))
+        super().__init__(NetId.parse(self.port.net_id), Views(self._live, self._derived))
         self.uri = InterfaceUri.parse(self.port.interface)
         self.live: LiveValues = live or NothingRuns()
         self.identity = identity
@@ -142,12 +142,12 @@ class EapContent(EapObjects):
                 return item.index, subindex
         return None
 
-    def live_octets(self, index: int, key: str, size: int) -> bytes:
+    def _live(self, index: int, key: str, size: int) -> bytes:
         """Return what *key* shows of what the object is about; zero if that does not run."""
         octets = self.live.octets(key, self.name_of(index))
         return octets if octets is not None and len(octets) == size else bytes(size)
 
-    def derived_octets(self, index: int, subindex: int) -> bytes:
+    def _derived(self, index: int, subindex: int) -> bytes:
         """Return a length, a count, a type or a free index."""
         entry = self[index].entries[subindex]
         return entry.kind.encode(self._compute(profile.row_of(index), index, subindex))

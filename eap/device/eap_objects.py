@@ -5,7 +5,9 @@ Nothing in here asks who may write what; that is decided in ``eap_dictionary``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
@@ -38,27 +40,30 @@ _CHANGEABLE = {
 """Which entry says that those that the profile calls changeable may be written in Op."""
 
 
+class Views(NamedTuple):
+    """What entries show that is not stored in them."""
+
+    live: Callable[[int, str, int], bytes]
+    """Called with the index of the object, the key of the entry and its size in octets."""
+    derived: Callable[[int, int], bytes]
+    """Called with index and sub-index."""
+
+
 class EapObjects(ObjectDictionary):
     """The objects of an EAP port, by index and by kind.
 
     Args:
         publisher: NetID of the port.
+        views: Where entries get their values that store none.
     """
 
-    def __init__(self, publisher: bytes) -> None:
+    def __init__(self, publisher: bytes, views: Views) -> None:
+        self._views = views
         self._members: dict[int, dict[int, OdObject]] = {row.first: {} for row in profile.ALL}
         self._publisher = publisher
         super().__init__()
         for row in profile.STATIC:
             self.add(self.make_object(row, row.first))
-
-    def live_octets(self, index: int, key: str, size: int) -> bytes:
-        """Return what a live entry of the object at *index* shows."""
-        raise NotImplementedError
-
-    def derived_octets(self, index: int, subindex: int) -> bytes:
-        """Return what an entry shows that is computed."""
-        raise NotImplementedError
 
     def add(self, item: OdObject) -> None:
         """Add an object of the profile."""
@@ -125,9 +130,9 @@ class EapObjects(ObjectDictionary):
         own = kind if row.kind == OWN_TYPE else datatypes.parse(row.kind)
         read = None
         if row.live:
-            read = partial(self.live_octets, index, row.live, own.size)
+            read = partial(self._views.live, index, row.live, own.size)
         elif row.derived:
-            read = partial(self.derived_octets, index, subindex)
+            read = partial(self._views.derived, index, subindex)
         return Entry(
             row.numbered(subindex), own, row.access, row.default, read=read,
             unit=UNITS[row.unit], minimum=row.minimum, maximum=row.maximum,

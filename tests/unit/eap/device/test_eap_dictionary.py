@@ -7,6 +7,7 @@ import pytest
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.fault import DeviceFault, FaultCode
 from eap.device.stored import configuration
+from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.eap1000keys import AddressMode, Frame, Rx, Tx, Var
@@ -174,6 +175,52 @@ def test_a_change_in_op_that_cannot_run_is_taken_back(udp):
     assert "PD ID is used twice" in _refused(
         udp, AbortCode.PARAMETER, 0xD000, Tx.PD_ID, 7, state=OP
     )
+
+
+def test_nobody_has_to_want_to_know(udp):
+    sender(udp)
+    write(udp, 0x8000, Frame.CHANGEABLE, 1)
+    write(udp, 0x8000, Frame.PORT_NUMBER, 7, OP)
+    write(udp, 0xF200, 1, 8)
+    assert udp.upload(0x8000, Frame.PORT_NUMBER, OP) == b"\7\0"
+
+
+class TestInformation:
+    @pytest.mark.parametrize(
+        ("kind", "indexes"),
+        [
+            (info.ListType.TX_MAPPABLE, [0x6000, 0x7000]),
+            (info.ListType.RX_MAPPABLE, [0x7000]),
+            (
+                info.ListType.BACKUP,
+                [0x1600, 0x1A00, 0x6000, 0x7000, 0x8000, 0xD000, 0xE000, 0xF800, 0xF810, 0xF811],
+            ),
+            (info.ListType.SETTINGS, []),
+        ],
+    )
+    def test_lists_name_the_objects_that_there_are(self, udp, kind, indexes):
+        receiver(sender(udp))
+        octets = info.object_list(udp, kind)
+        assert list(struct.unpack(f"<{len(octets) // 2}H", octets))[1:] == indexes
+
+    def test_every_object_and_entry_is_described(self, udp):
+        receiver(sender(udp))
+        everything = info.object_list(udp, info.ListType.ALL)
+        indexes = struct.unpack(f"<{len(everything) // 2}H", everything)[1:]
+        assert list(indexes) == [item.index for item in udp]
+        for index in indexes:
+            assert info.object_description(udp, index)[6:] == udp[index].name.encode()
+            for subindex, entry in udp[index].entries.items():
+                described = info.entry_description(udp, index, subindex, 0x7F)
+                assert described.endswith(entry.name.encode())
+                assert entry.name
+
+    def test_a_cycle_time_has_a_unit_and_limits(self, udp):
+        described = info.entry_description(udp, 0xF800, 8, 0x78)
+        assert described[3] & 0x78 == 0x78
+        assert described[10:] == struct.pack("<4I", 0xFA030000, 10_000, 100, 60_000_000) + (
+            b"Device cycle time"
+        )
 
 
 def test_a_state_is_asked_for_in_any_state(udp):

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 from eap.od.abort import AbortCode, SdoAbortError, name_of
 
 
@@ -18,3 +21,19 @@ def test_message_names_object_reason_and_detail() -> None:
         "data is longer than the entry (0x06070012): 5 octets for UDINT"
     )
     assert (error.code, error.index, error.subindex) == (0x06020000, 0x1018, 1)
+
+
+def _named(*folders: str) -> set[str]:
+    """Return the codes that the files of *folders* name, the tree's root being the start."""
+    root = Path(__file__).resolve().parents[4]
+    return {
+        name
+        for folder in folders
+        for file in (root / folder).rglob("*.py")
+        if file.name not in {"abort.py", "test_abort.py"}
+        for name in re.findall(r"\bAbortCode\.([A-Z_0-9]+)\b", file.read_text())
+    }
+
+
+def test_every_code_that_is_sent_is_provoked_by_a_test_that_names_it():
+    assert _named("eap/od", "eap/device", "devicebus") <= _named("tests")
