@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -12,6 +12,7 @@ from eap.cli.group import ExitCode
 from eap.cli.output import write_json, write_text
 from eap.cli.params import json_option
 from eap.cli.plant_params import keep_going_option, plant_arguments, running_plant
+from eap.errors import ControlError
 
 if TYPE_CHECKING:
     from eap.appliance.plant_change import Done
@@ -67,23 +68,33 @@ def rollback(
         _finish(ctx, link, done, {}, as_json=as_json)
 
 
-def _take(steps: Iterable[Done], *, as_json: bool) -> list[Done]:
+class _Taken(NamedTuple):
+    """The steps that were taken, and what broke them off."""
+
+    steps: list[Done]
+    error: ControlError | None
+
+
+def _take(steps: Iterable[Done], *, as_json: bool) -> _Taken:
     """Take all steps, and tell of each as soon as it is done."""
     from eap.cli.plan_view import done_lines
 
-    taken = []
-    for done in steps:
-        taken.append(done)
-        if not as_json:
-            for line in done_lines(done):
-                write_text(line)
-    return taken
+    taken: list[Done] = []
+    try:
+        for done in steps:
+            taken.append(done)
+            if not as_json:
+                for line in done_lines(done):
+                    write_text(line)
+    except ControlError as exc:
+        return _Taken(taken, exc)
+    return _Taken(taken, None)
 
 
 def _finish(
     ctx: click.Context,
     link: PlantLink,
-    taken: list[Done],
+    taken: _Taken,
     refusing: dict[str, list[str]],
     *,
     as_json: bool,
@@ -91,7 +102,7 @@ def _finish(
     """Say what came of it, and end with the exit code that stands for it."""
     from eap.cli.plan_view import end_lines
 
-    is_ok = not refusing and all(each.outcome.ok for each in taken)
+    is_ok = not (refusing or taken.error) and all(each.outcome.ok for each in taken.steps)
     if as_json:
         steps = [
             {
@@ -101,12 +112,18 @@ def _finish(
                 "results": each.outcome.results,
                 "refused": each.outcome.refused,
             }
-            for each in taken
+            for each in taken.steps
         ]
         refused = [{"station": name, "refused": why} for name, why in refusing.items()]
-        write_json({"ok": is_ok, "steps": steps, "refused": refused})
+        error = None if taken.error is None else str(taken.error)
+        write_json({"ok": is_ok, "steps": steps, "refused": refused, "error": error})
     else:
-        for line in end_lines(taken, refusing, len(link.stations)):
+        is_broken_off = taken.error is not None
+        for line in end_lines(
+            taken.steps, refusing, len(link.stations), is_broken_off=is_broken_off
+        ):
             write_text(line)
+    if taken.error is not None:
+        raise taken.error
     if not is_ok:
         ctx.exit(ExitCode.FAILED)

@@ -73,9 +73,20 @@ def done_lines(done: Done) -> Iterator[str]:
 
 
 def end_lines(
-    taken: Sequence[Done], refusing: Mapping[str, Sequence[str]], stations: int
+    taken: Sequence[Done],
+    refusing: Mapping[str, Sequence[str]],
+    stations: int,
+    *,
+    is_broken_off: bool = False,
 ) -> Iterator[str]:
-    """Yield what came of all steps, and what to do about it if that is not all."""
+    """Yield what came of all steps, and what to do about it if these were not all.
+
+    Args:
+        taken: The steps.
+        refusing: Why stations were not asked at all.
+        stations: How many there are.
+        is_broken_off: Whether there would have been more, had the appliance answered.
+    """
     for name, reasons in refusing.items():
         yield f"{name} cannot change while it runs"
         yield from (f"  ! {reason}" for reason in reasons)
@@ -87,9 +98,10 @@ def end_lines(
         others = stations - len(changed)
         rest = f", {others} as before" if others else ""
         yield f"{count(len(changed), 'station')} changed{rest}"
-    if refused and changed:
-        yield f"{', '.join(refused)} refused: changed until then {_are(changed)}"
-        yield "'eapctl rollback' brings back what ran before"
+    if changed and (refused or is_broken_off):
+        what = f"{', '.join(refused)} refused" if refused else "broken off"
+        yield f"{what}: changed until then {_are(changed)}"
+        yield "'eapctl apply' goes on with it, 'eapctl rollback' brings back what ran before"
 
 
 def _are(names: Iterable[str]) -> str:

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from eap.appliance.plant_change import load_or_raise
 from eap.cli import main
 from eap.config.new_plant import Shape, plant_text
+from eap.errors import ControlError
 from tests.support.plantstub import PlantStub
 
 CHANGE = "~ 0xF800:08 Configured objects: Device cycle time"
@@ -79,7 +80,7 @@ def test_refusal_in_the_middle(stub, file):
         "  ! not today",
         "1 station changed, 2 as before",
         "station-02 refused: changed until then is station-01",
-        "'eapctl rollback' brings back what ran before",
+        "'eapctl apply' goes on with it, 'eapctl rollback' brings back what ran before",
     ]
     assert stub.specs["station-03"].cycle_us == 20_000
     result = run("apply", file, "--keep-going")
@@ -106,3 +107,23 @@ def test_what_cannot_be_leaves_all_as_it_is(stub, file):
 
 def test_nothing_to_roll_back(stub, file):
     assert run("rollback", file).output == "nothing was changed\n"
+
+
+def test_appliance_that_goes_away(stub, file):
+    def refuse(spec):
+        if spec.name == "station-02":
+            raise ControlError("appliance ring does not answer")
+        return False
+
+    stub.refuses = refuse
+    result = run("apply", file)
+    assert (result.exit_code, result.stderr) == (1, "appliance ring does not answer\n")
+    assert result.output.splitlines()[2:5] == [
+        "1 station changed, 2 as before",
+        "broken off: changed until then is station-01",
+        "'eapctl apply' goes on with it, 'eapctl rollback' brings back what ran before",
+    ]
+    result = run("apply", file, "--json")
+    assert result.exit_code == 1
+    document = json.loads(result.stdout)
+    assert (document["ok"], document["error"]) == (False, "appliance ring does not answer")
