@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -97,14 +98,20 @@ def _digest(content: bytes) -> str:
 def _lean(value: Any) -> Any:
     """Return *value* for JSON, records without the fields that hold their defaults."""
     if isinstance(value, msgspec.Struct):
-        fields = {}
-        if value.__struct_config__.tag is not None:
-            fields["kind"] = value.__struct_config__.tag
-        for field in msgspec.structs.fields(value):
-            held = getattr(value, field.name)
-            if held != field.default:
-                fields[field.name] = _lean(held)
-        return fields
+        tag, defaults = _outline(type(value))
+        lean = {"kind": tag} if tag is not None else {}
+        for name, default in defaults:
+            held = getattr(value, name)
+            if held != default:
+                lean[name] = _lean(held)
+        return lean
     if isinstance(value, tuple):
         return [_lean(each) for each in value]
     return value
+
+
+@cache
+def _outline(kind: type[msgspec.Struct]) -> tuple[Any, tuple[tuple[str, Any], ...]]:
+    """Return the tag of records of *kind*, and their fields with their defaults."""
+    fields = msgspec.structs.fields(kind)
+    return kind.__struct_config__.tag, tuple((field.name, field.default) for field in fields)

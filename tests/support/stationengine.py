@@ -11,7 +11,7 @@ from eap.appliance.station_keeper import StationKeeper
 from eap.appliance.store import Store
 from eap.device.eap_content import Identity
 from eap.device.live import NothingRuns
-from eap.errors import EapError
+from eap.errors import EapError, EngineGoneError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
@@ -24,6 +24,7 @@ class StationEngine:
         state: In which state.
         calls: What it was asked for, in order.
         failure: Raised by the next call.
+        gone: Whether an EngineGoneError was raised.
         asked: Set once it was asked for something.
         gate: What it waits for before it does anything.
     """
@@ -33,6 +34,7 @@ class StationEngine:
         self.state = state
         self.calls: list[str] = []
         self.failure: EapError | None = None
+        self.gone = False
         self.asked = asyncio.Event()
         self.gate: asyncio.Event | None = None
 
@@ -41,25 +43,30 @@ class StationEngine:
         self.spec = spec
 
     async def set_state(self, station: str, state: DeviceState) -> None:
-        await self._note(f"{station} {state.name}")
+        is_stop = state < self.state  # which an engine does not refuse
+        await self._note(f"{station} {state.name}", EngineGoneError if is_stop else EapError)
         self.state = state
 
-    async def _note(self, call: str) -> None:
+    async def _note(self, call: str, can_fail: type[EapError] = EapError) -> None:
         self.calls.append(call)
         self.asked.set()
         if self.gate is not None:
             await self.gate.wait()
-        if self.failure is not None:
+        if isinstance(self.failure, can_fail):
             failure, self.failure = self.failure, None
+            self.gone = isinstance(failure, EngineGoneError)
             raise failure
 
 
 def make_device(
-    spec: StationSpec, state: DeviceState = DeviceState.OP, plant: str = "demo"
+    spec: StationSpec,
+    state: DeviceState = DeviceState.OP,
+    *,
+    engine: StationEngine | None = None,
 ) -> tuple[StationDevice, StationEngine]:
-    """Return a device and the engine that it asks."""
-    engine = StationEngine(spec, state)
-    keeper = StationKeeper(spec, state, Store(plant), engine)
+    """Return a device of the plant ``demo`` and the engine that it asks."""
+    engine = engine or StationEngine(spec, state)
+    keeper = StationKeeper(spec, state, Store("demo"), engine)
     return StationDevice(keeper, NothingRuns(), Identity(device_name="test")), engine
 
 
