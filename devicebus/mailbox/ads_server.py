@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from devicebus.mailbox.ads_services import AdsServices
-from devicebus.mailbox.aoe_server import AmsAnswer
+from eap.aoe.answer import AmsAnswer
 from eap.codec.ads import AdsError, AdsRange, IndexGroup, encode_result
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from devicebus.mailbox.aoe_server import AmsAnswer
+from eap.aoe.answer import AmsAnswer
 from eap.codec.ads import AdsError, AdsRange, AdsReadWrite, IndexGroup, encode_result
 from eap.codec.ams import AmsCommand
 from eap.errors import TruncatedError

@@ -7,10 +7,10 @@ back.  Those of an answer are, if the slave wants it.
 from __future__ import annotations
 
 from devicebus.errors import MailboxProtocolError, MailboxSizeError
-from devicebus.mailbox.aoe_fragment import Assembler, iter_fragments
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Ask, Conversation, reading
 from devicebus.mailbox.match import answers, is_aoe_fragment
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.aoe.fragment import Assembler, iter_fragments
 from eap.codec.ams import AmsHeader, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxHeader, MailboxType
 

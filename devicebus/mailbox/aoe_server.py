@@ -6,36 +6,13 @@ What is longer than the mailbox comes and goes in fragments.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
-from devicebus.mailbox.aoe_fragment import Assembler, iter_fragments
 from devicebus.mailbox.protocol import MailboxSizes, refuse
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.fragment import Assembler, iter_fragments
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.codec.mailbox import MailboxError
 from eap.errors import CodecError
-
-
-class AmsAnswer(NamedTuple):
-    """What goes back to the sender of a request."""
-
-    data: bytes = b""
-    error_code: int = 0
-    """Of the AMS header: why the request reached nobody."""
-
-
-def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
-    """Return the packet that brings *answer* back to who sent the request with *header*."""
-    back = AmsHeader(
-        header.source,
-        header.source_port,
-        header.target,
-        header.target_port,
-        header.command,
-        header.state_flags | StateFlags.RESPONSE,
-        error_code=answer.error_code,
-        invoke_id=header.invoke_id,
-    )
-    return encode_packet(back, answer.data)
 
 
 class AoeServer:

@@ -13,8 +13,8 @@ import logging
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
-from devicebus.mailbox.aoe_fragment import Assembler, iter_fragments
-from devicebus.mailbox.aoe_server import AmsAnswer, response_to
+from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.fragment import Assembler, iter_fragments
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
 from devicebus.mailbox.ads_services import AdsServices
-from devicebus.mailbox.aoe_server import AmsAnswer
+from eap.aoe.answer import AmsAnswer
 from eap.appliance.ads_result import ads_result
 from eap.appliance.configuration import Configuration
 from eap.appliance.device_change import Plan, dump_all, eap_ports, fill_all, make_plan

@@ -20,6 +20,8 @@ class AdsError(IntEnum):
     TARGET_PORT = 0x006
     TARGET_MACHINE = 0x007
     COMMAND = 0x008
+    AMS_LENGTH = 0x00E
+    HOST_UNREACHABLE = 0x01B
     FRAGMENT = 0x01C
     GENERAL = 0x700
     SERVICE = 0x701
@@ -32,6 +34,8 @@ class AdsError(IntEnum):
     NO_MEMORY = 0x70A
     NOT_FOUND = 0x70C
     STATE = 0x712
+    TIMEOUT = 0x719
+    ACCESS_DENIED = 0x723
 
 
 class IndexGroup(IntEnum):

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Awaitable
 from typing import NamedTuple, Self
 
-from devicebus.mailbox.aoe_server import AmsAnswer
+from eap.aoe.answer import AmsAnswer
 from eap.appliance.aoe_desk import AoeDesk
 from eap.ids import NetId
 

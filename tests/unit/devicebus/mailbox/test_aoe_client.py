@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from devicebus.errors import BusError, MailboxProtocolError, MailboxSizeError
 from devicebus.mailbox import aoe_client
-from devicebus.mailbox.aoe_server import AmsAnswer, AoeServer
+from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.aoe.answer import AmsAnswer
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.ids import NetId

@@ -4,9 +4,10 @@ import msgspec
 import pytest
 
 from devicebus.errors import MailboxRefusedError
-from devicebus.mailbox.aoe_fragment import Assembler, iter_fragments
-from devicebus.mailbox.aoe_server import AmsAnswer, AoeServer
+from devicebus.mailbox.aoe_server import AoeServer
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.fragment import Assembler, iter_fragments
 from eap.codec.ams import AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.codec.mailbox import MailboxError, decode_frame
 from tests.support.vectors import load_all

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 import pytest
 
-from devicebus.mailbox.aoe_fragment import Assembler, iter_fragments
-from devicebus.mailbox.aoe_server import AmsAnswer
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.fragment import Assembler, iter_fragments
 from eap.appliance import aoe_desk
 from eap.appliance.aoe_desk import DEVICE_PORT, AoeDesk, AoeDoor
 from eap.codec.ads import AdsError

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from devicebus.mailbox.aoe_server import AmsAnswer
+from eap.aoe.answer import AmsAnswer
 from eap.appliance import mailbox_stream
 from eap.appliance.aoe_desk import AoeDesk
 from eap.appliance.discards import Refusal

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devicebus.mailbox.aoe_fragment import (
+from eap.aoe.fragment import (
     FRAGMENT_TIMEOUT_NS,
     MAX_LENGTH,
     MAX_PACKETS,
