@@ -97,7 +97,7 @@ class Entry:
         self.name = name
         self.kind = datatypes.parse(kind) if isinstance(kind, str) else kind
         self.access = access
-        self.default = self.kind.encode(self.kind.zero if value is None else value)
+        self.default = bytes(self.kind.size) if value is None else self.kind.encode(value)
         if self.is_text:
             self.default = self.default.rstrip(b"\0")
         self.read = read
