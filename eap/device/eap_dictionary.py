@@ -100,6 +100,8 @@ class EapDictionary(EapContent):
         is_there = index in self and row in profile.VARIABLES
         kind = self[index].entries[Var.DEFAULT].kind if is_there else DEFAULT_TYPE
         largest = self.make_object(row, index, kind, row.last_subindex)
+        for number, entry in self._objects.get(index, largest).entries.items():
+            largest.entries[number].access = entry.access
         ObjectDictionary([largest]).check_download(index, subindex, size, state, complete=complete)
 
     @contextmanager

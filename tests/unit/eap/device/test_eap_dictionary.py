@@ -399,6 +399,14 @@ class TestBeforeTheDataIsThere:
             udp.check_download(*where, state)
         assert caught.value.code == code
 
+    def test_what_an_object_says_to_be_changeable_is_let_by_in_op(self, udp):
+        sender(udp)
+        write(udp, 0x8000, Frame.CHANGEABLE, 1)
+        udp.check_download(0x8000, Frame.DESTINATION_MAC, 6, OP)
+        with pytest.raises(SdoAbortError) as caught:
+            udp.check_download(0x8000, Frame.NAME, 6, OP)
+        assert caught.value.code == AbortCode.DEVICE_STATE
+
     def test_the_default_of_a_variable_is_as_long_as_its_type(self, udp):
         variable(udp, 0x6000, "level", "BLOCK(900)")
         udp.check_download(0x6000, Var.DEFAULT, 900, PREOP)
