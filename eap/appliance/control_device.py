@@ -110,11 +110,12 @@ class RollbackParameters(StationParameters, frozen=True, kw_only=True):
     spec: StationSpec | None = None
 
 
-def object_row(item: OdObject) -> dict[str, Any]:
-    """Return an object without its entries."""
+def object_row(item: OdObject, label: str) -> dict[str, Any]:
+    """Return an object without its entries; *label* is the name of what it is about."""
     return {
         "index": item.index,
         "name": item.name,
+        "label": label,
         "code": item.code.name,
         "max_subindex": item.max_subindex,
     }

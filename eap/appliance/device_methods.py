@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -66,13 +67,14 @@ class DeviceMethods:
             for item in dictionary
             if flag is None or any(each.access & flag for each in item.entries.values())
         )
-        return _page(chosen, wanted.first, words.object_row)
+        return _page(chosen, wanted.first, partial(_object_row, dictionary))
 
     def _describe(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdDescribeParameters)
-        item = _existing_or_new(self._dictionary(wanted.target), wanted.index, wanted.subindex)
+        dictionary = self._dictionary(wanted.target)
+        item = _existing_or_new(dictionary, wanted.index, wanted.subindex)
         rows = [words.entry_row(*each) for each in item.entries.items()]
-        return words.object_row(item) | {"entries": rows}
+        return _object_row(dictionary, item) | {"entries": rows}
 
     def _read(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdReadParameters)
@@ -90,7 +92,7 @@ class DeviceMethods:
     def _dump(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdDumpParameters)
         device, port = self._find(wanted.target)
-        state = device.od_state()
+        dictionary, state = device.dictionaries[port], device.od_state()
 
         def row(item: OdObject) -> dict[str, Any]:
             entries = [
@@ -98,9 +100,9 @@ class DeviceMethods:
                 | {"data": entry.octets.hex() if entry.access & state.read_right else None}
                 for subindex, entry in item.entries.items()
             ]
-            return words.object_row(item) | {"entries": entries}
+            return _object_row(dictionary, item) | {"entries": entries}
 
-        return _page(device.dictionaries[port], wanted.first, row)
+        return _page(dictionary, wanted.first, row)
 
     def _state(self, params: dict[str, Any]) -> dict[str, Any]:
         device, _ = self._find(parameters(params, words.TargetParameters).target)
@@ -153,6 +155,11 @@ class DeviceMethods:
     def _dictionary(self, target: str) -> EapDictionary:
         device, port = self._find(target)
         return device.dictionaries[port]
+
+
+def _object_row(dictionary: EapDictionary, item: OdObject) -> dict[str, Any]:
+    is_there = item.index in dictionary
+    return words.object_row(item, dictionary.name_of(item.index) if is_there else "")
 
 
 def _page(

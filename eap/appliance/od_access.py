@@ -41,7 +41,11 @@ def read_object(device: OdDevice, index: int, first: int) -> dict[str, Any]:
     octets = device.read(index, first, complete=True)
     found = device.describe(index)
     row = {"index": index, "subindex": first, "complete": True, "name": found.name}
-    return row | {"data": octets.hex(), "entries": _parts(found, first, octets)}
+    return row | {
+        "label": found.label,
+        "data": octets.hex(),
+        "entries": _parts(found, first, octets),
+    }
 
 
 def write_entry(
@@ -83,6 +87,7 @@ def object_rows(objects: Iterable[ObjectInfo]) -> Iterator[dict[str, Any]]:
         yield {
             "index": each.index,
             "name": each.name,
+            "label": each.label,
             "code": each.code,
             "max_subindex": each.max_subindex,
         }
@@ -91,7 +96,7 @@ def object_rows(objects: Iterable[ObjectInfo]) -> Iterator[dict[str, Any]]:
 def dump_rows(contents: Iterable[Content]) -> Iterator[dict[str, Any]]:
     """Yield entries with their values, or with the reason why there is none."""
     for each in contents:
-        row = {"object": each.object.name, "code": each.object.code}
+        row = {"object": each.object.name, "label": each.object.label, "code": each.object.code}
         row |= _row(each.object.index, each.entry, each.octets)
         yield row | {"error": each.error} if each.error else row
 

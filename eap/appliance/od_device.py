@@ -35,6 +35,8 @@ class ObjectInfo(msgspec.Struct, frozen=True):
     code: str
     """VAR, ARRAY, RECORD, or its number."""
     max_subindex: int
+    label: str = ""
+    """Name of what it is about, if the device tells."""
     entries: tuple[EntryInfo, ...] = ()
     """In the order of their subindexes; gaps are left out."""
 

@@ -79,7 +79,7 @@ class StationOd:
 
 
 def _object(row: dict[str, Any]) -> ObjectInfo:
-    return ObjectInfo(row["index"], row["name"], row["code"], row["max_subindex"])
+    return ObjectInfo(row["index"], row["name"], row["code"], row["max_subindex"], row["label"])
 
 
 def _described(row: dict[str, Any]) -> ObjectInfo:

@@ -49,8 +49,10 @@ def list_objects(target: Target, as_json: bool) -> None:
             write_json(row)
         return
     from eap.cli.bus_view import object_table
+    from eap.cli.od_view import object_name
 
-    write_tables([object_table(rows)])
+    named = (row | {"name": object_name(row["name"], row["label"])} for row in rows)
+    write_tables([object_table(named)])
 
 
 @od.command()

@@ -43,7 +43,13 @@ def object_lines(row: Row) -> Iterator[str]:
 
 def object_line(row: Row) -> str:
     """Return index and name of an object, as a remark."""
-    return f"# 0x{row['index']:04X} {row.get('object', row['name'])}".rstrip()
+    name = row["object"] if "object" in row else row["name"]
+    return f"# 0x{row['index']:04X} {object_name(name, row['label'])}"
+
+
+def object_name(name: str, label: str) -> str:
+    """Return the name of an object, with that of what it is about."""
+    return f"{name} ({label})" if label else name
 
 
 def _literal(row: Row) -> str:

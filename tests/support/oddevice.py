@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from msgspec.structs import replace
+
 from eap.appliance.od_device import Content, EntryInfo, ObjectInfo
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
@@ -72,7 +74,7 @@ class MemoryDevice:
     def describe(self, index: int) -> ObjectInfo:
         item = self.dictionary[index]
         entries = tuple(_entry(sub, entry) for sub, entry in item.entries.items())
-        return ObjectInfo(index, item.name, item.code.name, item.max_subindex, entries)
+        return replace(_info(item), entries=entries)
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
         try:
@@ -128,7 +130,11 @@ def methods(device: MemoryDevice) -> dict[str, Any]:
 
 
 def _info(item: OdObject) -> ObjectInfo:
-    return ObjectInfo(item.index, item.name, item.code.name, item.max_subindex)
+    return ObjectInfo(item.index, item.name, item.code.name, item.max_subindex, _label(item))
+
+
+def _label(item: OdObject) -> str:
+    return next((str(e.value) for e in item.entries.values() if e.name == "Name"), "")
 
 
 def _entry(subindex: int, entry: Entry) -> EntryInfo:
@@ -148,6 +154,7 @@ def _object_row(item: OdObject) -> dict[str, Any]:
     return {
         "index": item.index,
         "name": item.name,
+        "label": _label(item),
         "code": item.code.name,
         "max_subindex": item.max_subindex,
     }

@@ -13,9 +13,10 @@ from eap.pd.device import DeviceState
 
 def test_rows_of_objects_and_entries():
     item = record(0x2000, "Key", {2: Entry("Secret", "UINT", WO, 5, unit=0xFA030000, maximum=9)})
-    assert words.object_row(item) == {
+    assert words.object_row(item, "front door") == {
         "index": 0x2000,
         "name": "Key",
+        "label": "front door",
         "code": "RECORD",
         "max_subindex": 2,
     }

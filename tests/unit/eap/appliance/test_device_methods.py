@@ -58,10 +58,12 @@ def test_list(call):
     assert rows["objects"][0] == {
         "index": 0x1000,
         "name": "Device type",
+        "label": "",
         "code": "VAR",
         "max_subindex": 0,
     }
     assert call("od_list", target="left/eap0") == rows
+    assert {row["label"] for row in rows["objects"] if row["index"] == 0xD000} == {"state"}
     mappable = [row["index"] for row in call("od_list", target="left", list="tx")["objects"]]
     assert mappable
     assert all(0x6000 <= index < 0x7000 for index in mappable)

@@ -77,7 +77,7 @@ def test_refusal_of_another_kind(station, answers):
 
 
 def test_type_of_a_later_release(station, answers):
-    row = {"index": 1, "name": "", "code": "VAR", "max_subindex": 0}
+    row = {"index": 1, "name": "", "label": "", "code": "VAR", "max_subindex": 0}
     entry = {"subindex": 0, "name": "New", "type": "DATE", "access": "r", "unit": ""}
     answers["od_describe"] = lambda _: row | {"entries": [entry]}
     assert station.entry(1, 0).kind is None

@@ -32,11 +32,17 @@ def command(stub):
 
 def test_list(command, stub):
     lines = command("list", "mixer").output.splitlines()
-    assert " 0xD000  TxPD 0           RECORD  7" in lines
+    assert any(line.split() == ["0xD000", "TxPD", "0", "RECORD", "7"] for line in lines)
     rows = [
         json.loads(line) for line in command("list", "mixer/eap0", "--json").output.splitlines()
     ]
-    assert rows[0] == {"index": 0x1000, "name": "Device type", "code": "VAR", "max_subindex": 0}
+    assert rows[0] == {
+        "index": 0x1000,
+        "name": "Device type",
+        "label": "",
+        "code": "VAR",
+        "max_subindex": 0,
+    }
     assert {params["target"] for _, params in stub.requests} == {"mixer", "mixer/eap0"}
 
 
@@ -172,10 +178,10 @@ def test_a_dump_is_for_people(command):
     assert lines[0] == (
         "# The objects of mixer.  'eapctl od write TARGET --from FILE' writes them to another"
     )
-    start = lines.index("# 0x6000 Tx variable 0")
+    start = lines.index('# 0x6000 Tx variable 0 (speed "set" # 1)')
     assert lines[start - 1 : start + 7] == [
         "",
-        "# 0x6000 Tx variable 0",
+        '# 0x6000 Tx variable 0 (speed "set" # 1)',
         "# 0x6000:00 = USINT 9  # SubIndex 000",
         "# 0x6000:01 = REAL 1.5  # Value",
         '0x6000:04 = STRING(40) "REAL"  # Type name',
