@@ -19,6 +19,17 @@ from eap.errors import CodecError
 FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
 
 
+def aoe_packet(data: Buffer) -> bytes | Refusal:
+    """Return the AMS packet in a frame of type 5, or why there is none for a station."""
+    try:
+        header, body = decode_frame(data)
+    except CodecError:
+        return Refusal.TRUNCATED
+    if header.type is not MailboxType.AOE or header.address:
+        return Refusal.MAILBOX
+    return bytes(body)
+
+
 class MailboxDoor:
     """Where frames come in.
 
@@ -42,12 +53,9 @@ class MailboxDoor:
             now_ns: The time on the monotonic clock.
             for_all: Whether it came by multicast.
         """
-        try:
-            header, body = decode_frame(data)
-        except CodecError:
-            return Refusal.TRUNCATED
-        if header.type is not MailboxType.AOE or header.address:
-            return Refusal.MAILBOX
+        body = aoe_packet(data)
+        if isinstance(body, Refusal):
+            return body
 
         def reply(packet: bytes) -> None:
             # Requests are told apart by who asks and by their numbers, so what repeats a counter
@@ -56,6 +64,6 @@ class MailboxDoor:
             back = MailboxHeader(0, 0, type=MailboxType.AOE, counter=self._counter)
             send(encode_frame(back, packet))
 
-        if self._aoe.receive_packet(bytes(body), reply, now_ns, for_all=for_all):
+        if self._aoe.receive_packet(body, reply, now_ns, for_all=for_all):
             return None
         return Refusal.MAILBOX

@@ -8,7 +8,7 @@ from time import monotonic_ns
 
 from eap.appliance.aoe_desk import AoeDesk
 from eap.appliance.discards import Refusal
-from eap.appliance.mailbox_door import MailboxDoor
+from eap.appliance.mailbox_door import MailboxDoor, aoe_packet
 from eap.pd.link import Channel, Origin, OutFrame
 
 
@@ -49,6 +49,8 @@ class MailboxIntake:
         self._channel.send([OutFrame(buffer, len(header), destination)], monotonic_ns())
 
 
-def ignore(data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
-    """Leave a frame to another intake that gets it too."""
-    del data, size, at_ns, origin
+def judge(data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
+    """Leave a frame to another intake that gets it too; return why that does not take it."""
+    del at_ns, origin
+    packet = aoe_packet(data[:size])
+    return packet if isinstance(packet, Refusal) else None

@@ -11,7 +11,7 @@ from eap.appliance.aoe_desk import AoeDesk
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.appliance.intake import FrameIntake, watch_channel
-from eap.appliance.mailbox_intake import MailboxIntake, ignore
+from eap.appliance.mailbox_intake import MailboxIntake, judge
 from eap.appliance.tcp_door import TcpDoor
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.ids import InterfaceUri
@@ -109,7 +109,7 @@ class _Sockets:
         served: set[int] = set()
         for owner in shared.owners:
             spec = self._handover.port(owner)
-            intake = FrameIntake([owner.station], self._counters, self._now_ns, ignore)
+            intake = FrameIntake([owner.station], self._counters, self._now_ns, judge)
             port = interface.port(
                 intake.take, vlan_id=spec.vlan_id, priority=spec.vlan_priority, join=spec.join
             )

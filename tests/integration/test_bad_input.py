@@ -10,6 +10,8 @@ from collections.abc import Iterator
 import pytest
 
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE, EtherCatHeader
+from eap.codec.mailbox import MailboxHeader, MailboxType
+from eap.codec.mailbox import encode_frame as encode_mailbox_frame
 from eap.codec.pd import FIRST_PD, PdFrameHeader, PdHeader, encode_frame
 from eap.ids import NetId
 from tests.support.appliance import Appliance, Plants, troubles, wait_until
@@ -74,7 +76,10 @@ def hostile_frames() -> dict[str, list[bytes]]:
         + [bytes(too_long), bytes(announced)],
         "count_too_large": [bytes(too_many)],
         "wrong_type": [EtherCatHeader(21, 0, kind).encode() + bytes(21) for kind in (0, 1, 7, 15)],
-        "mailbox": [EtherCatHeader(6, 0, 5).encode() + bytes(6)],
+        "mailbox": [
+            EtherCatHeader(6, 0, 5).encode() + bytes(6),
+            encode_mailbox_frame(MailboxHeader(0, type=MailboxType.COE), bytes(10)),
+        ],
         "wrong_publisher": [pd_frame(STRANGER, PdHeader(1, 7, LENGTH), bytes(LENGTH))],
         "unknown_id": [pd_frame(SENDER, PdHeader(2, 7, LENGTH), bytes(LENGTH))],
         "version": [pd_frame(SENDER, PdHeader(1, 8, LENGTH), bytes(LENGTH))],

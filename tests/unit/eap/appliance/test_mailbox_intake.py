@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from eap.appliance.discards import Refusal
-from eap.appliance.mailbox_intake import MailboxIntake, ignore
+from eap.appliance.mailbox_intake import MailboxIntake, judge
 from tests.support import aoe
 
 TARGET = "1.1.1.1.2.1"
@@ -86,5 +86,9 @@ def test_what_is_not_taken_has_a_reason():
     assert tell(Wire(), ask(kind=3)) is Refusal.MAILBOX
 
 
-def test_ignored_frame_is_not_counted():
-    assert ignore(memoryview(b""), 0, 0, Wire()) is None
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [(ask(), None), (ask(kind=3), Refusal.MAILBOX), (ask()[:-1], Refusal.TRUNCATED)],
+)
+def test_frame_that_another_intake_takes_is_only_judged(frame, reason):
+    assert judge(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason
