@@ -25,8 +25,13 @@ from eap.pd.engine import Engine
 from eap.pd.spec import StationSpec
 from eap.pd.station import Station
 
-SWITCH_S = 5e-6
-"""How long a cycle waits for the interpreter, as often as it lets go of it in a system call."""
+SWITCH_S = 1e-4
+"""How long a cycle waits for the interpreter, as often as it lets go of it in a system call.
+
+It wakes as often as that to ask again.  Where it shares a processor with the thread that builds, as
+with ``--cpu``, an interval as short as such a wake-up takes (5 us were tried) leaves that thread no
+time to let go of the interpreter, and both hang.
+"""
 MOST_WAITING = 64
 _LOOK_S = 0.01
 _SWAP_NS = 1_000_000
