@@ -1,4 +1,4 @@
-"""Destinations at run time: as one word of the process image, and what may take another's place.
+"""Destinations at run time: as one word of the process image, and as the NetID that one may be.
 
 The word is the kind, then a MAC address, or an IPv4 address and the port.
 """
@@ -7,19 +7,11 @@ from __future__ import annotations
 
 from ipaddress import IPv4Address
 
-from eap.errors import ConfigError
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
 
 _KIND_SHIFT = 48
 _KINDS = {DestinationKind.MAC: 1, DestinationKind.IP: 2, DestinationKind.TCP: 3}
 _BY_NUMBER = {number: kind for kind, number in _KINDS.items()}
-_TRANSPORT = {DestinationKind.NET_ID: DestinationKind.MAC}
-_FORMS = {
-    DestinationKind.MAC: "a MAC address or a NetID",
-    DestinationKind.NET_ID: "a MAC address or a NetID",
-    DestinationKind.IP: "an IPv4 address",
-    DestinationKind.TCP: "tcp:// and an IPv4 address",
-}
 _LOW = (1 << _KIND_SHIFT) - 1
 
 
@@ -47,21 +39,6 @@ def from_word(word: int) -> Destination | None:
     if kind is DestinationKind.MAC:
         return Destination(kind, str(MacAddr(address.to_bytes(6))))
     return Destination(kind, str(IPv4Address(address >> 16)), address & 0xFFFF)
-
-
-def check_target(old: str, new: str) -> None:
-    """Check that frames to *old* can be sent to *new* as they are: by the same kind of network.
-
-    Raises:
-        ConfigError: it is no address, or one of another kind, which may have less room for a frame.
-    """
-    try:
-        kind = Destination.parse(new).kind
-    except ValueError as exc:
-        raise ConfigError(f"destination: {exc}") from None
-    wanted = Destination.parse(old).kind
-    if _TRANSPORT.get(kind, kind) is not _TRANSPORT.get(wanted, wanted):
-        raise ConfigError(f"frames to {old} cannot be sent to {new}, expected {_FORMS[wanted]}")
 
 
 def net_id_of(destination: str) -> NetId | None:

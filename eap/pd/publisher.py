@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 from eap.ids import NetId
-from eap.pd.address import check_target, from_word, net_id_of, to_word
+from eap.pd.address import from_word, net_id_of, to_word
 from eap.pd.gather import Gather
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
@@ -90,30 +90,6 @@ class Publisher:
         self._others: list[TxFrame] = []
         self._sending: list[tuple[TxFrame, Selection]] = []
         self.read_controls()
-
-    def has(self, name: str) -> bool:
-        """Whether the port sends frame *name*."""
-        return any(frame.place.name == name for frame in self.frames)
-
-    def retarget(self, name: str, destination: str) -> None:
-        """Send frame *name* to *destination* from the next cycle on, and leave all others alone.
-
-        To a NetID nothing is sent until its address is learned.
-
-        Raises:
-            ConfigError: the port cannot send it there.
-        """
-        frame = next(frame for frame in self.frames if frame.place.name == name)
-        check_target(frame.place.destination, destination)
-        for sought, frames in list(self.sought.items()):
-            if frame in frames:
-                frames.remove(frame)
-            if not frames:
-                del self.sought[sought]
-        net_id = net_id_of(destination)
-        frame.retarget("" if net_id is not None else destination)
-        self._note_target(frame, net_id)
-        self._group_frames()
 
     def learn(self, net_id: bytes, destination: str) -> None:
         """Send what goes to *net_id* to *destination*, where its frames come from."""

@@ -16,7 +16,6 @@ from types import MappingProxyType
 
 import msgspec
 
-from eap.errors import ConfigError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.answerer import Answerer
 from eap.pd.device import Device, DeviceState
@@ -149,18 +148,6 @@ class Station:
         if learner := self._learners.get(port):
             learner.sought = () if publisher is None else publisher.sought
             learner.learn = forget if publisher is None else publisher.learn
-
-    def retarget(self, frame: str, destination: str) -> None:
-        """Send TxFrame *frame* to *destination* from the next cycle on; the others are left alone.
-
-        Raises:
-            ConfigError: the station pushes no such frame, or its port cannot send it there.
-        """
-        for publisher, _ in self._publishers:
-            if isinstance(publisher, Publisher) and publisher.has(frame):
-                publisher.retarget(frame, destination)
-                return
-        raise ConfigError(f"station {self.spec.name} sends no frame {frame!r} of its own accord")
 
     def drain_also(self, channel: Channel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""

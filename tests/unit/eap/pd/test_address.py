@@ -4,9 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.errors import ConfigError
 from eap.ids import Destination, MacAddr, NetId
-from eap.pd.address import check_target, from_word, net_id_of, to_word
+from eap.pd.address import from_word, net_id_of, to_word
 
 macs = st.binary(min_size=6, max_size=6).map(lambda octets: str(MacAddr(octets)))
 ports = st.integers(0, 65535).map(lambda port: f":{port}" if port else "")
@@ -34,30 +33,3 @@ def test_net_ids_are_told_from_addresses() -> None:
     assert net_id_of("5.23.91.23.2.1") == NetId.parse("5.23.91.23.2.1")
     for text in ("10.0.0.1", "02:00:00:00:00:01", "tcp://10.0.0.1", "", "a.b.c.d.e.f"):
         assert net_id_of(text) is None
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("10.0.0.1", "10.0.0.2:4000"),
-        ("239.1.1.1", "10.0.0.2"),
-        ("02:00:00:00:00:01", "5.23.91.23.2.1"),
-        ("5.23.91.23.2.1", "01:01:05:04:00:00"),
-        ("tcp://10.0.0.1", "tcp://10.0.0.2"),
-    ],
-)
-def test_frames_may_go_elsewhere_by_the_same_kind_of_network(old: str, new: str) -> None:
-    check_target(old, new)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("10.0.0.1", "tcp://10.0.0.2"),
-        ("5.23.91.23.2.1", "10.0.0.1"),
-        ("tcp://10.0.0.1", "10.0.0.1"),
-    ],
-)
-def test_frames_are_not_sent_by_another_kind_of_network(old: str, new: str) -> None:
-    with pytest.raises(ConfigError, match=f"frames to {old} cannot be sent to {new}, expected "):
-        check_target(old, new)

@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-import pytest
-
 from eap.codec.pd import iter_pds
-from eap.errors import ConfigError
 from eap.ids import NetId
 from eap.pd.image import Image
 from eap.pd.inputs import Inputs
@@ -196,59 +193,3 @@ def test_configured_mac_is_used_and_nothing_is_learned():
     assert sender.frames["f"]["address"] == THEIR_MAC
     assert sender.frames["f"]["destination"] == THERE
     assert [3] in sender.cycle(1)
-
-
-def test_retargeting_one_frame_leaves_the_others_as_they_are():
-    sender = two_frames()
-    sender.cycle(1)
-    g_before = sender.publisher.frames[1].whole.out
-    sender.publisher.retarget("f", "10.0.0.7:4000")
-    assert sender.publisher.frames[1].whole.out is g_before
-    sent = sender.publisher.frames_to_send(2, 0)
-    sender.publisher.sent((), 0)
-    assert [frame.destination for frame in sent] == ["10.0.0.7:4000", "10.0.0.2"]
-    assert sender.frames["f"]["address"] == "10.0.0.7:4000"
-    assert sender.frames["f"]["sent"] == 2
-
-
-def test_retargeting_while_all_frames_go_in_each_cycle():
-    spec = station(
-        variables=written("x:UINT"),
-        frames=tuple(
-            TxFrameSpec(name, "eap0", f"10.0.0.{n}", (TxPdSpec(f"p{n}", n, ("x",)),))
-            for n, name in enumerate("abc", 1)
-        ),
-    )
-    sender = Sender(spec)
-    sender.cycle(1)
-    sender.publisher.retarget("b", "10.0.0.99")
-    sent = sender.publisher.frames_to_send(2, 0)
-    assert [frame.destination for frame in sent] == ["10.0.0.1", "10.0.0.99", "10.0.0.3"]
-
-
-def test_retargeting_between_mac_address_and_net_id():
-    sender = Sender(by_net_id())
-    sender.publisher.learn(NetId.parse(THERE), THEIR_MAC)
-    sender.publisher.retarget("f", "02:00:00:00:00:09")
-    assert sender.publisher.sought == {}
-    assert sender.frames["f"]["address"] == "02:00:00:00:00:09"
-    sender.publisher.retarget("f", "5.23.91.26.1.1")
-    assert sender.frames["f"]["address"] is None
-    assert sender.cycle(1) == [[3]]
-    sender.publisher.learn(NetId.parse("5.23.91.26.1.1"), THEIR_MAC)
-    assert sorted(sender.cycle(2)) == [[1], [3]]
-
-
-@pytest.mark.parametrize(
-    ("name", "destination", "match"),
-    [
-        ("f", "somewhere", "'somewhere' is not an IPv4 address"),
-        ("f", "tcp://10.0.0.7", "frames to 10.0.0.1 cannot be sent to tcp.*expected an IPv4 addr"),
-        ("f", "02:00:00:00:00:09", "expected an IPv4 address"),
-    ],
-)
-def test_retargeting_is_refused_where_no_frame_gets(name, destination, match):
-    sender = two_frames()
-    with pytest.raises(ConfigError, match=match):
-        sender.publisher.retarget(name, destination)
-    assert sender.frames["f"]["address"] == "10.0.0.1"

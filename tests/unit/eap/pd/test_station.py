@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eap.codec.pd import iter_pds
-from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackChannel, LoopbackLines
 from eap.pd.engine import Engine
@@ -612,18 +611,6 @@ def test_frames_to_a_net_id_go_where_its_own_frames_come_from():
     assert sorted(pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame)) == [1, 2]
     by_id, by_mac = station_status(made.image, 0)["frames"]
     assert (by_id["address"], by_mac["address"]) == ("02:00:00:00:00:07", "02:00:00:00:00:05")
-
-
-def test_a_frame_is_sent_elsewhere_while_the_station_runs():
-    made, _ = assemble(addressed())
-    made.start(0)
-    made.retarget("by-mac", "01:01:05:04:00:00")
-    made.cycle(MS, MS)
-    by_id, by_mac = station_status(made.image, 0)["frames"]
-    assert (by_mac["address"], by_mac["sent"]) == ("01:01:05:04:00:00", 1)
-    assert (by_id["address"], by_id["skipped"]) == (None, 1)
-    with pytest.raises(ConfigError, match="station a sends no frame 'other' of its own"):
-        made.retarget("other", "01:01:05:04:00:00")
 
 
 def succeed(before: Station, spec: StationSpec) -> Station:
