@@ -63,11 +63,15 @@ class PlantLink:
     Args:
         clients: The appliance of each station.
         file: The plant file.
+        absent: Its stations that do not run here.
     """
 
-    def __init__(self, clients: Mapping[str, Client], file: Path) -> None:
+    def __init__(
+        self, clients: Mapping[str, Client], file: Path, absent: tuple[str, ...] = ()
+    ) -> None:
         self._clients = clients
         self._file = str(file.resolve())
+        self.absent = absent
 
     @property
     def stations(self) -> tuple[str, ...]:
@@ -125,8 +129,9 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
                 f"no station of plant {plant.name} runs here: start them with 'eapctl run {file}'",
                 code=ErrorCode.UNAVAILABLE,
             )
-        here = {name: found[name] for s in plant.stations if (name := s.name) in found}
-        yield PlantLink(here, file)
+        order = [station.name for station in plant.stations]
+        here = {name: found[name] for name in order if name in found}
+        yield PlantLink(here, file, tuple(name for name in order if name not in found))
     finally:
         for client in clients:
             client.close()

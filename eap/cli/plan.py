@@ -14,7 +14,7 @@ from eap.cli.plant_params import plant_arguments, running_plant
 
 @click.command(short_help="Show what differs between a plant file and what runs.")
 @plant_arguments
-@json_option("Print one object: ok, stations with their changes, and the steps of 'apply'.")
+@json_option("Print one object: ok, stations with changes, the steps of 'apply', who is absent.")
 @click.pass_context
 def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], as_json: bool) -> None:
     """Show, object by object, what differs between PLANT and its stations that run here.
@@ -28,6 +28,7 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], as_json: bo
         plans = plan_all(link, wanted)
         is_possible = not any(each.refused for each in plans)
         order = steps_to(link, wanted) if is_possible else []
+        absent = () if stations else link.absent
     if as_json:
         rows = [
             {
@@ -39,9 +40,11 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], as_json: bo
             for each in plans
         ]
         steps = [{"station": step.station, "why": step.why} for step in order]
-        write_json({"ok": is_possible, "stations": rows, "steps": steps})
+        write_json({"ok": is_possible, "stations": rows, "steps": steps, "absent": absent})
     else:
         for line in plan_lines(plans, order):
             write_text(line)
+        if absent:
+            write_text(f"not running here: {', '.join(absent)}")
     if not is_possible:
         ctx.exit(ExitCode.FAILED)

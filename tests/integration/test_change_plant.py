@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from eap.appliance.plant_change import load_or_raise
+from eap.config.new_plant import Shape, plant_text
 from eap.device.rollout import without_alternates
 from eap.pd.spec import StationSpec
 from tests.support.appliance import EAPCTL, Appliance, Plants, run_eapctl, troubles, wait_until
@@ -183,6 +184,18 @@ def test_a_kill_in_the_middle(line: Line, victim: str, delay_ms: int) -> None:
     assert line.exported() == line.new
     before = line.subscriptions()
     assert_nothing_lost(before, line)
+
+
+def test_a_change_where_cycles_and_builds_share_a_processor(farm: Plants) -> None:
+    text = plant_text("ring", 3, Shape.RING, address="127.9.15.{n}", cycle_us=2000)
+    file = farm.write(text, "ring.yaml")
+    ring = farm.run(file, "--cpu", "0")
+    for _ in range(3):
+        for divider in (5, 1):
+            changed = text.replace("version: 1,", f"version: 1, cycle_us: {divider * 2000},")
+            file.write_text(changed)
+            assert "3 stations changed" in ring.command("apply", str(file))
+    assert ring.status()["processes"]["engine"]["restarts"] == 0
 
 
 def all_run(line: Line) -> bool:

@@ -70,3 +70,15 @@ def test_no_plant(stub, file):
     assert "did you mean station-02?" in result.stderr
     file.write_text("plant: 1")
     assert plan(file).exit_code == 2
+
+
+def test_stations_elsewhere(file, runtime):
+    specs = load_or_raise(file).stations
+    with ExitStack() as stack:
+        PlantStub("ring", specs[1:], stack)
+        assert plan(file).output.splitlines() == [
+            "nothing differs: all 2 stations are as the file says",
+            "not running here: station-01",
+        ]
+        assert json.loads(plan(file, "--json").output)["absent"] == ["station-01"]
+        assert json.loads(plan(file, "--json", "--station", "station-02").output)["absent"] == []
