@@ -25,6 +25,7 @@ from eap.net.mmsg import ReceiveBatch
 from eap.net.tcp import TcpReceiver
 from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine
+from eap.pd.image import Image
 from eap.pd.layout import plan_layout
 from eap.pd.link import Channel, Taker
 from eap.pd.spec import PortKind, PortSpec, Wake
@@ -100,6 +101,10 @@ class EnginePlant:
             connection.close()  # the peer has left again
             return
         port.accept(receiver)
+
+    def image(self, station: str) -> Image:
+        """Return the process image of a station as it is now."""
+        return self._stations[station].file.image
 
     def publish_discards(self) -> None:
         """Show what the interfaces dropped since the last time."""

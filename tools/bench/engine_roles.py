@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from time import monotonic_ns
@@ -68,7 +69,7 @@ def run(job: dict[str, Any]) -> None:
             plant="lateness",
             plant_file="",
             stations=stations,
-            sockets=tuple(map(_own, shared.descriptions)),
+            sockets=own_sockets(shared.descriptions),
         )
         with closing(EnginePlant(handover)) as plant:
             realtime.prepare(job["priority"], [job["cpu"]])
@@ -117,6 +118,11 @@ def _station(number: int, cycle_us: int) -> StationSpec:
             ),
         ),
     )
+
+
+def own_sockets(shared: Iterable[SharedSocket]) -> tuple[SharedSocket, ...]:
+    """Return descriptions with descriptors that the engine may close."""
+    return tuple(map(_own, shared))
 
 
 def _own(shared: SharedSocket) -> SharedSocket:
