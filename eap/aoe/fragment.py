@@ -75,15 +75,21 @@ class Assembler:
 
     Attributes:
         dropped: Packets of which fragments were missing, late, or did not fit together.
+        octets: Kept of the packets that are not complete.
     """
 
     def __init__(self) -> None:
         self.dropped = 0
+        self.octets = 0
         self._partial: dict[tuple[int, NetId, int], _Partial] = {}
 
     def reset(self) -> None:
         """Forget the packets that are not complete."""
         self._partial.clear()
+        self.octets = 0
+
+    def __len__(self) -> int:
+        return len(self._partial)
 
     def receive(self, header: AmsHeader, body: bytes, now_ns: int) -> Taken:
         """Take the fragment with *header* and *body*.
@@ -93,7 +99,7 @@ class Assembler:
         """
         number, fragment = header.invoke_id >> 16, header.invoke_id & 0xFFFF
         key = number, header.source, header.source_port
-        self._forget_late(now_ns)
+        self.expire(now_ns)
         if fragment == 0:
             self._start(key)
         partial = self._partial.get(key)
@@ -102,6 +108,7 @@ class Assembler:
             raise MalformedError(f"fragment {fragment} of packet {number} out of order",
                                  layout="AmsHeader")  # fmt: skip
         partial.content += body
+        self.octets += len(body)
         partial.next += 1
         partial.deadline_ns = now_ns + FRAGMENT_TIMEOUT_NS
         missing = _missing(partial.content)
@@ -111,8 +118,13 @@ class Assembler:
                                  layout="AmsHeader")  # fmt: skip
         if missing:
             return Taken(None, _acknowledge(header))
-        del self._partial[key]
+        self._forget(key)
         return Taken(header.encode()[:_ADDRESSES] + bytes(partial.content), None)
+
+    def expire(self, now_ns: int) -> None:
+        """Forget the packets whose next fragment is late."""
+        for key in [key for key, each in self._partial.items() if now_ns > each.deadline_ns]:
+            self._drop(key)
 
     def _start(self, key: tuple[int, NetId, int]) -> None:
         if key in self._partial:
@@ -122,12 +134,13 @@ class Assembler:
         self._partial[key] = _Partial()
 
     def _drop(self, key: tuple[int, NetId, int]) -> None:
-        self._partial.pop(key, None)
+        self._forget(key)
         self.dropped += 1
 
-    def _forget_late(self, now_ns: int) -> None:
-        for key in [key for key, each in self._partial.items() if now_ns > each.deadline_ns]:
-            self._drop(key)
+    def _forget(self, key: tuple[int, NetId, int]) -> None:
+        partial = self._partial.pop(key, None)
+        if partial is not None:
+            self.octets -= len(partial.content)
 
 
 def _missing(content: bytearray) -> int:

@@ -1,0 +1,133 @@
+"""Whether a request may go on: circles, links that are down, and how much is in flight.
+
+AoE has no count of hops.  What came in by a door does not go back to where it came from; a request
+that this router has passed on already, and whose answer it still waits for, has run in a circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from eap.aoe.action import Outcome
+from eap.aoe.inflight import InFlight
+from eap.aoe.refusal import Refusal
+from eap.aoe.routes import Route, RouteTable
+from eap.aoe.way import Door, Way
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+
+_PREFIX = 4
+"""Octets that all NetIDs of a station have in common."""
+
+
+class Limits(NamedTuple):
+    """How much a router takes on."""
+
+    in_flight: int = 4096
+    """Requests that wait, of all connections."""
+    per_connection: int = 512
+    """Requests of one connection that wait."""
+    timeout_ns: int = 4_500_000_000
+    """How long an answer may take: an error comes back before clients lose patience at 5 s."""
+
+
+class Judge:
+    """Decides on requests.
+
+    Args:
+        net_id: Of the router.
+        table: The routes.
+        doors: All doors by name.
+        in_flight: What waits.
+        limits: How much may wait.
+    """
+
+    def __init__(
+        self,
+        net_id: NetId,
+        table: RouteTable,
+        doors: Mapping[str, Door],
+        in_flight: InFlight,
+        limits: Limits,
+    ) -> None:
+        self._net_id = net_id
+        self._table = table
+        self._doors = doors
+        self._in_flight = in_flight
+        self._limits = limits
+        self._down: set[Way] = set()
+        self._closed: set[str] = set()
+
+    def hop_down(self, door: str, address: str | None) -> None:
+        """Refuse what would go to *address* by *door*, or to any address."""
+        if address is None:
+            self._closed.add(door)
+        else:
+            self._down.add(Way(door, address))
+
+    def hop_up(self, door: str, address: str | None) -> None:
+        """Take back what :meth:`hop_down` was told with the same arguments."""
+        if address is None:
+            self._closed.discard(door)
+        else:
+            self._down.discard(Way(door, address))
+
+    def is_down(self, hop: Way) -> bool:
+        """Say whether nothing can go to *hop* now."""
+        return hop in self._down or hop.door in self._closed
+
+    def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
+        """Return how a request goes on that is for nobody here."""
+        found = self._table.find(header.target)
+        if found is None:
+            return Refusal(AdsError.TARGET_MACHINE, f"no route to {header.target}")
+        route, octets = found
+        if octets < _PREFIX and header.target[:_PREFIX] == self._net_id[:_PREFIX]:
+            # Whoever has a route for the station's NetIDs would send it back here.
+            text = f"this station has no NetID {header.target}"
+            return Refusal(AdsError.TARGET_MACHINE, text)
+        return self._find_obstacle(header, way, route) or route
+
+    def is_again(self, header: AmsHeader, onward: bytes, way: Way) -> bool:
+        """Say whether it is a doubled packet, or asked again, while the first one waits."""
+        if self._doors[way.door].is_stream:
+            return False
+        return self._in_flight.is_asked(way, onward, header.invoke_id)
+
+    def find_circle(self, header: AmsHeader, onward: bytes, route: Route) -> Refusal | None:
+        """Say whether a request was passed on from here already."""
+        known = self._in_flight.get(header.invoke_id)
+        if known is None or known.route is None:
+            return None
+        if known.onward != onward or known.header.command != header.command:
+            return None
+        text = f"it was passed on from here already: routes to {header.target} run in a circle"
+        return Refusal(AdsError.TARGET_MACHINE, text, route.hop, Outcome.LOOP)
+
+    def find_room(self, way: Way) -> Refusal | None:
+        """Say whether too many requests wait for one more."""
+        if self._in_flight.count(way) >= self._limits.per_connection:
+            text = f"{self._limits.per_connection} requests of the connection wait already"
+            return Refusal(AdsError.MAILBOX_FULL, text)
+        if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
+            text = f"{self._limits.in_flight} requests wait already"
+            return Refusal(AdsError.MAILBOX_FULL, text)
+        return None
+
+    def _find_obstacle(self, header: AmsHeader, way: Way, route: Route) -> Refusal | None:
+        back = self._table.find(header.source)
+        if back is not None and back[1] >= _PREFIX and back[0].is_unidirectional:
+            text = f"route {back[0].name} is unidirectional: nothing may be asked from there"
+            return Refusal(AdsError.ACCESS_DENIED, text)
+        hop = route.hop
+        if hop.door not in self._doors:
+            text = f"route {route.name} is by {hop.door}, which this station does not have"
+            return Refusal(AdsError.HOST_UNREACHABLE, text)
+        if hop.door == way.door and (hop == way or not self._doors[hop.door].is_hub):
+            text = f"route {route.name} leads back to where it came from"
+            return Refusal(AdsError.TARGET_MACHINE, text, hop, Outcome.LOOP)
+        if self.is_down(hop):
+            return Refusal(AdsError.HOST_UNREACHABLE, f"{route.name} ({hop}) is down", hop)
+        return None

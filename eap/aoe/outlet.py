@@ -1,0 +1,50 @@
+"""Packets on their way out: in one piece, or in fragments where a door has not the room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from eap.aoe.action import Forward, Reply
+from eap.aoe.fragment import iter_fragments
+from eap.aoe.way import Door, Way
+from eap.codec.ams import AmsHeader
+
+
+class Outlet:
+    """The doors of a router, seen from inside.
+
+    Raises:
+        ValueError: a door has not even room for a fragment, or the name of another.
+    """
+
+    def __init__(self, doors: Iterable[Door]) -> None:
+        self._doors: dict[str, Door] = {}
+        self._number = 0
+        for door in doors:
+            if door.name in self._doors:
+                raise ValueError(f"two doors {door.name!r}")
+            if door.room and door.room <= AmsHeader.SIZE:
+                raise ValueError(
+                    f"door {door.name!r}: {door.room} octets, expected more than {AmsHeader.SIZE}"
+                )
+            self._doors[door.name] = door
+
+    @property
+    def doors(self) -> Mapping[str, Door]:
+        """All doors by name."""
+        return self._doors
+
+    def reply(self, way: Way, packet: bytes) -> Reply:
+        """Return how *packet* goes back by *way*."""
+        return Reply(way, self._cut(way.door, packet))
+
+    def forward(self, hop: Way, packet: bytes, ticket: int) -> Forward:
+        """Return how *packet* goes on to *hop*."""
+        return Forward(hop, self._cut(hop.door, packet), ticket)
+
+    def _cut(self, door: str, packet: bytes) -> tuple[bytes, ...]:
+        room = self._doors[door].room
+        if not room or len(packet) <= room:
+            return (packet,)
+        self._number += 1
+        return tuple(iter_fragments(packet, self._number, room - AmsHeader.SIZE))

@@ -1,0 +1,279 @@
+"""Requests that go on to the next hop, and their answers that come back.
+
+A request that goes on has an invoke id of the router's own, so that nothing a client chooses can be
+mixed up with what another one does, and an answer that comes too late is nobody's.  An id that a
+router before this one gave is kept: a packet that runs in a circle is known by it.
+"""
+
+from __future__ import annotations
+
+import struct
+
+from eap.aoe.action import Action, Outcome, Trace
+from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.inflight import InFlight, Pending
+from eap.aoe.invoke import InvokeIds, is_marked
+from eap.aoe.judge import Judge, Limits
+from eap.aoe.notifier import Notifier, request_to_end
+from eap.aoe.outlet import Outlet
+from eap.aoe.passed import Passed
+from eap.aoe.record import Record
+from eap.aoe.refusal import Refusal, Refuser, wants_answer
+from eap.aoe.routes import Route, RouteTable
+from eap.aoe.subscriptions import Subscription
+from eap.aoe.way import Way
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
+from eap.ids import NetId
+
+_ADDRESSES = struct.Struct("<6sH6sH")
+_HALF = _ADDRESSES.size // 2
+_INVOKE_ID = 28
+"""Where it stands in a packet; between the addresses and it nothing changes on the way."""
+
+
+class Passage:
+    """What a router passes on.
+
+    Attributes:
+        in_flight: What waits for an answer.
+        notifier: Notifications that pass.
+    """
+
+    def __init__(
+        self,
+        net_id: NetId,
+        table: RouteTable,
+        outlet: Outlet,
+        refuser: Refuser,
+        record: Record,
+        *,
+        first_invoke_id: int,
+        limits: Limits,
+    ) -> None:
+        self.in_flight = InFlight()
+        self.notifier = Notifier(outlet)
+        self._table = table
+        self._outlet = outlet
+        self._refuser = refuser
+        self._record = record
+        self._limits = limits
+        self._ids = InvokeIds(first_invoke_id)
+        self._judge = Judge(net_id, table, outlet.doors, self.in_flight, limits)
+        self._passed = Passed()
+
+    def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
+        """Pass a request on that is for nobody here, or refuse it.
+
+        Raises:
+            TruncatedError: it is a notification shorter than it says.
+        """
+        if header.command == AmsCommand.NOTIFICATION:
+            body = data[AmsHeader.SIZE :]
+            replies = self.notifier.hand_on(header, body, lambda hop: self._is_from(hop, way))
+            if replies:
+                return list(replies)
+        route = self._judge.find_route(header, way)
+        if isinstance(route, Refusal):
+            return self._refuser.refuse(header, way, route, now_ns)
+        onward = _ADDRESSES.pack(
+            route.to_real(header.target), header.target_port,
+            self._table.to_virtual(header.source, way), header.source_port,
+        )  # fmt: skip
+        if not wants_answer(header):
+            return self._pass_once(header, data, onward, way, route, now_ns)
+        pending = self._admit(header, data, onward, way, route, now_ns)
+        if not isinstance(pending, Pending):
+            return pending
+        self.notifier.follow_request(header, data[AmsHeader.SIZE :], onward, way)
+        return [self._forward(pending.invoke_id, data, onward, route)]
+
+    def wait_for_service(
+        self, header: AmsHeader, data: bytes, way: Way, now_ns: int
+    ) -> int | list[Action]:
+        """Remember a request that a service of this station gets; return its ticket, or refuse."""
+        pending = self._admit(header, data, data[: _ADDRESSES.size], way, None, now_ns)
+        return pending.invoke_id if isinstance(pending, Pending) else pending
+
+    def take_answer(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
+        """Send an answer back to who asked, unless it is late or comes from somewhere else."""
+        pending = self.in_flight.get(header.invoke_id)
+        if pending is None or not self._is_answer(header, data, way, pending):
+            return self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
+        self.in_flight.pop(header.invoke_id)
+        actions: list[Action] = []
+        surplus = self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :])
+        if surplus is not None:
+            actions += self._end(surplus, now_ns)
+        if pending.came_by is None:
+            self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
+            return actions
+        asked = pending.header
+        back = _ADDRESSES.pack(asked.source, asked.source_port, asked.target, asked.target_port)
+        number = asked.invoke_id.to_bytes(4, "little")
+        packet = back + data[_ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
+        actions += self._send_back(pending, pending.came_by, packet, header.error_code, now_ns)
+        return actions
+
+    def answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
+        """Send back what a service says to the request with *ticket*, if it still waits."""
+        pending = self.in_flight.get(ticket)
+        if pending is None or pending.route is not None or pending.came_by is None:
+            return []
+        self.in_flight.pop(ticket)
+        packet = response_to(pending.header, answer)
+        return self._send_back(pending, pending.came_by, packet, answer.error_code, now_ns)
+
+    def send_failed(self, ticket: int, text: str, now_ns: int) -> list[Action]:
+        """Answer a request that its door could not send."""
+        pending = self.in_flight.pop(ticket)
+        return [] if pending is None else self._fail(pending, text, now_ns)
+
+    def connection_closed(self, way: Way, now_ns: int) -> list[Action]:
+        """Forget who waits at *way*, and end their notifications."""
+        for pending in self.in_flight.abandon(way):
+            if pending.route is None:
+                self.in_flight.pop(pending.invoke_id)
+        actions: list[Action] = []
+        for subscription in self.notifier.subscriptions.close(way):
+            actions += self._end(subscription, now_ns)
+        return actions
+
+    def hop_down(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
+        """Answer what waits for a hop, and refuse what will be for it."""
+        self._judge.hop_down(door, address)
+        self.notifier.subscriptions.forget_hop(door, address)
+        actions: list[Action] = []
+        for pending in self.in_flight.on(door, address):
+            self.in_flight.pop(pending.invoke_id)
+            actions += self._fail(pending, text, now_ns)
+        return actions
+
+    def hop_up(self, door: str, address: str | None) -> None:
+        """Pass requests on to a hop again."""
+        self._judge.hop_up(door, address)
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has something to do."""
+        return self.in_flight.next_timeout()
+
+    def handle_timeout(self, now_ns: int) -> list[Action]:
+        """Answer the requests whose time is up."""
+        actions: list[Action] = []
+        for pending in self.in_flight.due(now_ns):
+            self.in_flight.pop(pending.invoke_id)
+            if pending.came_by is not None:
+                actions += self._time_out(pending, now_ns)
+        return actions
+
+    def _admit(
+        self, header: AmsHeader, data: bytes, onward: bytes, way: Way, route: Route | None,
+        now_ns: int,
+    ) -> Pending | list[Action]:  # fmt: skip
+        """Remember a request that has an answer, unless something speaks against it."""
+        if self._judge.is_again(header, onward, way):
+            text = "the same request waits already"
+            return self._refuser.drop(way, header, Outcome.DROPPED, text, now_ns)
+        why = None if route is None else self._judge.find_circle(header, onward, route)
+        why = why or self._judge.find_room(way)
+        if why is not None:
+            return self._refuser.refuse(header, way, why, now_ns)
+        invoke_id = header.invoke_id
+        if route is None or not is_marked(invoke_id) or invoke_id in self.in_flight:
+            invoke_id = self._ids.take(self.in_flight)
+        allowed = self._limits.timeout_ns
+        if route is not None:
+            allowed = route.timeout_ns or allowed
+            self._record.hops.of(route.hop).ask(len(data))
+        pending = Pending(invoke_id, header, way, route, onward, now_ns, now_ns + allowed)
+        self.in_flight.add(pending)
+        return pending
+
+    def _pass_once(
+        self, header: AmsHeader, data: bytes, onward: bytes, way: Way, route: Route, now_ns: int
+    ) -> list[Action]:
+        """Pass on what has no answer, unless it was passed on a short time ago."""
+        invoke_id = header.invoke_id
+        if is_marked(invoke_id):
+            if (invoke_id, onward) in self._passed:
+                text = f"passed on already: doubled, or routes to {header.target} run in a circle"
+                return self._refuser.drop(way, header, Outcome.LOOP, text, now_ns)
+        else:
+            invoke_id = self._ids.take(self.in_flight)
+        self._passed.add(invoke_id, onward)
+        self._record.hops.of(route.hop).ask(len(data))
+        return [self._forward(invoke_id, data, onward, route)]
+
+    def _forward(self, invoke_id: int, data: bytes, onward: bytes, route: Route) -> Action:
+        number = invoke_id.to_bytes(4, "little")
+        packet = onward + data[_ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
+        return self._outlet.forward(route.hop, packet, invoke_id)
+
+    def _is_answer(self, header: AmsHeader, data: bytes, way: Way, pending: Pending) -> bool:
+        return (
+            pending.route is not None
+            and self._is_from(pending.route.hop, way)
+            and header.command == pending.header.command
+            and data[:_HALF] == pending.onward[_HALF:]
+        )
+
+    def _is_from(self, hop: Way, way: Way) -> bool:
+        return hop == way or (hop.door == way.door and self._outlet.doors[way.door].is_shared)
+
+    def _send_back(
+        self, pending: Pending, way: Way, packet: bytes, error_code: int, now_ns: int
+    ) -> list[Action]:
+        route = pending.route
+        took_ns = now_ns - pending.at_ns
+        hop, text = None, ""
+        self._record.connections.of(way).answer(len(packet), took_ns)
+        if route is not None:
+            hop = route.hop
+            self._record.hops.of(hop).answer(len(packet), took_ns)
+            if error_code:
+                text = f"error 0x{error_code:x} from {route.name} ({hop}) or from behind it"
+        self._record.enter(
+            Trace(now_ns, Outcome.ANSWERED, way, hop, pending.header, error_code, took_ns, text)
+        )
+        return [self._outlet.reply(way, packet)]
+
+    def _fail(self, pending: Pending, text: str, now_ns: int) -> list[Action]:
+        if pending.route is None or pending.came_by is None:
+            return []
+        hop = pending.route.hop
+        why = Refusal(AdsError.HOST_UNREACHABLE, f"{pending.route.name} ({hop}): {text}", hop)
+        took_ns = now_ns - pending.at_ns
+        return self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
+
+    def _time_out(self, pending: Pending, now_ns: int) -> list[Action]:
+        allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
+        if pending.route is None:
+            who, hop = "its service", None
+        else:
+            hop = pending.route.hop
+            who = f"{pending.route.name} ({hop})"
+        why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", hop)
+        took_ns = now_ns - pending.at_ns
+        actions = self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
+        if pending.route is not None and pending.header.command == AmsCommand.ADD_NOTIFICATION:
+            # If it is granted after all, somebody has to end it.
+            pending.came_by, pending.at_ns = None, now_ns
+            pending.deadline_ns = now_ns + self._limits.timeout_ns
+            self.in_flight.add(pending)
+        return actions
+
+    def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
+        """Ask the server to end a notification, for nobody."""
+        header, body, route = request_to_end(subscription)
+        invoke_id = self._ids.take(self.in_flight)
+        deadline_ns = now_ns + self._limits.timeout_ns
+        pending = Pending(invoke_id, header, None, route, subscription.onward, now_ns, deadline_ns)
+        self.in_flight.add(pending)
+        return [self._forward(invoke_id, encode_packet(header, body), subscription.onward, route)]
+
+
+def _unasked(answer: AmsHeader) -> str:
+    return (
+        f"an answer of {answer.source}:{answer.source_port} to {answer.target}:{answer.target_port}"
+        " that nobody waits for, or not any more"
+    )

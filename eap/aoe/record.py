@@ -1,0 +1,81 @@
+"""What a router remembers of what it did: counts, traffic by way, and the latest traces."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import msgspec
+
+from eap.aoe.action import Outcome, Trace
+from eap.aoe.traffic import TrafficTable
+from eap.aoe.way import Way
+from eap.codec.ams import AmsCommand, AmsHeader
+
+MAX_EVENTS = 1024
+"""Traces that wait for somebody who reads them; the oldest makes room."""
+MAX_LATEST = 256
+"""Traces that are kept for people who ask later."""
+
+
+class Record:
+    """The memory of a router.
+
+    Attributes:
+        latest: The latest traces, the oldest first.
+        counts: Packets by what became of them.
+        connections: What was asked from each, which have not been closed.
+        hops: What was asked of each.
+        missed: Traces that nobody took in time.
+    """
+
+    def __init__(self) -> None:
+        self.latest: deque[Trace] = deque(maxlen=MAX_LATEST)
+        self.counts = dict.fromkeys(Outcome, 0)
+        self.connections = TrafficTable()
+        self.hops = TrafficTable()
+        self.missed = 0
+        self._events: deque[Trace] = deque()
+
+    def next_event(self) -> Trace | None:
+        """Take the oldest trace of what was not simply answered."""
+        return self._events.popleft() if self._events else None
+
+    def enter(self, trace: Trace) -> None:
+        """Remember what became of a packet."""
+        self.counts[trace.outcome] += 1
+        self.latest.append(trace)
+        if trace.outcome is Outcome.ANSWERED and not trace.error_code:
+            return
+        if len(self._events) >= MAX_EVENTS:
+            self._events.popleft()
+            self.missed += 1
+        self._events.append(trace)
+
+
+class Stats(msgspec.Struct, frozen=True):
+    """What a router does and did.
+
+    Attributes:
+        in_flight: Requests that wait for their answers.
+        subscriptions: Notifications that pass.
+        fragment_octets: Kept of packets that are not complete.
+        routes: That there are.
+        counts: Packets by what became of them.
+        missed_traces: That nobody took in time.
+    """
+
+    in_flight: int
+    subscriptions: int
+    fragment_octets: int
+    routes: int
+    counts: dict[Outcome, int]
+    missed_traces: int
+
+
+def describe(header: AmsHeader, way: Way | None = None) -> str:
+    """Return a request in words: service, target and source."""
+    where = f" ({way})" if way is not None else ""
+    return (
+        f"{AmsCommand.name_of(header.command)} of {header.target}:{header.target_port}"
+        f" for {header.source}:{header.source_port}{where}"
+    )

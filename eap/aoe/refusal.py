@@ -1,0 +1,65 @@
+"""Answers of a router itself: why a request went no further."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from eap.aoe.action import Action, Outcome, Trace
+from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.outlet import Outlet
+from eap.aoe.record import Record, describe
+from eap.aoe.way import Way
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
+
+
+class Refusal(NamedTuple):
+    """Why a request goes no further."""
+
+    error: AdsError
+    text: str
+    hop: Way | None = None
+    """Where it stopped, unless here."""
+    outcome: Outcome = Outcome.FAILED
+
+
+def wants_answer(header: AmsHeader) -> bool:
+    """Say whether the sender of a request waits for an answer."""
+    return not (
+        header.state_flags & StateFlags.NO_RETURN or header.command == AmsCommand.NOTIFICATION
+    )
+
+
+class Refuser:
+    """Answers with errors, and remembers each."""
+
+    def __init__(self, outlet: Outlet, record: Record) -> None:
+        self._outlet = outlet
+        self._record = record
+
+    def refuse(
+        self, header: AmsHeader, way: Way | None, why: Refusal, at_ns: int, took_ns: int = 0
+    ) -> list[Action]:
+        """Answer the request with *header*, as it came by *way*; None if nobody waits."""
+        text = f"{describe(header, way)}: {why.text}"
+        self._record.enter(
+            Trace(at_ns, why.outcome, way, why.hop, header, why.error, took_ns, text)
+        )
+        if why.hop is not None:
+            self._record.hops.of(why.hop).fail(why.text)
+        if way is None or not wants_answer(header):
+            return []
+        packet = response_to(header, AmsAnswer(error_code=why.error))
+        traffic = self._record.connections.of(way)
+        traffic.fail(why.text)
+        traffic.answer(len(packet), took_ns)
+        return [self._outlet.reply(way, packet)]
+
+    def drop(
+        self, way: Way, header: AmsHeader | None, outcome: Outcome, text: str, at_ns: int
+    ) -> list[Action]:
+        """Say nothing to anybody, and remember it."""
+        subject = str(way) if header is None else describe(header, way)
+        text = f"{subject}: {text}"
+        self._record.enter(Trace(at_ns, outcome, way, None, header, 0, 0, text))
+        return []

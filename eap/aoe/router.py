@@ -1,0 +1,193 @@
+"""The router of a station: AMS packets to its own services and to the next station (ETG.1020).
+
+Every request is answered exactly once, on the connection that it came by: by its target, or with
+an error of the AMS header that says why it did not get there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable
+
+from eap.aoe.action import Action, Deliver, Outcome, Reply, Trace
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.judge import Limits
+from eap.aoe.outlet import Outlet
+from eap.aoe.passage import Passage
+from eap.aoe.reassembly import Reassembly
+from eap.aoe.record import Record, Stats
+from eap.aoe.refusal import Refusal, Refuser, wants_answer
+from eap.aoe.routes import RouteTable
+from eap.aoe.way import Door, Way
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
+from eap.errors import CodecError, MalformedError
+from eap.ids import NetId
+
+_NOBODY = 0
+"""Ticket of a request that has no answer."""
+
+
+class Router:
+    """What becomes of every packet.
+
+    Args:
+        net_id: Of the router itself.
+        table: The routes; they may change at any time.
+        doors: By which packets come and go.
+        first_invoke_id: Another one at each start, see :class:`~eap.aoe.invoke.InvokeIds`.
+        limits: How much it takes on.
+
+    Attributes:
+        record: What it did.
+    """
+
+    def __init__(
+        self,
+        net_id: NetId,
+        table: RouteTable,
+        doors: Iterable[Door],
+        *,
+        first_invoke_id: int,
+        limits: Limits | None = None,
+    ) -> None:
+        self.record = Record()
+        self._table = table
+        self._outlet = Outlet(doors)
+        self._refuser = Refuser(self._outlet, self.record)
+        self._devices: dict[NetId, Container[int]] = {}
+        self._fragments = Reassembly()
+        self._passage = Passage(
+            net_id, table, self._outlet, self._refuser, self.record,
+            first_invoke_id=first_invoke_id, limits=limits or Limits(),
+        )  # fmt: skip
+
+    def add_device(self, net_id: NetId, ports: Container[int]) -> None:
+        """Let services answer for *net_id*; *ports* says at any time which AMS ports it has."""
+        self._devices[net_id] = ports
+
+    def remove_device(self, net_id: NetId) -> None:
+        """Answer for *net_id* no more."""
+        self._devices.pop(net_id, None)
+
+    def receive_packet(
+        self, data: bytes, door: str, connection: str, now_ns: int, *, for_all: bool = False
+    ) -> list[Action]:
+        """Act on a packet, or on the fragment of one; nothing that a peer sends raises.
+
+        Args:
+            data: Header and what follows it.
+            door: That it came by.
+            connection: That it came by, or its sender's address.
+            now_ns: The time on the monotonic clock.
+            for_all: Whether others got it too: who is not meant says nothing.
+        """
+        way = Way(door, connection)
+        try:
+            header, body = decode_packet(data)
+            if header.command == AmsCommand.FRAGMENT:
+                return self._receive_fragment(header, bytes(body), way, now_ns, for_all=for_all)
+            end = AmsHeader.SIZE + header.length
+            packet = data if len(data) == end else data[:end]
+            return self._receive_whole(header, packet, way, now_ns, for_all=for_all)
+        except CodecError as exc:
+            return self._refuser.drop(way, None, Outcome.DROPPED, str(exc), now_ns)
+
+    def receive_answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
+        """Send back what a service of this station says to the request with *ticket*.
+
+        What comes after its time, or after its connection was closed, is dropped.
+        """
+        return self._passage.answer(ticket, answer, now_ns)
+
+    def send_failed(self, ticket: int, text: str, now_ns: int) -> list[Action]:
+        """Answer the request with *ticket*, which its door could not send; *text* says why."""
+        return self._passage.send_failed(ticket, text, now_ns)
+
+    def connection_closed(self, door: str, connection: str, now_ns: int) -> list[Action]:
+        """Forget whom nobody can answer any more, and end the notifications that they had."""
+        way = Way(door, connection)
+        self._fragments.forget(way)
+        self.record.connections.forget(way)
+        return self._passage.connection_closed(way, now_ns)
+
+    def hop_down(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
+        """Answer what waits for *address*, and what will be for it, with "host unreachable".
+
+        Args:
+            door: By which it is reached.
+            address: None for all that are reached by the door.
+            text: Why, for people.
+            now_ns: The time on the monotonic clock.
+        """
+        return self._passage.hop_down(door, address, text, now_ns)
+
+    def hop_up(self, door: str, address: str | None) -> None:
+        """Pass requests on again; the arguments are those of :meth:`hop_down`."""
+        self._passage.hop_up(door, address)
+
+    def next_timeout(self) -> int | None:
+        """Return when :meth:`handle_timeout` has something to do."""
+        times = self._passage.next_timeout(), self._table.next_timeout()
+        return min((each for each in times if each is not None), default=None)
+
+    def handle_timeout(self, now_ns: int) -> list[Action]:
+        """Answer the requests whose time is up, and forget the routes that expired."""
+        self._table.expire(now_ns)
+        return self._passage.handle_timeout(now_ns)
+
+    def next_event(self) -> Trace | None:
+        """Take the oldest trace of what was not simply answered."""
+        return self.record.next_event()
+
+    def stats(self) -> Stats:
+        """Return what is going on, and what was."""
+        return Stats(
+            in_flight=len(self._passage.in_flight),
+            subscriptions=len(self._passage.notifier.subscriptions),
+            fragment_octets=self._fragments.octets,
+            routes=len(self._table),
+            counts=dict(self.record.counts),
+            missed_traces=self.record.missed,
+        )
+
+    def _receive_fragment(
+        self, header: AmsHeader, body: bytes, way: Way, now_ns: int, *, for_all: bool
+    ) -> list[Action]:
+        if header.state_flags & StateFlags.RESPONSE:
+            return []  # ours want no acknowledgement
+        packet, acknowledgement = self._fragments.receive(way, header, body, now_ns)
+        if packet is None:
+            return [] if acknowledgement is None or for_all else [Reply(way, (acknowledgement,))]
+        whole, _ = decode_packet(packet)
+        if whole.command == AmsCommand.FRAGMENT:
+            raise MalformedError("a fragment in fragments", layout="AmsHeader")
+        return self._receive_whole(whole, packet, way, now_ns, for_all=for_all)
+
+    def _receive_whole(
+        self, header: AmsHeader, data: bytes, way: Way, now_ns: int, *, for_all: bool
+    ) -> list[Action]:
+        if header.state_flags & StateFlags.RESPONSE:
+            return self._passage.take_answer(header, data, way, now_ns)
+        ports = self._devices.get(header.target)
+        if ports is None and for_all:
+            return []
+        self.record.connections.of(way).ask(len(data))
+        if header.source in self._devices and not self._outlet.doors[way.door].is_this_host:
+            text = f"it comes back to where it began: {header.source} is of this station"
+            why = Refusal(AdsError.TARGET_MACHINE, text, outcome=Outcome.LOOP)
+            return self._refuser.refuse(header, way, why, now_ns)
+        if ports is None:
+            return self._passage.take_request(header, data, way, now_ns)
+        return self._deliver(header, data, way, ports, now_ns)
+
+    def _deliver(
+        self, header: AmsHeader, data: bytes, way: Way, ports: Container[int], now_ns: int
+    ) -> list[Action]:
+        if header.target_port not in ports:
+            text = f"nothing has port {header.target_port} of {header.target}"
+            return self._refuser.refuse(header, way, Refusal(AdsError.TARGET_PORT, text), now_ns)
+        body = data[AmsHeader.SIZE :]
+        if not wants_answer(header):
+            return [Deliver(_NOBODY, header, body, way)]
+        ticket = self._passage.wait_for_service(header, data, way, now_ns)
+        return [Deliver(ticket, header, body, way)] if isinstance(ticket, int) else ticket

@@ -1,0 +1,77 @@
+"""A router with the doors of a station, for tests: packets in, packets out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from eap.aoe.action import Action, Deliver, Forward, Outcome, Reply
+from eap.aoe.judge import Limits
+from eap.aoe.router import Router
+from eap.aoe.routes import Route, RouteTable
+from eap.aoe.way import Door, Way
+from eap.ids import NetId
+from tests.support.ams import Ams, parse
+
+ROUTER = "5.1.1.1.1.1"
+DEVICE = "5.1.1.1.2.1:65535"
+CLIENT = "192.168.0.9.1.1:30000"
+FAR = "6.1.1.1.1.1"
+FAR_DEVICE = f"{FAR}:851"
+LINK = Way("link", "10.0.0.6")
+SECOND_LINK = Way("link", "10.0.0.7")
+DOORS = (
+    Door("tcp", is_stream=True, is_hub=True),
+    Door("here", is_stream=True, is_hub=True, is_this_host=True),
+    Door("link", is_hub=True, is_stream=True),
+    Door("segment"),
+    Door("broker", is_shared=True),
+    Door("narrow", room=60),
+)
+
+
+def route(net_id: str, hop: Way, name: str = "", **more: object) -> Route:
+    return Route(NetId.parse(net_id), name or f"to {net_id}", hop, **more)
+
+
+class Station:
+    """A router; what it wants done is taken apart."""
+
+    def __init__(self, routes: Iterable[Route] = (), *, first_id: int = 1000,
+                 limits: Limits | None = None) -> None:  # fmt: skip
+        self.table = RouteTable([*routes])
+        self.router = Router(
+            NetId.parse(ROUTER), self.table, DOORS, first_invoke_id=first_id, limits=limits
+        )
+        self.router.add_device(NetId.parse(ROUTER), {10000})
+        self.router.add_device(NetId.parse("5.1.1.1.2.1"), {65535})
+        self.now_ns = 0
+
+    def give(self, packet: Ams, way: Way, **more: bool) -> list[Action]:
+        return self.router.receive_packet(
+            packet.octets(), way.door, way.connection, self.now_ns, **more
+        )
+
+    def forwarded(self, packet: Ams, way: Way) -> Ams:
+        """Give a request that goes on; return what the hop gets."""
+        (action,) = self.give(packet, way)
+        assert isinstance(action, Forward), action
+        return parse(*action.packets)
+
+    def delivered(self, packet: Ams, way: Way) -> Deliver:
+        """Give a request for a service; return what that gets."""
+        (action,) = self.give(packet, way)
+        assert isinstance(action, Deliver), action
+        return action
+
+    def replied(self, packet: Ams, way: Way) -> tuple[Way, Ams]:
+        """Give a packet that something goes back for; return where, and what."""
+        return only_reply(self.give(packet, way))
+
+    def events(self) -> list[tuple[Outcome, str]]:
+        return [(each.outcome, each.text) for each in iter(self.router.next_event, None)]
+
+
+def only_reply(actions: list[Action]) -> tuple[Way, Ams]:
+    (action,) = actions
+    assert isinstance(action, Reply), action
+    return action.way, parse(*action.packets)

@@ -1,0 +1,7 @@
+from __future__ import annotations
+
+from eap.aoe.action import Outcome
+
+
+def test_outcomes_have_the_names_that_people_read() -> None:
+    assert sorted(Outcome) == ["answered", "dropped", "failed", "late", "loop"]

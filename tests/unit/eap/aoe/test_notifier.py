@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from eap.aoe.action import Outcome
+from eap.aoe.routes import Route
+from eap.aoe.way import Way
+from eap.ids import NetId
+from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams, parse
+from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, SECOND_LINK, Station, route
+from tests.unit.eap.aoe.test_subscriptions import stream
+
+SECOND = 1_000_000_000
+ONE, TWO = Way("tcp", "1"), Way("tcp", "2")
+ADD = Ams(FAR_DEVICE, CLIENT, ADD_NOTIFICATION, body=bytes(40))
+NOTICE = Ams(CLIENT, FAR_DEVICE, NOTIFICATION)
+
+
+def granted(handle: int, result: int = 0) -> bytes:
+    return result.to_bytes(4, "little") + handle.to_bytes(4, "little")
+
+
+def subscribed(*ways: Way, routes: tuple[Route, ...] = (route(FAR, LINK),)) -> Station:
+    """Return a station by which each way has one notification; the handles count from 1."""
+    station = Station(routes)
+    asked = ADD._replace(target=f"{routes[0].net_id}:851")
+    for handle, way in enumerate(ways, 1):
+        onward = station.forwarded(asked, way)
+        assert station.replied(onward.answer(granted(handle)), LINK)[0] == way
+    return station
+
+
+def test_notification_goes_to_who_asked_for_it_with_one_address_for_both() -> None:
+    station = subscribed(ONE, TWO)
+    for handle, way in ((1, ONE), (2, TWO)):
+        notice = NOTICE._replace(body=stream((5, {handle: b"data"})))
+        assert station.replied(notice, LINK) == (way, notice)
+    both = NOTICE._replace(body=stream((5, {1: b"a", 2: b"b"})))
+    parts = {each.way: parse(*each.packets).body for each in station.give(both, LINK)}
+    assert parts == {ONE: stream((5, {1: b"a"})), TWO: stream((5, {2: b"b"}))}
+
+
+def test_notification_that_nobody_asked_for_goes_nowhere() -> None:
+    station = subscribed(ONE)
+    assert station.give(NOTICE._replace(body=stream((5, {9: b""}))), LINK) == []
+    assert station.give(NOTICE._replace(body=stream((5, {1: b""}))), SECOND_LINK) == []
+    assert station.give(NOTICE._replace(body=b"short"), LINK) == []
+    assert [outcome for outcome, _ in station.events()] == [
+        Outcome.FAILED, Outcome.FAILED, Outcome.DROPPED
+    ]  # fmt: skip
+
+
+def test_notification_comes_from_the_address_that_was_asked() -> None:
+    virtual = route("10.0.0.6.1.1", LINK, real=NetId.parse(FAR))
+    station = subscribed(ONE, routes=(virtual,))
+    notice = NOTICE._replace(body=stream((5, {1: b"data"})))
+    assert station.replied(notice, LINK) == (ONE, notice._replace(source="10.0.0.6.1.1:851"))
+
+
+def test_notification_may_go_by_a_route() -> None:
+    station = Station([route("192.168.0.9.1.1", SECOND_LINK)])
+    notice = NOTICE._replace(body=stream((5, {1: b"data"})))
+    onward = station.forwarded(notice, LINK)
+    assert onward == notice._replace(invoke_id=onward.invoke_id)
+
+
+def test_refused_notifications_are_not_remembered() -> None:
+    for body, error in ((granted(1, 0x714), 0), (granted(1), 7), (b"\0\0\0\0", 0)):
+        station = Station([route(FAR, LINK)])
+        station.replied(station.forwarded(ADD, ONE).answer(body, error), LINK)
+        assert station.router.stats().subscriptions == 0
+
+
+def test_deleted_notification_is_forgotten_by_its_client_only() -> None:
+    station = subscribed(ONE)
+    delete = ADD._replace(command=DELETE_NOTIFICATION, body=b"\1\0\0\0")
+    station.forwarded(delete, TWO)
+    station.forwarded(delete._replace(body=b"\2\0\0\0"), ONE)
+    station.forwarded(delete._replace(body=b""), ONE)
+    assert station.router.stats().subscriptions == 1
+    station.forwarded(delete, ONE)
+    assert station.router.stats().subscriptions == 0
+
+
+def test_closed_connection_ends_its_notifications_at_the_server() -> None:
+    station = subscribed(ONE, TWO)
+    (action,) = station.router.connection_closed(*ONE, 1)
+    end = parse(*action.packets)
+    assert (action.hop, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\1\0\0\0")
+    assert (end.target, end.source) == (FAR_DEVICE, CLIENT)
+    assert station.give(end.answer(), LINK) == []
+    assert station.router.stats().in_flight == 0
+    station.router.hop_down(*LINK, "gone", 1)
+    assert station.router.stats().subscriptions == 0
+    assert station.router.connection_closed(*TWO, 1) == []
+
+
+def test_notification_granted_to_a_closed_connection_is_ended() -> None:
+    station = Station([route(FAR, LINK)])
+    onward = station.forwarded(ADD, ONE)
+    station.router.connection_closed(*ONE, 1)
+    (end,) = station.give(onward.answer(granted(5)), LINK)
+    assert parse(*end.packets).body == b"\5\0\0\0"
+
+
+def test_notification_granted_too_late_is_ended() -> None:
+    station = Station([route(FAR, LINK)])
+    onward = station.forwarded(ADD, ONE)
+    assert len(station.router.handle_timeout(5 * SECOND)) == 1
+    (action,) = station.give(onward.answer(granted(5)), LINK)
+    assert parse(*action.packets).command == DELETE_NOTIFICATION
+    assert station.router.handle_timeout(20 * SECOND) == []
+    assert station.router.stats().in_flight == 0

@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+from eap.aoe.action import Outcome, Trace
+from eap.aoe.record import MAX_EVENTS, MAX_LATEST, Record, describe
+from eap.aoe.way import Way
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+
+
+def trace(at_ns: int, outcome: Outcome = Outcome.FAILED, error: int = 7) -> Trace:
+    return Trace(at_ns, outcome, None, None, None, error, 0, "")
+
+
+def test_what_was_simply_answered_is_no_event() -> None:
+    record = Record()
+    record.enter(trace(1, Outcome.ANSWERED, 0))
+    record.enter(trace(2, Outcome.ANSWERED, 6))
+    record.enter(trace(3))
+    assert [each.at_ns for each in iter(record.next_event, None)] == [2, 3]
+    assert [each.at_ns for each in record.latest] == [1, 2, 3]
+    assert (record.counts[Outcome.ANSWERED], record.counts[Outcome.FAILED]) == (2, 1)
+
+
+def test_traces_are_limited() -> None:
+    record = Record()
+    for number in range(MAX_EVENTS + 3):
+        record.enter(trace(number))
+    assert record.missed == 3
+    assert record.next_event() == trace(3)
+    assert len(record.latest) == MAX_LATEST
+
+
+def test_requests_are_described_for_people() -> None:
+    header = AmsHeader(NetId.parse("5.1.1.1.1.1"), 851, NetId.parse("6.1.1.1.1.1"), 3000, 2)
+    assert describe(header) == "READ of 5.1.1.1.1.1:851 for 6.1.1.1.1.1:3000"
+    assert describe(header, Way("tcp", "x")).endswith("3000 (x by tcp)")

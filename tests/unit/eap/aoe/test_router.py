@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import pytest
+
+from eap.aoe.action import Deliver, Outcome, Reply
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.fragment import iter_fragments
+from eap.aoe.routes import Origin
+from eap.aoe.way import Way
+from eap.codec.ams import StateFlags
+from eap.ids import NetId
+from tests.support.ams import NOTIFICATION, Ams, parse
+from tests.support.aoerouter import (
+    CLIENT,
+    DEVICE,
+    FAR,
+    FAR_DEVICE,
+    LINK,
+    ROUTER,
+    Station,
+    only_reply,
+    route,
+)
+
+TCP, UDP = Way("tcp", "10.0.0.9:4711 #1"), Way("segment", "02:00:00:00:00:09")
+
+
+def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
+    station = Station()
+    asked = Ams(DEVICE, CLIENT, invoke_id=7, body=b"request")
+    delivered = station.delivered(asked, TCP)
+    assert (delivered.body, delivered.came_by) == (b"request", TCP)
+    assert delivered.header.encode() + delivered.body == asked.octets()
+    answer = AmsAnswer(b"data")
+    back = only_reply(station.router.receive_answer(delivered.ticket, answer, 5))
+    assert back == (TCP, asked.answer(b"data"))
+    assert station.router.receive_answer(delivered.ticket, answer, 6) == []
+    assert station.events() == []
+
+
+@pytest.mark.parametrize(
+    ("target", "error", "text"),
+    [
+        (FAR_DEVICE, 7, "no route to 6.1.1.1.1.1"),
+        ("5.1.1.1.2.1:1001", 6, "nothing has port 1001 of 5.1.1.1.2.1"),
+    ],
+)
+def test_unknown_targets_are_answered_and_named(target: str, error: int, text: str) -> None:
+    station = Station()
+    asked = Ams(target, CLIENT)
+    assert station.replied(asked, TCP) == (TCP, asked.answer(b"", error))
+    assert station.events() == [(Outcome.FAILED, f"READ of {target} for {CLIENT} ({TCP}): {text}")]
+
+
+def test_default_route_takes_no_net_id_of_the_station() -> None:
+    station = Station([route("0.0.0.0.0.0", LINK, octets=0)])
+    assert station.forwarded(Ams("9.9.9.9.9.9:1", CLIENT), TCP).target == "9.9.9.9.9.9:1"
+    asked = Ams("5.1.1.1.9.1:1", CLIENT)
+    assert station.replied(asked, TCP) == (TCP, asked.answer(b"", 7))
+
+
+def test_own_source_is_refused_unless_it_is_of_this_host() -> None:
+    station = Station([route(FAR, LINK)])
+    asked = Ams(DEVICE, f"{ROUTER}:30000")
+    assert station.replied(asked, TCP) == (TCP, asked.answer(b"", 7))
+    (event,) = station.events()
+    assert event[0] is Outcome.LOOP
+    assert "comes back to where it began" in event[1]
+    assert station.delivered(asked, Way("here", "1")).header.source_port == 30000
+    assert station.forwarded(asked._replace(target=FAR_DEVICE), Way("here", "1"))
+
+
+def test_what_came_by_multicast_is_for_who_is_meant() -> None:
+    station = Station([route(FAR, LINK)])
+    assert station.give(Ams(FAR_DEVICE, CLIENT), UDP, for_all=True) == []
+    assert station.give(Ams("9.9.9.9.9.9:1", CLIENT), UDP, for_all=True) == []
+    (delivered,) = station.give(Ams(DEVICE, CLIENT), UDP, for_all=True)
+    assert isinstance(delivered, Deliver)
+
+
+def test_request_without_answer_gets_none() -> None:
+    station = Station()
+    quiet = Ams(DEVICE, CLIENT, flags=StateFlags.ADS | StateFlags.NO_RETURN)
+    assert station.delivered(quiet, TCP).ticket == 0
+    assert station.give(quiet._replace(target="9.9.9.9.9.9:1"), TCP) == []
+    assert station.delivered(Ams(DEVICE, CLIENT, NOTIFICATION, body=bytes(8)), TCP).ticket == 0
+    assert station.router.receive_answer(0, AmsAnswer(), 1) == []
+    assert station.router.stats().in_flight == 0
+
+
+def test_removed_device_is_unknown() -> None:
+    station = Station()
+    station.router.remove_device(NetId.parse("5.1.1.1.2.1"))
+    assert station.replied(Ams(DEVICE, CLIENT), TCP)[1].error == 7
+
+
+def test_broken_packets_are_named_and_answered_by_nobody() -> None:
+    station = Station()
+    octets = Ams(DEVICE, CLIENT, body=b"abc").octets()
+    for broken in (b"", octets[:31], octets[:-1]):
+        assert station.router.receive_packet(broken, "tcp", "1", 0) == []
+    events = station.events()
+    assert [outcome for outcome, _ in events] == [Outcome.DROPPED] * 3
+    assert "length 3, but 2 octets follow" in events[2][1]
+
+
+def test_surplus_octets_go_no_further() -> None:
+    station = Station([route(FAR, LINK)])
+    octets = Ams(FAR_DEVICE, CLIENT, body=b"abc").octets() + b"more"
+    (forward,) = station.router.receive_packet(octets, "tcp", "1", 0)
+    assert parse(*forward.packets).body == b"abc"
+
+
+def test_fragments_are_put_together_and_what_is_too_long_goes_in_fragments() -> None:
+    station = Station()
+    narrow = Way("narrow", "1")
+    asked = Ams(DEVICE, CLIENT, invoke_id=9, body=bytes(range(90)))
+    *before, last = iter_fragments(asked.octets(), 4, 28)
+    for each in before:
+        assert station.router.receive_packet(each, *narrow, 0) == []
+    (delivered,) = station.router.receive_packet(last, *narrow, 0)
+    assert delivered.body == asked.body
+    (reply,) = station.router.receive_answer(delivered.ticket, AmsAnswer(bytes(80)), 0)
+    client = Station([route(FAR, LINK)])
+    whole = [client.router.receive_packet(each, *TCP, 0) for each in reply.packets]
+    assert len(whole) == 4
+    assert "nobody waits for" in client.events()[0][1]  # it was put together: an answer
+
+
+def test_fragments_are_acknowledged_to_who_wants_it() -> None:
+    station = Station()
+    first = parse(next(iter_fragments(Ams(DEVICE, CLIENT, body=bytes(50)).octets(), 4, 28)))
+    wanting = first._replace(flags=StateFlags.ADS)
+    assert station.replied(wanting, UDP) == (UDP, wanting.answer(b""))
+    assert station.give(wanting, UDP, for_all=True) == []
+    assert station.give(wanting.answer(b""), UDP) == []
+    assert station.router.stats().fragment_octets == 28
+    station.router.connection_closed(*UDP, 0)
+    assert station.router.stats().fragment_octets == 0
+
+
+def test_fragments_in_fragments_are_dropped() -> None:
+    station = Station()
+    inner = next(iter_fragments(Ams(DEVICE, CLIENT, body=bytes(50)).octets(), 4, 28))
+    for each in iter_fragments(inner, 5, 28):
+        assert station.router.receive_packet(each, *TCP, 0) == []
+    assert "a fragment in fragments" in station.events()[-1][1]
+
+
+def test_time_of_routes_and_requests_is_one() -> None:
+    station = Station([route(FAR, LINK, origin=Origin.LEARNED, expires_at_ns=50)])
+    assert station.router.next_timeout() == 50
+    asked = Ams(FAR_DEVICE, CLIENT)
+    station.forwarded(asked, TCP)
+    assert station.router.handle_timeout(50) == []
+    assert station.replied(asked, TCP) == (TCP, asked.answer(b"", 7))
+    assert station.router.next_timeout() == 4_500_000_000
+    assert station.router.stats().routes == 0
+
+
+def test_what_passes_is_counted() -> None:
+    station = Station([route(FAR, LINK)])
+    asked = Ams(FAR_DEVICE, CLIENT, body=b"12")
+    onward = station.forwarded(asked, TCP)
+    station.now_ns = 700
+    (reply,) = station.give(onward.answer(b"1234"), LINK)
+    assert isinstance(reply, Reply)
+    client = station.router.record.connections.of(TCP)
+    hop = station.router.record.hops.of(LINK)
+    for traffic in (client, hop):
+        assert (traffic.requests, traffic.answers, traffic.errors) == (1, 1, 0)
+        assert (traffic.octets_asked, traffic.octets_answered) == (34, 36)
+        assert traffic.round_trip_ns == 700
+    assert station.router.stats().counts[Outcome.ANSWERED] == 1
+    assert station.router.record.latest[-1].took_ns == 700
+    station.router.connection_closed(*TCP, 800)
+    assert TCP not in station.router.record.connections.snapshot()
