@@ -7,6 +7,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from time import monotonic_ns
 
 from eap.appliance.aoe_desk import AoeDesk
 from eap.appliance.image_values import ImageValues
@@ -20,6 +21,9 @@ from eap.errors import ImageError
 from eap.ids import NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
+from eap.pd.words import StationWord
+
+_LATELY_NS = 2_000_000_000
 
 
 class Devices:
@@ -56,6 +60,8 @@ class Devices:
         for station in stations:
             name, image = station.name, images[station.name]
             keeper = StationKeeper(station, states.get(name, DeviceState.OP), store, engine)
+            if _runs(image):
+                self._has_restarted.set()  # services before this one, in the middle of a change
             player = SourcePlayer(station, image)
             keeper.on_change = player.change
             self._players.append(player)
@@ -84,7 +90,7 @@ class Devices:
             group.create_task(self._follow_restarts())
 
     def engine_has_restarted(self) -> None:
-        """Tell the new engine, soon, what it may not know."""
+        """Tell the new engine, soon, what it may have missed."""
         self._has_restarted.set()
 
     async def _follow_restarts(self) -> None:
@@ -96,6 +102,12 @@ class Devices:
                     image.catch_up()  # an engine that died may have retired nothing
             for device in self.by_station.values():
                 await device.tell_again()
+
+
+def _runs(image: StationImage) -> bool:
+    """Tell whether an engine has run a cycle of the station just now."""
+    ran_at_ns = image.image.words[StationWord.CYCLE_AT_NS]
+    return bool(ran_at_ns) and monotonic_ns() - ran_at_ns < _LATELY_NS
 
 
 def _desk(station: StationSpec, device: StationDevice) -> AoeDesk:

@@ -110,7 +110,7 @@ class StationDevice:
         await self._jobs.serve()
 
     async def tell_again(self) -> None:
-        """Tell an engine that was started again what it may not know."""
+        """Tell the engine what it is to run, which it may have missed."""
         await self._jobs.do(self._keeper.tell_again)
 
     def upload(self, port: str, index: int, subindex: int, *, complete: bool = False) -> bytes:

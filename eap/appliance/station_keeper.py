@@ -161,14 +161,16 @@ class StationKeeper:
             logger.warning("%s; after a start it will be in another state", exc)
 
     async def tell_again(self) -> None:
-        """Tell an engine that was started again what it may not know."""
-        if not self._is_unsure:
-            return
+        """Tell the engine what it is to run, which it may have missed.
+
+        It may have read what was kept just before that changed, and services may have been killed
+        between the two.
+        """
         try:
             await self._engine.configure(self.spec.name, self.spec)
             await self._engine.set_state(self.spec.name, self.state)
         except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
-            logger.warning("station %s, after a start of the engine: %s", self.spec.name, exc)
+            logger.warning("station %s, after a start: %s", self.spec.name, exc)
         else:
             self._is_unsure = False
 

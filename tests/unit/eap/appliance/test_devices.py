@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from time import monotonic_ns
 
 import pytest
 from msgspec.structs import replace
@@ -85,7 +86,9 @@ def test_sources_follow_the_configuration(devices, files, stations):
     play(devices, script)
 
 
-def test_engine_that_was_started_again_is_told(devices, engine, stations):
+def test_engine_that_was_started_again_is_told(images, engine, stations):
+    devices = Devices("demo", stations[:1], {}, images, engine, "1.2")
+
     async def script():
         engine.failure = EngineGoneError("gone")
         _, fault = await devices.by_station["left"].apply(replace(stations[0], cycle_us=20_000))
@@ -95,7 +98,23 @@ def test_engine_that_was_started_again_is_told(devices, engine, stations):
         await asyncio.wait_for(engine.asked.wait(), 5)
 
     play(devices, script)
-    assert engine.spec == stations[0]
+    assert engine.calls.count("configure left") == 2
+
+
+def test_engine_that_runs_already_is_told_what_it_may_have_missed(stations, images, files, engine):
+    files["left"].image.words[StationWord.CYCLE_AT_NS] = monotonic_ns()
+    spec = replace(stations[0], cycle_us=20_000)
+    states = {"left": DeviceState.SAFEOP}
+    devices = Devices("demo", (spec,), states, images, engine, "1.2")
+
+    async def script():
+        async with asyncio.timeout(5):
+            while engine.state is not DeviceState.SAFEOP:  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+
+    play(devices, script)
+    assert engine.spec == spec
+    assert engine.calls == ["configure left", "left SAFEOP"]
 
 
 def test_image_that_a_dead_engine_did_not_retire_is_left(devices, files, stations, tmp_path):
