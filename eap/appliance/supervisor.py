@@ -27,7 +27,7 @@ from eap.appliance.plantfile import load_plant, require_own_buses
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
 from eap.appliance.sockets import SharedSockets
-from eap.appliance.store import Store, settle
+from eap.appliance.store import Store, effective, settle
 from eap.appliance.what_runs import what_runs_now
 from eap.config.load import Plant
 from eap.errors import ConfigError
@@ -100,11 +100,31 @@ def _run(
     first_state: DeviceState = DeviceState.OP,
 ) -> int:
     settle(info.plant, stations, first_state)
+    if info.plant_file:
+        _tell_what_is_kept(info.plant, stations)
     with SharedSockets(stations, folder.control_socket) as sockets:
         supervisor = Supervisor(
             info, stations, folder, sockets, options=options, first_state=first_state
         )
         return supervisor.run()
+
+
+def _tell_what_is_kept(plant: str, stations: Sequence[StationSpec]) -> None:
+    """Say which stations start otherwise than their plant file alone would have them."""
+    for spec, kept in zip(stations, effective(plant, stations), strict=True):
+        if kept.spec != spec:
+            logger.warning(
+                "station %s runs as it was configured last; 'eapctl plan' shows what differs from"
+                " the plant file",
+                spec.name,
+            )
+        if kept.state is not DeviceState.OP:
+            logger.warning(
+                "station %s starts in %s, which was asked for last; 'eapctl state %s OP' ends that",
+                spec.name,
+                kept.state.name,
+                spec.name,
+            )
 
 
 def _load(plant_file: Path) -> Plant:

@@ -149,11 +149,19 @@ def test_what_was_applied_survives_a_restart(line: Line) -> None:
     line.file.write_text(new_text())
     line.command("apply")
     line.command("rollback")
+    line.appliance.command("state", "control", "PREOP")
     assert line.appliance.stop() == (0, "", "")
     line.appliance = line.start()
     assert line.exported() == line.old  # although the file says otherwise
+    assert line.appliance.command("state", "control") == "control: PREOP\n"
+    line.appliance.command("state", "control", "OP")
     line.command("rollback")
     assert line.exported() == line.new
+    told = line.appliance.stop()[2].splitlines()
+    assert [text.split()[2] for text in told] == [CHANGED, RECEIVER, "control"]
+    assert told[0].endswith("configured last; 'eapctl plan' shows what differs from the plant file")
+    assert "starts in PREOP, which was asked for last" in told[2]
+    line.appliance = line.start()
     line.appliance.process.kill()
     line.appliance.process.wait()
     line.appliance = line.start()
