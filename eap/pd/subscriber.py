@@ -10,12 +10,12 @@ import struct
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from eap.codec.ethercat import EtherCatHeader, FrameType
-from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
-from eap.errors import TruncatedError
+from eap.codec.ethercat import EtherCatHeader
+from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
 from eap.pd.account import Account, Timing
 from eap.pd.frame_plan import FramePlan, Refused, Taken
+from eap.pd.frame_walk import walk
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace
 from eap.pd.link import Origin
@@ -213,7 +213,7 @@ class Subscriber:
 
     def _learn(self, data: memoryview, size: int) -> FramePlan | None:
         """Make the plan of a layout not seen before; count and drop what is no PD frame."""
-        pds = _walk(data, size)
+        pds = walk(data, size)
         if isinstance(pds, Discard):
             self._discard(pds, 1)
             return None
@@ -373,25 +373,3 @@ def _refuse_all(reasons: list[tuple[Subscription, Discard]]) -> Refused:
     counters += [s.place.words + RxWord.DISCARDED + DISCARD_INDEX[why] for s, why in reasons]
     mismatches = [(s.place.words, _VAR_STATE[why]) for s, why in reasons if why in _VAR_STATE]
     return Refused(tuple(counters), tuple(mismatches))
-
-
-def _walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | Discard:
-    """Return each PD header with its offset, or why the frame is dropped as a whole."""
-    try:
-        ethercat = EtherCatHeader.decode(data[:size])
-        if ethercat.type != FrameType.PROCESS_DATA:
-            return Discard.WRONG_TYPE
-        end = PD_FRAME_START + ethercat.length
-        frame = data[: min(end, size)]
-        count = PdFrameHeader.decode(frame, PD_FRAME_START).count
-        if FIRST_PD + count * PdHeader.SIZE > end:
-            return Discard.COUNT_TOO_LARGE
-        pds = []
-        offset = FIRST_PD
-        for _ in range(count):
-            header = PdHeader.decode(frame, offset)
-            pds.append((header, offset))
-            offset += PdHeader.SIZE + header.length
-    except TruncatedError:
-        return Discard.TRUNCATED
-    return pds if offset <= end <= size else Discard.TRUNCATED

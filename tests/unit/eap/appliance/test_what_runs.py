@@ -45,3 +45,11 @@ def test_what_needs_other_sockets_does_not_run(caplog):
         found = what_runs_now(handover())
     assert found.stations == (left(), right())
     assert "station left: the plant file runs: port eap0: interface" in caplog.text
+
+
+def test_what_no_engine_can_run_does_not_run(caplog):
+    store(replace(left(), variables=()))
+    with caplog.at_level(logging.WARNING):
+        found = what_runs_now(handover())
+    assert found.stations == (left(), right())
+    assert "station left: the plant file runs: it cannot be built: KeyError" in caplog.text
