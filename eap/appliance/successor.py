@@ -97,7 +97,7 @@ class Successor:
         station.follow(before, now_ns)
         for bus, ties in self._ties:
             bus.tie(ties)
-        engine.replace(before, station)
+        engine.replace(before, station, now_ns)
         self._file.release()
         place.file.wake_waiters()
         place.file.close()

@@ -42,13 +42,16 @@ class Engine:
         """Whether every station has run a cycle since the start, or has one beyond SOON_NS."""
         return all(each.has_run or each.cycle_ns > SOON_NS for each in self._stations)
 
-    def replace(self, old: Station, new: Station) -> None:
+    def replace(self, old: Station, new: Station, now_ns: int) -> None:
         """Run *new*, which has the buses of *old*, in its place; its cycle counter goes on."""
         index = self._stations.index(old)
         self._stations[index] = new
         if new.cycle_ns != old.cycle_ns:
             by_station = {number: due_ns for due_ns, number in self._due}
-            by_station[index] += new.cycle_ns - old.cycle_ns
+            due_ns = by_station[index] - old.cycle_ns + new.cycle_ns
+            by_station[index] = (
+                due_ns + max(0, -(-(now_ns - due_ns) // new.cycle_ns)) * new.cycle_ns
+            )
             self._due = [(due_ns, number) for number, due_ns in by_station.items()]
             heapify(self._due)
 

@@ -112,7 +112,7 @@ class Line:
         images.carry_words()
         images.carry_values(before.inputs.memory)
         station.follow(before, self.now)
-        self.engine.replace(before, station)
+        self.engine.replace(before, station, self.now)
         self.stations[name] = station
 
 

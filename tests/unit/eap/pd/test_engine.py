@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pytest
+
 from eap.pd.engine import SOON_NS, Engine
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
 from eap.pd.station import Station
@@ -167,3 +169,28 @@ def test_frames_are_taken_as_they_arrive_where_that_is_wanted():
     engine.receive(MS + 200)
     assert made.image.words[StationWord.ENGINE_SEQUENCE] % 2 == 0
     assert made.image.read("x") == 5
+
+
+@pytest.mark.parametrize(
+    ("before_us", "after_us", "now_ns", "due_ns"),
+    [
+        (1000, 1000, 0, 2 * MS),
+        (1000, 5000, 0, 6 * MS),
+        (10_000, 1000, 12 * MS, 12 * MS),
+        (10_000, 1000, 15 * MS + 1, 16 * MS),  # what was not due before has not been missed
+    ],
+)
+def test_a_station_that_is_replaced_may_have_another_cycle(before_us, after_us, now_ns, due_ns):
+    old, new = (
+        Station(spec, image_of(spec), lambda: None)
+        for spec in (station(cycle_us=cycle_us) for cycle_us in (before_us, after_us))
+    )
+    engine = Engine([old])
+    engine.start(0)
+    engine.handle_timeout(engine.next_timeout())
+    new.start(0)
+    engine.replace(old, new, now_ns)
+    assert engine.next_timeout() == due_ns
+    engine.handle_timeout(due_ns)
+    assert new.image.words[StationWord.CYCLE] == 1
+    assert new.image.words[StationWord.OVERRUNS] == 0

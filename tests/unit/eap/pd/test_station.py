@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eap.codec.pd import iter_pds
+from eap.errors import LocalProtocolError
 from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackChannel, LoopbackLines
+from eap.pd.device import DeviceState
 from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.link import OutFrame
@@ -46,6 +48,7 @@ from tests.support.cyclic import (
     bus_port,
     eap_port,
     entries,
+    give,
     image_of,
     octets,
     received,
@@ -669,3 +672,167 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     empty = succeed(after, msgspec.structs.replace(made.spec, frames=()))
     empty.takers["eap0"](memoryview(other), len(other), 2 * SECOND, From("02:00:00:00:00:0a"))
     assert station_status(empty.image, 0)["frames"] == []
+
+
+def moody() -> StationSpec:
+    """Sends by change, by event, and what asks; receives answers and something with a time-out."""
+    return station(
+        variables=(
+            *written("x:UINT", "y:UINT"),
+            *(VariableSpec(name, "UINT", Writer.ENGINE) for name in ("a", "r")),
+        ),
+        frames=(
+            TxFrameSpec(
+                "f",
+                "eap0",
+                "10.0.0.1",
+                (
+                    TxPdSpec("change", 1, ("x",), trigger=TriggerSpec(on_change=OnChangeSpec())),
+                    TxPdSpec("event", 2, ("y",), trigger=TriggerSpec(event=True)),
+                ),
+            ),
+            TxFrameSpec("q", "eap0", "10.0.0.1", (TxPdSpec("ask", 3, ("y",)),)),
+        ),
+        subscriptions=(
+            RxPdSpec("answer", "eap0", 4, ("a",), PEER, poll_request="ask"),
+            RxPdSpec("in", "eap0", 7, ("r",), PEER, timeout_ms=3, substitute=Substitute.ZERO),
+        ),
+    )
+
+
+def sent_ids(wire: Watched) -> list[int]:
+    """Return what was sent since the last look."""
+    ids = sorted(pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame))
+    wire.sent.clear()
+    return ids
+
+
+def set_value(image: Image, name: str, value: int) -> None:
+    with image.writing(Writer.APPLICATION):
+        image.write(name, value)
+
+
+def test_triggers_go_on_in_a_station_configured_anew():
+    made, wire = assemble(moody())
+    made.start(0)
+    made.cycle(MS, MS)
+    assert sent_ids(wire) == [1, 3]
+    set_value(made.image, "event.VarCtrl", 2)
+    made.cycle(2 * MS, 2 * MS)
+    assert sent_ids(wire) == [2, 3]
+    after = succeed_with_values(made, made.spec)
+    after.cycle(3 * MS, 3 * MS)
+    assert sent_ids(wire) == [3]  # neither the data nor the bit has changed
+    set_value(after.image, "x", 5)
+    after.cycle(4 * MS, 4 * MS)
+    assert sent_ids(wire) == [1, 3]
+    wire.refuse = True
+    set_value(after.image, "event.VarCtrl", 0)
+    after.cycle(5 * MS, 5 * MS)
+    set_value(after.image, "event.VarCtrl", 2)
+    after.cycle(6 * MS, 6 * MS)
+    wire.refuse = False
+    wire.sent.clear()
+    last = succeed_with_values(after, after.spec)
+    last.cycle(7 * MS, 7 * MS)
+    assert sent_ids(wire) == [2, 3]  # the event that could not be sent
+
+
+def test_a_pd_that_is_another_one_now_is_sent_though_its_data_is_the_same():
+    made, wire = assemble(moody())
+    made.start(0)
+    made.cycle(MS, MS)
+    first, second = made.spec.frames
+    change, event = first.pds
+    renewed = msgspec.structs.replace(change, version=9)
+    frames = (msgspec.structs.replace(first, pds=(renewed, event)), second)
+    wire.sent.clear()
+    after = succeed_with_values(made, msgspec.structs.replace(made.spec, frames=frames))
+    after.cycle(2 * MS, 2 * MS)
+    assert sent_ids(wire) == [1, 3]
+
+
+def test_a_question_is_answered_across_a_change():
+    made, _ = assemble(moody())
+    made.start(0)
+    made.cycle(MS, MS)
+    after = succeed_with_values(made, made.spec)
+    give(after.takers["eap0"], octets([(4, b"\1\0")], cycle=1), MS + 300_000)
+    status = station_status(after.image, SECOND)["pd"]["rx"][0]
+    assert (status["received"], status["response_us"]["max"]) == (1, 300)
+
+
+def test_time_outs_go_on_and_new_ones_begin():
+    made, wire = assemble(moody())
+    made.start(0)
+    wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
+    made.cycle(MS, MS)
+    after = succeed_with_values(made, made.spec, 2 * MS)
+    after.cycle(3 * MS, 3 * MS)
+    assert after.image.read("r") == 5
+    after.cycle(5 * MS, 5 * MS)
+    assert after.image.read("r") == 0
+    answer, stale = made.spec.subscriptions
+    without = msgspec.structs.replace(stale, timeout_ms=0, substitute=Substitute.HOLD)
+    spec = msgspec.structs.replace(made.spec, subscriptions=(answer, without))
+    last = succeed_with_values(after, spec, 5 * MS)
+    last.cycle(SECOND, SECOND)
+    assert station_status(last.image, SECOND)["pd"]["rx"][1]["timeouts"] == 1
+
+
+def succeed_with_values(before: Station, spec: StationSpec, now_ns: int = 0) -> Station:
+    """Configure a station anew, its variables included."""
+    image = image_of(spec)
+    images = ImageSuccession(before.image, image)
+    images.carry_words()
+    images.carry_values(before.inputs.memory)
+    after = Station(spec, image, lambda: None)
+    after.prepare_to_follow(before)
+    images.settle()
+    images.carry_words()
+    before.inputs.refresh()
+    images.carry_values(before.inputs.memory)
+    after.follow(before, now_ns)
+    return after
+
+
+def test_below_op_nothing_is_received_and_below_safeop_nothing_sent():
+    made, wire = assemble(moody())
+    made.start(0, DeviceState.PREOP)
+    take = made.takers["eap0"]
+
+    def run(at: int) -> list[int]:
+        give(take, octets([(7, b"\5\0")], cycle=at), at * MS)
+        made.cycle(at * MS, at * MS)
+        return sent_ids(wire)
+
+    assert run(1) == []
+    made.go(DeviceState.SAFEOP, MS)
+    assert run(2) == [1, 3]
+    assert run(3) == [3]
+    made.go(DeviceState.OP, 3 * MS)
+    assert run(4) == [3]
+    made.go(DeviceState.PREOP, 4 * MS)
+    assert run(5) == []
+    made.go(DeviceState.OP, 50 * MS)
+    assert run(51) == [1, 3]  # what goes by change goes first, as after a start
+    rx = station_status(made.image, SECOND)["pd"]["rx"][1]
+    assert (rx["received"], rx["lost"], rx["timeouts"]) == (2, None, 0)
+    assert station_status(made.image, SECOND)["discarded"] == {"suppressed": 4}
+    with pytest.raises(LocalProtocolError, match="INIT cannot be requested"):
+        made.go(DeviceState.INIT, SECOND)
+
+
+def test_what_was_replaced_can_be_taken_apart():
+    made, wire = assemble(moody())
+    made.start(0)
+    wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
+    made.cycle(MS, MS)
+    after = succeed_with_values(made, made.spec)
+    made.dissolve()
+    assert made.image.places == {}
+    wire.sent.clear()
+    wire.waiting.append((octets([(7, b"\6\0")], cycle=2), 2 * MS))
+    after.cycle(2 * MS, 2 * MS)
+    assert after.image.read("r") == 6
+    assert sent_ids(wire) == [3]
