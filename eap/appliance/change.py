@@ -8,6 +8,9 @@ from msgspec.structs import asdict
 
 from eap.pd.spec import PortSpec, StationSpec
 
+_IN_FRAMES = {"net_id", "eap_sm"}
+"""Fields of a port that only say what its frames carry."""
+
 
 def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
     """Return what differs between the two and cannot be changed by the engine, one line each."""
@@ -27,8 +30,7 @@ def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
 def _differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
     was = asdict(old)
     for field, value in asdict(new).items():
-        # Frames carry the NetID, and that is all it is needed for.
-        if field != "net_id" and value != was[field]:
+        if field not in _IN_FRAMES and value != was[field]:
             yield (
                 f"{field} is another one" if field == "bus" else f"{field} {was[field]} -> {value}"
             )

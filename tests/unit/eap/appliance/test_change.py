@@ -15,8 +15,8 @@ def test_all_but_ports_may_change():
     assert needs_new_start(left(), replace(left(), frames=(), variables=(), cycle_us=7)) == []
 
 
-def test_the_net_id_of_a_port_may_change():
-    port = replace(eap_port(1), net_id="9.9.9.9.1.1")
+def test_what_frames_say_of_a_port_may_change():
+    port = replace(eap_port(1), net_id="9.9.9.9.1.1", eap_sm=True)
     assert needs_new_start(left(), left(port)) == []
 
 
