@@ -21,6 +21,7 @@ from tests.support.vectors import FOLDER, Vector, load_all, load_datagrams
 
 FRAMES = [v for v in load_all("ethernet", "frame") if not v.error]
 MESSAGES = load_all("mailbox")
+PACKETS = load_all("ams")
 
 
 def by_name(vectors: list[Vector]) -> pytest.MarkDecorator:
@@ -107,6 +108,13 @@ def test_ams_frame(vector: Vector) -> None:
     assert_packet(memoryview(vector.frame)[2:], vector.fields["ams"])
 
 
+@by_name(PACKETS)
+def test_ams_packet(vector: Vector) -> None:
+    header, data = ams.decode_packet(vector.octets)
+    assert_fields(header, vector.fields)
+    assert ams.encode_packet(header, data) == vector.octets
+
+
 @by_name(of_type(FrameType.DATAGRAM))
 def test_datagram_frame(vector: Vector) -> None:
     datagrams = list(iter_datagrams(vector.frame))
@@ -145,6 +153,6 @@ def test_captured_datagram(fields: dict) -> None:
 
 
 def test_every_file_is_used() -> None:
-    used = {v.name.partition("/")[0] for v in FRAMES + MESSAGES} | {"type1_datagrams"}
+    used = {v.name.partition("/")[0] for v in FRAMES + MESSAGES + PACKETS} | {"type1_datagrams"}
     later = {"ams_discovery"}  # no codec of this project reads AMS discovery yet
     assert used | later == {path.stem for path in FOLDER.glob("*.yaml")}

@@ -1,0 +1,136 @@
+"""One device that ADS clients talk to: whoever answers behind a NetID and a port."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+from eap.aoe.ads_notifications import Client, NotificationTable
+from eap.aoe.ads_operation import (
+    AdsRefusedError,
+    Operation,
+    Outcome,
+    Read,
+    ReadDeviceInfo,
+    ReadState,
+    ReadWrite,
+    Write,
+    WriteControl,
+)
+from eap.aoe.ads_request import encode_refusal, parse_request
+from eap.aoe.ads_space import AdsSpace
+from eap.aoe.ads_state import DeviceDataSpace, States
+from eap.aoe.answer import AmsAnswer
+from eap.codec.ads import AdsDeviceInfo, AdsError
+from eap.codec.adsnotification import AddNotification
+
+Control: TypeAlias = Callable[[WriteControl], None]
+"""Acts on a WriteControl, or raises AdsRefusedError."""
+Judge: TypeAlias = Callable[[Operation], AdsError]
+"""Says why a client may not have an operation done; NONE if it may."""
+
+
+def allow(operation: Operation) -> AdsError:
+    """Let anybody do anything."""
+    del operation
+    return AdsError.NONE
+
+
+def refuse_control(request: WriteControl) -> None:
+    """Take no other state, whatever is asked for."""
+    del request
+    raise AdsRefusedError(AdsError.SERVICE)
+
+
+class AdsDevice:
+    """The services of one device.
+
+    Args:
+        info: What ReadDeviceInfo tells.
+        states: What ReadState tells.
+        spaces: That read and write; the first that has an index group answers for it.
+        control: Acts on WriteControl.
+
+    Attributes:
+        notifications: Whom it tells of what; the caller says when a cycle is over.
+    """
+
+    def __init__(
+        self,
+        info: AdsDeviceInfo,
+        states: States,
+        spaces: Sequence[AdsSpace],
+        *,
+        control: Control = refuse_control,
+    ) -> None:
+        self.notifications = NotificationTable()
+        self._info = info
+        self._states = states
+        self._spaces = (*spaces, DeviceDataSpace(states))
+        self._control = control
+
+    def answer(
+        self, command: int, body: bytes, client: Client, now_ns: int, *, judge: Judge = allow
+    ) -> AmsAnswer:
+        """Do what a request asks for, as far as *judge* has nothing against it.
+
+        Args:
+            command: Of the AMS header.
+            body: What follows the header.
+            client: Whom notifications belong to.
+            now_ns: The time on the monotonic clock.
+            judge: Looks at each operation, also at those of a sum command.
+        """
+        try:
+            request = parse_request(command, body)
+        except AdsRefusedError as exc:
+            if exc.result is AdsError.COMMAND:
+                return AmsAnswer(error_code=exc.result)
+            return AmsAnswer(encode_refusal(command, exc.result))
+        outcomes = []
+        for operation in request.operations:
+            reason = judge(operation)
+            outcomes.append(Outcome(reason) if reason else self.perform(operation, client, now_ns))
+        return AmsAnswer(request.encode_answer(outcomes))
+
+    def perform(self, operation: Operation, client: Client, now_ns: int) -> Outcome:
+        """Do one operation."""
+        try:
+            return Outcome(data=self._perform(operation, client, now_ns))
+        except AdsRefusedError as exc:
+            return Outcome(exc.result)
+
+    def _perform(self, operation: Operation, client: Client, now_ns: int) -> bytes:
+        match operation:
+            case Read(group, offset, length):
+                return _fitting(self._space(group).read(group, offset, length), length)
+            case Write(group, offset, data):
+                self._space(group).write(group, offset, data)
+            case ReadWrite(group, offset, length, data):
+                space = self._space(group)
+                return _fitting(space.read_write(group, offset, length, data), length)
+            case ReadState():
+                return self._states().encode()
+            case ReadDeviceInfo():
+                return self._info.encode()
+            case WriteControl():
+                self._control(operation)
+            case AddNotification(group, offset, length):
+                source = self._space(group).watch(group, offset, length)
+                handle = self.notifications.add(client, operation, source, now_ns)
+                return handle.to_bytes(4, "little")
+            case _:
+                self.notifications.delete(client, operation.handle)
+        return b""
+
+    def _space(self, group: int) -> AdsSpace:
+        for space in self._spaces:
+            if group in space.groups:
+                return space
+        raise AdsRefusedError(AdsError.INDEX_GROUP)
+
+
+def _fitting(data: bytes, length: int) -> bytes:
+    if len(data) > length:
+        raise AdsRefusedError(AdsError.SIZE)
+    return data

@@ -1,0 +1,110 @@
+"""What an ADS client wants done, one thing at a time, and how it came out.
+
+Every request is a list of operations: one, or those of a sum command.  Whoever grants access looks
+at operations, whoever serves does them one after the other, and ``ads_request`` makes the answer of
+their outcomes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.adsnotification import AddNotification
+
+
+class ReadDeviceInfo(NamedTuple):
+    """Who are you?"""
+
+
+class ReadState(NamedTuple):
+    """Which states are you in?"""
+
+
+class Read(NamedTuple):
+    """*length*: octets that the client has room for."""
+
+    group: int
+    offset: int
+    length: int
+
+
+class Write(NamedTuple):
+    """*data*: as many octets as the request says."""
+
+    group: int
+    offset: int
+    data: bytes
+
+
+class ReadWrite(NamedTuple):
+    """*length*: octets that the client has room for."""
+
+    group: int
+    offset: int
+    length: int
+    data: bytes
+
+
+class WriteControl(NamedTuple):
+    """Take these states."""
+
+    ads_state: int
+    device_state: int
+    data: bytes
+
+
+class DeleteNotification(NamedTuple):
+    """Take a handle back."""
+
+    handle: int
+
+
+Operation: TypeAlias = (
+    ReadDeviceInfo
+    | ReadState
+    | Read
+    | Write
+    | ReadWrite
+    | WriteControl
+    | AddNotification
+    | DeleteNotification
+)
+
+
+class Outcome(NamedTuple):
+    """How an operation came out."""
+
+    result: int = AdsError.NONE
+    data: bytes = b""
+    """What stands behind the result; of a Read or ReadWrite without its length."""
+
+
+class AdsRefusedError(Exception):
+    """An operation that is answered with a result other than 0."""
+
+    def __init__(self, result: AdsError) -> None:
+        super().__init__(result.name)
+        self.result = result
+
+
+def is_change(operation: Operation) -> bool:
+    """Say whether an operation changes anything but what a client keeps of its own.
+
+    A ReadWrite does, unless its group is known to look something up by a name.
+    """
+    if isinstance(operation, ReadWrite):
+        return operation.group not in _LOOKUPS
+    if isinstance(operation, Write):
+        return operation.group != IndexGroup.RELEASE_HANDLE
+    return isinstance(operation, WriteControl)
+
+
+_LOOKUPS = frozenset(
+    (
+        IndexGroup.SYMBOL_HANDLE,
+        IndexGroup.VALUE_BY_NAME,
+        IndexGroup.SYMBOL_BY_NAME,
+        IndexGroup.SYMBOL_ENTRY_BY_NAME,
+    )
+)

@@ -1,0 +1,150 @@
+"""ADS symbols: how a server tells of its variables (AdsSymbolEntry and its kin of AdsDef.h)."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+from eap.codec.wire import Buffer, WireStruct, u16, u32
+from eap.errors import MalformedError, TruncatedError
+
+_ENCODING = "cp1252"
+"""TwinCAT's, for names, types and comments."""
+MAX_TEXT = 255
+"""Octets of a name, type or comment: clients have room for 256 with the NUL."""
+
+
+class AdsType(IntEnum):
+    """ADSDATATYPEID: how the octets of a value are meant."""
+
+    VOID = 0
+    INT16 = 2
+    INT32 = 3
+    REAL32 = 4
+    REAL64 = 5
+    INT8 = 16
+    UINT8 = 17
+    UINT16 = 18
+    UINT32 = 19
+    INT64 = 20
+    UINT64 = 21
+    STRING = 30
+    WSTRING = 31
+    REAL80 = 32
+    BIT = 33
+    BIG = 65
+
+
+class SymbolFlag(IntFlag):
+    """ADSSYMBOLFLAG."""
+
+    PERSISTENT = 0x0001
+    BIT_VALUE = 0x0002
+    READ_ONLY = 0x0020
+
+
+class SymbolPlace(WireStruct, frozen=True):
+    """AdsSymbolInfoByName: where a value is; *size* in octets."""
+
+    group: u32
+    offset: u32
+    size: u32
+
+
+class UploadInfo(WireStruct, frozen=True):
+    """What SYM_UPLOADINFO2 tells; the first two fields are SYM_UPLOADINFO.  Sizes in octets."""
+
+    symbols: u32
+    symbol_size: u32
+    types: u32 = 0
+    type_size: u32 = 0
+    max_dynamic: u32 = 0
+    used_dynamic: u32 = 0
+
+
+class _EntryHead(WireStruct, frozen=True):
+    """AdsSymbolEntry; lengths of texts without their NUL."""
+
+    entry_length: u32
+    group: u32
+    offset: u32
+    size: u32
+    type: u32
+    flags: u32
+    name_length: u16
+    type_length: u16
+    comment_length: u16
+
+
+class SymbolEntry(NamedTuple):
+    """One variable as a server tells of it."""
+
+    place: SymbolPlace
+    type: int
+    """An AdsType; kept as a number if it is none."""
+    flags: int
+    name: str
+    type_name: str
+    comment: str = ""
+
+
+def encode_entry(entry: SymbolEntry) -> bytes:
+    """Return an entry with its texts, each cut to MAX_TEXT octets and ended by a NUL."""
+    texts = [encode_text(text) for text in (entry.name, entry.type_name, entry.comment)]
+    lengths = [len(text) for text in texts]
+    place = entry.place
+    head = _EntryHead(
+        _EntryHead.SIZE + sum(lengths) + len(texts),
+        place.group,
+        place.offset,
+        place.size,
+        entry.type,
+        entry.flags,
+        *lengths,
+    )
+    return head.encode() + b"".join(text + b"\0" for text in texts)
+
+
+def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
+    """Return the entry at *offset*, and where the next one begins.
+
+    Raises:
+        TruncatedError: the data ends before the entry does.
+        MalformedError: its texts do not fit in it.
+    """
+    head = _EntryHead.decode(data, offset)
+    end = offset + head.entry_length
+    lengths = (head.name_length, head.type_length, head.comment_length)
+    if head.entry_length < _EntryHead.SIZE + sum(lengths) + len(lengths):
+        raise MalformedError(
+            f"{head.entry_length} octets do not hold texts of {lengths}",
+            layout="AdsSymbolEntry",
+            offset=offset,
+        )
+    if end > len(data):
+        raise TruncatedError(
+            f"{head.entry_length} octets, but {len(data) - offset} follow",
+            layout="AdsSymbolEntry",
+            offset=offset,
+        )
+    texts = []
+    at = offset + _EntryHead.SIZE
+    for length in lengths:
+        texts.append(bytes(data[at : at + length]).decode(_ENCODING, "replace"))
+        at += length + 1
+    place = SymbolPlace(head.group, head.offset, head.size)
+    return SymbolEntry(place, head.type, head.flags, *texts), end
+
+
+def encode_text(text: str) -> bytes:
+    """Return a text in TwinCAT's encoding, without NUL."""
+    return text.encode(_ENCODING, "replace").replace(b"\0", b"?")[:MAX_TEXT]
+
+
+def decode_name(data: Buffer) -> str:
+    """Return the name that a client asks for: UTF-8 or TwinCAT's encoding, up to a NUL."""
+    octets, _, _ = bytes(data).partition(b"\0")
+    try:
+        return octets.decode()
+    except UnicodeDecodeError:
+        return octets.decode(_ENCODING, "replace")

@@ -1,0 +1,387 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, rule
+
+from eap.aoe import ads_notifications
+from eap.aoe.ads_notifications import FULL_PACKET, MAX_WATCHED, NotificationTable
+from eap.aoe.ads_operation import AdsRefusedError
+from eap.codec.ads import AdsError
+from eap.codec.adsnotification import (
+    AddNotification,
+    Sample,
+    Stamp,
+    TransMode,
+    decode_notification,
+    to_filetime,
+)
+
+MS = 1_000_000
+CYCLE = TransMode.SERVER_CYCLE
+CHANGE = TransMode.SERVER_ON_CHANGE
+
+
+class Value:
+    """Something to watch; None is refused with *refusal*."""
+
+    def __init__(self, octets: bytes = b"\0") -> None:
+        self.octets: bytes | None = octets
+        self.refusal = AdsError.BUSY
+        self.reads = 0
+
+    def __call__(self) -> bytes:
+        self.reads += 1
+        if self.octets is None:
+            raise AdsRefusedError(self.refusal)
+        return self.octets
+
+
+def asked(mode: int, *, cycle_ms: float = 0, delay_ms: float = 0, length: int = 1):
+    return AddNotification(0, 0, length, mode, int(delay_ms * 10_000), int(cycle_ms * 10_000))
+
+
+def cycle(table: NotificationTable, now_ms: float) -> list[tuple[object, list[Stamp]]]:
+    """End a cycle; return clients with the stamps that they are told of."""
+    now_ns = int(now_ms * MS)
+    notices = table.handle_cycle(now_ns, to_filetime(now_ns))
+    return [(client, decode_notification(data)) for client, data in notices]
+
+
+def stamp(now_ms: float, *samples: tuple[int, bytes]) -> Stamp:
+    return Stamp(to_filetime(int(now_ms * MS)), tuple(Sample(*sample) for sample in samples))
+
+
+@pytest.fixture
+def table() -> NotificationTable:
+    return NotificationTable()
+
+
+@pytest.mark.parametrize("mode", [TransMode.SERVER_CYCLE, TransMode.SERVER_CYCLE_2])
+def test_cyclic_ones_are_sampled_in_their_cycle(table, mode: int) -> None:
+    value = Value(b"a")
+    handle = table.add("me", asked(mode, cycle_ms=20), value, 0)
+    told = [(now, cycle(table, now)) for now in range(10, 80, 10)]
+    assert [(now, stamps) for now, stamps in told if stamps] == [
+        (now, [("me", [stamp(now, (handle, b"a"))])]) for now in (10, 20, 40, 60)
+    ]
+    assert value.reads == 4
+
+
+def test_first_sample_never_comes_in_the_moment_of_the_request(table) -> None:
+    table.add("me", asked(CYCLE), Value(), 5 * MS)
+    assert cycle(table, 5) == []
+    assert len(cycle(table, 5.1)) == 1
+
+
+def test_a_cycle_of_zero_is_every_cycle(table) -> None:
+    table.add("me", asked(CYCLE), Value(), 0)
+    assert [len(cycle(table, now)) for now in (1, 2, 3)] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("mode", [TransMode.SERVER_ON_CHANGE, TransMode.SERVER_ON_CHANGE_2])
+def test_changes_are_told_with_the_first_value(table, mode: int) -> None:
+    value = Value(b"a")
+    handle = table.add("me", asked(mode), value, 0)
+    assert cycle(table, 1) == [("me", [stamp(1, (handle, b"a"))])]
+    assert cycle(table, 2) == []
+    value.octets = b"b"
+    assert cycle(table, 3) == [("me", [stamp(3, (handle, b"b"))])]
+    assert cycle(table, 4) == []
+
+
+def test_a_change_back_between_two_looks_is_not_seen(table) -> None:
+    value = Value(b"a")
+    table.add("me", asked(CHANGE, cycle_ms=30), value, 0)
+    assert cycle(table, 10)
+    value.octets = b"b"
+    assert cycle(table, 20) == []
+    value.octets = b"a"
+    assert [cycle(table, now) for now in (30, 40)] == [[], []]
+    value.octets = b"c"
+    assert cycle(table, 60) != []
+
+
+def test_mean_distance_is_kept_where_cycles_do_not_divide_it(table) -> None:
+    table.add("me", asked(CYCLE, cycle_ms=15), Value(), 0)
+    told = [now for now in range(10, 160, 10) if cycle(table, now)]
+    assert told == [10, 20, 30, 50, 60, 80, 90, 110, 120, 140, 150]
+
+
+def test_cycles_that_are_a_little_early_count(table) -> None:
+    table.add("me", asked(CYCLE, cycle_ms=10), Value(), 0)
+    assert [bool(cycle(table, now)) for now in (10, 19.9, 30.1, 39.8, 50)] == [True] * 5
+
+
+def test_nothing_is_made_up_for_after_a_pause(table) -> None:
+    table.add("me", asked(CYCLE, cycle_ms=10), Value(), 0)
+    assert [len(cycle(table, now)) for now in (10, 1000, 1001, 1010)] == [1, 1, 0, 1]
+
+
+def test_samples_of_one_cycle_share_a_stamp_and_wait_for_others(table) -> None:
+    one, two = Value(b"1"), Value(b"2")
+    first = table.add("me", asked(CYCLE, delay_ms=25), one, 0)
+    second = table.add("me", asked(CHANGE, delay_ms=50), two, 0)
+    assert [cycle(table, now) for now in (10, 20, 30)] == [[], [], []]
+    two.octets = b"3"
+    assert cycle(table, 40) == [
+        (
+            "me",
+            [
+                stamp(10, (first, b"1"), (second, b"2")),
+                stamp(20, (first, b"1")),
+                stamp(30, (first, b"1")),
+                stamp(40, (first, b"1"), (second, b"3")),
+            ],
+        )
+    ]
+    assert cycle(table, 50) == []
+
+
+def test_the_most_impatient_sample_takes_the_others_along(table) -> None:
+    patient = table.add("me", asked(CHANGE, delay_ms=1000), Value(b"p"), 0)
+    assert cycle(table, 10) == []
+    hasty = table.add("me", asked(CHANGE), Value(b"h"), 10 * MS)
+    assert cycle(table, 20) == [("me", [stamp(10, (patient, b"p")), stamp(20, (hasty, b"h"))])]
+
+
+def test_full_packets_go_without_waiting(table) -> None:
+    size = FULL_PACKET // 2
+    table.add("me", asked(CYCLE, delay_ms=10_000, length=size), Value(bytes(size)), 0)
+    assert cycle(table, 10) == []
+    told = cycle(table, 20)
+    assert [stamps[0].time for _, stamps in told] == [stamp(10).time]
+    big = table.add("me", asked(CHANGE, length=MAX_WATCHED), Value(bytes(MAX_WATCHED)), 20 * MS)
+    told = cycle(table, 30)
+    samples = [sample for _, stamps in told for each in stamps for sample in each.samples]
+    assert [len(sample.data) for sample in samples] == [size, size, MAX_WATCHED]
+    assert samples[-1].handle == big
+
+
+def test_handles_belong_to_their_client(table) -> None:
+    mine = table.add("me", asked(CYCLE), Value(), 0)
+    yours = table.add("you", asked(CYCLE), Value(), 0)
+    assert mine != yours
+    for client, handle in (("you", mine), ("nobody", mine), ("me", 77), ("me", 0)):
+        with pytest.raises(AdsRefusedError, match="NOTIFICATION_HANDLE"):
+            table.delete(client, handle)
+    assert [client for client, _ in cycle(table, 1)] == ["me", "you"]
+    table.delete("me", mine)
+    assert [client for client, _ in cycle(table, 2)] == ["you"]
+    assert table.clients() == ("you",)
+
+
+def test_a_client_that_is_gone_is_forgotten(table) -> None:
+    for _ in range(3):
+        table.add("me", asked(CYCLE, delay_ms=100), Value(), 0)
+    assert cycle(table, 1) == []
+    table.forget("me")
+    table.forget("nobody")
+    assert cycle(table, 1000) == []
+    assert table.stats()[:2] == (0, 0)
+    assert table.next_timeout() is None
+
+
+def test_what_waits_for_a_client_goes_with_its_last_notification(table) -> None:
+    handle = table.add("me", asked(CYCLE, delay_ms=100), Value(), 0)
+    assert cycle(table, 1) == []
+    table.delete("me", handle)
+    assert cycle(table, 1000) == []
+    assert table.clients() == ()
+
+
+def test_a_source_that_fails_for_now_is_asked_again(table) -> None:
+    value = Value(b"a")
+    handle = table.add("me", asked(CHANGE), value, 0)
+    value.octets = None
+    assert cycle(table, 1) == []
+    value.octets = b"a"
+    assert cycle(table, 2) == [("me", [stamp(2, (handle, b"a"))])]
+
+
+def test_a_source_that_fails_for_good_ends_its_notification(table) -> None:
+    value = Value(b"a")
+    other = table.add("me", asked(CYCLE, delay_ms=100), Value(b"o"), 0)
+    handle = table.add("me", asked(CYCLE, delay_ms=100), value, 0)
+    assert cycle(table, 1) == []
+    value.octets, value.refusal = None, AdsError.SYMBOL_VERSION
+    assert cycle(table, 2) == [
+        ("me", [stamp(1, (other, b"o"), (handle, b"a")), stamp(2, (other, b"o"))]),
+        ("me", [stamp(2, (handle, b""))]),
+    ]
+    with pytest.raises(AdsRefusedError):
+        table.delete("me", handle)
+    assert table.stats() == (1, 1, 3, 2, 1)
+
+
+def test_a_last_source_that_fails_ends_its_client(table) -> None:
+    value = Value()
+    value.octets, value.refusal = None, AdsError.NOT_FOUND
+    handle = table.add("me", asked(CYCLE), value, 0)
+    assert cycle(table, 1) == [("me", [stamp(1, (handle, b""))])]
+    assert table.clients() == ()
+
+
+def test_next_timeout_is_that_of_samples_and_of_packets(table) -> None:
+    assert table.next_timeout() is None
+    table.add("me", asked(CYCLE, cycle_ms=80, delay_ms=5), Value(), 0)
+    assert table.next_timeout() == 1
+    assert cycle(table, 10) == []
+    assert table.next_timeout() == 15 * MS
+    assert cycle(table, 15)
+    assert table.next_timeout() == 70 * MS
+
+
+@pytest.mark.parametrize(
+    ("request_", "result"),
+    [
+        (asked(TransMode.NONE), "TRANS_MODE"),
+        (asked(TransMode.CLIENT_CYCLE), "TRANS_MODE"),
+        (asked(TransMode.CLIENT_ON_CHANGE), "TRANS_MODE"),
+        (asked(TransMode.CLIENT_1_REQUEST), "TRANS_MODE"),
+        (asked(0xFFFF_FFFF), "TRANS_MODE"),
+        (asked(CYCLE, length=0), "WATCH_SIZE"),
+        (asked(CYCLE, length=MAX_WATCHED + 1), "WATCH_SIZE"),
+    ],
+)
+def test_requests_that_are_refused(table, request_: AddNotification, result: str) -> None:
+    with pytest.raises(AdsRefusedError, match=result):
+        table.add("me", request_, Value(), 0)
+    assert table.stats() == (0, 0, 0, 0, 0)
+
+
+def test_clients_and_their_handles_are_bounded(table, monkeypatch) -> None:
+    monkeypatch.setattr(ads_notifications, "MAX_HANDLES", 3)
+    monkeypatch.setattr(ads_notifications, "MAX_CLIENTS", 2)
+    handles = [table.add("me", asked(CYCLE), Value(), 0) for _ in range(3)]
+    table.add("you", asked(CYCLE), Value(), 0)
+    for client in ("me", "third"):
+        with pytest.raises(AdsRefusedError, match="NO_MORE_HANDLES"):
+            table.add(client, asked(CYCLE), Value(), 0)
+    table.delete("me", handles[0])
+    assert table.add("me", asked(CYCLE), Value(), 0) not in handles
+
+
+def test_handles_come_round_after_all_others(table, monkeypatch) -> None:
+    kept = table.add("me", asked(CYCLE), Value(), 0)
+    monkeypatch.setattr(table, "_next_handle", 0xFFFF_FFFF)
+    assert table.add("me", asked(CYCLE), Value(), 0) == 0xFFFF_FFFF
+    assert kept == 1
+    assert table.add("me", asked(CYCLE), Value(), 0) == 2
+
+
+def test_notifications_that_come_and_go_leave_nothing_behind(table) -> None:
+    for n in range(1000):
+        handle = table.add("me", asked(CYCLE, cycle_ms=100), Value(), n)
+        table.delete("me", handle)
+    assert len(table._due) < 20
+    assert table.stats()[:2] == (0, 0)
+
+
+CLIENTS = st.sampled_from("abc")
+
+
+class Watched(RuleBasedStateMachine):
+    """Any order of adding, deleting, leaving, changing, failing and cycles.
+
+    Each client sees, for each handle of its own, exactly what a plain model says, in order of
+    time, and no sample later than its delay and one cycle.
+    """
+
+    handles = Bundle("handles")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.table = NotificationTable()
+        self.now = 0
+        self.alive: dict[int, tuple[str, Value, AddNotification]] = {}
+        self.last: dict[int, bytes] = {}
+        self.unsent: dict[int, list[tuple[int, bytes]]] = {}
+
+    @rule(
+        target=handles,
+        client=CLIENTS,
+        mode=st.sampled_from([CYCLE, CHANGE]),
+        cycle_ms=st.sampled_from([0, 1, 7, 30]),
+        delay_ms=st.sampled_from([0, 5, 40]),
+    )
+    def add(self, client, mode, cycle_ms, delay_ms):
+        request = asked(mode, cycle_ms=cycle_ms, delay_ms=delay_ms)
+        value = Value(b"x")
+        handle = self.table.add(client, request, value, self.now)
+        assert handle not in self.alive
+        self.alive[handle] = client, value, request
+        self.unsent[handle] = []
+        return handle
+
+    @rule(handle=consumes(handles))
+    def delete(self, handle):
+        if handle in self.alive:
+            client = self.alive.pop(handle)[0]
+            self.table.delete(client, handle)
+        else:
+            with pytest.raises(AdsRefusedError):
+                self.table.delete("a", handle)
+
+    @rule(client=CLIENTS)
+    def leave(self, client):
+        self.table.forget(client)
+        for handle in [h for h, (owner, *_) in self.alive.items() if owner == client]:
+            del self.alive[handle]
+
+    @rule(handle=handles, octets=st.sampled_from([b"x", b"y", b"z", None]))
+    def change(self, handle, octets):
+        if handle in self.alive:
+            self.alive[handle][1].octets = octets
+
+    @rule(handle=handles)
+    def fail(self, handle):
+        if handle in self.alive:
+            self.alive[handle][1].octets = None
+            self.alive[handle][1].refusal = AdsError.NOT_FOUND
+
+    @rule(ms=st.integers(1, 50))
+    def end_cycle(self, ms):
+        self.now += ms * MS
+        before = {handle: value.reads for handle, (_, value, _) in self.alive.items()}
+        notices = self.table.handle_cycle(self.now, self.now)
+        ended = set()
+        for handle, (_, value, request) in self.alive.items():
+            if value.reads == before[handle]:
+                assert request.cycle, "a cycle of 0 is every cycle"
+            elif value.octets is None:
+                ended |= {handle} if value.refusal is AdsError.NOT_FOUND else set()
+            elif request.mode == CYCLE or self.last.get(handle) != value.octets:
+                self.last[handle] = value.octets
+                self.unsent[handle].append((self.now, value.octets))
+        self._compare(notices, ended)
+
+    def _compare(self, notices, ended):
+        for client, data in notices:
+            for time, samples in decode_notification(data):
+                for handle, octets in samples:
+                    if handle not in self.alive:
+                        continue  # taken before it was deleted
+                    assert self.alive[handle][0] == client
+                    if octets:
+                        assert self.unsent[handle].pop(0) == (time, octets)
+                    else:
+                        assert handle in ended
+                        assert not self.unsent[handle]
+                        ended.discard(handle)
+                        del self.alive[handle]
+        assert not ended
+        for handle, (_, _, request) in self.alive.items():
+            for time, _ in self.unsent[handle]:
+                assert self.now < time + request.max_delay * 100
+
+    @invariant()
+    def counts(self):
+        stats = self.table.stats()
+        assert stats.notifications == len(self.alive)
+        assert set(self.table.clients()) == {client for client, *_ in self.alive.values()}
+
+
+TestWatched = Watched.TestCase
+TestWatched.settings = settings(max_examples=60, stateful_step_count=40)
