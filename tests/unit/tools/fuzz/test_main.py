@@ -53,7 +53,7 @@ def test_find_is_printed_and_fails(
 def test_unknown_target_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["nothing"])
-    assert "'nothing' is no target (one of ams," in capsys.readouterr().err
+    assert "'nothing' is no target (one of ads, ams," in capsys.readouterr().err
 
 
 def test_runs_as_a_program() -> None:
