@@ -27,7 +27,7 @@ from typing import NamedTuple
 import eap
 from devicebus.mailbox.coe_client import upload
 from eap.appliance.attach import AttachedStation
-from eap.appliance.bus_running import open_running
+from eap.appliance.commands.bus_running import open_running
 from eap.appliance.runtime import VARIABLE
 from eap.errors import EapError
 from eap.net.ticker import Ticker

@@ -34,6 +34,14 @@ IDLE_S = 10.0
 """A conversation in which nothing is asked for so long is ended: others may wait for it."""
 TURN_S = 30.0
 """How long the turn at a mailbox is waited for."""
+MARGIN_S = 10.0
+"""Beyond the time-out of a mailbox message: those of other protocols may go first."""
+PATIENCE_S = 5.0
+"""How long a bus that is not up yet, or whose engine starts again, is waited for."""
+TRANSFER_S = 5.0
+"""What datagrams that are passed on may take."""
+BRING_S = 60.0
+"""What bringing slaves to a state may take."""
 
 MS = 1_000_000
 _MAX_MS = 60_000

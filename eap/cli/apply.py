@@ -15,8 +15,8 @@ from eap.cli.plant_params import keep_going_option, plant_arguments, running_pla
 from eap.errors import ControlError
 
 if TYPE_CHECKING:
-    from eap.appliance.plant_change import Done
-    from eap.appliance.plant_link import PlantLink
+    from eap.appliance.commands.plant_change import Done
+    from eap.appliance.commands.plant_link import PlantLink
 
 
 @click.command(short_help="Let a running plant become what its file says.")
@@ -36,7 +36,7 @@ def apply(
 
     Exits with 1 when a station refused.
     """
-    from eap.appliance.plant_change import apply_steps, plan_all, steps_to
+    from eap.appliance.commands.plant_change import apply_steps, plan_all, steps_to
 
     with running_plant(plant, stations) as (link, wanted):
         refusing = {each.station: each.refused for each in plan_all(link, wanted) if each.refused}
@@ -61,7 +61,7 @@ def rollback(
 
     Exits with 1 when a station refused.
     """
-    from eap.appliance.plant_change import roll_back
+    from eap.appliance.commands.plant_change import roll_back
 
     with running_plant(plant, stations) as (link, wanted):
         done = _take(roll_back(link, tuple(wanted), keep_going=keep_going), as_json=as_json)

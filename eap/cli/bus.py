@@ -55,7 +55,7 @@ def bus() -> None:
 @json_option("Print one object.")
 def scan(bus: Place, as_json: bool) -> None:
     """Show all slaves: identity, state, alias, mailbox protocols."""
-    from eap.appliance.bus_info import scan_rows
+    from eap.appliance.commands.bus_info import scan_rows
 
     with open_session(bus) as session:
         rows = scan_rows(session)
@@ -77,7 +77,7 @@ def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
     One slave, or all of them.  The master of a running station keeps them there.  Behind an
     interface nobody does: a slave with outputs leaves OP when nobody sends it process data.
     """
-    from eap.appliance.bus_info import state_rows
+    from eap.appliance.commands.bus_info import state_rows
 
     target = words[-1].upper() if words and words[-1].upper() in STATES else None
     rest = words[:-1] if target else words
@@ -101,7 +101,7 @@ def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
 @json_option("Print one object.")
 def diag(slave: str | None, bus: Place, as_json: bool) -> None:
     """Show states, errors of ports, and where they start."""
-    from eap.appliance.bus_info import diagnosis
+    from eap.appliance.commands.bus_info import diagnosis
 
     with open_session(bus) as session:
         found = diagnosis(session, slave)
@@ -125,7 +125,7 @@ def sii() -> None:
 @json_option("Print one object, with all octets in hexadecimal digits.")
 def sii_dump(slave: str, file: Path | None, bus: Place, as_json: bool) -> None:
     """Read the EEPROM; with FILE, store its octets there."""
-    from eap.appliance.bus_info import read_eeprom
+    from eap.appliance.commands.bus_info import read_eeprom
 
     with open_session(bus) as session:
         content, image = read_eeprom(session, slave)
@@ -149,7 +149,7 @@ def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
 
     The master of a running station takes note of it when it brings its bus up anew.
     """
-    from eap.appliance.bus_info import write_eeprom
+    from eap.appliance.commands.bus_info import write_eeprom
 
     with open_session(bus) as session:
         done = write_eeprom(session, slave, file.read_bytes())
@@ -176,7 +176,7 @@ def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
 @json_option("Print one object.")
 def voe(slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, as_json: bool) -> None:
     """Send a message of a vendor's own protocol and print the answer."""
-    from eap.appliance.bus_foe import exchange
+    from eap.appliance.commands.bus_foe import exchange
 
     with open_session(bus) as session:
         answer = exchange(session, slave, vendor, vendor_type, data)

@@ -52,7 +52,7 @@ def get(
 
     FILE is NAME in this folder if left out.
     """
-    from eap.appliance.bus_foe import get_file
+    from eap.appliance.commands.bus_foe import get_file
 
     target = file or Path(Path(name).name)
     with open_session(bus) as session, _progress(name, hidden=as_json) as report:
@@ -76,7 +76,7 @@ def put(
     as_json: bool,
 ) -> None:
     """Write FILE to a slave, as NAME if that is given."""
-    from eap.appliance.bus_foe import put_file
+    from eap.appliance.commands.bus_foe import put_file
 
     target = name or file.name
     with open_session(bus) as session, _progress(target, hidden=as_json) as report:

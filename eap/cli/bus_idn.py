@@ -55,7 +55,7 @@ def idn() -> None:
 @json_option("Print one object.")
 def read(slave: str, number: Idn, drive: int, bus: Place, as_json: bool) -> None:
     """Read an IDN with its name, unit and limits."""
-    from eap.appliance.bus_idn import read_idn
+    from eap.appliance.commands.bus_idn import read_idn
 
     with open_session(bus) as session:
         row = read_idn(session, slave, number, drive=drive)
@@ -79,7 +79,7 @@ def write(slave: str, number: Idn, value: str, drive: int, bus: Place, as_json: 
 
     The numbers of a list have commas between them.
     """
-    from eap.appliance.bus_idn import write_idn
+    from eap.appliance.commands.bus_idn import write_idn
 
     with open_session(bus) as session:
         row = write_idn(session, slave, number, value, drive=drive)
@@ -96,7 +96,7 @@ def write(slave: str, number: Idn, value: str, drive: int, bus: Place, as_json: 
 @json_option("Print one object a line.")
 def list_idns(slave: str, drive: int, bus: Place, as_json: bool) -> None:
     """List all IDNs of a drive."""
-    from eap.appliance.bus_idn import list_idns as rows_of
+    from eap.appliance.commands.bus_idn import list_idns as rows_of
 
     with open_session(bus) as session:
         if as_json:

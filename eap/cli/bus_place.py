@@ -11,7 +11,7 @@ from eap.cli.params import CommandT
 from eap.ids import InterfaceUri
 
 if TYPE_CHECKING:
-    from eap.appliance.bus_slave import SlaveBus
+    from eap.appliance.commands.bus_slave import SlaveBus
 
 _PLACE, _INTERFACE, _PLANT = "place", "interface", "plant"
 _FORMS = "STATION/PORT", "--interface URI"
@@ -128,10 +128,10 @@ def parse_uri(text: str) -> InterfaceUri:
 def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
     """Open the bus; imported here, so that ``--help`` need not wait for a master."""
     if isinstance(bus, BusPort):
-        from eap.appliance.bus_running import open_running
+        from eap.appliance.commands.bus_running import open_running
 
         return open_running(*bus)
-    from eap.appliance import bus_session
+    from eap.appliance.commands import bus_session
 
     return bus_session.open_bus(bus)
 

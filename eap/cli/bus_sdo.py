@@ -54,7 +54,7 @@ def read(
     as_json: bool,
 ) -> None:
     """Read an entry."""
-    from eap.appliance.bus_sdo import read_entry
+    from eap.appliance.commands.bus_sdo import read_entry
 
     with open_session(bus) as session:
         row = read_entry(session, slave, *entry, kind=kind, complete=complete)
@@ -87,7 +87,7 @@ def write(
     VALUE is as the type has it: 12, 0xC, -1.5e3, true, text; hexadecimal digits for a block and
     with --complete.
     """
-    from eap.appliance.bus_sdo import write_entry
+    from eap.appliance.commands.bus_sdo import write_entry
 
     with open_session(bus) as session:
         row = write_entry(session, slave, *entry, value, kind=kind, complete=complete)
@@ -105,7 +105,7 @@ def write(
 @json_option("Print one object a line.")
 def list_objects(slave: str, bus: Place, as_json: bool) -> None:
     """List the objects that the slave describes."""
-    from eap.appliance.bus_sdo import list_objects as rows_of
+    from eap.appliance.commands.bus_sdo import list_objects as rows_of
 
     with open_session(bus) as session:
         if as_json:
@@ -123,7 +123,7 @@ def list_objects(slave: str, bus: Place, as_json: bool) -> None:
 @json_option("Print one object a line.")
 def dump(slave: str, bus: Place, as_json: bool) -> None:
     """Read every entry of every object that the slave describes."""
-    from eap.appliance.bus_sdo import dump_entries
+    from eap.appliance.commands.bus_sdo import dump_entries
 
     with open_session(bus) as session:
         if as_json:

@@ -15,7 +15,7 @@ from eap.cli.params import json_option
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from eap.appliance.packets import Packet
+    from eap.appliance.commands.packets import Packet
 
 _SEPARATORS = str.maketrans("", "", ":-, \t\r\n")
 
@@ -58,7 +58,7 @@ def decode(ctx: click.Context, source: tuple[str, ...], as_json: bool) -> None:
 
     Exit code 1 means that a frame had an error, 2 that the input cannot be read.
     """
-    from eap.appliance.decode import decode_frame
+    from eap.appliance.commands.decode import decode_frame
 
     failed, shown = False, 0
     for frame in _frames(" ".join(source)):
@@ -89,7 +89,7 @@ def _frames(source: str) -> Iterator[_Frame]:
 
 
 def _frames_of_file(name: str) -> Iterator[_Frame]:
-    from eap.appliance.capture import iter_capture
+    from eap.appliance.commands.capture import iter_capture
     from eap.errors import CodecError
 
     try:
@@ -102,7 +102,7 @@ def _frames_of_file(name: str) -> Iterator[_Frame]:
 
 
 def _frames_of_octets(octets: bytes) -> Iterator[_Frame]:
-    from eap.appliance.packets import cut_frames, unwrap
+    from eap.appliance.commands.packets import cut_frames, unwrap
 
     packet = unwrap(octets)
     if packet is None:

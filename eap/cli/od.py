@@ -13,7 +13,7 @@ from eap.cli.output import write_json, write_tables, write_text
 from eap.cli.params import json_option
 
 if TYPE_CHECKING:
-    from eap.appliance.od_target import Target
+    from eap.appliance.commands.od_target import Target
     from eap.codec.datatypes import DataType
 
 _TYPE = click.option(
@@ -39,8 +39,8 @@ def od() -> None:
 @json_option("Print one object a line.")
 def list_objects(target: Target, as_json: bool) -> None:
     """List all objects with their names."""
-    from eap.appliance.od_access import object_rows
-    from eap.appliance.od_target import open_device
+    from eap.appliance.commands.od_access import object_rows
+    from eap.appliance.commands.od_target import open_device
 
     with open_device(target) as device:
         rows = list(object_rows(device.objects()))
@@ -67,8 +67,8 @@ def read(
     entry: Entry, kind: DataType | None, complete: bool, target: Target, as_json: bool
 ) -> None:
     """Read an entry, or a whole object."""
-    from eap.appliance.od_access import read_entry, read_object
-    from eap.appliance.od_target import open_device
+    from eap.appliance.commands.od_access import read_entry, read_object
+    from eap.appliance.commands.od_target import open_device
 
     with open_device(target) as device:
         row = read_object(device, *entry) if complete else read_entry(device, *entry, kind)
@@ -126,8 +126,8 @@ def write(
         load(target, file, as_json=as_json)
         return
     place = _entry_to_write(entry, value, octets, complete=complete)
-    from eap.appliance.od_access import write_entry, write_octets
-    from eap.appliance.od_target import open_device
+    from eap.appliance.commands.od_access import write_entry, write_octets
+    from eap.appliance.commands.od_target import open_device
 
     with open_device(target) as device:
         if octets is not None:
@@ -147,8 +147,8 @@ def write(
 @json_option("Print one entry a line, as an object.")
 def dump(target: Target, as_json: bool) -> None:
     """Write all entries of all objects to stdout, for people and for 'od write --from'."""
-    from eap.appliance.od_access import dump_rows
-    from eap.appliance.od_target import open_device
+    from eap.appliance.commands.od_access import dump_rows
+    from eap.appliance.commands.od_target import open_device
 
     with open_device(target) as device:
         rows = dump_rows(device.contents())

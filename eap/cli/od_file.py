@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.od_load import Download
+from eap.appliance.commands.od_load import Download
 from eap.cli.bus_params import parse_entry
 from eap.cli.od_view import RAW, Row, object_line, value_line
 from eap.codec import datatypes

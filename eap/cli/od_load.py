@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eap.appliance import od_load
-from eap.appliance.od_target import Target, open_device
+from eap.appliance.commands import od_load
+from eap.appliance.commands.od_target import Target, open_device
 from eap.cli.od_file import read_file
 from eap.cli.output import write_json, write_text
 

@@ -11,7 +11,7 @@ import click
 from eap.cli.params import plant_option
 
 if TYPE_CHECKING:
-    from eap.appliance.od_target import Target
+    from eap.appliance.commands.od_target import Target
 
 
 def target_argument(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -25,7 +25,7 @@ def target_argument(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _target(text: str, plant: str | None) -> Target:
-    from eap.appliance.od_target import Target
+    from eap.appliance.commands.od_target import Target
 
     try:
         return Target.parse(text)._replace(plant=plant)

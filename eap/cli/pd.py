@@ -33,7 +33,7 @@ def pd() -> None:
 @json_option("One object a line: a PD, or the variables of a station that no PD carries.")
 def list_pds(plant: str | None, station: str | None, as_json: bool) -> None:
     """List every PD with what identifies it, and every variable with its type and writer."""
-    from eap.appliance.client import connect
+    from eap.appliance.commands.client import connect
     from eap.cli.pd_view import pd_rows, pd_tables
 
     with ExitStack() as stack:
@@ -99,7 +99,7 @@ def set_value(words: tuple[str, ...], plant: str | None, as_json: bool) -> None:
     VALUE as the variable's type has it: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
     hexadecimal digits for a raw block.
     """
-    from eap.appliance.client import connect_station
+    from eap.appliance.commands.client import connect_station
     from eap.codec import datatypes
 
     target, text = parse_assignment(words)

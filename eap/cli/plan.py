@@ -21,7 +21,7 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], as_json: bo
 
     Nothing is changed.  Exits with 1 when a station cannot become what the file says while it runs.
     """
-    from eap.appliance.plant_change import plan_all, steps_to
+    from eap.appliance.commands.plant_change import plan_all, steps_to
     from eap.cli.plan_view import plan_lines
 
     with running_plant(plant, stations) as (link, wanted):

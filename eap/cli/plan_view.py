@@ -13,8 +13,8 @@ from eap.cli.words import count
 from eap.od.abort import entry_name
 
 if TYPE_CHECKING:
-    from eap.appliance.plant_change import Done
-    from eap.appliance.plant_link import StationPlan
+    from eap.appliance.commands.plant_change import Done
+    from eap.appliance.commands.plant_link import StationPlan
     from eap.device.rollout import Step
 
 _SIGNS = {"added": "+", "removed": "-", "changed": "~"}

@@ -12,7 +12,7 @@ import click
 from eap.cli.params import PLANT_FILE, CommandT
 
 if TYPE_CHECKING:
-    from eap.appliance.plant_link import PlantLink
+    from eap.appliance.commands.plant_link import PlantLink
     from eap.pd.spec import StationSpec
 
 
@@ -43,8 +43,8 @@ def running_plant(
         The connections, and what the *wanted* stations are to be, which is all that run here
         unless some are named.
     """
-    from eap.appliance.plant_change import choose, load_or_raise
-    from eap.appliance.plant_link import link_to
+    from eap.appliance.commands.plant_change import choose, load_or_raise
+    from eap.appliance.commands.plant_link import link_to
 
     plant = load_or_raise(file)
     with link_to(plant, file) as link:

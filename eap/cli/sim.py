@@ -61,7 +61,8 @@ def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults:
     When they answer, one line {"ready": true, "slaves": n} appears on stdout; Ctrl-C or SIGTERM
     ends them.  docs/simulator.md describes bus files; config/buses has some to start from.
     """
-    from eap.appliance import busfile, segment_process  # yaml and sockets; --help must not wait
+    from eap.appliance import busfile  # yaml and sockets; --help must not wait
+    from eap.appliance.segment import process as segment_process
 
     loaded = busfile.load_or_raise(bus)
     if second is not None and not (loaded.spec.ring and second.scheme == "ethernet"):

@@ -130,7 +130,7 @@ def set_value(
 
 
 def _send(bus: BusPort, command: dict[str, Any], plant: str | None) -> None:
-    from eap.appliance.client import connect_station
+    from eap.appliance.commands.client import connect_station
 
     with connect_station(bus.station, plant) as client:
         client.request("bus_fault", station=bus.station, port=bus.port, command=command)

@@ -12,7 +12,7 @@ from eap.cli.output import write_json, write_text
 from eap.cli.params import json_option
 
 if TYPE_CHECKING:
-    from eap.appliance.od_target import Target
+    from eap.appliance.commands.od_target import Target
 
 STATES = ("PREOP", "SAFEOP", "OP")
 _OF_SLAVES = ("INIT", *STATES, "BOOT")
@@ -54,7 +54,7 @@ def state(ctx: click.Context, wanted: str | None, target: Target, as_json: bool)
 
 
 def _of_station(target: Target, wanted: str | None) -> dict[str, Any]:
-    from eap.appliance.client import connect_station
+    from eap.appliance.commands.client import connect_station
 
     with connect_station(target.station, target.plant) as client:
         if wanted is None:
@@ -65,8 +65,8 @@ def _of_station(target: Target, wanted: str | None) -> dict[str, Any]:
 
 
 def _of_slave(target: Target, wanted: str | None) -> dict[str, Any]:
-    from eap.appliance.bus_info import state_rows
-    from eap.appliance.bus_running import open_running
+    from eap.appliance.commands.bus_info import state_rows
+    from eap.appliance.commands.bus_running import open_running
 
     with open_running(target.station, target.port, target.plant) as bus:
         (row,) = state_rows(bus, target.slave, wanted)

@@ -28,7 +28,7 @@ def status(plant: str | None, station: str | None, as_json: bool) -> None:
 
 def _ask(plant: str | None, station: str | None) -> dict[str, Any]:
     """Return the merged answer of the chosen appliances, cut down to *station* if it is given."""
-    from eap.appliance.client import connect, merge_status
+    from eap.appliance.commands.client import connect, merge_status
 
     with ExitStack() as stack:
         clients = [stack.enter_context(client) for client in connect(plant, station)]

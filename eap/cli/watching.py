@@ -13,7 +13,7 @@ from datetime import datetime
 from queue import SimpleQueue
 from typing import Any
 
-from eap.appliance.client import connect_station
+from eap.appliance.commands.client import connect_station
 from eap.errors import EapError
 
 

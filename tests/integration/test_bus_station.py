@@ -13,8 +13,8 @@ from unittest import mock
 
 import pytest
 
-from eap.appliance.bus_running import open_running
-from eap.appliance.bus_sdo import read_entry
+from eap.appliance.commands.bus_running import open_running
+from eap.appliance.commands.bus_sdo import read_entry
 from eap.appliance.runtime import VARIABLE
 from tests.support.addresses import own_address
 from tests.support.appliance import EAPCTL, plants, wait_until

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from eap.appliance.plant_change import load_or_raise
+from eap.appliance.commands.plant_change import load_or_raise
 from eap.config.new_plant import Shape, plant_text
 from eap.device.rollout import without_alternates
 from eap.pd.spec import StationSpec

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.client import connect
+from eap.appliance.commands.client import connect
 
 pytestmark = pytest.mark.net
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.client import Client, connect
+from eap.appliance.commands.client import Client, connect
 from eap.codec.ethercat import EAP_PORT, EtherCatHeader
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.errors import ControlError

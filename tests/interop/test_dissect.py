@@ -15,8 +15,8 @@ from scapy.sessions import TCPSession
 
 from devicebus.wire.datagram import Command, Datagram, DatagramHeader
 from devicebus.wire.datagram import encode_frame as encode_datagrams
-from eap.appliance.capture import iter_capture
-from eap.appliance.decode import decode_frame
+from eap.appliance.commands.capture import iter_capture
+from eap.appliance.commands.decode import decode_frame
 from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.codec.mailbox import encode_frame as encode_mailbox
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.capture import iter_capture
-from eap.appliance.decode import decode_frame
+from eap.appliance.commands.capture import iter_capture
+from eap.appliance.commands.decode import decode_frame
 from eap.codec.pd import PdFrameHeader
 from eap.ids import NetId
 from tests.support.appliance import Plants, plants, wait_until

@@ -13,7 +13,7 @@ from collections.abc import Awaitable
 from typing import NamedTuple, Self
 
 from eap.aoe.answer import AmsAnswer
-from eap.appliance.aoe_desk import AoeDesk
+from eap.appliance.services.aoe_desk import AoeDesk
 from eap.ids import NetId
 
 DEVICE = 0xFFFF

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Self
 from unittest import mock
 
-from eap.appliance.client import connect_those
+from eap.appliance.commands.client import connect_those
 from eap.appliance.runtime import VARIABLE
 
 EAPCTL = [sys.executable, "-m", "eap"]

@@ -13,17 +13,17 @@ from typing import Any
 import msgspec
 
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_client import BusClient
-from eap.appliance.bus_methods import Buses
 from eap.appliance.control import encode_request
-from eap.appliance.control_server import ControlServer
-from eap.appliance.engine_link import EngineLink
 from eap.appliance.handover import PortName
-from eap.appliance.methods import Methods
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
-from eap.appliance.segment_link import SegmentLink
+from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus_methods import Buses
+from eap.appliance.services.control_server import ControlServer
+from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.methods import Methods
+from eap.appliance.services.segment_link import SegmentLink
+from eap.appliance.services.status import ProcessMeter, appliance_status
 from eap.appliance.station_image import StationImage
-from eap.appliance.status import ProcessMeter, appliance_status
 from eap.net.image_file import ImageFile, create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (

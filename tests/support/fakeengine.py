@@ -37,7 +37,7 @@ from eap.appliance.bus_request import (
     SlaveReport,
     Transfer,
 )
-from eap.appliance.bus_target import bring_all, bring_one
+from eap.appliance.engine.bus_target import bring_all, bring_one
 from eap.appliance.handover import PortName
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError

@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 
 from devicebus.sim.spec import FaultSpec
-from eap.appliance import bus_session
-from eap.appliance.bus_session import BusSession
 from eap.appliance.busfile import load_or_raise
+from eap.appliance.commands import bus_session
+from eap.appliance.commands.bus_session import BusSession
 
 BUSES = Path(__file__).parents[2] / "config" / "buses"
 STEP_NS = 20_000

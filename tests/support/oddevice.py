@@ -6,7 +6,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from eap.appliance.od_device import Content, EntryInfo, ObjectInfo
+from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RO, RW, RW_PREOP, WO, Access, Entry, OdObject, OdState, record, variable

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from eap.appliance.packets import unwrap
+from eap.appliance.commands.packets import unwrap
 from eap.codec.pd import PD_FRAME_START, PdFrameHeader, iter_pds
 
 _ALL = 3  # ETH_P_ALL; taps for one EtherType are not shown what leaves

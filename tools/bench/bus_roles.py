@@ -11,7 +11,7 @@ from devicebus.mailbox.coe_client import upload
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_session import open_bus
+from eap.appliance.commands.bus_session import open_bus
 from eap.ids import InterfaceUri
 from tools.bench.buses import FILE
 from tools.bench.pacing import answer

@@ -9,11 +9,11 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
-from eap.appliance.build import EnginePlant
-from eap.appliance.engine_process import StopFlag, run_cycles
+from eap.appliance.engine.build import EnginePlant
+from eap.appliance.engine.process import StopFlag, run_cycles
 from eap.appliance.handover import Handover
-from eap.appliance.sockets import SharedSockets
 from eap.appliance.station_request import Configure
+from eap.appliance.supervisor.sockets import SharedSockets
 from eap.errors import EapError
 from eap.net import realtime
 from eap.pd import pieces

@@ -12,10 +12,10 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.build import EnginePlant
-from eap.appliance.engine_process import StopFlag, run_cycles
+from eap.appliance.engine.build import EnginePlant
+from eap.appliance.engine.process import StopFlag, run_cycles
 from eap.appliance.handover import NO_DESCRIPTOR, Handover, SharedSocket
-from eap.appliance.sockets import SharedSockets
+from eap.appliance.supervisor.sockets import SharedSockets
 from eap.net import realtime
 from eap.pd.engine import Engine
 from eap.pd.spec import (

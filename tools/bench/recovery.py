@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import eap
 from eap.appliance.attach import AttachedStation
-from eap.appliance.client import Client, connect_station
+from eap.appliance.commands.client import Client, connect_station
 from eap.appliance.runtime import VARIABLE
 from eap.net.ticker import Ticker
 from tools.bench import buses, machine

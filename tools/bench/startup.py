@@ -16,7 +16,7 @@ from tools.bench.settings import Settings
 TITLE = "Start-up, whole processes"
 _EMPTY = "bare interpreter, the reference"
 _IMPORTS = {
-    "import the engine process": "import eap.appliance.engine_process",
+    "import the engine process": "import eap.appliance.engine.process",
     "import eap.attach": "import eap; eap.attach",
 }
 

@@ -14,8 +14,8 @@ import pytest
 
 import eap
 from eap.appliance import attach as attach_module
+from eap.appliance.engine.successor import EngineStation, Successor
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
-from eap.appliance.successor import EngineStation, Successor
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.net.image_file import ImageFile, create_image, prepare_image
 from eap.pd.engine import Engine

@@ -6,7 +6,13 @@ import pytest
 from msgspec.structs import replace
 
 from eap.appliance.configuration import Configuration
-from eap.appliance.device_change import dump_all, eap_ports, fill_all, make_plan, plan_rollback
+from eap.appliance.device_change import (
+    dump_all,
+    eap_ports,
+    fill_all,
+    make_plan,
+    plan_rollback,
+)
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import dump
 from eap.pd.spec import (

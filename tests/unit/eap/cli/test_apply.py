@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
 
-from eap.appliance.plant_change import load_or_raise
+from eap.appliance.commands.plant_change import load_or_raise
 from eap.cli import main
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ControlError

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from rich.console import Console
 
-from eap.appliance.decode import decode_frame
+from eap.appliance.commands.decode import decode_frame
 from eap.cli.decode_view import frame_tree
 from tests.support.vectors import Vector, load_all
 

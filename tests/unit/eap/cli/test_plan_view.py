@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.appliance.plant_link import StationPlan
+from eap.appliance.commands.plant_link import StationPlan
 from eap.cli.plan_view import change_line, plan_lines
 from eap.device.rollout import Step
 from tests.support.fakeappliance import station

@@ -9,7 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from eap.appliance.plant_change import load_or_raise
+from eap.appliance.commands.plant_change import load_or_raise
 from eap.cli.plant_params import keep_going_option, plant_arguments, running_plant
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ConfigError, ControlError

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from eap.appliance import segment_process
+from eap.appliance.segment import process as segment_process
 from eap.cli.group import exit_code_of
 from eap.cli.sim import run
 

@@ -4,7 +4,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.appliance.client import connect_station
+from eap.appliance.commands.client import connect_station
 from eap.cli.watching import changes
 from eap.errors import ControlError
 from tests.unit.eap.cli.conftest import Appliance

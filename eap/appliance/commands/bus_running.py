@@ -1,0 +1,235 @@
+"""The bus of a running station, as a command uses it: its master is asked over the control socket.
+
+Conversations and procedures run here, their single steps there.  What a command has begun ends with
+its connection, however it ends.
+"""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from time import monotonic, monotonic_ns
+from typing import Any, TypeVar
+
+import msgspec
+
+from devicebus.errors import BusError
+from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.access import Reply, fprd
+from devicebus.master.procedure import Answer, Procedure, Sleep, Step
+from devicebus.master.topology import find_joints
+from devicebus.wire.alstatus import AlState, state_name
+from devicebus.wire.register import AlStatus, DlStatus, Register
+from eap.appliance import control_bus
+from eap.appliance.bus_request import BusReport, SlaveReport
+from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
+from eap.appliance.commands.client import Client, connect_station
+from eap.appliance.control_bus import ask_parameters, datagram_row, protocol_of, to_replies
+from eap.errors import ControlError
+
+T = TypeVar("T")
+
+LOOK_S = 0.1
+"""How often *meanwhile* is called while something runs."""
+
+_MARGIN_S = 10.0
+"""For services on its way back from a restart, beyond what it waits for itself."""
+_S = 1_000_000_000
+_PER_STEP = 60
+
+
+class RunningBus:
+    """One bus port of a running station; fits :class:`eap.appliance.commands.bus_slave.SlaveBus`.
+
+    Args:
+        client: Connected to the appliance; nobody else asks it meanwhile.
+        station: Name of the station.
+        port: Name of its bus port.
+    """
+
+    def __init__(self, client: Client, station: str, port: str) -> None:
+        self._client = client
+        self._where = {"station": station, "port": port}
+        self._reports: dict[int, SlaveReport] = {}
+
+    def scan(self) -> Sequence[Slave]:
+        """Return the slaves that the running master knows, and where they are now."""
+        reports = self._describe().slaves
+        self._reports = {report.station: report for report in reports}
+        registers = self.run(_look(list(self._reports)))
+        joints = find_joints([dl_status for _, dl_status in registers])
+        return [
+            Slave(
+                station=report.station,
+                name=report.name,
+                vendor=report.vendor,
+                product=report.product,
+                revision=report.revision,
+                serial=report.serial,
+                alias=report.alias,
+                status=al_status,
+                protocols=report.protocols,
+                parent=joint.parent,
+                ports=joint.ports,
+                fault=report.fault,
+            )
+            for report, (al_status, _), joint in zip(reports, registers, joints, strict=True)
+        ]
+
+    def find(self, name: str) -> Slave:
+        """Return the slave with a station address or a name; raise BusError if that is not one."""
+        return choose(self.scan(), name)
+
+    def converse(
+        self,
+        slave: Slave,
+        begin: Begin[T],
+        name: str,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> T:
+        """Talk to a slave's mailbox until the conversation ends; return its result.
+
+        Raises:
+            BusError: the slave has no mailbox, or does not answer.
+            SdoAbortError, SoeError, FoeError: it refuses.
+            ControlError: the appliance has gone, or others use the mailbox all the while.
+        """
+        del name  # the master has its own
+        report = self._reports[slave.station]
+        if not report.to_slave:
+            raise no_mailbox(slave, state_name(slave.status.state))
+        conversation = begin(MailboxSizes(report.to_slave, report.to_master))
+        try:
+            return self._lead(slave, conversation, meanwhile)
+        finally:
+            conversation.close()
+
+    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
+        """Bring slaves to a state, where the master keeps them then.
+
+        Raises:
+            AlStatusError, StateTimeoutError: one refuses, or takes too long.
+            BusError: several do.
+        """
+        everyone = {slave.station for slave in slaves} == set(self._reports)
+        for station in [0] if everyone else [slave.station for slave in slaves]:
+            self._request(control_bus.BRING_S, "bus_bring", slave=station, state=target.name)
+
+    def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
+        """Run a procedure to its end and return its result, or raise what went wrong."""
+        del name
+        try:
+            step = next(procedure)
+            while True:
+                try:
+                    replies = self._do(step)
+                except BusError as exc:
+                    step = procedure.throw(exc)
+                else:
+                    step = procedure.send(Answer(replies, monotonic_ns()))
+        except StopIteration as end:
+            value: T = end.value
+            return value
+        finally:
+            procedure.close()
+
+    def frame_counts(self) -> FrameCounts:
+        """Return the frames of the master since the engine started."""
+        report = self._describe()
+        sent, lost = report.frames_sent, report.frames_lost
+        return FrameCounts(sent, sent - lost, lost)
+
+    def _describe(self) -> BusReport:
+        found = self._request(control_bus.PATIENCE_S, "bus_describe", wait=True)
+        return msgspec.convert(found, BusReport)
+
+    def _do(self, step: Step) -> list[Reply]:
+        if isinstance(step, Sleep):
+            select.select([], [], [], max(0, step.duration_ns) / _S)
+            return []
+        rows = [datagram_row(access) for access in step]
+        answer = self._request(control_bus.TRANSFER_S, "bus_transfer", datagrams=rows)
+        return to_replies(answer["replies"])
+
+    def _lead(
+        self, slave: Slave, conversation: Conversation[T], meanwhile: Callable[[], None] | None
+    ) -> T:
+        look_s = 0.0
+        number: int | None = None
+        try:
+            ask = next(conversation)
+            number = self._open(slave, ask)
+            while True:
+                try:
+                    message = Message(ask.type, self._ask(number, ask), monotonic_ns())
+                except BusError as exc:
+                    ask = conversation.throw(exc)
+                else:
+                    ask = conversation.send(message)
+                if meanwhile is not None and monotonic() >= look_s:
+                    meanwhile()
+                    look_s = monotonic() + LOOK_S
+        except StopIteration as end:
+            value: T = end.value
+            return value
+        except KeyboardInterrupt:
+            number = None  # an answer may be under way: the end of the connection ends it all
+            raise
+        finally:
+            if number is not None:
+                with suppress(ControlError):
+                    self._client.request("bus_close", conversation=number)
+
+    def _open(self, slave: Slave, ask: Ask) -> int:
+        answer = self._request(
+            control_bus.TURN_S,
+            "bus_open",
+            slave=slave.station,
+            protocol=protocol_of(ask.type),
+        )
+        return int(answer["conversation"])
+
+    def _ask(self, number: int, ask: Ask) -> bytes:
+        patience_s = (ask.timeout_ns + ask.delay_ns) / _S + control_bus.MARGIN_S + _MARGIN_S
+        answer = self._client.request_within(
+            patience_s, "bus_ask", conversation=number, **ask_parameters(ask)
+        )
+        return bytes.fromhex(answer["data"])
+
+    def _request(self, patience_s: float, method: str, **params: Any) -> Any:
+        return self._client.request_within(patience_s + _MARGIN_S, method, **self._where, **params)
+
+
+@contextmanager
+def open_running(station: str, port: str, plant: str | None = None) -> Iterator[RunningBus]:
+    """Connect to the appliance that runs a station, for the length of a block.
+
+    Raises:
+        ControlError: none runs it, or several do and *plant* does not choose among them.
+    """
+    with connect_station(station, plant) as client:
+        yield RunningBus(client, station, port)
+
+
+def _look(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:
+    """Read where slaves stand and what is wired to them; zeros for one that does not answer."""
+    replies: list[Reply] = []
+    for start in range(0, len(stations), _PER_STEP):
+        answers, _ = yield [
+            access
+            for station in stations[start : start + _PER_STEP]
+            for access in (
+                fprd(station, Register.AL_STATUS, AlStatus.SIZE),
+                fprd(station, Register.DL_STATUS, DlStatus.SIZE),
+            )
+        ]
+        replies += answers
+    return [
+        (
+            AlStatus.decode(al.data) if al.wkc else AlStatus(0),
+            DlStatus.decode(dl.data) if dl.wkc else DlStatus(),
+        )
+        for al, dl in zip(replies[::2], replies[1::2], strict=True)
+    ]

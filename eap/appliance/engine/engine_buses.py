@@ -1,0 +1,91 @@
+"""All buses of an engine process: made from the handover, started, and brought to rest."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Callable, Mapping
+
+from eap.appliance.engine.bus_desk import BusDesk, ServeStation
+from eap.appliance.engine.bus_settings import master_settings
+from eap.appliance.engine.engine_bus import EngineBus
+from eap.appliance.engine.successor import EngineStation
+from eap.appliance.handover import NO_DESCRIPTOR, BusSocket, Handover
+from eap.net.busport import BusPort
+
+REST_NS = 300_000_000
+"""How long slaves may take to rest when the engine ends."""
+_EPOCH_S = 946_684_800
+"""2000-01-01, from which the clocks of slaves count."""
+
+
+class EngineBuses:
+    """The buses of *stations*, in the order of the handover.
+
+    Attributes:
+        buses: By their numbers in requests.
+        desk: Where services asks for something; None in a test without services.
+        arrivals: What to call when a descriptor is readable.
+    """
+
+    def __init__(
+        self,
+        handover: Handover,
+        stations: Mapping[str, EngineStation],
+        serve_station: ServeStation,
+    ) -> None:
+        self._handover = handover
+        self.buses = [self._make(given, stations[given.owner.station]) for given in handover.buses]
+        self.desk: BusDesk | None = None
+        self.arrivals: dict[int, Callable[[int], None]] = {
+            bus.fileno(): bus.drain for bus in self.buses
+        }
+        if handover.bus_fd != NO_DESCRIPTOR:
+            self.desk = BusDesk(socket.socket(fileno=handover.bus_fd), self.buses, serve_station)
+            self.arrivals[self.desk.fileno()] = self.desk.serve
+
+    def start(self, now_ns: int) -> None:
+        """Begin to bring all buses up."""
+        if self.desk is not None:
+            self.desk.greet()
+        for bus in self.buses:
+            bus.start(now_ns)
+
+    def rest(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        """Bring all slaves to INIT, or as far as they get in REST_NS."""
+        now_ns = clock()
+        end_ns = now_ns + REST_NS
+        tasks = {bus: bus.shut_down(now_ns) for bus in self.buses}
+        while (now_ns := clock()) < end_ns:
+            waiting = [bus for bus, task in tasks.items() if not task.is_done]
+            if not waiting:
+                return
+            times = [end_ns, *(at for bus in waiting if (at := bus.next_timeout()) is not None)]
+            select.select(waiting, [], [], max(0, min(times) - now_ns) / 1e9)
+            for bus in waiting:
+                bus.drain(clock())
+                bus.handle_timeout(clock())
+
+    def close(self) -> None:
+        """Let go of all sockets."""
+        for bus in self.buses:
+            bus.close()
+        if self.desk is not None:
+            self.desk.close()
+
+    def _make(self, given: BusSocket, place: EngineStation) -> EngineBus:
+        port = self._handover.port(given.owner)
+        station = place.station
+        epoch_offset_ns = time.time_ns() - time.monotonic_ns() - _EPOCH_S * 1_000_000_000
+        bus = EngineBus(
+            port,
+            master_settings(port, station.spec.cycle_us, epoch_offset_ns),
+            station.cycle_ns,
+            station.image,
+            station.memory_of,
+            BusPort(socket.socket(fileno=given.engine_fd)),
+        )
+        station.connect_bus(bus)
+        place.buses[port.name] = bus
+        return bus

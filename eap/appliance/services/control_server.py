@@ -1,0 +1,245 @@
+"""The control socket: many clients, each with its requests in order and its subscriptions beside.
+
+Rule: a client can only delay itself.  Nothing is queued for it: a subscription takes its next look
+at the values when the last line has left, and who takes nothing for SLOW_READER_S is disconnected.
+What a client waits for on a bus is cancelled when it leaves, and what it has open there is ended.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import select
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from devicebus.errors import BusError
+from eap.appliance.bus_failure import to_failure
+from eap.appliance.control import (
+    MAX_CLIENTS,
+    MAX_LINE,
+    MAX_SUBSCRIPTIONS,
+    SLOW_READER_S,
+    ErrorCode,
+    Failure,
+    Request,
+    UnsubscribeParameters,
+    decode_request,
+    encode_error,
+    encode_event,
+    encode_failure,
+    encode_result,
+    parameters,
+    request_id,
+)
+from eap.appliance.control_bus import BUS_METHODS
+from eap.appliance.services.bus_methods import BusConnection, Buses
+from eap.appliance.services.methods import Methods, Watch
+from eap.errors import ControlError, ImageError
+from eap.od.abort import SdoAbortError
+
+logger = logging.getLogger(__name__)
+
+
+class ControlServer:
+    """Serve *methods*, and those on *buses*, on a listening Unix socket."""
+
+    def __init__(
+        self, methods: Methods, buses: Buses, *, slow_reader_s: float = SLOW_READER_S
+    ) -> None:
+        self._methods = methods
+        self._buses = buses
+        self._slow_reader_s = slow_reader_s
+        self._clients = 0
+
+    async def serve(self, listener: socket.socket) -> None:
+        """Accept clients until cancelled; *listener* stays open."""
+        listener.setblocking(False)
+        loop = asyncio.get_running_loop()
+        async with asyncio.TaskGroup() as group:
+            while True:
+                try:
+                    connection, _ = await loop.sock_accept(listener)
+                except OSError as exc:
+                    # Out of descriptors: those who wait keep waiting, the plant goes on.
+                    logger.warning("control socket: %s", exc.strerror)
+                    await asyncio.sleep(1)
+                    continue
+                group.create_task(self.serve_client(connection))
+
+    async def serve_client(self, connection: socket.socket) -> None:
+        """Answer one client until it leaves."""
+        loop = asyncio.get_running_loop()
+        reader = _Reader(connection, loop)
+        transport, protocol = await loop.connect_accepted_socket(
+            lambda: asyncio.StreamReaderProtocol(reader, loop=loop), connection
+        )
+        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
+        self._clients += 1
+        bus = BusConnection(self._buses)
+        try:
+            client = _Client(self._methods, bus, writer, self._slow_reader_s)
+            if self._clients > MAX_CLIENTS:
+                reason = f"{MAX_CLIENTS} clients are connected, which is all there is room for"
+                await client.send(encode_error(None, ControlError(reason, code=ErrorCode.BUSY)))
+            else:
+                await client.run(reader)
+        except* (OSError, TimeoutError) as group:
+            logger.debug("control client left: %s", group.exceptions[0])
+        finally:
+            bus.close()
+            self._clients -= 1
+            transport.abort()
+
+
+class _Reader(asyncio.StreamReader):
+    """Reads lines, and notices at once when the client has gone while it waits for an answer."""
+
+    def __init__(self, connection: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__(limit=MAX_LINE, loop=loop)
+        self._connection = connection
+        self._clock = loop.time
+        self._has_gone = False
+        self._wait: asyncio.Timeout | None = None
+
+    @asynccontextmanager
+    async def while_there(self) -> AsyncIterator[None]:
+        """Raise TimeoutError in a block that waits when the client has gone."""
+        self._wait = asyncio.timeout_at(self._clock() if self._has_gone else None)
+        try:
+            async with self._wait:
+                yield
+        finally:
+            self._wait = None
+
+    def feed_eof(self) -> None:
+        """Take the end of what the client sends; it may still wait for answers."""
+        super().feed_eof()
+        poll = select.poll()
+        poll.register(self._connection, 0)
+        if poll.poll(0):  # hung up: not only its sending side is closed
+            self._note_end()
+
+    def set_exception(self, exc: Exception) -> None:
+        """Take the end of a connection that broke."""
+        super().set_exception(exc)
+        self._note_end()
+
+    def _note_end(self) -> None:
+        self._has_gone = True
+        if self._wait is not None:
+            self._wait.reschedule(self._clock())
+
+
+class _Client:
+    def __init__(
+        self,
+        methods: Methods,
+        bus: BusConnection,
+        writer: asyncio.StreamWriter,
+        slow_reader_s: float,
+    ) -> None:
+        self._methods = methods
+        self._bus = bus
+        self._writer = writer
+        self._slow_reader_s = slow_reader_s
+        self._subscriptions: dict[int, asyncio.Task[None]] = {}
+        self._last_subscription = 0
+
+    async def send(self, line: bytes) -> None:
+        """Put one line out, and wait until most of it has gone."""
+        self._writer.write(line)
+        async with asyncio.timeout(self._slow_reader_s):
+            await self._writer.drain()
+
+    async def run(self, reader: _Reader) -> None:
+        async with asyncio.TaskGroup() as group:
+            while line := await self._next_line(reader):
+                await self._answer(line, reader, group)
+            for task in self._subscriptions.values():
+                task.cancel()
+
+    async def _next_line(self, reader: asyncio.StreamReader) -> bytes:
+        """Return the next line, empty at the end or when the client sends no lines."""
+        try:
+            return await reader.readuntil(b"\n")
+        except asyncio.IncompleteReadError:
+            return b""
+        except asyncio.LimitOverrunError:
+            reason = f"a line has at most {MAX_LINE} octets"
+            error = ControlError(reason, code=ErrorCode.BAD_REQUEST)
+            await self.send(encode_error(None, error))
+            return b""
+
+    async def _answer(self, line: bytes, reader: _Reader, group: asyncio.TaskGroup) -> None:
+        number = None
+        try:
+            request = decode_request(line)
+            number = request.id
+            if request.method == "subscribe":
+                await self._subscribe(number, request.params, group)
+                return
+            async with reader.while_there():
+                result = await self._call(request)
+        except TimeoutError:
+            raise
+        except ControlError as exc:
+            await self.send(encode_error(request_id(line) if number is None else number, exc))
+        except ImageError as exc:
+            error = ControlError(str(exc), code=ErrorCode.UNAVAILABLE)
+            await self.send(encode_error(number, error))
+        except BusError as exc:
+            why = to_failure(exc)
+            failure = Failure(ErrorCode.BUS, why.message, why.kind, why.detail)
+            await self.send(encode_failure(number, failure))
+        except SdoAbortError as exc:
+            failure = Failure(ErrorCode.ABORT, str(exc), detail=exc.code)
+            await self.send(encode_failure(number, failure))
+        except Exception:
+            logger.exception("control method failed")
+            error = ControlError("this request failed inside", code=ErrorCode.INTERNAL)
+            await self.send(encode_error(number, error))
+        else:
+            await self.send(encode_result(number, result))
+
+    async def _call(self, request: Request) -> Any:
+        if request.method == "unsubscribe":
+            return self._unsubscribe(request.params)
+        if request.method in BUS_METHODS:
+            return await self._bus.call(request.method, request.params)
+        return await self._methods.call(request.method, request.params)
+
+    async def _subscribe(
+        self, number: int | None, params: dict[str, Any], group: asyncio.TaskGroup
+    ) -> None:
+        if len(self._subscriptions) >= MAX_SUBSCRIPTIONS:
+            reason = f"this connection has {MAX_SUBSCRIPTIONS} subscriptions, which is the limit"
+            raise ControlError(reason, code=ErrorCode.BUSY)
+        watch = self._methods.watch(params)
+        self._last_subscription += 1
+        subscription = self._last_subscription
+        await self.send(encode_result(number, {"subscription": subscription}))
+        self._subscriptions[subscription] = group.create_task(self._events(subscription, watch))
+
+    def _unsubscribe(self, params: dict[str, Any]) -> dict[str, Any]:
+        subscription = parameters(params, UnsubscribeParameters).subscription
+        task = self._subscriptions.pop(subscription, None)
+        if task is None:
+            reason = f"no subscription {subscription} on this connection"
+            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+        task.cancel()
+        return {"unsubscribed": subscription}
+
+    async def _events(self, subscription: int, watch: Watch) -> None:
+        while True:
+            try:
+                event = watch.next_event()
+            except ImageError as exc:
+                event = {"error": {"code": ErrorCode.UNAVAILABLE, "message": str(exc)}}
+            except ControlError as exc:
+                event = {"error": {"code": exc.code, "message": str(exc)}}
+            if event is not None:
+                await self.send(encode_event(subscription, event))
+            await asyncio.sleep(watch.period_ms / 1000)

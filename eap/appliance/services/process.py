@@ -1,0 +1,169 @@
+"""The services process: everything of an appliance that may take its time.
+
+It is started by the supervisor with one argument, the descriptor of its handover.  Whatever happens
+here, the engine goes on: the two share images, and pairs of sockets on which it never waits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+import sys
+from contextlib import ExitStack
+from importlib.metadata import version
+from pathlib import Path
+from time import monotonic_ns
+from typing import Any
+
+from eap.appliance.discards import DiscardCounters
+from eap.appliance.handover import (
+    NO_DESCRIPTOR,
+    Handover,
+    tell_ready,
+)
+from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus_methods import Buses
+from eap.appliance.services.control_server import ControlServer
+from eap.appliance.services.device_methods import DeviceMethods
+from eap.appliance.services.devices import Devices
+from eap.appliance.services.engine_client import EngineClient
+from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.methods import Methods
+from eap.appliance.services.monitor_ways import open_ways
+from eap.appliance.services.monitoring import SubscriberWatch
+from eap.appliance.services.segment_link import SegmentLink
+from eap.appliance.services.sockets import open_doors
+from eap.appliance.services.status import ProcessMeter, appliance_status
+from eap.appliance.station_image import StationImage
+from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
+from eap.net import realtime
+
+IMAGE_PATIENCE_S = 15.0
+STATUS_PATIENCE_S = 0.3
+"""How long ``status`` waits for what the engine says of its buses."""
+RELEASE = version("eap-appliance")
+_IMAGE_PAUSE_S = 0.01
+
+
+class Services:
+    """The objects of one services process, from its start to its end."""
+
+    def __init__(self, handover: Handover, resources: ExitStack) -> None:
+        self._handover = handover
+        self._resources = resources
+        self._folder = ApplianceFolder(Path(handover.folder))
+        self._names = [station.name for station in handover.stations]
+        self._counters = resources.enter_context(
+            DiscardCounters(self._folder.discards("services"), self._names)
+        )
+        self._link = resources.enter_context(socket.socket(fileno=handover.link_fd))
+        self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
+        self._stopping = asyncio.Event()
+
+    async def run(self) -> None:
+        """Serve until SIGTERM."""
+        images = {name: await self._open_image(name) for name in self._names}
+        # Not before: whoever waits for images of an engine that failed just ends.
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
+        link = EngineLink(socket.socket(fileno=self._handover.bus_fd))
+        self._resources.callback(link.close)
+        devices = self._devices(images, link)
+        doors = open_doors(
+            self._handover, devices.desks, self._counters, self._link, self._resources
+        )
+        buses = self._buses(link)
+        methods = self._methods(images, buses, devices)
+        server = ControlServer(methods, buses)
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(server.serve(self._listener))]
+            tasks += [group.create_task(door.serve()) for door in doors]
+            tasks.append(group.create_task(devices.serve()))
+            watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
+            tasks.append(group.create_task(watch.run()))
+            tell_ready(self._handover.ready_fd, {})
+            await self._stopping.wait()
+            for task in tasks:
+                task.cancel()
+
+    async def _open_image(self, station: str) -> StationImage:
+        """Open one image; at the first start the engine is just making it."""
+        deadline_ns = monotonic_ns() + int(IMAGE_PATIENCE_S * 1e9)
+        while True:
+            try:
+                image = StationImage(self._folder.image(station))
+            except ImageError:
+                if monotonic_ns() > deadline_ns:
+                    raise
+            else:
+                self._resources.callback(image.close)
+                return image
+            await asyncio.sleep(_IMAGE_PAUSE_S)
+
+    def _devices(self, images: dict[str, StationImage], link: EngineLink) -> Devices:
+        handover = self._handover
+        engine = EngineClient(link, Path(handover.folder))
+        devices = Devices(
+            handover.plant, handover.stations, handover.states, images, engine, RELEASE
+        )
+        link.on_restart.append(devices.engine_has_restarted)
+        return devices
+
+    def _methods(self, images: dict[str, StationImage], buses: Buses, devices: Devices) -> Methods:
+        meter = ProcessMeter()
+        engine = self._resources.enter_context(
+            DiscardCounters(self._folder.discards("engine"), self._names)
+        )
+        identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
+
+        async def status() -> dict[str, Any]:
+            return appliance_status(
+                self._folder.read_info(),
+                [each.image for each in images.values()],
+                (engine.stats(), self._counters.stats()),
+                meter,
+                await buses.reports(STATUS_PATIENCE_S),
+            )
+
+        return Methods(
+            identity,
+            images,
+            status=status,
+            stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
+            more=DeviceMethods(devices.by_station, self._handover.plant_file).table(),
+        )
+
+    def _buses(self, link: EngineLink) -> Buses:
+        handover = self._handover
+        segments = {}
+        for bus in handover.buses:
+            if bus.command_fd != NO_DESCRIPTOR:
+                segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
+                self._resources.callback(segments[bus.owner].close)
+        client = BusClient(link, [bus.owner for bus in handover.buses])
+        return Buses(handover.stations, client if handover.buses else None, segments)
+
+
+def main() -> int:
+    """Return the exit code: 2 for what this machine or the specification lacks."""
+    handover = Handover.from_descriptor(int(sys.argv[1]))
+    realtime.die_with_parent(handover.supervisor)
+    logging.basicConfig(format="services: %(message)s", level=logging.INFO)
+    try:
+        with ExitStack() as resources:
+            asyncio.run(_serve(handover, resources))
+    except EapError as exc:
+        sys.stderr.write(f"services: {exc}\n")
+        return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
+    return 0
+
+
+async def _serve(handover: Handover, resources: ExitStack) -> None:
+    await Services(handover, resources).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

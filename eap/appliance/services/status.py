@@ -1,0 +1,131 @@
+"""``status --json`` of one appliance: its processes from /proc, its stations from their images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
+from typing import Any
+
+from eap.appliance.bus_request import BusReport
+from eap.appliance.handover import PortName
+from eap.appliance.runtime import ApplianceInfo, ProcessInfo
+from eap.appliance.services.bus_status import bus_document, bus_link
+from eap.errors import EnvironmentalError
+from eap.ids import InterfaceUri
+from eap.net.interface import interface_of, link_is_up
+from eap.pd.image import Image
+from eap.pd.report import station_status
+from eap.pd.spec import PortKind
+from eap.pd.words import StationWord
+
+VERSION = 1
+MIN_SAMPLE_NS = 200_000_000
+"""Two questions closer than this get the same CPU share: the kernel counts in ticks of 10 ms."""
+
+_TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+class ProcessMeter:
+    """CPU share and memory of processes, by pid, between one question and the next."""
+
+    def __init__(self) -> None:
+        self._samples: dict[int, tuple[int, int, float]] = {}
+
+    def measure(self, pid: int, now_ns: int) -> dict[str, Any]:
+        """Return *cpu* in percent of one core and *rss* in octets, both None for one that is gone.
+
+        The share is that since the last question, or since the process started; *now_ns* is on
+        the clock of process start times (CLOCK_BOOTTIME).
+        """
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
+        except (OSError, IndexError):
+            self._samples.pop(pid, None)
+            return {"cpu": None, "rss": None}
+        used_ns = (int(fields[11]) + int(fields[12])) * _TICK_NS
+        started_ns = int(fields[19]) * _TICK_NS
+        at_ns, before_ns, share = self._samples.get(pid, (started_ns, 0, 0.0))
+        if now_ns - at_ns >= MIN_SAMPLE_NS:
+            share = round(100 * (used_ns - before_ns) / (now_ns - at_ns), 1)
+            self._samples[pid] = (now_ns, used_ns, share)
+        return {"cpu": share, "rss": resident}
+
+
+def appliance_status(
+    info: ApplianceInfo,
+    images: Iterable[Image],
+    discarded: Sequence[Mapping[str, Mapping[str, int]]],
+    meter: ProcessMeter,
+    buses: Mapping[PortName, BusReport],
+) -> dict[str, Any]:
+    """Return the whole answer.
+
+    Args:
+        info: What the supervisor tells.
+        images: Of all stations.
+        discarded: What each process turned away, by station.
+        meter: Of the processes.
+        buses: What the engine says of its buses, of none if it does not answer.
+    """
+    now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
+    stations = []
+    for image in images:
+        station = station_status(image, monotonic_ns(), time_ns())
+        station["cycle_age_us"] = _cycle_age_us(image)
+        for port in station["ports"]:
+            if port["kind"] == PortKind.BUS:
+                report = buses.get(PortName(station["name"], port["name"]))
+                port.update(bus_document(report), link=bus_link(report))
+            else:
+                port["link"] = link_state(port["interface"])
+        counts = station["discarded"]
+        for by_station in discarded:
+            for reason, count in by_station.get(image.layout.station, {}).items():
+                counts[reason] = counts.get(reason, 0) + count
+        stations.append(station)
+    engine = _process(info.engine, meter, now_ns)
+    engine["realtime"] = info.engine.report.get("realtime", {})
+    if report := next(iter(buses.values()), None):
+        engine["bus_requests"] = {"malformed": report.malformed, "dropped": report.dropped}
+    processes = {
+        "supervisor": {"pid": info.supervisor, **meter.measure(info.supervisor, now_ns)},
+        "engine": engine,
+        "services": _process(info.services, meter, now_ns),
+    }
+    if info.segments:
+        processes["segments"] = {
+            name: _process(process, meter, now_ns) for name, process in info.segments.items()
+        }
+    return {
+        "version": VERSION,
+        "plant": info.plant,
+        "processes": processes,
+        "stations": stations,
+    }
+
+
+def _cycle_age_us(image: Image) -> int | None:
+    """Return how long ago the last cycle ran, None before the first: a hung engine shows here."""
+    ran_at_ns = image.words[StationWord.CYCLE_AT_NS]
+    return max(monotonic_ns() - ran_at_ns, 0) // 1000 if ran_at_ns else None
+
+
+def link_state(interface: str) -> str:
+    """Return ``up`` or ``down`` for the network interface behind a port's URI."""
+    uri = InterfaceUri.parse(interface)
+    if uri.scheme == "loop":
+        return "up"
+    try:
+        name = uri.host if uri.scheme == "ethernet" else interface_of(uri.host)
+    except EnvironmentalError:
+        return "down"  # the address has been taken from this machine
+    return "up" if link_is_up(name) else "down"
+
+
+def _process(process: ProcessInfo, meter: ProcessMeter, now_ns: int) -> dict[str, Any]:
+    measured = meter.measure(process.pid, now_ns) if process.pid else {"cpu": None, "rss": None}
+    return {"pid": process.pid or None, **measured, "restarts": process.restarts}

@@ -1,0 +1,157 @@
+"""The TCP listener of a station: who connects shows by the first frame where it belongs.
+
+Type 4 goes to the engine, descriptor and all; nothing is read here, so the engine finds the frame
+whole.  Type 5 is answered in this process.  All other connections are closed, and the reason is
+counted at the station.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable, Sequence
+
+from eap.appliance.discards import Refusal
+from eap.appliance.handover import PortName
+from eap.appliance.passing import PassedConnection, pass_connection
+from eap.appliance.services.aoe_desk import AoeDesk
+from eap.appliance.services.mailbox_stream import serve_stream
+from eap.codec.ethercat import EtherCatHeader, FrameType
+
+FIRST_FRAME_S = 5.0
+"""How long a connection may stay silent before its first frame header."""
+MAX_WAITING = 32
+"""Connections of one listener whose first frame has not come yet."""
+MAX_STREAMS = 32
+"""Connections of one listener that carry type 5."""
+_PEEK_PAUSE_S = 0.02
+
+logger = logging.getLogger(__name__)
+
+
+class TcpDoor:
+    """One listening socket and the ports behind it.
+
+    Args:
+        listener: Opened by the supervisor; it stays open.
+        takers: Ports that take type 4 from TCP; may be empty.
+        link: To the engine.
+        refuse: Counts a connection that was closed.
+        desks: Of the stations that answer type 5 here.
+    """
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        takers: tuple[PortName, ...],
+        link: socket.socket,
+        refuse: Callable[[Refusal], None],
+        desks: Sequence[AoeDesk],
+        *,
+        first_frame_s: float = FIRST_FRAME_S,
+    ) -> None:
+        self._listener = listener
+        self._takers = takers
+        self._link = link
+        self._refuse = refuse
+        self._desks = desks
+        self._first_frame_s = first_frame_s
+        self._waiting = 0
+        self._streams = 0
+
+    async def serve(self) -> None:
+        """Accept until cancelled."""
+        self._listener.setblocking(False)
+        loop = asyncio.get_running_loop()
+        async with asyncio.TaskGroup() as group:
+            while True:
+                try:
+                    connection, address = await loop.sock_accept(self._listener)
+                except OSError as exc:
+                    logger.warning("TCP listener: %s", exc.strerror)
+                    await asyncio.sleep(1)
+                    continue
+                peer = f"{address[0]}:{address[1]}"
+                if self._waiting < MAX_WAITING:
+                    self._waiting += 1  # not in the task: a crowd is accepted before it runs
+                    group.create_task(self._sort(connection, peer))
+                else:
+                    self._close(connection, peer, Refusal.TCP_FULL)
+
+    async def _sort(self, connection: socket.socket, peer: str) -> None:
+        try:
+            async with asyncio.timeout(self._first_frame_s):
+                frame_type = await _first_type(connection)
+        except TimeoutError:
+            self._close(connection, peer, Refusal.TCP_SILENT)
+            return
+        except OSError:
+            connection.close()  # it left before it said anything
+            return
+        except asyncio.CancelledError:
+            connection.close()
+            raise
+        finally:
+            self._waiting -= 1
+        if frame_type == FrameType.MAILBOX:
+            await self._serve_stream(connection, peer)
+        else:
+            self._dispatch(connection, peer, frame_type)
+
+    async def _serve_stream(self, connection: socket.socket, peer: str) -> None:
+        if self._streams >= MAX_STREAMS:
+            self._close(connection, peer, Refusal.TCP_FULL)
+            return
+        self._streams += 1
+        try:
+            await serve_stream(connection, self._desks, self._refuse)
+        finally:
+            self._streams -= 1
+
+    def _dispatch(self, connection: socket.socket, peer: str, frame_type: int) -> None:
+        if frame_type != FrameType.PROCESS_DATA:
+            self._close(connection, peer, Refusal.WRONG_TYPE)
+        elif not self._takers:
+            self._close(connection, peer, Refusal.TCP_OFF)
+        elif pass_connection(self._link, connection, PassedConnection(self._takers, peer)):
+            connection.close()
+        else:
+            self._close(connection, peer, Refusal.ENGINE_BUSY)
+
+    def _close(self, connection: socket.socket, peer: str, reason: Refusal) -> None:
+        logger.debug("TCP connection from %s closed: %s", peer, reason)
+        self._refuse(reason)
+        connection.close()
+
+
+async def _first_type(connection: socket.socket) -> int:
+    """Return the type in the first frame header, which stays in the socket.
+
+    Raises:
+        OSError: the peer closed before it sent a whole header.
+    """
+    while True:
+        await _wait_readable(connection)
+        head = connection.recv(EtherCatHeader.SIZE, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        if not head:
+            raise ConnectionError("closed before the first frame")
+        if len(head) == EtherCatHeader.SIZE:
+            return EtherCatHeader.decode(head).type
+        await asyncio.sleep(_PEEK_PAUSE_S)  # one octet stays readable: do not spin on it
+
+
+async def _wait_readable(connection: socket.socket) -> None:
+    loop = asyncio.get_running_loop()
+    readable = loop.create_future()
+    fd = connection.fileno()
+    loop.add_reader(fd, _set_once, readable)
+    try:
+        await readable
+    finally:
+        loop.remove_reader(fd)
+
+
+def _set_once(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)

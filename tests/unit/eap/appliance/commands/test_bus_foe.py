@@ -1,0 +1,88 @@
+"""Files of slaves."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+
+import pytest
+
+from devicebus.errors import FoeError
+from eap.appliance.commands.bus_foe import exchange, get_file, put_file
+from eap.errors import ConfigError, EnvironmentalError
+from tests.support.loopbus import LoopBus
+
+CONTENT = random.Random(1).randbytes(50_000)
+
+
+@pytest.fixture
+def bus():
+    with LoopBus("drive").session() as session:
+        yield session
+
+
+@pytest.fixture
+def reports():
+    return []
+
+
+def get(bus, name, target, reports):
+    def report(done, total):
+        reports.append((done, total))
+
+    return get_file(bus, "drive", name, target, password=0, report=report)
+
+
+def put(bus, source, name, reports):
+    def report(done, total):
+        reports.append((done, total))
+
+    return put_file(bus, "drive", source, name, password=0, report=report)
+
+
+def test_there_and_back(bus, tmp_path, reports):
+    source, target = tmp_path / "a.bin", tmp_path / "b.bin"
+    source.write_bytes(CONTENT)
+    there = put(bus, source, "firmware.bin", reports)
+    assert reports[0][1] == reports[-1][0] == len(CONTENT)
+    back = get(bus, "firmware.bin", target, reports)
+    assert reports[-1] == (len(CONTENT), len(CONTENT))
+    assert target.read_bytes() == CONTENT
+    digest = hashlib.sha256(CONTENT).hexdigest()
+    for row in (there, back):
+        assert (row["octets"], row["sha256"], row["name"]) == (50_000, digest, "firmware.bin")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bin", "b.bin"]
+
+
+def test_file_that_the_slave_lacks(bus, tmp_path, reports):
+    target = tmp_path / "kept.bin"
+    target.write_bytes(b"as it was")
+    with pytest.raises(FoeError, match="file not found"):
+        get(bus, "nothing.bin", target, reports)
+    assert target.read_bytes() == b"as it was"
+    assert [path.name for path in tmp_path.iterdir()] == ["kept.bin"]
+
+
+def test_files_of_this_machine_that_do_not_work(bus, tmp_path, reports):
+    with pytest.raises(EnvironmentalError, match="cannot be read"):
+        put(bus, tmp_path / "nothing", "firmware.bin", reports)
+    with pytest.raises(EnvironmentalError, match="cannot be written"):
+        get(bus, "firmware.bin", tmp_path / "no" / "folder", reports)
+
+
+def test_name_that_does_not_fit_the_mailbox(bus, tmp_path, reports):
+    source = tmp_path / "a.bin"
+    source.write_bytes(CONTENT)
+    with pytest.raises(ConfigError, match="file 'xxx"):
+        put(bus, source, "x" * 2000, reports)
+    with pytest.raises(ConfigError, match="file 'xxx"):
+        get(bus, "x" * 2000, tmp_path / "b", reports)
+
+
+def test_vendor_message_is_echoed(bus):
+    assert exchange(bus, "drive", 0x1234, 5, b"\1\2\3") == {
+        "slave": 1001,
+        "vendor_id": 0x1234,
+        "vendor_type": 5,
+        "data": "010203",
+    }

@@ -1,0 +1,102 @@
+"""What a bus tells about its slaves."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import BusError, SiiError
+from devicebus.wire import sii
+from eap.appliance.commands.bus_info import (
+    diagnosis,
+    read_eeprom,
+    scan_rows,
+    state_rows,
+    write_eeprom,
+)
+from tests.support.loopbus import LoopBus
+
+
+@pytest.fixture
+def line():
+    return LoopBus("coe")
+
+
+def test_scan(line):
+    with line.session() as bus:
+        rows = scan_rows(bus)
+    assert rows[2] == {
+        "address": 1003,
+        "name": "sensor",
+        "vendor": 0xE5A,
+        "product": 0x0BBC3052,
+        "revision": 0x10000,
+        "serial": 0,
+        "alias": 0,
+        "state": "INIT",
+        "code": 0,
+        "mailbox": ["CoE"],
+        "parent": 1,
+        "ports": [0],
+        "fault": "",
+    }
+    assert [row["parent"] for row in rows] == [None, 0, 1]
+
+
+def test_states(line):
+    with line.session() as bus:
+        assert [row["state"] for row in state_rows(bus, None, None)] == ["INIT"] * 3
+        assert [row["state"] for row in state_rows(bus, None, "PREOP")] == ["PREOP"] * 3
+        (row,) = state_rows(bus, "sensor", "SAFEOP")
+        assert (row["address"], row["state"], row["reason"]) == (1003, "SAFEOP", "")
+
+
+def test_slave_that_refused_says_why(line):
+    line.fault(kind="refuse", slave="sensor", state="PREOP", code=0x51)
+    with line.session() as bus:
+        with pytest.raises(BusError):
+            state_rows(bus, "sensor", "PREOP")
+        (row,) = state_rows(bus, "sensor", None)
+    assert (row["state"], row["code"], row["reason"]) == ("INIT+ERROR", 0x51, "EEPROM error")
+
+
+def test_diagnosis_of_a_sound_bus(line):
+    with line.session() as bus:
+        found = diagnosis(bus, None)
+    assert found["starts_at"] is None
+    assert found["frames"]["lost"] == 0
+    slave = found["slaves"][1]
+    assert (slave["address"], slave["name"], slave["state"]) == (1002, "buttons", "INIT")
+    assert [port["is_open"] for port in slave["ports"]] == [True, True, False, False]
+
+
+def test_diagnosis_names_where_damage_starts(line):
+    memory = line.segment.segment.slaves[1].esc.memory
+    memory[0x0300] = 3
+    memory[0x0311] = 2
+    with line.session() as bus:
+        found = diagnosis(bus, None)
+        (only,) = diagnosis(bus, "buttons")["slaves"]
+    assert found["starts_at"] == {"slave": 1002, "name": "buttons", "port": 0, "neighbour": 1001}
+    assert only["ports"][0]["invalid_frames"] == 3
+    assert only["ports"][1]["lost_links"] == 2
+
+
+def test_eeprom_there_and_back(line):
+    with line.session() as bus:
+        content, image = read_eeprom(bus, "sensor")
+        assert (content["name"], content["vendor"], content["intact"]) == ("sensor", 0xE5A, True)
+        assert content["octets"] == len(image)
+        changed = bytearray(image)
+        changed[8] = 7  # the alias
+        changed[sii.CHECKED] = sii.checksum(changed[: sii.CHECKED])
+        written = write_eeprom(bus, "sensor", bytes(changed))
+        assert written == {"address": 1003, "name": "sensor", "octets": len(image)}
+        assert read_eeprom(bus, "sensor")[1] == changed
+
+
+def test_image_that_no_slave_would_load(line):
+    with line.session() as bus:
+        image = bytearray(read_eeprom(bus, "sensor")[1])
+        image[0] ^= 1
+        with pytest.raises(SiiError, match="check sum"):
+            write_eeprom(bus, "sensor", bytes(image))

@@ -1,0 +1,265 @@
+"""Requests of services: each is answered once, and none of them disturbs the bus."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+import msgspec
+import pytest
+
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import Command
+from devicebus.wire.register import Register
+from eap.appliance.bus_request import (
+    Answer,
+    AskMailbox,
+    Bring,
+    Cancel,
+    Datagram,
+    Describe,
+    Failure,
+    FromEngine,
+    Hello,
+    Ping,
+    Transfer,
+)
+from eap.appliance.engine.bus_desk import MAX_OUTSTANDING, MAX_PER_SLAVE, PER_WAKE_UP, BusDesk
+from eap.appliance.station_request import Configure, SetState
+from eap.codec.mailbox import MailboxType
+from eap.errors import EngineRefusedError
+from tests.support.cyclic import MS
+from tests.support.enginebus import BusRig
+
+pytestmark = pytest.mark.net
+
+UPLOAD = bytes.fromhex("0020 40 1810 01 00000000")
+"""SDO upload of 0x1018:01."""
+SECOND = 1_000_000_000
+
+
+class Office:
+    """A desk in front of one bus, and services at the other end of the pair."""
+
+    def __init__(self, rig):
+        self.rig = rig
+        self.services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.services.setblocking(False)
+        self.desk = BusDesk(engine, [rig.bus], self.serve_station)
+        self.heard = {}
+        self.asked = []
+
+    def serve_station(self, request, now_ns, reply):
+        """Refuse what concerns one station, and do everything else."""
+        self.asked.append((request, now_ns))
+        reply(EngineRefusedError("not now") if request.station == "two" else None)
+
+    def post(self, *requests):
+        for request in requests:
+            self.services.send(msgspec.msgpack.encode(request))
+        for _ in range(-(-len(requests) // PER_WAKE_UP)):
+            self.desk.serve(self.rig.now_ns)
+
+    def collect(self):
+        decoder = msgspec.msgpack.Decoder(FromEngine)
+        while True:
+            try:
+                message = decoder.decode(self.services.recv(1 << 20))
+            except BlockingIOError:
+                return self.heard
+            assert message.id not in self.heard
+            self.heard[message.id] = message
+
+    def ask(self, request, limit_ns=5 * SECOND):
+        """Post one request and return its answer."""
+        self.post(request)
+        self.rig.wait(lambda: request.id in self.collect(), limit_ns)
+        return self.heard[request.id]
+
+    def close(self):
+        self.services.close()
+        self.desk.close()
+
+
+@pytest.fixture
+def office(tmp_path):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    made = Office(rig)
+    yield made
+    made.close()
+
+
+def ask(number, station=1002, request=UPLOAD, kind=MailboxType.COE, **more):
+    more.setdefault("timeout_ns", SECOND)
+    return AskMailbox(id=number, bus=0, station=station, type=kind, request=request, **more)
+
+
+def read(number, *commands, adp=1002, ado=Register.AL_STATUS):
+    datagrams = tuple(Datagram(command, adp, ado, bytes(2), 3) for command in commands)
+    return Transfer(id=number, bus=0, datagrams=datagrams)
+
+
+def test_a_new_engine_greets(office):
+    office.desk.greet()
+    message = msgspec.msgpack.decode(office.services.recv(100), type=FromEngine)
+    assert message == Hello(os.getpid())
+
+
+def test_a_bus_is_described(office):
+    answer = office.ask(Describe(id=7, bus=0))
+    assert answer.report.is_up
+    assert [(each.station, each.name, each.state) for each in answer.report.slaves] == [
+        (1001, "coupler", AlState.OP),
+        (1002, "io", AlState.OP),
+        (1003, "level", AlState.OP),
+    ]
+
+
+def test_a_mailbox_answers(office):
+    answer = office.ask(ask(1))
+    assert answer == Answer(id=1, data=bytes.fromhex("0030 43 1810 01 5a0e0000"))
+
+
+def test_what_needs_no_reply_is_answered_when_it_is_sent(office):
+    abort = bytes.fromhex("0020 80 1810 01 00000008")
+    assert office.ask(ask(1, request=abort, expects_reply=False)) == Answer(id=1)
+
+
+def test_who_listens_gets_what_comes(office):
+    answer = office.ask(ask(3, listen=True, timeout_ns=20 * MS))
+    assert answer.failure.kind == "MailboxTimeoutError"
+    assert "no COE reply within 20 ms" in answer.failure.message
+
+
+def test_a_slave_without_a_mailbox_says_so_at_once(office):
+    failure = office.ask(ask(1, station=1003)).failure
+    assert "slave 1003 (level) has no mailbox" in failure.message
+    assert "no slave 1234" in office.ask(ask(2, station=1234)).failure.message
+    assert "no mailbox protocol 14" in office.ask(ask(3, kind=14)).failure.message
+
+
+def test_datagrams_are_sent_together(office):
+    answer = office.ask(read(1, Command.FPRD, Command.BRD))
+    assert [(each.wkc, each.data[0], each.tries) for each in answer.outcomes] == [
+        (1, AlState.OP, 1),
+        (3, AlState.OP, 1),
+    ]
+
+
+def test_lost_datagrams_are_an_answer_too(office):
+    office.rig.wire.is_deaf = True
+    assert office.ask(read(1, Command.FPRD)).failure.kind == "FrameLostError"
+
+
+@pytest.mark.parametrize(
+    "command", [Command.BWR, Command.BRW, Command.LRW, Command.LWR, Command.LRD, Command.FRMW, 77]
+)
+def test_what_disturbs_others_is_refused(office, command):
+    failure = office.ask(read(1, Command.FPRD, command)).failure
+    assert f"command {int(command)}: it would disturb" in failure.message
+
+
+@pytest.mark.parametrize(
+    ("request_", "reason"),
+    [
+        (Transfer(id=1, bus=0, datagrams=()), "0 datagrams, expected 1 to 256"),
+        (read(1, *[Command.NOP] * 257), "257 datagrams"),
+        (read(1, Command.FPRD, ado=0x10000), "expected addresses of 16 bits"),
+        (Transfer(id=1, bus=0, datagrams=(Datagram(4, 1, 1, b"", 1),)), "with 0 octets"),
+        (Describe(id=1, bus=1), "no bus 1, there are 1"),
+        (Describe(id=1, bus=-1), "no bus -1"),
+        (Bring(id=1, bus=0, station=0, target=5), "no state 5, expected"),
+        (Bring(id=1, bus=0, station=9, target=8), "no slave 9"),
+    ],
+)
+def test_what_cannot_be_is_refused(office, request_, reason):
+    assert reason in office.ask(request_).failure.message
+
+
+def test_slaves_are_brought_and_kept(office):
+    assert office.ask(Bring(id=1, bus=0, station=1003, target=AlState.PREOP)).failure is None
+    office.rig.run(2 * MS)
+    assert office.rig.value("level.state") == AlState.PREOP
+    assert office.ask(Bring(id=2, bus=0, station=0, target=AlState.SAFEOP)).failure is None
+    office.rig.run(300 * MS)
+    assert office.rig.value("state") == AlState.SAFEOP
+
+
+def test_messages_that_are_none_are_counted(office):
+    office.services.send(b"\xc1")
+    office.services.send(msgspec.msgpack.encode({"do": "everything"}))
+    office.post(Describe(id=1, bus=0))
+    assert office.desk.malformed == 2
+    report = office.collect()[1].report
+    assert (report.malformed, report.dropped) == (2, 0)
+
+
+def test_only_some_are_taken_at_a_time(office):
+    for number in range(PER_WAKE_UP + 3):
+        office.services.send(msgspec.msgpack.encode(Describe(id=number, bus=0)))
+    office.desk.serve(office.rig.now_ns)
+    assert len(office.collect()) == PER_WAKE_UP
+    office.desk.serve(office.rig.now_ns)
+    assert len(office.collect()) == PER_WAKE_UP + 3
+
+
+def test_one_slave_has_so_many_requests_and_the_others_theirs(office):
+    office.post(*[ask(number) for number in range(MAX_PER_SLAVE + 1)])
+    office.post(ask(1000, station=1001))
+    heard = office.collect()
+    assert list(heard) == [MAX_PER_SLAVE]
+    assert "64 requests to slave 1002 are under way" in heard[MAX_PER_SLAVE].failure.message
+    office.rig.wait(lambda: len(office.collect()) == MAX_PER_SLAVE + 2)
+    assert sum(1 for each in office.heard.values() if each.failure is None) == MAX_PER_SLAVE + 1
+    assert office.ask(ask(2000)).failure is None
+
+
+def test_all_together_have_an_end_too(office, monkeypatch):
+    monkeypatch.setattr("eap.appliance.engine.bus_desk.MAX_OUTSTANDING", 3)
+    assert MAX_OUTSTANDING == 1024
+    office.post(ask(1), ask(2), ask(3, station=1001), read(4, Command.FPRD))
+    assert "3 requests are under way already" in office.collect()[4].failure.message
+
+
+def test_who_cancels_hears_nothing_more(office):
+    office.post(ask(1, listen=True), ask(2), Cancel(id=1), Cancel(id=99))
+    office.rig.wait(lambda: 2 in office.collect())
+    office.rig.run(1500 * MS)
+    assert list(office.collect()) == [2]
+    assert office.rig.bus.tasks == set()
+
+
+def test_a_number_that_comes_again_is_somebody_elses(office):
+    office.post(ask(5, listen=True), ask(5))
+    office.rig.wait(lambda: 5 in office.collect())
+    assert office.heard[5].data[:3] == bytes.fromhex("003043")
+
+
+def test_answers_that_nobody_reads_are_dropped(office):
+    for number in range(2000):
+        office.services.send(msgspec.msgpack.encode(Describe(id=number, bus=0)))
+        office.desk.serve(office.rig.now_ns)
+    assert office.desk.dropped > 0
+    read_ = len(office.collect())
+    assert read_ + office.desk.dropped == 2000
+    assert office.ask(ask(5000)).failure is None
+    assert office.ask(Describe(id=5001, bus=0)).report.dropped == office.desk.dropped
+
+
+def test_without_services_nothing_happens(office):
+    office.services.close()
+    office.desk.serve(office.rig.now_ns)
+    office.desk.greet()
+    assert office.desk.dropped == 1
+
+
+def test_what_is_asked_of_a_station_is_passed_on_and_answered_when_it_is_done(office):
+    configure = Configure(id=1, station="one", path="/a.spec")
+    refused = SetState(id=2, station="two", state=4)
+    office.post(configure, refused, Ping(id=3))
+    assert office.asked == [(configure, office.rig.now_ns), (refused, office.rig.now_ns)]
+    answers = office.collect()
+    assert answers[1] == Answer(id=1)
+    assert answers[2].failure == Failure("EngineRefusedError", "not now")
+    assert answers[3] == Answer(id=3)

@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import pytest
+
+from devicebus.master.event import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
+from eap.appliance.engine.bus_faults import SlaveFaults
+
+
+class Master:
+    def __init__(self, *events):
+        self._events = list(events)
+
+    def next_event(self):
+        return self._events.pop(0) if self._events else None
+
+
+@pytest.mark.parametrize(
+    ("event", "text"),
+    [
+        (SlaveLost(1001, 1), "it does not answer"),
+        (SlaveFailed(1001, "it refuses", 1), "it refuses"),
+        (
+            SlaveLeft(1001, 0x14, 0x1B, 1),
+            "it went to SAFEOP+ERROR by itself: AL status code 0x001B, sync manager watchdog",
+        ),
+        (SlaveLeft(1001, 0x01, 0, 1), "it went to INIT by itself"),
+        (BusLost(1), ""),
+    ],
+)
+def test_what_happened_has_words(event, text):
+    faults = SlaveFaults()
+    faults.take_events(Master(event))
+    assert faults.of(1001) == text
+    assert faults.of(1002) == ""
+
+
+def test_the_last_counts_until_the_slave_is_back():
+    faults = SlaveFaults()
+    faults.take_events(Master(SlaveLost(1001, 1), SlaveLost(1002, 1), SlaveFailed(1001, "x", 2)))
+    assert (faults.of(1001), faults.of(1002)) == ("x", "it does not answer")
+    faults.take_events(Master(SlaveBack(1001, 1, 3)))
+    assert (faults.of(1001), faults.of(1002)) == ("", "it does not answer")

@@ -1,0 +1,302 @@
+"""The control server with real clients over socket pairs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+
+import pytest
+
+from eap.appliance.control import MAX_LINE, MAX_SUBSCRIPTIONS
+from eap.appliance.services import control_server
+from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus_methods import Buses
+from eap.appliance.services.control_server import ControlServer
+from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.methods import Methods, Watch
+from eap.errors import ControlError, TornReadError
+from eap.od.abort import AbortCode, SdoAbortError
+from eap.pd.spec import PortKind, PortSpec, StationSpec
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.loopbus import LoopBus
+
+pytestmark = pytest.mark.net
+
+
+async def torn():
+    raise TornReadError("torn", writer="engine")
+
+
+@pytest.fixture
+def methods(images):
+    return Methods({"plant": "demo"}, images, status=torn, stop=lambda: 1 / 0)
+
+
+NO_BUSES = Buses((), None, {})
+
+
+class Talk:
+    """One client of a server, both in one loop."""
+
+    def __init__(self, server: ControlServer) -> None:
+        self._server = server
+
+    async def __aenter__(self):
+        ours, theirs = socket.socketpair()
+        self.task = asyncio.ensure_future(self._server.serve_client(theirs))
+        self.reader, self.writer = await asyncio.open_unix_connection(sock=ours, limit=2 * MAX_LINE)
+        return self
+
+    async def __aexit__(self, *_):
+        self.writer.close()
+        await asyncio.wait_for(self.task, 5)
+
+    def say(self, line: str | bytes) -> None:
+        self.writer.write((line.encode() if isinstance(line, str) else line) + b"\n")
+
+    async def hear(self) -> dict:
+        return json.loads(await asyncio.wait_for(self.reader.readline(), 5))
+
+    async def ask(self, method: str, **params) -> dict:
+        self.say(json.dumps({"v": 1, "id": 1, "method": method, "params": params}))
+        return await self.hear()
+
+
+def test_requests_are_answered_in_order(methods):
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            for number in range(3):
+                client.say(f'{{"v":1,"id":{number},"method":"hello"}}')
+            assert [(await client.hear())["id"] for _ in range(3)] == [0, 1, 2]
+
+    asyncio.run(talk())
+
+
+def test_refusals_keep_the_connection(methods):
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            client.say("what?")
+            assert (await client.hear())["error"]["code"] == "bad_request"
+            client.say('{"v":2,"id":7,"method":"hello"}')
+            answer = await client.hear()
+            assert (answer["id"], answer["error"]["code"]) == (7, "version")
+            assert (await client.ask("helo"))["error"]["code"] == "unknown_method"
+            assert (await client.ask("status"))["error"]["code"] == "unavailable"
+            assert (await client.ask("stop"))["error"]["code"] == "internal"
+            assert (await client.ask("hello"))["result"]["plant"] == "demo"
+
+    asyncio.run(talk())
+
+
+def test_refusals_of_dictionaries_carry_their_abort_code(images):
+    def refuse(params):
+        raise SdoAbortError(AbortCode.NO_OBJECT, 0x2000, 1)
+
+    methods = Methods({}, images, status=torn, stop=lambda: None, more={"od_read": refuse})
+
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            error = (await client.ask("od_read"))["error"]
+            assert (error["code"], error["detail"]) == ("abort", 0x06020000)
+            assert error["message"].startswith("0x2000:01: object does not exist")
+
+    asyncio.run(talk())
+
+
+def test_a_line_without_end_is_refused_and_ends_the_connection(methods):
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            client.say(b"x" * (MAX_LINE + 1))
+            assert str(MAX_LINE) in (await client.hear())["error"]["message"]
+            assert await client.reader.read() == b""
+
+    asyncio.run(talk())
+
+
+def test_subscriptions_run_beside_requests_until_unsubscribed(methods):
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            answer = await client.ask("subscribe", station="left", names=["name"], period_ms=10)
+            number = answer["result"]["subscription"]
+            event = await client.hear()
+            assert event["subscription"] == number
+            assert event["event"]["values"] == {"name": "abc"}
+            assert (await client.hear())["subscription"] == number
+            client.say('{"v":1,"id":5,"method":"hello"}')
+            while "result" not in (answer := await client.hear()):
+                assert answer["subscription"] == number
+            assert answer["id"] == 5
+            params = json.dumps({"subscription": number})
+            client.say(f'{{"v":1,"id":6,"method":"unsubscribe","params":{params}}}')
+            while "result" not in (answer := await client.hear()):
+                pass
+            assert answer["result"] == {"unsubscribed": number}
+            again = await client.ask("unsubscribe", subscription=number)
+            assert again["error"]["code"] == "unknown_name"
+
+    asyncio.run(talk())
+
+
+@pytest.mark.parametrize(
+    ("exc", "code"),
+    [
+        (TornReadError("torn", writer="engine"), "unavailable"),
+        (ControlError("gone", code="unknown_name"), "unknown_name"),
+    ],
+)
+def test_a_subscription_outlives_what_cannot_be_read(methods, monkeypatch, exc, code):
+    def fail(self):
+        raise exc
+
+    async def talk():
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
+            with monkeypatch.context() as patch:
+                patch.setattr(Watch, "next_event", fail)
+                await client.ask("subscribe", station="left", names=["name"], period_ms=10)
+                assert (await client.hear())["event"]["error"]["code"] == code
+            while "error" in (event := (await client.hear())["event"]):
+                pass
+            assert event["values"] == {"name": "abc"}
+
+    asyncio.run(talk())
+
+
+def test_there_are_limits_on_subscriptions_and_clients(methods, monkeypatch):
+    monkeypatch.setattr(control_server, "MAX_CLIENTS", 1)
+
+    async def talk():
+        server = ControlServer(methods, NO_BUSES)
+        async with Talk(server) as client:
+            for _ in range(MAX_SUBSCRIPTIONS):
+                answer = await client.ask("subscribe", station="left", on="change", names=["name"])
+                assert "result" in answer
+                await client.hear()
+            answer = await client.ask("subscribe", station="left")
+            assert answer["error"]["code"] == "busy"
+            async with Talk(server) as second:
+                assert (await second.hear())["error"]["code"] == "busy"
+                assert await second.reader.read() == b""
+        async with Talk(server) as third:
+            assert "result" in await third.ask("hello")
+
+    asyncio.run(talk())
+
+
+def test_who_does_not_read_is_disconnected(methods):
+    async def talk():
+        server = ControlServer(methods, NO_BUSES, slow_reader_s=0.05)
+        ours, theirs = socket.socketpair()
+        with ours:
+            ours.sendall(b'{"v":1,"method":"variables","params":{"station":"left"}}\n' * 2000)
+            await asyncio.wait_for(server.serve_client(theirs), 10)
+
+    asyncio.run(talk())
+
+
+def test_a_listener_serves_many(methods, tmp_path):
+    async def talk():
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(tmp_path / "control"))
+            listener.listen()
+            serving = asyncio.ensure_future(ControlServer(methods, NO_BUSES).serve(listener))
+            for _ in range(2):
+                reader, writer = await asyncio.open_unix_connection(str(tmp_path / "control"))
+                writer.write(b'{"v":1,"id":1,"method":"hello"}\n')
+                assert json.loads(await reader.readline())["id"] == 1
+                writer.close()
+                await writer.wait_closed()
+            serving.cancel()
+            await asyncio.wait([serving])
+
+    asyncio.run(talk())
+
+
+class Slow:
+    """Methods that wait, and what became of those who waited."""
+
+    def __init__(self) -> None:
+        self.outcomes = []
+        self.begun = asyncio.Event()
+
+    async def wait(self):
+        self.begun.set()
+        try:
+            await asyncio.sleep(0.2)
+        except asyncio.CancelledError:
+            self.outcomes.append("cancelled")
+            raise
+        self.outcomes.append("answered")
+        return {}
+
+
+STATUS = b'{"v":1,"id":1,"method":"status"}\n'
+
+
+@pytest.mark.parametrize("rest", [b"", STATUS * 3, b'{"v":1'])
+def test_who_leaves_is_not_waited_for(files, rest):
+    async def talk():
+        slow = Slow()
+        methods = Methods({}, files, status=slow.wait, stop=lambda: None)
+        server = ControlServer(methods, NO_BUSES)
+        ours, theirs = socket.socketpair()
+        with ours:
+            serving = asyncio.ensure_future(server.serve_client(theirs))
+            ours.sendall(STATUS + rest)
+            await slow.begun.wait()
+        await asyncio.wait_for(serving, 0.1)
+        assert slow.outcomes == ["cancelled"]
+
+    asyncio.run(talk())
+
+
+def test_who_only_stops_sending_gets_answers(files):
+    async def talk():
+        slow = Slow()
+        methods = Methods({}, files, status=slow.wait, stop=lambda: None)
+        ours, theirs = socket.socketpair()
+        with ours:
+            ours.sendall(STATUS)
+            ours.shutdown(socket.SHUT_WR)
+            await asyncio.wait_for(ControlServer(methods, NO_BUSES).serve_client(theirs), 5)
+            assert ours.recv(100) == b'{"v":1,"id":1,"result":{}}\n'
+        assert slow.outcomes == ["answered"]
+
+    asyncio.run(talk())
+
+
+def test_what_was_sent_before_leaving_is_done(files):
+    async def talk():
+        stopped = []
+        methods = Methods({}, files, status=torn, stop=lambda: stopped.append(True))
+        ours, theirs = socket.socketpair()
+        with ours:
+            ours.sendall(b'{"v":1,"id":1,"method":"stop"}\n')
+        await asyncio.wait_for(ControlServer(methods, NO_BUSES).serve_client(theirs), 5)
+        assert stopped == [True]
+
+    asyncio.run(talk())
+
+
+def test_errors_of_a_bus_keep_kind_and_detail(methods):
+    async def talk():
+        engine = FakeEngine(FakeBus(LoopBus("drive")))
+        link = EngineLink(engine.services)
+        port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1")
+        station = StationSpec("left", "1.1.1.1.1.1", 10_000, (port,))
+        buses = Buses((station,), BusClient(link, [PORT]), {})
+        where = {"station": "left", "port": "bus0"}
+        async with Talk(ControlServer(methods, buses)) as client:
+            answer = await client.ask("bus_open", **where, slave=1009, protocol="coe")
+            assert answer["result"] == {"conversation": 1}
+            answer = await client.ask("bus_ask", conversation=1, request="00")
+            assert answer["error"]["code"] == "bus"
+            assert answer["error"]["kind"] == "BusError"
+            assert "no slave 1009" in answer["error"]["message"]
+            engine.buses[0].line.fault(kind="refuse", slave="drive", state="SAFEOP", code=0x1B)
+            error = (await client.ask("bus_bring", **where, state="SAFEOP"))["error"]
+            assert (error["kind"], error["detail"]) == ("AlStatusError", 2 << 16 | 0x1B)
+        link.close()
+        engine.close()
+
+    asyncio.run(talk())

@@ -1,0 +1,94 @@
+"""Frames of type 5 as datagrams and on Ethernet: who is answered, and how."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from eap.appliance.discards import Refusal
+from eap.appliance.services.mailbox_intake import MailboxIntake, judge
+from tests.support import aoe
+
+TARGET = "1.1.1.1.2.1"
+
+
+class Wire:
+    """A channel that keeps what it is to send, and an origin."""
+
+    def __init__(self, headroom: bytes = b"", minimum_size: int = 0, sender: str = "peer") -> None:
+        self.minimum_size = minimum_size
+        self.sent: list[tuple[str, bytes]] = []
+        self._headroom = headroom
+        self._sender = sender
+
+    def link_header(self, destination):
+        return destination.encode() + self._headroom if self._headroom else b""
+
+    def send(self, frames, now_ns):
+        self.sent += [(frame.destination, bytes(frame.buffer)) for frame in frames]
+        return ()
+
+    def sender_of(self, data):
+        return self._sender
+
+
+def tell(wire: Wire, frame: bytes, *, for_many: bool = False) -> Refusal | None:
+    desk = aoe.echoing_desk(TARGET)
+    intake = MailboxIntake([desk], wire, 1472, lambda data: for_many)
+
+    async def run():
+        serving = asyncio.ensure_future(desk.serve())
+        padded = memoryview(frame + bytes(20))
+        reason = intake.take(padded, len(frame), 0, wire)
+        await desk.wait_idle()
+        serving.cancel()
+        return reason
+
+    return asyncio.run(run())
+
+
+def ask(target: str = TARGET, **more) -> bytes:
+    return aoe.frame(aoe.packet(target, 4, b"abc"), **more)
+
+
+def test_answer_goes_to_the_sender():
+    wire = Wire()
+    assert tell(wire, ask()) is None
+    ((destination, frame),) = wire.sent
+    assert destination == "peer"
+    assert aoe.answer(frame).data == b"\4cba"
+
+
+def test_answer_has_the_headers_and_the_size_that_its_wire_wants():
+    wire = Wire(b"!", 90)
+    tell(wire, ask())
+    ((_, frame),) = wire.sent
+    assert frame.startswith(b"peer!")
+    assert len(frame) == 90
+    assert aoe.answer(frame[5:]).data == b"\4cba"
+
+
+def test_who_has_no_address_gets_no_answer():
+    wire = Wire(sender="")
+    assert tell(wire, ask()) is Refusal.MAILBOX
+    assert wire.sent == []
+
+
+@pytest.mark.parametrize(("for_many", "answers"), [(False, 1), (True, 0)])
+def test_stranger_is_told_unless_many_were_asked(for_many, answers):
+    wire = Wire()
+    assert tell(wire, ask("9.9.9.9.9.9"), for_many=for_many) is None
+    assert len(wire.sent) == answers
+
+
+def test_what_is_not_taken_has_a_reason():
+    assert tell(Wire(), ask(kind=3)) is Refusal.MAILBOX
+
+
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [(ask(), None), (ask(kind=3), Refusal.MAILBOX), (ask()[:-1], Refusal.TRUNCATED)],
+)
+def test_frame_that_another_intake_takes_is_only_judged(frame, reason):
+    assert judge(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason

@@ -1,0 +1,120 @@
+"""Frames of type 5 over a TCP connection."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+import pytest
+
+from eap.aoe.answer import AmsAnswer
+from eap.appliance.discards import Refusal
+from eap.appliance.services import mailbox_stream
+from eap.appliance.services.aoe_desk import AoeDesk
+from eap.appliance.services.mailbox_stream import serve_stream
+from eap.ids import NetId
+from tests.support import aoe
+
+pytestmark = pytest.mark.net
+
+TARGET = "1.1.1.1.2.1"
+
+
+def ask(body: bytes = b"abc", number: int = 1) -> bytes:
+    return aoe.frame(aoe.packet(TARGET, 4, body, invoke_id=number))
+
+
+def talk(script, desk: AoeDesk | None = None) -> list[Refusal]:
+    """Run ``script(reader, writer)`` on a connection that is being served."""
+    desk = desk or aoe.echoing_desk(TARGET)
+    refused: list[Refusal] = []
+
+    async def run():
+        ours, theirs = socket.socketpair()
+        serving = asyncio.ensure_future(desk.serve())
+        stream = asyncio.ensure_future(serve_stream(theirs, [desk], refused.append))
+        reader, writer = await asyncio.open_connection(sock=ours)
+        try:
+            await script(reader, writer)
+        finally:
+            writer.close()
+            await asyncio.wait_for(stream, 5)
+            serving.cancel()
+
+    asyncio.run(run())
+    return refused
+
+
+async def hear(reader: asyncio.StreamReader) -> aoe.Answer:
+    head = await asyncio.wait_for(reader.readexactly(2), 5)
+    return aoe.answer(head + await reader.readexactly((head[0] | head[1] << 8) & 0x7FF))
+
+
+def test_frames_are_cut_by_their_length():
+    async def script(reader, writer):
+        octets = ask(b"1", 1) + ask(b"2" * 1500, 2) + ask(b"3", 3)
+        for at in (0, 1, 5, 60, 700):
+            following = {0: 1, 1: 5, 5: 60, 60: 700, 700: len(octets)}[at]
+            writer.write(octets[at:following])
+            await writer.drain()
+            await asyncio.sleep(0.01)
+        assert [(await hear(reader)).invoke_id for _ in range(3)] == [1, 2, 3]
+
+    assert talk(script) == []
+
+
+def test_who_has_only_closed_its_sending_side_is_still_answered():
+    async def slow(command: int, data: bytes) -> AmsAnswer:
+        await asyncio.sleep(0.05)
+        return AmsAnswer(bytes(4) + data)
+
+    async def script(reader, writer):
+        writer.write(ask(b"late"))
+        writer.write_eof()
+        assert (await hear(reader)).data == b"late"
+        assert await reader.read() == b""
+
+    desk = AoeDesk({NetId.parse(TARGET): slow}, {NetId.parse(TARGET)})
+    assert talk(script, desk) == []
+
+
+@pytest.mark.parametrize("octets", [b"\x04\x40" + bytes(4), b"\x05\x50" + bytes(5)])
+def test_what_is_no_mailbox_frame_ends_the_connection(octets):
+    async def script(reader, writer):
+        writer.write(ask() + octets)
+        assert (await hear(reader)).error == 0
+        assert await asyncio.wait_for(reader.read(), 5) == b""
+
+    assert talk(script) == [Refusal.TCP_TYPE]
+
+
+def test_frame_that_is_not_taken_is_counted_and_the_connection_goes_on():
+    async def script(reader, writer):
+        writer.write(aoe.frame(b"x" * 10, kind=3) + ask())
+        assert (await hear(reader)).error == 0
+
+    assert talk(script) == [Refusal.MAILBOX]
+
+
+def test_client_that_breaks_off_costs_nothing():
+    async def script(reader, writer):
+        writer.write(ask() + ask()[:20])
+        await writer.drain()
+        writer.transport.abort()
+
+    assert talk(script) == []
+
+
+def test_client_that_takes_nothing_is_disconnected(monkeypatch):
+    monkeypatch.setattr(mailbox_stream, "SLOW_READER_S", 0.05)
+
+    async def script(reader, writer):
+        for _ in range(2000):
+            writer.write(ask(b"x" * 1900))
+            try:
+                await asyncio.wait_for(writer.drain(), 1)
+            except OSError:
+                return
+        raise AssertionError("still connected")
+
+    talk(script)

@@ -1,0 +1,184 @@
+"""Connections sorted by their first frame."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from eap.appliance.discards import Refusal
+from eap.appliance.handover import PortName
+from eap.appliance.passing import take_connection
+from eap.appliance.services import tcp_door
+from eap.appliance.services.tcp_door import TcpDoor
+from eap.codec.ethercat import EtherCatHeader
+from tests.support import aoe
+
+pytestmark = pytest.mark.net
+
+OWNERS = (PortName("a", "eap0"),)
+TARGET = "1.1.1.1.2.1"
+
+
+def frame(kind: int) -> bytes:
+    return EtherCatHeader(4, 0, kind).encode() + bytes(4)
+
+
+class Scene:
+    """A door, the engine's end of its link, and what it refused."""
+
+    def __init__(self, listener, engine, refused) -> None:
+        self.address = listener.getsockname()
+        self.engine = engine
+        self.refused = refused
+
+    async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        return await asyncio.open_connection(*self.address)
+
+    async def send(self, data: bytes) -> bytes:
+        """Return what comes back until the door closes."""
+        reader, writer = await self.connect()
+        writer.write(data)
+        try:
+            return await asyncio.wait_for(reader.read(), 5)
+        except ConnectionResetError:
+            return b""
+        finally:
+            writer.close()
+
+
+def play(
+    script: Callable[[Scene], Awaitable[None]], takers=OWNERS, first_frame_s: float = 5
+) -> list[Refusal]:
+    refused: list[Refusal] = []
+
+    async def run():
+        services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with services, engine, socket.create_server(("127.0.0.1", 0)) as listener:
+            desk = aoe.echoing_desk(TARGET)
+            door = TcpDoor(
+                listener, takers, services, refused.append, [desk], first_frame_s=first_frame_s
+            )
+            serving = [asyncio.ensure_future(each.serve()) for each in (door, desk)]
+            await script(Scene(listener, engine, refused))
+            for task in serving:
+                task.cancel()
+            await asyncio.wait(serving)
+
+    asyncio.run(run())
+    return refused
+
+
+def test_type_4_goes_to_the_engine_with_its_first_frame():
+    async def script(scene):
+        _, writer = await scene.connect()
+        data = frame(4)
+        writer.write(data[:1])
+        await writer.drain()
+        await asyncio.sleep(0.05)
+        writer.write(data[1:])
+        async with asyncio.timeout(5):
+            while (taken := take_connection(scene.engine)) is None:  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+        connection, passed = taken
+        with connection:
+            assert passed.owners == OWNERS
+            assert passed.peer == "{}:{}".format(*writer.get_extra_info("sockname"))
+            assert connection.recv(100) == data
+        writer.close()
+
+    assert play(script) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "takers", "reason"),
+    [
+        (5, OWNERS, Refusal.TCP_TYPE),
+        (4, (), Refusal.TCP_OFF),
+        (7, OWNERS, Refusal.WRONG_TYPE),
+    ],
+)
+def test_others_are_closed_with_a_reason(kind, takers, reason):
+    async def script(scene):
+        assert await scene.send(frame(kind)) == b""
+
+    assert play(script, takers) == [reason]
+
+
+def test_type_5_is_answered_here():
+    async def script(scene):
+        reader, writer = await scene.connect()
+        writer.write(aoe.frame(aoe.packet(TARGET, 4, b"abc")))
+        writer.write_eof()
+        back = await asyncio.wait_for(reader.read(), 5)
+        assert aoe.answer(back).data == b"\4cba"
+        writer.close()
+
+    assert play(script) == []
+
+
+def test_there_is_a_limit_to_those_who_talk(monkeypatch):
+    monkeypatch.setattr(tcp_door, "MAX_STREAMS", 1)
+    question = aoe.frame(aoe.packet(TARGET, 4, b""))
+
+    async def script(scene):
+        reader, writer = await scene.connect()
+        writer.write(question)
+        await asyncio.wait_for(reader.readexactly(8), 5)
+        assert await scene.send(question) == b""
+        writer.close()
+
+    assert play(script) == [Refusal.TCP_FULL]
+
+
+def test_who_says_nothing_is_closed():
+    async def script(scene):
+        assert await scene.send(b"") == b""
+
+    assert play(script, first_frame_s=0.05) == [Refusal.TCP_SILENT]
+
+
+def test_who_leaves_before_a_frame_is_not_counted():
+    async def script(scene):
+        for _ in range(3):
+            _, writer = await scene.connect()
+            writer.close()
+            await writer.wait_closed()
+        assert await scene.send(frame(7)) == b""
+
+    assert play(script) == [Refusal.WRONG_TYPE]
+
+
+def test_a_gone_engine_link_closes_the_connection():
+    async def script(scene):
+        scene.engine.close()
+        assert await scene.send(frame(4)) == b""
+
+    assert play(script) == [Refusal.ENGINE_BUSY]
+
+
+def test_there_is_a_limit_to_those_who_wait(monkeypatch):
+    monkeypatch.setattr(tcp_door, "MAX_WAITING", 1)
+
+    async def script(scene):
+        _, silent = await scene.connect()
+        assert await scene.send(b"") == b""
+        silent.close()
+
+    assert play(script) == [Refusal.TCP_FULL]
+
+
+def test_the_limit_holds_when_all_come_at_once(monkeypatch):
+    monkeypatch.setattr(tcp_door, "MAX_WAITING", 2)
+
+    async def script(scene):
+        crowd = [socket.create_connection(scene.address) for _ in range(6)]  # before any is taken
+        for connection in crowd[2:]:  # closed by the door, the first two wait
+            connection.setblocking(False)
+            assert await asyncio.get_running_loop().sock_recv(connection, 1) == b""
+        for connection in crowd:
+            connection.close()
+
+    assert play(script) == [Refusal.TCP_FULL] * 4

@@ -1,0 +1,89 @@
+"""One child process: start, readiness, output, end; and when it comes back."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+from pathlib import Path
+from time import monotonic_ns
+
+import pytest
+
+from eap.appliance.handover import Handover
+from eap.appliance.supervisor import child as module
+from eap.appliance.supervisor.child import Child, RestartPolicy, describe_end
+
+SECOND_NS = 1_000_000_000
+HANDOVER = Handover(os.getpid(), "/nowhere", "demo", "demo.yaml", (), ())
+READS_ITS_HANDOVER = """\
+import os, sys
+from eap.appliance.handover import Handover, tell_ready
+handover = Handover.from_descriptor(int(sys.argv[1]))
+tell_ready(handover.ready_fd, {"plant": handover.plant})
+print("first line")
+sys.stderr.write("no newline")
+sys.exit(3)
+"""
+
+
+def test_a_long_life_is_followed_by_a_start_at_once():
+    policy = RestartPolicy()
+    assert [policy.delay_ns(2 * SECOND_NS) for _ in range(4)] == [0, 0, 0, 0]
+
+
+def test_short_lives_wait_ever_longer_up_to_a_limit():
+    policy = RestartPolicy()
+    delays = [policy.delay_ns(1) for _ in range(10)]
+    assert delays[0] == 0
+    assert delays[1] == module.FIRST_BACKOFF_NS
+    assert delays == sorted(delays)
+    assert delays[-1] == module.LONGEST_BACKOFF_NS
+    assert policy.delay_ns(module.HEALTHY_AFTER_NS) == 0
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [(0, "exit code 0"), (2, "exit code 2"), (-9, "killed by SIGKILL"), (-77, "by signal 77")],
+)
+def test_ends_have_words(code, words):
+    assert words in describe_end(code)
+
+
+def make(tmp_path: Path, monkeypatch, code: str) -> Child:
+    (tmp_path / "eap_child_for_test.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path.cwd()}")
+    return Child("test", "eap_child_for_test")
+
+
+def wait(fd: int) -> None:
+    assert select.select([fd], [], [], 10)[0] == [fd]
+
+
+@pytest.mark.net
+def test_from_start_to_end(tmp_path, monkeypatch, capsys):
+    child = make(tmp_path, monkeypatch, READS_ITS_HANDOVER)
+    assert child.pid == 0
+    child.start(HANDOVER, [], monotonic_ns())
+    assert child.pid
+    wait(child.ready_fd)
+    assert child.take_readiness()
+    assert child.report == {"plant": "demo"}
+    assert child.ready_fd == -1
+    wait(child.pid_fd)
+    assert child.reap() == (3, "no newline")
+    assert (child.pid, child.pid_fd, child.error_fd) == (0, -1, -1)
+    assert capsys.readouterr().err == "first line\nno newline\n"
+
+
+@pytest.mark.net
+def test_one_that_dies_before_it_is_ready(tmp_path, monkeypatch):
+    child = make(tmp_path, monkeypatch, "import time; time.sleep(60)")
+    child.start(HANDOVER, [], monotonic_ns())
+    assert not child.forward_output()
+    child.ask_to_end(signal.SIGKILL)
+    wait(child.ready_fd)
+    assert not child.take_readiness()
+    wait(child.pid_fd)
+    assert child.reap() == (-signal.SIGKILL, "it said nothing")
+    child.ask_to_end(signal.SIGTERM)  # nobody is there: nothing happens

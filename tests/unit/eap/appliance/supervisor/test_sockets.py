@@ -1,0 +1,112 @@
+"""The plan of shared sockets, and that all of them open or none."""
+
+from __future__ import annotations
+
+import gc
+import os
+import socket
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from eap.appliance.handover import NO_DESCRIPTOR, PortName, SocketKind
+from eap.appliance.supervisor.sockets import SharedSockets, plan_sockets
+from eap.errors import EnvironmentalError
+from eap.pd.spec import BusPortSpec, PortKind, PortSpec
+from tests.unit.eap.appliance.conftest import eap_port, left, right
+
+LEFT, RIGHT = PortName("left", "eap0"), PortName("right", "eap0")
+
+
+def test_a_udp_port_needs_a_pair_and_a_listener():
+    planned = plan_sockets([left(), right()])
+    assert [(s.kind, s.address, s.port, s.owners) for s in planned] == [
+        (SocketKind.UDP, "127.9.2.1", 34980, (LEFT,)),
+        (SocketKind.UDP, "127.9.2.2", 34980, (RIGHT,)),
+        (SocketKind.TCP, "127.9.2.1", 34980, (LEFT,)),
+        (SocketKind.TCP, "127.9.2.2", 34980, (RIGHT,)),
+    ]
+
+
+def test_groups_and_broadcasts_have_their_own():
+    port = eap_port(1, "udp://127.9.2.1:5000", join=("239.1.1.1", "239.1.1.2"), broadcast=True)
+    planned = plan_sockets([left(port)])
+    assert [(s.kind, s.group, s.port) for s in planned] == [
+        (SocketKind.UDP, "", 5000),
+        (SocketKind.GROUP, "239.1.1.1", 5000),
+        (SocketKind.GROUP, "239.1.1.2", 5000),
+        (SocketKind.GROUP, "255.255.255.255", 5000),
+        (SocketKind.TCP, "", 5000),
+    ]
+
+
+def test_stations_share_an_ethernet_interface():
+    planned = plan_sockets(
+        [left(eap_port(1, "ethernet://eth0", vlan_id=5)), right(eap_port(2, "ethernet://eth0"))]
+    )
+    assert [(s.kind, s.address, s.owners) for s in planned] == [
+        (SocketKind.PACKET, "eth0", (LEFT, RIGHT)),
+        (SocketKind.ARP, "eth0", (LEFT,)),
+        (SocketKind.ARP, "eth0", (RIGHT,)),
+    ]
+    assert [s.vlan_id for s in planned] == [0, 5, 0]
+
+
+def test_what_stays_in_the_engine_needs_none():
+    assert plan_sockets([left(eap_port(1, "loop://line"))]) == ()
+    tcp_only = plan_sockets([left(eap_port(1, "tcp://127.9.2.1"))])
+    assert [s.kind for s in tcp_only] == [SocketKind.TCP]
+
+
+def open_descriptors() -> int:
+    gc.collect()  # what an earlier test left to the collector must not go while we count
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+@pytest.mark.net
+def test_all_are_opened_and_described(tmp_path):
+    before = open_descriptors()
+    port = eap_port(1, join=("239.1.1.1",), broadcast=True)
+    with SharedSockets([left(port)], tmp_path / "control") as shared:
+        for described in shared.descriptions:
+            assert (described.engine_fd == NO_DESCRIPTOR) == (described.kind is SocketKind.TCP)
+            assert described.services_fd != NO_DESCRIPTOR
+        inherited = {*shared.engine_descriptors(), *shared.services_descriptors()}
+        assert len(inherited) == open_descriptors() - before
+        assert not any(os.get_inheritable(fd) for fd in inherited)
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(tmp_path / "control"))
+    assert open_descriptors() == before
+
+
+@pytest.mark.net
+def test_buses_add_theirs(tmp_path):
+    before = open_descriptors()
+    bus = PortSpec("bus0", PortKind.BUS, "sim:///x.yaml", "1.1.1.1.1.9", bus=BusPortSpec("/x.yaml"))
+    station = left()
+    station = msgspec.structs.replace(station, ports=(*station.ports, bus))
+    with SharedSockets([station], tmp_path / "control") as shared:
+        (described,) = shared.buses
+        engine, services = shared.engine_descriptors(), shared.services_descriptors()
+        assert {described.engine_fd, shared.engine_bus} < set(engine)
+        assert {described.command_fd, shared.services_bus} < set(services)
+        own_datagrams = {each.engine_fd for each in shared.descriptions} - {NO_DESCRIPTOR}
+        assert set(engine) & set(services) == own_datagrams
+        segment = {described.segment_fd, described.segment_command_fd}
+        assert len({*engine, *services, *segment}) == open_descriptors() - before
+    assert open_descriptors() == before
+
+
+@pytest.mark.net
+def test_nothing_stays_open_when_one_fails(tmp_path):
+    before = open_descriptors()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
+        squatter.bind(("127.9.2.2", 34980))
+        with pytest.raises(EnvironmentalError, match=r"127\.9\.2\.2:34980"):
+            SharedSockets([left(), right()], tmp_path / "control")
+    assert open_descriptors() == before
+    (tmp_path / "control").touch()
+    with pytest.raises(EnvironmentalError, match="control socket"):
+        SharedSockets([left()], tmp_path / "control")
+    assert open_descriptors() == before
