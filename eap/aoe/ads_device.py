@@ -98,7 +98,7 @@ class AdsDevice:
         try:
             return Outcome(data=self._perform(operation, client, now_ns))
         except AdsRefusedError as exc:
-            return Outcome(exc.result)
+            return Outcome(exc.result, why=exc.why)
 
     def _perform(self, operation: Operation, client: Client, now_ns: int) -> bytes:
         match operation:

@@ -11,12 +11,12 @@ octets, as TwinCAT does, in a packet of its own, because AdsLib skips what follo
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from heapq import heapify, heappop, heappush
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from eap.aoe.ads_operation import AdsRefusedError
 from eap.aoe.ads_space import Source
+from eap.aoe.way import Way
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
     UNIT_NS,
@@ -26,6 +26,8 @@ from eap.codec.adsnotification import (
     TransMode,
     encode_notification,
 )
+from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
+from eap.ids import NetId
 
 MAX_HANDLES = 1024
 """Notifications of one client; TwinCAT's limit as well."""
@@ -35,12 +37,17 @@ MAX_WATCHED = 0xFFFF
 FULL_PACKET = 32 * 1024
 """Octets of samples of one client that are sent without waiting for more."""
 
-Client: TypeAlias = Hashable
-"""Whoever asked: for the caller to choose, such as a connection with an AMS address."""
-
 _CYCLIC = frozenset((TransMode.SERVER_CYCLE, TransMode.SERVER_CYCLE_2))
 _ON_CHANGE = frozenset((TransMode.SERVER_ON_CHANGE, TransMode.SERVER_ON_CHANGE_2))
 _FOR_NOW = frozenset((AdsError.BUSY, AdsError.NOT_READY))
+
+
+class Client(NamedTuple):
+    """Whoever asked: an AMS address, which programs of one computer share, and its connection."""
+
+    way: Way
+    net_id: NetId
+    port: int
 
 
 class Notice(NamedTuple):
@@ -48,6 +55,12 @@ class Notice(NamedTuple):
 
     client: Client
     data: bytes
+
+    def encode(self, net_id: NetId, port: int) -> bytes:
+        """Return the packet that brings it, from the device at *net_id* and *port*."""
+        client = self.client
+        header = AmsHeader(client.net_id, client.port, net_id, port, AmsCommand.NOTIFICATION)
+        return encode_packet(header, self.data)
 
 
 class NotificationStats(NamedTuple):
@@ -165,16 +178,12 @@ class NotificationTable:
             raise AdsRefusedError(AdsError.NOTIFICATION_HANDLE)
         self._remove(notification)
 
-    def forget(self, client: Client) -> None:
-        """End all notifications of a client that is gone."""
-        pending = self._clients.pop(client, None)
-        if pending is not None:
-            for handle in pending.handles:
+    def forget(self, way: Way) -> None:
+        """End all notifications that were asked for by a connection that is gone."""
+        for client in [client for client in self._clients if client.way == way]:
+            for handle in self._clients.pop(client).handles:
                 del self._notifications[handle]
-
-    def clients(self) -> tuple[Client, ...]:
-        """Return everybody who is told of something."""
-        return tuple(self._clients)
+        self._clear_due()
 
     def next_timeout(self) -> int | None:
         """Return when a cycle has something to do at the earliest, None if never."""
@@ -270,5 +279,8 @@ class NotificationTable:
         if not pending.handles:
             del self._clients[notification.client]
         if len(self._due) > 2 * len(self._notifications) + 16:
-            self._due = [entry for entry in self._due if entry[1] in self._notifications]
-            heapify(self._due)
+            self._clear_due()
+
+    def _clear_due(self) -> None:
+        self._due = [entry for entry in self._due if entry[1] in self._notifications]
+        heapify(self._due)

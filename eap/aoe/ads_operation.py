@@ -78,14 +78,17 @@ class Outcome(NamedTuple):
     result: int = AdsError.NONE
     data: bytes = b""
     """What stands behind the result; of a Read or ReadWrite without its length."""
+    why: str = ""
+    """For people, where there is more to say than the result does."""
 
 
 class AdsRefusedError(Exception):
-    """An operation that is answered with a result other than 0."""
+    """An operation that is answered with a result other than 0; *why* is for people."""
 
-    def __init__(self, result: AdsError) -> None:
-        super().__init__(result.name)
+    def __init__(self, result: AdsError, why: str = "") -> None:
+        super().__init__(f"{result.name}: {why}" if why else result.name)
         self.result = result
+        self.why = why
 
 
 def is_change(operation: Operation) -> bool:

@@ -6,8 +6,11 @@ import struct
 
 import pytest
 
+from eap.aoe.ads_notifications import Client
 from eap.aoe.answer import response_to
-from eap.codec.ams import AmsCommand, AmsHeader, decode_packet, encode_packet
+from eap.aoe.way import Way
+from eap.codec.ams import AmsCommand, decode_packet
+from eap.ids import NetId
 from tests.support.adsdevice import DictStore, Station, variable_device
 from tests.support.packets import ethernet
 from tests.support.tshark import dissect, write_pcap
@@ -15,7 +18,7 @@ from tests.support.vectors import load
 
 pytestmark = pytest.mark.tshark
 
-CLIENT = "client"
+CLIENT = Client(Way("tcp", "1"), NetId.parse("127.0.0.1.1.1"), 30000)
 
 
 def frame(packet: bytes) -> bytes:
@@ -52,16 +55,9 @@ def told(tmp_path):
         header, body = decode_packet(vector.octets)
         answer = device.answer(header.command, bytes(body), CLIENT, 0)
         answers.append(response_to(header, answer))
-        back = AmsHeader(
-            header.source,
-            header.source_port,
-            header.target,
-            header.target_port,
-            AmsCommand.NOTIFICATION,
-        )
         for now_ns in (1, 10**9):
-            for _, data in device.notifications.handle_cycle(now_ns, 133_000_000_000_000_000):
-                notices.append(encode_packet(back, data))
+            told = device.notifications.handle_cycle(now_ns, 133_000_000_000_000_000)
+            notices += [notice.encode(header.target, header.target_port) for notice in told]
     seen = ams_fields(tmp_path / "ads.pcap", [v.octets for v in vectors] + answers + notices)
     names = [vector.name.partition("/")[2] for vector in vectors]
     count = len(names)

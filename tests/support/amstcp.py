@@ -15,7 +15,10 @@ from collections.abc import Mapping
 from typing import Self
 
 from eap.aoe.ads_device import AdsDevice
+from eap.aoe.ads_notifications import Client
+from eap.aoe.way import Way
 from eap.codec.adsnotification import to_filetime
+from eap.ids import NetId
 
 PORT = 48898
 _PREFIX = struct.Struct("<HI")
@@ -96,9 +99,7 @@ class AmsTcpServer:
         del self._buffers[connection], self._numbers[number]
         with self.lock:
             for device in self._devices.values():
-                for client in device.notifications.clients():
-                    if client[0] == number:
-                        device.notifications.forget(client)
+                device.notifications.forget(Way("tcp", str(number)))
 
     def _answer(self, connection: socket.socket, number: int, packet: bytes) -> None:
         target, port, source, source_port, command, flags, *_, invoke_id = _HEADER.unpack_from(
@@ -108,7 +109,7 @@ class AmsTcpServer:
         error, body = 7, b""
         if device is not None:
             with self.lock:
-                client = (number, source, source_port)
+                client = Client(Way("tcp", str(number)), NetId(source), source_port)
                 answer = device.answer(command, packet[_HEADER.size :], client, time.monotonic_ns())
             error, body = answer.error_code, answer.data
         header = _HEADER.pack(
@@ -122,10 +123,9 @@ class AmsTcpServer:
                 notices = device.notifications.handle_cycle(
                     time.monotonic_ns(), to_filetime(time.time_ns())
                 )
-            for (number, source, source_port), data in notices:
-                header = _HEADER.pack(source, source_port, target, port, 8, 4, len(data), 0, 0)
-                if connection := self._numbers.get(number):
-                    self._send(connection, header + data)
+            for notice in notices:
+                if connection := self._numbers.get(int(notice.client.way.connection)):
+                    self._send(connection, notice.encode(NetId(target), port))
 
     def _send(self, connection: socket.socket, packet: bytes) -> None:
         connection.sendall(_PREFIX.pack(0, len(packet)) + packet)

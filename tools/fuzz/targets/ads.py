@@ -7,16 +7,20 @@ from itertools import cycle
 from struct import Struct
 
 from eap.aoe.ads_device import AdsDevice
+from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_request import MAX_ANSWER
 from eap.aoe.ads_symbols import SymbolSpace, SymbolTable, Variable
+from eap.aoe.way import Way
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name
 from eap.codec.adsnotification import decode_notification
 from eap.codec.ams import AmsCommand, AmsHeader
+from eap.ids import NetId
 from tools.fuzz.messages import cut
 
 _TYPES = {"flags": "WORD", "name": "STRING(20)", "curve": "REAL[4]", "depth": "INT24"}
 _HEAD = Struct("<5I")
+_CLIENT = Client(Way("door", "connection"), NetId(bytes(6)), 1)
 _COMMANDS = tuple(AmsCommand)
 _GROUPS = tuple(IndexGroup)
 
@@ -65,7 +69,7 @@ def fuzz_one(data: bytes) -> None:
     """Have every request answered, and notifications told; nothing may be raised."""
     device = _device()
     for now_ns, (command, body) in enumerate(_requests(data)):
-        answer = device.answer(command, body, "client", now_ns)
+        answer = device.answer(command, body, _CLIENT, now_ns)
         if len(answer.data) > MAX_ANSWER + 8 or not (answer.error_code or len(answer.data) >= 4):
             raise AssertionError(f"an answer of {len(answer.data)} octets")
         for _, notice in device.notifications.handle_cycle(now_ns, now_ns):

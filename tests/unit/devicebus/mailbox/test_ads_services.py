@@ -8,6 +8,7 @@ from devicebus.mailbox.ads_services import AdsServices
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand
 from eap.od import info
+from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RO, RW, Entry, OdState, array, record, variable
 
@@ -73,7 +74,7 @@ def test_descriptions(server, dictionary):
 
 
 def test_device_and_state(server):
-    assert call(server, AmsCommand.READ_DEVICE_INFO).data == OK + b"\1\0\0\0a drive with a l"
+    assert call(server, AmsCommand.READ_DEVICE_INFO).data == OK + b"\1\0\0\0a drive with a \0"
     assert call(server, AmsCommand.READ_STATE).data == OK + bytes.fromhex("05000000")
 
 
@@ -101,8 +102,20 @@ def test_refusals(server, command, numbers, data, result):
     assert call(server, command, *numbers, data=data) == (u32(result) + length, 0)
 
 
+def test_sums_are_done_item_by_item(server):
+    items = b"".join(map(u32, (0xF302, 0x1000_0000, 4, 0xF302, 0x3000_0000, 1)))
+    got = call(server, AmsCommand.READ_WRITE, 0xF080, 2, 13, len(items), data=items)
+    assert got.data == OK + u32(13) + OK + u32(0x70C) + u32(7) + b"\0"
+
+
 def test_service_that_is_not_there(server):
     assert call(server, AmsCommand.ADD_NOTIFICATION) == (b"", 0x701)
+
+
+def test_refusals_from_elsewhere_are_told_alike(server):
+    abort = SdoAbortError(AbortCode.NO_OBJECT, 0x3000, 0)
+    assert server.refuse(AmsCommand.WRITE, abort) == (u32(0x70C), 0)
+    assert server.refuse(AmsCommand.READ_WRITE, abort) == (u32(0x70C) + bytes(4), 0)
 
 
 def test_results_may_be_told_in_other_words(dictionary):

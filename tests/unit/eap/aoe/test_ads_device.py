@@ -7,16 +7,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.aoe.ads_device import AdsDevice
+from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import Read, Write, is_change
 from eap.aoe.ads_request import MAX_ANSWER
 from eap.aoe.ads_space import AdsSpace
+from eap.aoe.way import Way
 from eap.codec.ads import AdsError, AdsState, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
 from eap.codec.ams import AmsCommand
+from eap.ids import NetId
 from tests.support.adsdevice import DictStore, Station, info, variable_device
 
 G = IndexGroup
-CLIENT = ("a connection", "1.2.3.4.1.1", 30000)
+CLIENT = Client(Way("tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
 
 
 class Bench:
@@ -139,7 +142,7 @@ def test_each_operation_is_judged(bench) -> None:
 
 def test_operations_can_be_done_one_by_one(bench) -> None:
     handle = bench.handle("flags")
-    assert bench.device.perform(Read(G.VALUE_BY_HANDLE, handle, 2), CLIENT, 0) == (0, b"\1\x80")
+    assert bench.device.perform(Read(G.VALUE_BY_HANDLE, handle, 2), CLIENT, 0) == (0, b"\1\x80", "")
     assert bench.device.perform(Write(G.DATA, 1, b""), CLIENT, 0).result == AdsError.SIZE
 
 

@@ -42,4 +42,5 @@ def test_what_counts_as_a_change(operation: Operation, *, changes: bool) -> None
 
 def test_refusal_says_its_result() -> None:
     assert str(AdsRefusedError(AdsError.SIZE)) == "SIZE"
-    assert Outcome() == (AdsError.NONE, b"")
+    assert str(AdsRefusedError(AdsError.SIZE, "too long")) == "SIZE: too long"
+    assert Outcome() == (AdsError.NONE, b"", "")
