@@ -12,6 +12,8 @@ from eap.aoe.way import Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 
+_NO_RETURN = StateFlags.NO_RETURN.value  # a plain number: operators of flags are slow
+
 
 class Refusal(NamedTuple):
     """Why a request goes no further."""
@@ -25,9 +27,7 @@ class Refusal(NamedTuple):
 
 def wants_answer(header: AmsHeader) -> bool:
     """Say whether the sender of a request waits for an answer."""
-    return not (
-        header.state_flags & StateFlags.NO_RETURN or header.command == AmsCommand.NOTIFICATION
-    )
+    return not (header.state_flags & _NO_RETURN or header.command == AmsCommand.NOTIFICATION)
 
 
 class Refuser:

@@ -23,6 +23,7 @@ from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError, MalformedError
 from eap.ids import NetId
 
+_RESPONSE = StateFlags.RESPONSE.value  # a plain number: operators of flags are slow
 _NOBODY = 0
 """Ticket of a request that has no answer."""
 
@@ -153,7 +154,7 @@ class Router:
     def _receive_fragment(
         self, header: AmsHeader, body: bytes, way: Way, now_ns: int, *, for_all: bool
     ) -> list[Action]:
-        if header.state_flags & StateFlags.RESPONSE:
+        if header.state_flags & _RESPONSE:
             return []  # ours want no acknowledgement
         packet, acknowledgement = self._fragments.receive(way, header, body, now_ns)
         if packet is None:
@@ -166,7 +167,7 @@ class Router:
     def _receive_whole(
         self, header: AmsHeader, data: bytes, way: Way, now_ns: int, *, for_all: bool
     ) -> list[Action]:
-        if header.state_flags & StateFlags.RESPONSE:
+        if header.state_flags & _RESPONSE:
             return self._passage.take_answer(header, data, way, now_ns)
         ports = self._devices.get(header.target)
         if ports is None and for_all:

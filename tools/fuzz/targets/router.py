@@ -1,0 +1,72 @@
+"""Packets for a router: whatever comes, no exception and no answer to nobody."""
+
+from __future__ import annotations
+
+from eap.aoe.action import Deliver, Forward, Reply
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.router import Router
+from eap.aoe.routes import Route, RouteTable
+from eap.aoe.way import Door, Way
+from eap.codec.ams import AmsHeader, decode_packet
+from eap.ids import NetId
+from tools.fuzz.messages import cut
+
+_OWN = NetId.parse("5.1.1.1.1.1")
+_FAR = NetId.parse("6.1.1.1.1.1")
+_CLIENTS = (Way("tcp", "1"), Way("segment", "2"))
+_LINK = Way("link", "6")
+_NET_IDS = (_OWN, _FAR, NetId.parse("6.1.1.1.9.9"), NetId.parse("9.9.9.9.9.9"))
+_CLIENT_IDS = (NetId.parse("7.1.1.1.1.1"), NetId.parse("7.1.1.1.1.2"), _OWN, _FAR)
+
+
+def fuzz_one(data: bytes) -> None:
+    """Give the router *data* whole; then cut, with addresses that lead somewhere."""
+    router = Router(
+        _OWN,
+        RouteTable([Route(_FAR, "far", _LINK)]),
+        [Door("tcp", is_stream=True), Door("segment", room=60), Door("link", room=200)],
+        first_invoke_id=1,
+    )
+    router.add_device(_OWN, {1, 2, 3})
+    _give(router, data, _CLIENTS[0])
+    for message in cut(data):
+        for way in _CLIENTS:
+            _give(router, message, way)
+        if message:
+            _give(router, _addressed(message), _CLIENTS[message[0] >> 7])
+    router.handle_timeout(1 << 40)
+    router.connection_closed(*_CLIENTS[0], 1 << 40)
+    router.handle_timeout(1 << 41)
+    if router.stats().in_flight:
+        raise AssertionError("a request waits for ever")
+
+
+def _addressed(message: bytes) -> bytes:
+    choice, body = message[0], message[5:]
+    command = (2, 6, 7, 8, 9, 0x0902, 3, message[0])[choice >> 4 & 7]
+    invoke_id = int.from_bytes(message[1:5], "little")
+    target, source = _NET_IDS[choice & 3], _CLIENT_IDS[choice >> 2 & 3]
+    header = AmsHeader(target, choice & 3, source, 5, command, 4, len(body), 0, invoke_id)
+    return header.encode() + body
+
+
+def _give(router: Router, data: bytes, way: Way) -> None:
+    for action in router.receive_packet(data, *way, 0):
+        if isinstance(action, Reply):
+            if action.way != way:
+                raise AssertionError(f"an answer for {action.way}, which asked nothing")
+        elif isinstance(action, Deliver):
+            router.receive_answer(action.ticket, AmsAnswer(b"that"), 0)
+        else:
+            _answer(router, action, data)
+
+
+def _answer(router: Router, action: Forward, data: bytes) -> None:
+    """Answer what went on: with the octets of the fuzzer behind a proper header."""
+    header, _ = decode_packet(action.packets[0])
+    back = AmsHeader(
+        header.source, header.source_port, header.target, header.target_port, header.command,
+        header.state_flags | 1, len(data), 0, header.invoke_id,
+    )  # fmt: skip
+    for _ in range(2):
+        router.receive_packet(back.encode() + data, *_LINK, 0)
