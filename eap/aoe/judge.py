@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from eap.aoe.action import Outcome
 from eap.aoe.inflight import InFlight
+from eap.aoe.prober import Prober
 from eap.aoe.refusal import Refusal
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
@@ -42,6 +43,7 @@ class Judge:
         doors: All doors by name.
         in_flight: What waits.
         limits: How much may wait.
+        prober: Knows which hops do not answer.
     """
 
     def __init__(
@@ -51,12 +53,14 @@ class Judge:
         doors: Mapping[str, Door],
         in_flight: InFlight,
         limits: Limits,
+        prober: Prober | None = None,
     ) -> None:
         self._net_id = net_id
         self._table = table
         self._doors = doors
         self._in_flight = in_flight
         self._limits = limits
+        self._prober = prober
         self._down: set[Way] = set()
         self._closed: set[str] = set()
 
@@ -76,7 +80,9 @@ class Judge:
 
     def is_down(self, hop: Way) -> bool:
         """Say whether nothing can go to *hop* now."""
-        return hop in self._down or hop.door in self._closed
+        if hop in self._down or hop.door in self._closed:
+            return True
+        return self._prober is not None and self._prober.is_dead(hop)
 
     def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
         """Return how a request goes on that is for nobody here."""

@@ -17,6 +17,7 @@ from eap.aoe.judge import Judge, Limits
 from eap.aoe.notifier import Notifier, request_to_end
 from eap.aoe.outlet import Outlet
 from eap.aoe.passed import Passed
+from eap.aoe.prober import Prober
 from eap.aoe.record import Record
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
 from eap.aoe.routes import Route, RouteTable
@@ -50,6 +51,7 @@ class Passage:
         *,
         first_invoke_id: int,
         limits: Limits,
+        prober: Prober | None = None,
     ) -> None:
         self.in_flight = InFlight()
         self.notifier = Notifier(outlet)
@@ -58,8 +60,9 @@ class Passage:
         self._refuser = refuser
         self._record = record
         self._limits = limits
+        self._prober = prober
         self._ids = InvokeIds(first_invoke_id)
-        self._judge = Judge(net_id, table, outlet.doors, self.in_flight, limits)
+        self._judge = Judge(net_id, table, outlet.doors, self.in_flight, limits, prober)
         self._passed = Passed()
 
     def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
@@ -101,6 +104,8 @@ class Passage:
         if pending is None or not self._is_answer(header, data, way, pending):
             return self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
         self.in_flight.pop(header.invoke_id)
+        if self._prober is not None and pending.route is not None:
+            self._prober.hear(pending.route.hop, now_ns)
         actions: list[Action] = []
         surplus = self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :])
         if surplus is not None:
@@ -142,6 +147,10 @@ class Passage:
     def hop_down(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop, and refuse what will be for it."""
         self._judge.hop_down(door, address)
+        return self.hop_lost(door, address, text, now_ns)
+
+    def hop_lost(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
+        """Answer what waits for a hop: it will not."""
         self.notifier.subscriptions.forget_hop(door, address)
         actions: list[Action] = []
         for pending in self.in_flight.on(door, address):

@@ -13,6 +13,7 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.judge import Limits
 from eap.aoe.outlet import Outlet
 from eap.aoe.passage import Passage
+from eap.aoe.prober import MISSES, Prober
 from eap.aoe.reassembly import Reassembly
 from eap.aoe.record import Record, Stats
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
@@ -37,6 +38,7 @@ class Router:
         doors: By which packets come and go.
         first_invoke_id: Another one at each start, see :class:`~eap.aoe.invoke.InvokeIds`.
         limits: How much it takes on.
+        prober: Finds dead hops; without one only doors tell of them.
 
     Attributes:
         record: What it did.
@@ -50,16 +52,18 @@ class Router:
         *,
         first_invoke_id: int,
         limits: Limits | None = None,
+        prober: Prober | None = None,
     ) -> None:
         self.record = Record()
         self._table = table
         self._outlet = Outlet(doors)
         self._refuser = Refuser(self._outlet, self.record)
+        self._prober = prober
         self._devices: dict[NetId, Container[int]] = {}
         self._fragments = Reassembly()
         self._passage = Passage(
             net_id, table, self._outlet, self._refuser, self.record,
-            first_invoke_id=first_invoke_id, limits=limits or Limits(),
+            first_invoke_id=first_invoke_id, limits=limits or Limits(), prober=prober,
         )  # fmt: skip
 
     def add_device(self, net_id: NetId, ports: Container[int]) -> None:
@@ -120,21 +124,35 @@ class Router:
             text: Why, for people.
             now_ns: The time on the monotonic clock.
         """
+        if self._prober is not None:
+            self._prober.pause(door, address)
         return self._passage.hop_down(door, address, text, now_ns)
 
     def hop_up(self, door: str, address: str | None) -> None:
         """Pass requests on again; the arguments are those of :meth:`hop_down`."""
+        if self._prober is not None:
+            self._prober.resume(door, address)
         self._passage.hop_up(door, address)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
-        times = self._passage.next_timeout(), self._table.next_timeout()
+        times = [self._passage.next_timeout(), self._table.next_timeout()]
+        if self._prober is not None:
+            times.append(self._prober.next_timeout())
         return min((each for each in times if each is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> list[Action]:
-        """Answer the requests whose time is up, and forget the routes that expired."""
+        """Answer requests whose time is up, forget routes that expired, ask hops for life."""
         self._table.expire(now_ns)
-        return self._passage.handle_timeout(now_ns)
+        actions = self._passage.handle_timeout(now_ns)
+        if self._prober is not None:
+            for probe in self._prober.probes_due(now_ns):
+                if probe.is_found_dead:
+                    text = f"{MISSES} probes without an answer"
+                    actions += self._passage.hop_lost(*probe.hop, text, now_ns)
+                if probe.hop.door in self._outlet.doors:
+                    actions.append(self._outlet.forward(probe.hop, probe.packet, _NOBODY))
+        return actions
 
     def next_event(self) -> Trace | None:
         """Take the oldest trace of what was not simply answered."""
@@ -168,7 +186,7 @@ class Router:
         self, header: AmsHeader, data: bytes, way: Way, now_ns: int, *, for_all: bool
     ) -> list[Action]:
         if header.state_flags & _RESPONSE:
-            return self._passage.take_answer(header, data, way, now_ns)
+            return self._receive_answer(header, data, way, now_ns)
         ports = self._devices.get(header.target)
         if ports is None and for_all:
             return []
@@ -180,6 +198,16 @@ class Router:
         if ports is None:
             return self._passage.take_request(header, data, way, now_ns)
         return self._deliver(header, data, way, ports, now_ns)
+
+    def _receive_answer(
+        self, header: AmsHeader, data: bytes, way: Way, now_ns: int
+    ) -> list[Action]:
+        prober = self._prober
+        if prober is None or not prober.is_answer(header):
+            return self._passage.take_answer(header, data, way, now_ns)
+        is_shared = self._outlet.doors[way.door].is_shared
+        prober.take_answer(header, way, now_ns, is_shared=is_shared)
+        return []
 
     def _deliver(
         self, header: AmsHeader, data: bytes, way: Way, ports: Container[int], now_ns: int

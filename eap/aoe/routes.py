@@ -49,6 +49,8 @@ class Route(msgspec.Struct, frozen=True):
         expires_at_ns: When it is forgotten; None for never.
         real: The NetID that the station itself has, where *net_id* is a virtual one.
         timeout_ns: How long an answer may take; 0 for as long as usual.
+        is_probed: Whether the station answers whoever asks for its ADS state; where it answers
+            only whom it has a route to, it would be taken for dead.
 
     Raises:
         ValueError: a number of octets that cannot be, or a virtual NetID of a default route.
@@ -63,6 +65,7 @@ class Route(msgspec.Struct, frozen=True):
     expires_at_ns: int | None = None
     real: NetId | None = None
     timeout_ns: int = 0
+    is_probed: bool = True
 
     def __post_init__(self) -> None:
         if self.octets not in _LEVELS:
@@ -103,9 +106,14 @@ class _Ranked(NamedTuple):
 
 
 class RouteTable:
-    """All routes; which one is taken does not take longer the more there are."""
+    """All routes; which one is taken does not take longer the more there are.
+
+    Attributes:
+        version: Another one whenever there are other routes.
+    """
 
     def __init__(self, routes: Collection[Route] = ()) -> None:
+        self.version = 0
         self._routes: dict[tuple[NetId, Way], _Ranked] = {}
         self._by_prefix: dict[bytes, list[_Ranked]] = {}
         self._translated: dict[Way, list[Route]] = {}
@@ -137,6 +145,7 @@ class RouteTable:
         elif route.origin is Origin.LEARNED and self._learned >= MAX_LEARNED:
             return False
         self._number += 1
+        self.version += 1
         ranked = _Ranked(rank, route)
         self._routes[key] = ranked
         for prefix in _prefixes(route):
@@ -155,6 +164,7 @@ class RouteTable:
         if ranked is None:
             return False
         route = ranked.route
+        self.version += 1
         for prefix in _prefixes(route):
             _discard(self._by_prefix, prefix, ranked)
         if route.real is not None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from eap.aoe.action import Action, Deliver, Forward, Outcome, Reply
 from eap.aoe.judge import Limits
+from eap.aoe.prober import Prober
 from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
@@ -37,10 +38,12 @@ class Station:
     """A router; what it wants done is taken apart."""
 
     def __init__(self, routes: Iterable[Route] = (), *, first_id: int = 1000,
-                 limits: Limits | None = None) -> None:  # fmt: skip
+                 limits: Limits | None = None, is_probing: bool = False) -> None:  # fmt: skip
         self.table = RouteTable([*routes])
+        net_id = NetId.parse(ROUTER)
+        prober = Prober(net_id, self.table) if is_probing else None
         self.router = Router(
-            NetId.parse(ROUTER), self.table, DOORS, first_invoke_id=first_id, limits=limits
+            net_id, self.table, DOORS, first_invoke_id=first_id, limits=limits, prober=prober
         )
         self.router.add_device(NetId.parse(ROUTER), {10000})
         self.router.add_device(NetId.parse("5.1.1.1.2.1"), {65535})
