@@ -35,6 +35,11 @@ _REASONS = {
     "event": "event",
     "poll": "polled",
 }
+_STATES = {
+    "PREOP": "in PREOP, as was asked for last: it exchanges no process data",
+    "SAFEOP": "in SAFEOP, as was asked for last: it receives no process data",
+}
+"""What it means when a station is there."""
 _FRAME_STATES = {2: "larger than its network carries", 4: "nobody is there"}
 """What the bits of FrameState say beyond that a frame was not sent."""
 
@@ -222,6 +227,8 @@ def _remarks(station: Row) -> Iterator[str]:
 
 
 def _own_remarks(station: Row) -> Iterator[str]:
+    if meaning := _STATES.get(station["state"]):
+        yield f"{meaning} until 'eapctl state {station['name']} OP'"
     silent_us = station.get("cycle_age_us") or 0
     if silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * station.get("cycle_us", 0)):
         yield f"has not run a cycle for {words.duration(silent_us)}"

@@ -41,6 +41,11 @@ class DataType(msgspec.Struct, frozen=True):
     count: int = 1
     """Elements of an array, else 1."""
 
+    @property
+    def is_text(self) -> bool:
+        """Whether it is text, of which only as many octets count as are not NUL at the end."""
+        return self.code == 0x09
+
     def read(self, buffer: Buffer, offset: int) -> Value:
         """Return the value at *offset*; raise TruncatedError if the buffer ends before it."""
         if offset < 0 or offset + self.size > len(buffer):

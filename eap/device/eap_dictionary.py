@@ -303,4 +303,4 @@ def _part(
         raise SdoAbortError(code, index, 1)
     for (subindex, entry), offset in zip(chosen, plan.bit_offsets, strict=True):
         if entry.access & state.write_right:
-            yield subindex, take_bits(data, offset, entry)
+            yield subindex, take_bits(data, offset, entry.kind)

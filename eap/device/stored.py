@@ -54,11 +54,25 @@ def restore(dictionary: EapDictionary, kept: Mapping[int, Mapping[int, bytes]]) 
     Raises:
         SdoAbortError: there is no such entry, or it cannot hold that; nothing has changed then.
     """
-    _put_all(dictionary.blank(), kept)
-    for row in profile.DYNAMIC:
-        for index in dictionary.members(row):
+    wanted = dictionary.blank()
+    _put_all(wanted, kept)
+    adopt(dictionary, wanted)
+
+
+def adopt(dictionary: EapDictionary, wanted: EapDictionary) -> None:
+    """Give *dictionary* the configuration of *wanted*, another one of the same port.
+
+    Objects that are the same in both are not touched: most of a large station usually are.
+    """
+    before, after = configuration(dictionary), configuration(wanted)
+    changed = {index: kept for index, kept in after.items() if before.get(index) != kept}
+    for index in before:
+        row = profile.row_of(index)
+        if row.dynamic and (index in changed or index not in after):
             dictionary.remove(index)
-    _put_all(dictionary, _with_defaults(dictionary, kept))
+        elif row.list_row is not None and index in changed:
+            dictionary.resize(index, row.fixed_count)
+    _put_all(dictionary, changed)
 
 
 def copy(dictionary: EapDictionary) -> EapDictionary:
@@ -121,19 +135,8 @@ def decode(dictionary: EapDictionary, data: bytes) -> None:
 
 
 def _is_kept(entry: Entry) -> bool:
-    return entry.access & CONFIG == CONFIG
-
-
-def _with_defaults(
-    dictionary: EapDictionary, kept: Mapping[int, Mapping[int, bytes]]
-) -> Configuration:
-    """Return *kept* with what static objects hold when nobody has written them."""
-    fresh = configuration(dictionary.blank())
-    for row in profile.STATIC:
-        if row.list_row is not None and row.first in dictionary:
-            dictionary.resize(row.first, row.fixed_count)
-    merged = {index: {**fresh.get(index, {}), **entries} for index, entries in kept.items()}
-    return {**fresh, **merged}
+    # Of flags Python makes objects; there are as many entries as a station has of everything.
+    return int.__and__(entry.access, CONFIG) == CONFIG
 
 
 def _put_all(dictionary: EapDictionary, kept: Mapping[int, Mapping[int, bytes]]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from eap.codec import pdo
+from eap.codec.datatypes import DataType
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, Entry, OdObject, OdState
 
@@ -123,7 +124,7 @@ class ObjectDictionary:
         for (subindex, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
             if not entry.access & state.write_right:
                 continue
-            octets = take_bits(data, bit_offset, entry)
+            octets = take_bits(data, bit_offset, entry.kind)
             check_value(entry, index, subindex, octets)
             accepted.append((subindex, entry, octets))
         if count is not None:
@@ -230,11 +231,11 @@ def _put_bits(data: bytearray, bit_offset: int, entry: Entry) -> None:
         data[offset + 1] |= value >> 8
 
 
-def take_bits(data: bytes, bit_offset: int, entry: Entry) -> bytes:
-    """Return the octets of *entry* out of the data of a complete access."""
+def take_bits(data: bytes, bit_offset: int, kind: DataType) -> bytes:
+    """Return the octets of an entry of type *kind* out of the data of a complete access."""
     offset, bit = divmod(bit_offset, 8)
-    if not entry.kind.is_bits:
-        octets = data[offset : offset + entry.kind.size]
-        return octets.rstrip(b"\0") if entry.is_text else octets
+    if not kind.is_bits:
+        octets = data[offset : offset + kind.size]
+        return octets.rstrip(b"\0") if kind.is_text else octets
     word = int.from_bytes(data[offset : offset + 2], "little") >> bit
-    return bytes((word & (1 << entry.kind.bit_length) - 1,))
+    return bytes((word & (1 << kind.bit_length) - 1,))

@@ -110,7 +110,7 @@ class Entry:
     @property
     def is_text(self) -> bool:
         """Whether it may be shorter than its type (VISIBLE_STRING)."""
-        return self.kind.code == 0x09
+        return self.kind.is_text
 
     @property
     def octets(self) -> bytes:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from eap.codec.datatypes import DataType, Plain
 from eap.od.profiles.forms import Form, from_text, to_text
 
-_TEXT, _OCTETS = 0x09, 0x0A
+_OCTETS = 0x0A
 
 
 class _Known(NamedTuple):
@@ -56,7 +56,7 @@ _KNOWN = (
 
 def plain(kind: DataType, name: str, octets: bytes) -> Plain | None:
     """Return the value of an entry called *name* for JSON; None if *octets* are no such value."""
-    if kind.code == _TEXT:
+    if kind.is_text:
         return octets.rstrip(b"\0").decode(errors="replace")
     if len(octets) != kind.size:
         return None
@@ -78,7 +78,7 @@ def parse(kind: DataType, text: str) -> bytes:
         if kind.text == each.type and each.text.fullmatch(text):
             return from_text(each.form, kind, text)
     octets = kind.encode(kind.parse_text(text))
-    return octets.rstrip(b"\0") if kind.code == _TEXT else octets
+    return octets.rstrip(b"\0") if kind.is_text else octets
 
 
 def show(kind: DataType, name: str, octets: bytes) -> str | None:

@@ -180,7 +180,7 @@ def _shown(kind: DataType | None, octets: bytes | None, *, complete: bool) -> di
     if octets is None:
         return row | {"data": None}
     row["data"] = octets.hex()
-    if kind is not None and kind.code == _TEXT:
+    if kind is not None and kind.is_text:
         row["value"] = octets.rstrip(b"\0").decode(errors="replace")
     elif kind is not None and kind.code == _OCTETS:
         row["value"] = octets.hex()

@@ -13,6 +13,7 @@ from eap.codec.datatypes import DataType
 from eap.errors import ConfigError
 from eap.od import notation
 from eap.od.abort import entry_name
+from eap.od.dictionary import take_bits
 
 _PLAIN_SIZES = (1, 2, 4, 8)
 
@@ -135,13 +136,5 @@ def _parts(found: ObjectInfo, first: int, octets: bytes) -> list[dict[str, Any]]
     if len(kinds) != len(chosen) or plan.size != len(octets):
         return rows
     for entry, kind, bit_offset in zip(chosen, kinds, plan.bit_offsets, strict=True):
-        rows.append(_row(found.index, entry, _taken(octets, kind, bit_offset)))
+        rows.append(_row(found.index, entry, take_bits(octets, bit_offset, kind)))
     return rows
-
-
-def _taken(octets: bytes, kind: DataType, bit_offset: int) -> bytes:
-    offset, bit = divmod(bit_offset, 8)
-    if not kind.is_bits:
-        return octets[offset : offset + kind.size]
-    word = int.from_bytes(octets[offset : offset + 2], "little") >> bit
-    return bytes((word & (1 << kind.bit_length) - 1,))

@@ -11,6 +11,7 @@ from eap.appliance.commands.client import Client
 from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
 from eap.appliance.control import ErrorCode
 from eap.codec import datatypes
+from eap.device.eap_rules import CONTROL
 from eap.errors import ControlError
 from eap.od.abort import AbortCode, SdoAbortError
 
@@ -55,7 +56,12 @@ class StationOd:
         try:
             self._request("od_write", **where, data=octets.hex())
         except ControlError as exc:
-            if exc.code == ErrorCode.ABORT and f"0x{AbortCode.DEVICE_STATE:08X}" in str(exc):
+            # At the control word it is a state that was refused, and the reason says why.
+            if (
+                index != CONTROL
+                and exc.code == ErrorCode.ABORT
+                and f"0x{AbortCode.DEVICE_STATE:08X}" in str(exc)
+            ):
                 hint = f"bring it to PREOP first: eapctl state {self._target} PREOP"
                 raise ControlError(f"{exc}; {hint}", code=exc.code) from None
             raise

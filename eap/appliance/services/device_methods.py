@@ -117,9 +117,9 @@ class DeviceMethods:
         device = self._device(parameters(params, words.StationParameters).station)
         return words.export_document(device.spec, *device.last_change)
 
-    def _plan(self, params: dict[str, Any]) -> dict[str, Any]:
+    async def _plan(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.SpecParameters)
-        return words.plan_document(self._device(wanted.station).plan(wanted.spec))
+        return words.plan_document(await self._device(wanted.station).plan(wanted.spec))
 
     async def _apply(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.ApplyParameters)

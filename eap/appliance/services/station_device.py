@@ -7,6 +7,7 @@ Rule 3: in any state but PreOp the dictionaries say what runs.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -149,9 +150,9 @@ class StationDevice:
         """Go to the state numbered *wanted* as far as possible."""
         return await self._jobs.do(lambda: self._go(wanted))
 
-    def plan(self, spec: StationSpec) -> Plan:
+    async def plan(self, spec: StationSpec) -> Plan:
         """Return what it takes to run *spec*."""
-        return make_plan(self.spec, self.dictionaries, spec, {})
+        return await self._jobs.do(lambda: asyncio.to_thread(self._plan, spec))
 
     async def apply(
         self, spec: StationSpec, cause: str = "", *, of_plant_file: bool = False
@@ -162,7 +163,7 @@ class StationDevice:
         is to what the plant file of the appliance says now.
         """
         run = partial(self._keeper.change, cause=cause, applied=of_plant_file)
-        return await self._jobs.do(lambda: self._change(lambda: self.plan(spec), run))
+        return await self._jobs.do(lambda: self._change(lambda: self._plan(spec), run))
 
     async def roll_back(self, spec: StationSpec | None = None) -> tuple[Plan, DeviceFault | None]:
         """Run again what ran before the last change; returns as :meth:`apply` does.
@@ -175,16 +176,20 @@ class StationDevice:
 
         return await self._jobs.do(lambda: self._change(plan, self._keeper.take_back))
 
+    def _plan(self, spec: StationSpec) -> Plan:
+        return make_plan(self.spec, self.dictionaries, spec, {})
+
     async def _change(self, make: Callable[[], Plan], run: Run) -> tuple[Plan, DeviceFault | None]:
-        plan = make()
+        # A thousand PDs take a second, in which others want answers; only jobs write dictionaries.
+        plan = await asyncio.to_thread(make)
         if plan.refused or (plan.is_empty and plan.spec == self.spec):
             return plan, None
         try:
-            await run(plan.spec, plan.objects())
+            await run(plan.spec, await asyncio.to_thread(plan.objects))
         except DeviceFault as exc:
             return plan, exc
         for name, dictionary in self.dictionaries.items():
-            stored.restore(dictionary, stored.configuration(plan.dictionaries[name]))
+            stored.adopt(dictionary, plan.dictionaries[name])
         self._incomplete = None
         return plan, None
 

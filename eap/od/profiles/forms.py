@@ -57,7 +57,7 @@ def from_text(form: Form, kind: DataType, text: str) -> bytes:
         word = int(match[1], 16) << 16 | int(match[2], 16) << 8 | int(match[3])
         return kind.encode(word)
     octets = kind.encode(kind.parse_text(text))
-    return octets.rstrip(b"\0") if kind.code == 0x09 else octets
+    return octets.rstrip(b"\0") if kind.is_text else octets
 
 
 _MAPPING = re.compile(r"([0-9A-Fa-f]{1,4}):([0-9A-Fa-f]{1,2})/(\d{1,2}|1\d\d|2[0-4]\d|25[0-5])")

@@ -88,6 +88,18 @@ def test_processes_and_stations() -> None:
     assert "Worth a look" not in text
 
 
+@pytest.mark.parametrize(
+    ("state", "meaning"),
+    [
+        ("PREOP", "it exchanges no process data until 'eapctl state mixer OP'"),
+        ("SAFEOP", "it receives no process data until 'eapctl state mixer OP'"),
+    ],
+)
+def test_a_station_that_was_left_in_another_state(state: str, meaning: str) -> None:
+    text = " ".join(show(document(state=state)).split())
+    assert f"Worth a look mixer: in {state}, as was asked for last: {meaning}" in text
+
+
 def test_process_that_was_restarted_and_one_that_is_being() -> None:
     status = document()
     status["processes"]["engine"]["restarts"] = 2

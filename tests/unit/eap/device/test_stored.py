@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import (
     StoredError,
+    adopt,
     configuration,
     copy,
     decode,
@@ -59,6 +60,22 @@ def test_restoring_replaces_everything_and_keeps_what_is_not_configuration(udp):
     assert udp.upload(0xF100, 1, OP) == b"\x08\0"
     restore(udp, {})
     assert configuration(udp) == configuration(EapDictionary(BLANK, "eap0"))
+
+
+def test_adopting_touches_only_what_differs(udp):
+    sender(udp)
+    write(udp, 0xF811, 2, "239.1.1.1")
+    wanted = copy(udp)
+    write(wanted, 0xD000, Tx.PD_ID, 9)
+    write(wanted, 0xF811, 0, 1)
+    write(wanted, 0xF811, 1, "239.1.1.2")
+    variable(wanted, 0x6005, "more")
+    same = [udp[index] for index in (0x6000, 0x1A00, 0x8000)]
+    adopt(udp, wanted)
+    assert configuration(udp) == configuration(wanted)
+    assert [udp[each.index] for each in same] == same
+    adopt(udp, udp.blank())
+    assert configuration(udp) == configuration(udp.blank())
 
 
 def test_rights_that_the_configuration_grants_are_restored(udp):

@@ -67,6 +67,15 @@ def test_refusal_because_of_the_state(station, device):
         station.write(0xD000, 7, bytes(4))
 
 
+def test_a_refused_state_request_needs_no_hint(station, answers):
+    def refuse(params):
+        raise ControlError("0xF200:01: refused (0x08000022): no PDO", code="abort")
+
+    answers["od_write"] = refuse
+    with pytest.raises(ControlError, match=r"no PDO$"):
+        station.write(0xF200, 1, b"\x08\0")
+
+
 def test_refusal_of_another_kind(station, answers):
     def refuse(params):
         raise ControlError("no port eap0", code="unknown_name")
