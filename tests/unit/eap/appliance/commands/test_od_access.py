@@ -50,7 +50,8 @@ def test_bits_of_a_whole_object():
 def test_texts_of_a_whole_object_end_where_they_end(device, monkeypatch):
     kind = datatypes.parse("STRING(8)")
     name = EntryInfo(1, "Name", kind, "rw")
-    monkeypatch.setattr(device, "describe", lambda _: ObjectInfo(0x6000, "", "RECORD", 1, (name,)))
+    found = ObjectInfo(0x6000, "Name", "RECORD", 1, entries=(name,))
+    monkeypatch.setattr(device, "describe", lambda _: found)
     monkeypatch.setattr(device, "read", lambda *_, complete: b"level".ljust(kind.size, b"\0"))
     (row,) = od_access.read_object(device, 0x6000, 1)["entries"]
     assert (row["value"], row["data"]) == ("level", b"level".hex())
@@ -58,7 +59,7 @@ def test_texts_of_a_whole_object_end_where_they_end(device, monkeypatch):
 
 def test_whole_object_of_unknown_parts(device, monkeypatch):
     unknown = EntryInfo(7, "Cycle time", None, "rw")
-    found = ObjectInfo(0xD000, "TxPD 0", "RECORD", 7, (unknown,))
+    found = ObjectInfo(0xD000, "TxPD 0", "RECORD", 7, entries=(unknown,))
     monkeypatch.setattr(device, "describe", lambda _: found)
     row = od_access.read_object(device, 0xD000, 1)
     assert (row["data"], row["entries"]) == ("10270000", [])
