@@ -17,7 +17,7 @@ from eap.aoe.ads_operation import (
     Write,
     WriteControl,
 )
-from eap.aoe.ads_request import encode_refusal, parse_request
+from eap.aoe.ads_request import Outcomes, encode_refusal, parse_request
 from eap.aoe.ads_space import AdsSpace
 from eap.aoe.ads_state import DeviceDataSpace, States
 from eap.aoe.answer import AmsAnswer
@@ -87,11 +87,11 @@ class AdsDevice:
             if exc.result is AdsError.COMMAND:
                 return AmsAnswer(error_code=exc.result)
             return AmsAnswer(encode_refusal(command, exc.result))
-        outcomes = []
+        outcomes = Outcomes(request)
         for operation in request.operations:
             reason = judge(operation)
-            outcomes.append(Outcome(reason) if reason else self.perform(operation, client, now_ns))
-        return AmsAnswer(request.encode_answer(outcomes))
+            outcomes.add(Outcome(reason) if reason else self.perform(operation, client, now_ns))
+        return AmsAnswer(outcomes.encode())
 
     def perform(self, operation: Operation, client: Client, now_ns: int) -> Outcome:
         """Do one operation."""

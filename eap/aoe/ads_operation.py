@@ -109,5 +109,6 @@ _LOOKUPS = frozenset(
         IndexGroup.VALUE_BY_NAME,
         IndexGroup.SYMBOL_BY_NAME,
         IndexGroup.SYMBOL_ENTRY_BY_NAME,
+        IndexGroup.DATA_TYPE_BY_NAME,
     )
 )

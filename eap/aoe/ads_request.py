@@ -1,27 +1,26 @@
 """ADS requests taken apart into operations, and the answers put together again.
 
-Beckhoff ADS specification, commands 1 to 7 and 9; the layouts of sum commands are those of the
-header AdsDef.h of Beckhoff's AdsLib.  SUM_READ_EX answers with the lengths that were asked for,
-padded with zeros, SUM_READ_EX_2 with those that were read.
+Beckhoff ADS specification, commands 1 to 7 and 9.  Whoever cannot answer at once, because a bus
+lies between, does what ``AdsDevice.answer`` does in steps of its own: ``parse_request``, one
+outcome for each operation into ``Outcomes``, ``encode``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from eap.aoe.ads_operation import (
     AdsRefusedError,
-    DeleteNotification,
     Operation,
     Outcome,
-    Read,
     ReadDeviceInfo,
     ReadState,
     ReadWrite,
     Write,
     WriteControl,
 )
+from eap.aoe.ads_sum import SUM_COMMANDS, asked_length, padded, parse_delete, parse_read, taken
 from eap.codec.ads import (
     AdsError,
     AdsRange,
@@ -36,17 +35,8 @@ from eap.errors import TruncatedError
 
 MAX_ANSWER = 1 << 20
 """Octets of the longest answer; a sum command that asks for more is refused as a whole."""
-_HANDLE_SIZE = 4
-_RESULT_SIZE = 4
-
-
-class _Sum(NamedTuple):
-    """One of the sum commands."""
-
-    item_size: int
-    """Octets that each item has at the front of the request."""
-    split: Callable[[int, bytes], list[Operation]]
-    join: Callable[[Sequence[Operation], Sequence[Outcome]], bytes]
+_HEAD_SIZE = 8
+"""Octets of a result and of what stands beside it in the answer of a sum command."""
 
 
 class AdsRequest(NamedTuple):
@@ -69,13 +59,36 @@ class AdsRequest(NamedTuple):
         if self.sum_group == IndexGroup.SUM_READ and not self.index_offset:
             # Without results of its own, an item that failed is the result of the whole.
             result = next((item.result for item in outcomes if item.result), AdsError.NONE)
-            data = _padded(self.operations, outcomes)
+            data = padded(self.operations, outcomes)
         else:
             result = AdsError.NONE
-            data = _SUMS[self.sum_group].join(self.operations, outcomes)
+            data = SUM_COMMANDS[self.sum_group].join(self.operations, outcomes)
         if len(data) > min(self.read_length, MAX_ANSWER):
             return encode_refusal(self.command, AdsError.SIZE)
         return encode_result(result, data)
+
+
+class Outcomes:
+    """How the operations of one request came out, one after the other.
+
+    What the answer has no room for is refused as it comes, so that it need not be kept.
+    """
+
+    def __init__(self, request: AdsRequest) -> None:
+        self._request = request
+        self._room = MAX_ANSWER - _HEAD_SIZE * len(request.operations)
+        self._outcomes: list[Outcome] = []
+
+    def add(self, outcome: Outcome) -> None:
+        """Take the outcome of the next operation."""
+        if len(outcome.data) > self._room:
+            outcome = Outcome(AdsError.NO_MEMORY)
+        self._room -= len(outcome.data)
+        self._outcomes.append(outcome)
+
+    def encode(self) -> bytes:
+        """Return the body of the answer; there is an outcome for every operation."""
+        return self._request.encode_answer(self._outcomes)
 
 
 def parse_request(command: int, body: bytes) -> AdsRequest:
@@ -90,7 +103,7 @@ def parse_request(command: int, body: bytes) -> AdsRequest:
         raise AdsRefusedError(AdsError.COMMAND)
     try:
         operation = parser(body)
-        if isinstance(operation, ReadWrite) and operation.group in _SUMS:
+        if isinstance(operation, ReadWrite) and operation.group in SUM_COMMANDS:
             return _parse_sum(operation)
     except TruncatedError:
         raise AdsRefusedError(AdsError.SIZE) from None
@@ -123,159 +136,46 @@ _BEHIND_RESULT: dict[int, int] = {
 """Octets of an answer behind its result when there is no data."""
 
 
-def _parse_read(body: bytes) -> Read:
-    asked = AdsRange.decode(body)
-    return Read(asked.group, asked.offset, asked.length)
-
-
 def _parse_write(body: bytes) -> Write:
     head = AdsRange.decode(body)
-    return Write(head.group, head.offset, _taken(body, AdsRange.SIZE, head.length))
+    return Write(head.group, head.offset, taken(body, AdsRange.SIZE, head.length))
 
 
 def _parse_control(body: bytes) -> WriteControl:
     head = AdsWriteControl.decode(body)
-    data = _taken(body, AdsWriteControl.SIZE, head.length)
+    data = taken(body, AdsWriteControl.SIZE, head.length)
     return WriteControl(head.ads_state, head.device_state, data)
 
 
 def _parse_read_write(body: bytes) -> ReadWrite:
     head = AdsReadWrite.decode(body)
-    data = _taken(body, AdsReadWrite.SIZE, head.write_length)
+    data = taken(body, AdsReadWrite.SIZE, head.write_length)
     return ReadWrite(head.group, head.offset, head.read_length, data)
-
-
-def _parse_delete(body: bytes) -> DeleteNotification:
-    return DeleteNotification(int.from_bytes(_taken(body, 0, _HANDLE_SIZE), "little"))
 
 
 _PARSERS: dict[int, Callable[[bytes], Operation]] = {
     AmsCommand.READ_DEVICE_INFO: lambda _: ReadDeviceInfo(),
-    AmsCommand.READ: _parse_read,
+    AmsCommand.READ: parse_read,
     AmsCommand.WRITE: _parse_write,
     AmsCommand.READ_STATE: lambda _: ReadState(),
     AmsCommand.WRITE_CONTROL: _parse_control,
     AmsCommand.ADD_NOTIFICATION: AddNotification.decode,
-    AmsCommand.DELETE_NOTIFICATION: _parse_delete,
+    AmsCommand.DELETE_NOTIFICATION: parse_delete,
     AmsCommand.READ_WRITE: _parse_read_write,
 }
 
 
 def _parse_sum(request: ReadWrite) -> AdsRequest:
-    kind = _SUMS[request.group]
+    kind = SUM_COMMANDS[request.group]
     count = request.offset
     if not count and request.group == IndexGroup.SUM_READ:
         count = len(request.data) // kind.item_size
     if count * kind.item_size > len(request.data):
         raise AdsRefusedError(AdsError.SIZE)
     operations = kind.split(count, request.data)
-    if sum(map(_room, operations)) > MAX_ANSWER:
+    padding = sum(map(asked_length, operations)) if kind.is_padded else 0
+    if len(operations) * _HEAD_SIZE + padding > MAX_ANSWER:
         raise AdsRefusedError(AdsError.NO_MEMORY)
     return AdsRequest(
         AmsCommand.READ_WRITE, tuple(operations), request.group, request.length, request.offset
     )
-
-
-def _room(operation: Operation) -> int:
-    return 2 * _RESULT_SIZE + _asked(operation)
-
-
-def _asked(operation: Operation) -> int:
-    return operation.length if isinstance(operation, Read | ReadWrite) else 0
-
-
-def _split_reads(count: int, data: bytes) -> list[Operation]:
-    return [_parse_read(data[at : at + AdsRange.SIZE]) for at in _starts(count, AdsRange.SIZE)]
-
-
-def _split_writes(count: int, data: bytes) -> list[Operation]:
-    items: list[Operation] = []
-    behind = count * AdsRange.SIZE
-    for at in _starts(count, AdsRange.SIZE):
-        head = AdsRange.decode(data, at)
-        items.append(Write(head.group, head.offset, _taken(data, behind, head.length)))
-        behind += head.length
-    return items
-
-
-def _split_read_writes(count: int, data: bytes) -> list[Operation]:
-    items: list[Operation] = []
-    behind = count * AdsReadWrite.SIZE
-    for at in _starts(count, AdsReadWrite.SIZE):
-        head = AdsReadWrite.decode(data, at)
-        written = _taken(data, behind, head.write_length)
-        items.append(ReadWrite(head.group, head.offset, head.read_length, written))
-        behind += head.write_length
-    return items
-
-
-def _split_adds(count: int, data: bytes) -> list[Operation]:
-    size = AddNotification.SIZE
-    return [AddNotification.decode(data, at) for at in _starts(count, size)]
-
-
-def _split_deletes(count: int, data: bytes) -> list[Operation]:
-    return [_parse_delete(data[at : at + _HANDLE_SIZE]) for at in _starts(count, _HANDLE_SIZE)]
-
-
-def _starts(count: int, size: int) -> Iterable[int]:
-    return range(0, count * size, size)
-
-
-def _taken(data: bytes, start: int, length: int) -> bytes:
-    """Return *length* octets from *start*; refuse with SIZE if there are fewer."""
-    if len(data) - start < length:
-        raise AdsRefusedError(AdsError.SIZE)
-    return bytes(data[start : start + length])
-
-
-def _results(outcomes: Iterable[Outcome]) -> bytes:
-    return b"".join(encode_result(item.result) for item in outcomes)
-
-
-def _padded(operations: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
-    """Return what was read, each with the length that was asked for."""
-    return b"".join(
-        outcome.data.ljust(_asked(operation), b"\0")
-        for operation, outcome in zip(operations, outcomes, strict=True)
-    )
-
-
-def _join_reads(operations: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
-    return _results(outcomes) + _padded(operations, outcomes)
-
-
-def _join_results(_: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
-    return _results(outcomes)
-
-
-def _join_asked(operations: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
-    heads = b"".join(
-        encode_result(outcome.result) + _asked(operation).to_bytes(4, "little")
-        for operation, outcome in zip(operations, outcomes, strict=True)
-    )
-    return heads + _padded(operations, outcomes)
-
-
-def _join_returned(_: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
-    heads = b"".join(
-        encode_result(item.result) + len(item.data).to_bytes(4, "little") for item in outcomes
-    )
-    return heads + b"".join(item.data for item in outcomes)
-
-
-def _join_handles(_: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
-    return b"".join(
-        encode_result(item.result) + item.data.ljust(_HANDLE_SIZE, b"\0") for item in outcomes
-    )
-
-
-_SUMS: dict[int, _Sum] = {
-    IndexGroup.SUM_READ: _Sum(AdsRange.SIZE, _split_reads, _join_reads),
-    IndexGroup.SUM_WRITE: _Sum(AdsRange.SIZE, _split_writes, _join_results),
-    IndexGroup.SUM_READ_WRITE: _Sum(AdsReadWrite.SIZE, _split_read_writes, _join_returned),
-    IndexGroup.SUM_READ_EX: _Sum(AdsRange.SIZE, _split_reads, _join_asked),
-    IndexGroup.SUM_READ_EX_2: _Sum(AdsRange.SIZE, _split_reads, _join_returned),
-    IndexGroup.SUM_ADD_NOTIFICATION: _Sum(AddNotification.SIZE, _split_adds, _join_handles),
-    IndexGroup.SUM_DELETE_NOTIFICATION: _Sum(_HANDLE_SIZE, _split_deletes, _join_results),
-}

@@ -16,13 +16,16 @@ from eap.aoe.ads_operation import AdsRefusedError
 from eap.aoe.ads_space import AdsSpace, Source
 from eap.aoe.ads_types import SymbolType, symbol_type
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.adsdatatype import encode_data_type
 from eap.codec.adssymbol import (
+    HandleInfo,
     SymbolEntry,
     SymbolFlag,
     SymbolPlace,
     UploadInfo,
     decode_name,
     encode_entry,
+    encode_text,
 )
 from eap.codec.values import DataType
 
@@ -68,6 +71,10 @@ class _Symbol(NamedTuple):
             )
         )
 
+    def describe_handle(self, handle: int) -> bytes:
+        name = encode_text(self.type.name)
+        return HandleInfo(handle, self.type.size, 0, len(name)).encode() + name + b"\0"
+
 
 class SymbolTable:
     """All symbols of one configuration.
@@ -92,10 +99,27 @@ class SymbolTable:
         for name, index in self._indexes.items():
             key = name.casefold()
             self._folded[key] = None if key in self._folded else index
+        self._types = {
+            entry.name: encode_data_type(entry)
+            for symbol in self._symbols
+            for entry in symbol.type.describe()
+        }
         self.upload = b"".join(symbol.describe() for symbol in self._symbols)
+        self.type_upload = b"".join(self._types.values())
 
-    def __len__(self) -> int:
-        return len(self._symbols)
+    @property
+    def info(self) -> UploadInfo:
+        """How much there is to upload."""
+        return UploadInfo(
+            len(self._symbols), len(self.upload), len(self._types), len(self.type_upload)
+        )
+
+    def data_type(self, name: str) -> bytes:
+        """Return the entry of a type that symbols have; refuse with SYMBOL_NOT_FOUND."""
+        try:
+            return self._types[name.upper()]
+        except KeyError:
+            raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND) from None
 
     def handle_of(self, name: str) -> int:
         """Return the handle of a symbol; refuse with SYMBOL_NOT_FOUND."""
@@ -146,6 +170,7 @@ class SymbolSpace(AdsSpace):
             IndexGroup.DATA_TYPE_UPLOAD,
             IndexGroup.SYMBOL_UPLOAD_INFO_2,
             IndexGroup.SYMBOL_NOTIFICATION,
+            IndexGroup.DATA_TYPE_BY_NAME,
         )
     )
 
@@ -163,15 +188,13 @@ class SymbolSpace(AdsSpace):
         if group == IndexGroup.SYMBOL_VERSION:
             return bytes((self._table.version,))[:length]
         if group == IndexGroup.SYMBOL_UPLOAD_INFO:
-            return self._upload_info()[: min(length, 8)]
+            return self._table.info.encode()[: min(length, 8)]
         if group == IndexGroup.SYMBOL_UPLOAD_INFO_2:
-            return self._upload_info()[:length]
-        if group == IndexGroup.DATA_TYPE_UPLOAD:
-            return b""
+            return self._table.info.encode()[:length]
         if group == IndexGroup.SYMBOL_UPLOAD:
-            if len(self._table.upload) > length:
-                raise AdsRefusedError(AdsError.SIZE)
-            return self._table.upload
+            return _whole(self._table.upload, length)
+        if group == IndexGroup.DATA_TYPE_UPLOAD:
+            return _whole(self._table.type_upload, length)
         symbol, start = self._find(group, offset)
         return self._value(symbol)[start : start + length]
 
@@ -193,19 +216,19 @@ class SymbolSpace(AdsSpace):
         """Return what belongs to the name in *data*."""
         if group not in _BY_NAME:
             return super().read_write(group, offset, length, data)
-        handle = self._table.handle_of(decode_name(data))
+        name = decode_name(data)
+        if group == IndexGroup.DATA_TYPE_BY_NAME:
+            return _whole(self._table.data_type(name), length)
+        handle = self._table.handle_of(name)
         symbol = self._table.by_handle(handle)
         if group == IndexGroup.VALUE_BY_NAME:
             return self._value(symbol)[:length]
         if group == IndexGroup.SYMBOL_HANDLE:
-            answer = handle.to_bytes(4, "little")
-        elif group == IndexGroup.SYMBOL_BY_NAME:
-            answer = symbol.place.encode()
-        else:
-            answer = symbol.describe()
-        if len(answer) > length:
-            raise AdsRefusedError(AdsError.SIZE)
-        return answer
+            info = symbol.describe_handle(handle)
+            return _whole(info if len(info) <= length else info[:4], length)
+        if group == IndexGroup.SYMBOL_BY_NAME:
+            return _whole(symbol.place.encode(), length)
+        return _whole(symbol.describe(), length)
 
     def watch(self, group: int, offset: int, length: int) -> Source:
         """Return what gives a value, the first *length* octets of it, or the version."""
@@ -235,9 +258,6 @@ class SymbolSpace(AdsSpace):
     def _value(self, symbol: _Symbol) -> bytes:
         return symbol.type.to_client(self._store.read(symbol.variable.name))
 
-    def _upload_info(self) -> bytes:
-        return UploadInfo(len(self._table), len(self._table.upload)).encode()
-
 
 _BY_HANDLE = frozenset((IndexGroup.VALUE_BY_HANDLE, IndexGroup.SYMBOL_NOTIFICATION))
 _BY_NAME = frozenset(
@@ -246,5 +266,12 @@ _BY_NAME = frozenset(
         IndexGroup.VALUE_BY_NAME,
         IndexGroup.SYMBOL_BY_NAME,
         IndexGroup.SYMBOL_ENTRY_BY_NAME,
+        IndexGroup.DATA_TYPE_BY_NAME,
     )
 )
+
+
+def _whole(octets: bytes, length: int) -> bytes:
+    if len(octets) > length:
+        raise AdsRefusedError(AdsError.SIZE)
+    return octets

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from eap.aoe.ads_operation import AdsRefusedError
 from eap.codec.ads import AdsError
+from eap.codec.adsdatatype import DataTypeEntry
 from eap.codec.adssymbol import AdsType
 from eap.codec.values import Array, Block, Boolean, DataType, Integer, Real, String
 
@@ -35,6 +36,16 @@ class SymbolType(NamedTuple):
     """As IEC 61131-3 writes it."""
     size: int
     """Octets for a client."""
+
+    def describe(self) -> list[DataTypeEntry]:
+        """Return what clients may want to know of this type, and of its elements."""
+        if isinstance(self.kind, Array):
+            (of,) = symbol_type(self.kind.element).describe()
+        elif isinstance(self.kind, Block):
+            of = DataTypeEntry("BYTE", AdsType.UINT8, 1)
+        else:
+            return [DataTypeEntry(self.name, self.id, self.size)]
+        return [of, DataTypeEntry(self.name, self.id, self.size, of.name, self.size // of.size)]
 
     def to_client(self, octets: bytes) -> bytes:
         """Return what a client reads of a value; *octets* are those of our type."""

@@ -127,6 +127,7 @@ class IndexGroup(IntEnum):
     SYMBOL_UPLOAD_INFO_2 = 0xF00F
     SYMBOL_NOTIFICATION = 0xF010
     """Offset: a handle, whose value a notification watches."""
+    DATA_TYPE_BY_NAME = 0xF011
     SUM_READ = 0xF080
     SUM_WRITE = 0xF081
     SUM_READ_WRITE = 0xF082

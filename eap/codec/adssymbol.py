@@ -76,6 +76,18 @@ class _EntryHead(WireStruct, frozen=True):
     comment_length: u16
 
 
+class HandleInfo(WireStruct, frozen=True):
+    """What stands in front of the type's name where a client has room for more than a handle.
+
+    As the open client ads-client reads it; nobody documents *decoration*.
+    """
+
+    handle: u32
+    size: u32
+    decoration: u32
+    type_length: u16
+
+
 class SymbolEntry(NamedTuple):
     """One variable as a server tells of it."""
 

@@ -10,7 +10,9 @@ import time
 
 import pytest
 
-from eap.codec.ads import AdsError, AdsState
+from eap.codec.ads import AdsError, AdsState, IndexGroup
+from eap.codec.adsnotification import TransMode
+from eap.codec.adssymbol import AdsType, SymbolFlag
 from tests.support.addresses import own_address
 from tests.support.adsdevice import (
     BUS_NET_ID,
@@ -36,6 +38,28 @@ DEVICE = 0xFFFF
 
 def octets(net_id: str) -> bytes:
     return bytes(int(part) for part in net_id.split("."))
+
+
+NAMES_OF_TYPES = ("INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64",
+                  "REAL32", "REAL64", "STRING", "BIT")  # fmt: skip
+NAMES_OF_GROUPS = {
+    "SYM_HNDBYNAME": IndexGroup.SYMBOL_HANDLE,
+    "SYM_VALBYNAME": IndexGroup.VALUE_BY_NAME,
+    "SYM_VALBYHND": IndexGroup.VALUE_BY_HANDLE,
+    "SYM_RELEASEHND": IndexGroup.RELEASE_HANDLE,
+    "SYM_INFOBYNAME": IndexGroup.SYMBOL_BY_NAME,
+    "SYM_VERSION": IndexGroup.SYMBOL_VERSION,
+    "SYM_INFOBYNAMEEX": IndexGroup.SYMBOL_ENTRY_BY_NAME,
+    "SYM_UPLOAD": IndexGroup.SYMBOL_UPLOAD,
+    "SYM_UPLOADINFO": IndexGroup.SYMBOL_UPLOAD_INFO,
+    "SYM_DT_UPLOAD": IndexGroup.DATA_TYPE_UPLOAD,
+    "SYM_UPLOADINFO2": IndexGroup.SYMBOL_UPLOAD_INFO_2,
+    "SYMNOTE": IndexGroup.SYMBOL_NOTIFICATION,
+    "SUMUP_READ": IndexGroup.SUM_READ,
+    "SUMUP_WRITE": IndexGroup.SUM_WRITE,
+    "DEVICE_DATA": IndexGroup.DEVICE_DATA,
+}
+NAMES_OF_MODES = ("CLIENT_CYCLE", "SERVER_CYCLE")
 
 
 class Served:
@@ -111,6 +135,21 @@ def read_values(store):
         name: list(value) if isinstance(value, tuple | bytes) else value
         for name, value in ((name, store.get(name)) for name in VALUES)
     }
+
+
+def test_numbers_are_those_of_pyads():
+    constants = vars(pyads.constants)
+    assert {name: constants[f"ADST_{name}"] for name in NAMES_OF_TYPES} == {
+        name: AdsType[name] for name in NAMES_OF_TYPES
+    }
+    assert {n: constants[f"ADSIGRP_{n}"] for n in NAMES_OF_GROUPS} == NAMES_OF_GROUPS
+    modes = {name: constants[f"ADSTRANS_{name.replace('_', '')}"] for name in NAMES_OF_MODES}
+    assert modes == {name: TransMode[name] for name in NAMES_OF_MODES}
+    states = {name: AdsState[name] for name in ("RESET", "INIT", "RUN", "STOP", "CONFIG")}
+    assert states == {name: constants[f"ADSSTATE_{name}"] for name in states}
+    assert constants["ADSSYMBOLFLAG_READONLY"] == SymbolFlag.READ_ONLY
+    unknown = set(AdsError) - set(pyads.errorcodes.ERROR_CODES)
+    assert not unknown
 
 
 def test_info_and_states(plc, served):

@@ -8,7 +8,14 @@ from eap.aoe.ads_operation import AdsRefusedError
 from eap.aoe.ads_symbols import SymbolSpace, SymbolTable, Variable
 from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.adssymbol import AdsType, SymbolEntry, SymbolFlag, SymbolPlace, decode_entry
+from eap.codec.adssymbol import (
+    AdsType,
+    SymbolEntry,
+    SymbolFlag,
+    SymbolPlace,
+    UploadInfo,
+    decode_entry,
+)
 from tests.support.adsdevice import VALUES, DictStore, variables
 
 G = IndexGroup
@@ -64,10 +71,37 @@ def test_table_is_uploaded(space) -> None:
     )
     assert end == len(space.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 798, b"count"))
     info = space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 1024)
-    assert info == space.read(G.SYMBOL_UPLOAD_INFO, 0, 1024) + bytes(16)
-    assert space.read(G.DATA_TYPE_UPLOAD, 0, 1024) == b""
+    assert info[:8] == space.read(G.SYMBOL_UPLOAD_INFO, 0, 1024)
+    assert len(info) == 24
     with pytest.raises(AdsRefusedError, match="SIZE"):
         space.read(G.SYMBOL_UPLOAD, 0, size - 1)
+
+
+def test_types_of_symbols_are_told_and_uploaded(space) -> None:
+    info = UploadInfo.decode(space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 24))
+    octets = space.read(G.DATA_TYPE_UPLOAD, 0, BIG)
+    assert len(octets) == info.type_size
+    entries, at = {}, 0
+    while at < len(octets):
+        size = int.from_bytes(octets[at : at + 4], "little")
+        length = int.from_bytes(octets[at + 32 : at + 34], "little")
+        entries[octets[at + 42 : at + 42 + length].decode()] = octets[at : at + size]
+        at += size
+    assert len(entries) == info.types
+    assert {"INT", "ARRAY [0..3] OF INT", "STRING(15)", "BYTE", "BOOL"} <= set(entries)
+    for name, entry in entries.items():
+        assert space.read_write(G.DATA_TYPE_BY_NAME, 0, BIG, name.lower().encode()) == entry
+    with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
+        space.read_write(G.DATA_TYPE_BY_NAME, 0, BIG, b"ST_PUMP")
+    with pytest.raises(AdsRefusedError, match="SIZE"):
+        space.read_write(G.DATA_TYPE_BY_NAME, 0, 40, b"INT")
+
+
+def test_a_handle_comes_with_its_type_where_there_is_room(space) -> None:
+    octets = space.read_write(G.SYMBOL_HANDLE, 0, BIG, b"count")
+    assert octets == bytes.fromhex("03000001 04000000 00000000 0500") + b"UDINT\0"
+    assert space.read_write(G.SYMBOL_HANDLE, 0, len(octets), b"count") == octets
+    assert space.read_write(G.SYMBOL_HANDLE, 0, len(octets) - 1, b"count") == octets[:4]
 
 
 def test_values_are_written(space, store) -> None:
@@ -168,7 +202,8 @@ def test_what_the_store_refuses_is_passed_on(space, store) -> None:
 
 def test_table_without_symbols() -> None:
     table = SymbolTable([], 3)
-    assert (len(table), table.upload) == (0, b"")
+    assert table.info == UploadInfo(0, 0)
+    assert (table.upload, table.type_upload) == (b"", b"")
     with pytest.raises(AdsRefusedError, match="INDEX_OFFSET"):
         table.at(0)
 

@@ -93,6 +93,31 @@ def test_texts_may_be_shorter_and_truth_any_octet() -> None:
     assert symbol_type(datatypes.parse("BOOL")).from_client(b"\x80") == b"\1"
 
 
+@pytest.mark.parametrize(
+    ("text", "entries"),
+    [
+        ("UINT", [("UINT", AdsType.UINT16, 2, "", 0)]),
+        ("STRING(5)", [("STRING(5)", AdsType.STRING, 6, "", 0)]),
+        (
+            "INT24[3]",
+            [
+                ("DINT", AdsType.INT32, 4, "", 0),
+                ("ARRAY [0..2] OF DINT", AdsType.INT32, 12, "DINT", 3),
+            ],
+        ),
+        (
+            "BLOCK(7)",
+            [
+                ("BYTE", AdsType.UINT8, 1, "", 0),
+                ("ARRAY [0..6] OF BYTE", AdsType.UINT8, 7, "BYTE", 7),
+            ],
+        ),
+    ],
+)
+def test_what_types_are_made_of(text: str, entries: list) -> None:
+    assert symbol_type(datatypes.parse(text)).describe() == entries
+
+
 TEXTS = ["INT24", "UINT56[3]", "BIT5", "REAL", "LINT[2]", "STRING(9)", "BLOCK(5)", "BOOL", "DWORD"]
 
 
