@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -34,6 +35,8 @@ class LoadResult(msgspec.Struct, frozen=True):
 
     plant: Plant | None
     findings: tuple[Finding, ...]
+    lines: Mapping[str, int] = {}
+    """Of a plant: the line of each path of its file."""
 
 
 def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
@@ -55,4 +58,4 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     check_links(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)
-    return LoadResult(Plant(plant_file.plant, derive(index, path.parent)), ())
+    return LoadResult(Plant(plant_file.plant, derive(index, path.parent)), (), report.lines)

@@ -39,7 +39,14 @@ def test_a_plant_that_is_well(plant: Path) -> None:
     assert result.exit_code == 0, result.stderr
     assert result.stdout == (f"{plant}: plant line is well: 1 station, 1 PD sent, 0 PDs received\n")
     result = CliRunner().invoke(main, ["check", str(plant), "--json"])
-    assert (result.exit_code, result.stdout) == (0, '{"ok":true,"findings":[]}\n')
+    assert (result.exit_code, result.stdout) == (0, '{"ok":true,"findings":[],"warnings":[]}\n')
+    plant.write_text(PLANT.replace("[speed]", f"[{', '.join(['speed'] * 255)}]"))
+    result = CliRunner().invoke(main, ["check", str(plant)])
+    assert (result.exit_code, result.stdout.count("\n"), result.stderr.count("\n")) == (0, 1, 1)
+    assert result.stderr.startswith(f"warning: {plant}:3: station mixer does not fit")
+    result = CliRunner().invoke(main, ["check", str(plant), "--json"])
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert [each["line"] for each in json.loads(result.stdout)["warnings"]] == [3]
 
 
 def test_all_findings_at_once(plant: Path) -> None:

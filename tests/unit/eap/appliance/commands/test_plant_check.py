@@ -1,0 +1,58 @@
+"""Warnings about plant files that are well."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from eap.appliance.commands.plant_check import check_plant
+
+PLANT = """\
+plant: line
+stations:
+  - name: mixer
+    net_id: 1.1.1.1.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://127.0.9.1", net_id: 1.1.1.1.2.1}}
+      - {{name: eap1, kind: eap, interface: "udp://127.0.9.2", net_id: 1.1.1.1.3.1}}
+  - name: oven
+    net_id: 1.1.1.2.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://127.0.9.3", net_id: 1.1.1.2.2.1}}
+    variables: {{speed: BIT1, {name}: INT}}
+    frames:
+      - {{name: out, port: eap0, to: 239.1.2.3}}
+    publish:
+      - {{name: state, frame: out, id: 7, variables: [{variables}]}}
+"""
+
+
+def write(folder: Path, name: str = "level", count: int = 1) -> Path:
+    path = folder / "plant.yaml"
+    path.write_text(PLANT.format(name=name, variables=", ".join(["speed"] * count)))
+    return path
+
+
+@pytest.mark.parametrize("count", [1, 248])
+def test_what_fits_is_no_warning(tmp_path: Path, count: int) -> None:
+    result, warnings = check_plant(write(tmp_path, count=count))
+    assert (result.findings, warnings) == ((), ())
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"), [({"count": 255}, "PD state"), ({"name": "n" * 256}, "255 octets")]
+)
+def test_what_does_not_fit_is_said_with_its_line(tmp_path: Path, more: dict, reason: str) -> None:
+    path = write(tmp_path, **more)
+    result, (warning,) = check_plant(path)
+    assert result.plant
+    assert (warning.file, warning.line, warning.path) == (str(path), 8, "stations[1]")
+    assert "station oven does not fit into the object dictionary of eap0" in warning.message
+    assert reason in warning.message
+
+
+def test_a_file_that_is_no_plant_has_findings_only(tmp_path: Path) -> None:
+    result, warnings = check_plant(write(tmp_path, name="a b"))
+    assert result.findings
+    assert warnings == ()
