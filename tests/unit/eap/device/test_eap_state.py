@@ -293,4 +293,4 @@ class DeviceMachine(RuleBasedStateMachine):
 
 
 TestDevice = DeviceMachine.TestCase
-TestDevice.settings = settings(max_examples=20, stateful_step_count=25)
+TestDevice.settings = settings(max_examples=8, stateful_step_count=25)

@@ -50,17 +50,24 @@ def test_what_is_written_is_read_and_nothing_else_changes(data):
     assert {name: image.read(name) for name in names} == expected
 
 
-@given(st.data())
-def test_a_storer_writes_what_write_writes(data):
-    kinds = ("BOOL", "BIT3", "SINT", "USINT", "INT", "UINT24", "UDINT", "LINT", "REAL", "LREAL")
-    names = tuple(f"v{i}" for i in range(len(kinds)))
-    variables = received(*(f"v{i}:{kind}" for i, kind in enumerate(kinds)))
+STORED = ("BOOL", "BIT3", "SINT", "USINT", "INT", "UINT24", "UDINT", "LINT", "REAL", "LREAL")
+_ranges = [parse(kind).scalar_range for kind in STORED]
+
+
+@given(
+    st.tuples(
+        *(
+            st.integers(low, high) if isinstance(low, int) else st.floats(low, high)
+            for low, high in _ranges
+        )
+    )
+)
+def test_a_storer_writes_what_write_writes(values):
+    names = tuple(f"v{i}" for i in range(len(STORED)))
+    variables = received(*(f"v{i}:{kind}" for i, kind in enumerate(STORED)))
     spec = station(variables=variables, subscriptions=(RxPdSpec("r", "eap0", 1, names),))
     image, other = image_of(spec), image_of(spec)
-    for name, kind in zip(names, kinds, strict=True):
-        low, high = parse(kind).scalar_range
-        number = st.integers(low, high) if isinstance(low, int) else st.floats(low, high)
-        value = data.draw(number)
+    for name, value in zip(names, values, strict=True):
         image.storer(name)(value)
         other.write(name, value)
     assert bytes(image.memory) == bytes(other.memory)
