@@ -9,7 +9,7 @@ from eap.aoe.ads_notifications import Client, NotificationTable
 from eap.aoe.ads_operation import (
     AdsRefusedError,
     Operation,
-    Outcome,
+    OperationOutcome,
     Read,
     ReadDeviceInfo,
     ReadState,
@@ -90,15 +90,17 @@ class AdsDevice:
         outcomes = Outcomes(request)
         for operation in request.operations:
             reason = judge(operation)
-            outcomes.add(Outcome(reason) if reason else self.perform(operation, client, now_ns))
+            outcomes.add(
+                OperationOutcome(reason) if reason else self.perform(operation, client, now_ns)
+            )
         return AmsAnswer(outcomes.encode())
 
-    def perform(self, operation: Operation, client: Client, now_ns: int) -> Outcome:
+    def perform(self, operation: Operation, client: Client, now_ns: int) -> OperationOutcome:
         """Do one operation."""
         try:
-            return Outcome(data=self._perform(operation, client, now_ns))
+            return OperationOutcome(data=self._perform(operation, client, now_ns))
         except AdsRefusedError as exc:
-            return Outcome(exc.result, why=exc.why)
+            return OperationOutcome(exc.result, why=exc.why)
 
     def _perform(self, operation: Operation, client: Client, now_ns: int) -> bytes:
         match operation:

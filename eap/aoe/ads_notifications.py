@@ -37,6 +37,7 @@ MAX_WATCHED = 0xFFFF
 FULL_PACKET = 32 * 1024
 """Octets of samples of one client that are sent without waiting for more."""
 
+# TwinCAT's variants "in context" belong to the cycle of a task; here is only one cycle for all.
 _CYCLIC = frozenset((TransMode.SERVER_CYCLE, TransMode.SERVER_CYCLE_2))
 _ON_CHANGE = frozenset((TransMode.SERVER_ON_CHANGE, TransMode.SERVER_ON_CHANGE_2))
 _FOR_NOW = frozenset((AdsError.BUSY, AdsError.NOT_READY))

@@ -72,7 +72,7 @@ Operation: TypeAlias = (
 )
 
 
-class Outcome(NamedTuple):
+class OperationOutcome(NamedTuple):
     """How an operation came out."""
 
     result: int = AdsError.NONE

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from eap.aoe.ads_operation import (
     AdsRefusedError,
     Operation,
-    Outcome,
+    OperationOutcome,
     ReadDeviceInfo,
     ReadState,
     ReadWrite,
@@ -51,7 +51,7 @@ class AdsRequest(NamedTuple):
     index_offset: int = 0
     """Of a sum command: how many items it has, or 0."""
 
-    def encode_answer(self, outcomes: Sequence[Outcome]) -> bytes:
+    def encode_answer(self, outcomes: Sequence[OperationOutcome]) -> bytes:
         """Return the body of the answer; *outcomes* are in the order of the operations."""
         if not self.sum_group:
             (outcome,) = outcomes
@@ -77,12 +77,12 @@ class Outcomes:
     def __init__(self, request: AdsRequest) -> None:
         self._request = request
         self._room = MAX_ANSWER - _HEAD_SIZE * len(request.operations)
-        self._outcomes: list[Outcome] = []
+        self._outcomes: list[OperationOutcome] = []
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome: OperationOutcome) -> None:
         """Take the outcome of the next operation."""
         if len(outcome.data) > self._room:
-            outcome = Outcome(AdsError.NO_MEMORY)
+            outcome = OperationOutcome(AdsError.NO_MEMORY)
         self._room -= len(outcome.data)
         self._outcomes.append(outcome)
 
@@ -110,7 +110,7 @@ def parse_request(command: int, body: bytes) -> AdsRequest:
     return AdsRequest(command, (operation,))
 
 
-def encode_outcome(command: int, outcome: Outcome) -> bytes:
+def encode_outcome(command: int, outcome: OperationOutcome) -> bytes:
     """Return the body of the answer to a *command* with one operation."""
     if outcome.result:
         return encode_refusal(command, outcome.result)

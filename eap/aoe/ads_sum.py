@@ -13,7 +13,7 @@ from eap.aoe.ads_operation import (
     AdsRefusedError,
     DeleteNotification,
     Operation,
-    Outcome,
+    OperationOutcome,
     Read,
     ReadWrite,
     Write,
@@ -30,7 +30,7 @@ class SumCommand(NamedTuple):
     item_size: int
     """Octets that each item has at the front of the request."""
     split: Callable[[int, bytes], list[Operation]]
-    join: Callable[[Sequence[Operation], Sequence[Outcome]], bytes]
+    join: Callable[[Sequence[Operation], Sequence[OperationOutcome]], bytes]
     is_padded: bool = False
     """Whether the answer has the lengths that were asked for, whatever was read."""
 
@@ -58,7 +58,7 @@ def asked_length(operation: Operation) -> int:
     return operation.length if isinstance(operation, Read | ReadWrite) else 0
 
 
-def padded(operations: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
+def padded(operations: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     """Return what was read, each with the length that was asked for."""
     return b"".join(
         outcome.data.ljust(asked_length(operation), b"\0")
@@ -104,19 +104,19 @@ def _starts(count: int, size: int) -> Iterable[int]:
     return range(0, count * size, size)
 
 
-def _results(outcomes: Iterable[Outcome]) -> bytes:
+def _results(outcomes: Iterable[OperationOutcome]) -> bytes:
     return b"".join(encode_result(item.result) for item in outcomes)
 
 
-def _join_reads(operations: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
+def _join_reads(operations: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     return _results(outcomes) + padded(operations, outcomes)
 
 
-def _join_results(_: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
+def _join_results(_: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     return _results(outcomes)
 
 
-def _join_asked(operations: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
+def _join_asked(operations: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     heads = b"".join(
         encode_result(outcome.result) + asked_length(operation).to_bytes(4, "little")
         for operation, outcome in zip(operations, outcomes, strict=True)
@@ -124,14 +124,14 @@ def _join_asked(operations: Sequence[Operation], outcomes: Sequence[Outcome]) ->
     return heads + padded(operations, outcomes)
 
 
-def _join_returned(_: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
+def _join_returned(_: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     heads = b"".join(
         encode_result(item.result) + len(item.data).to_bytes(4, "little") for item in outcomes
     )
     return heads + b"".join(item.data for item in outcomes)
 
 
-def _join_handles(_: Sequence[Operation], outcomes: Sequence[Outcome]) -> bytes:
+def _join_handles(_: Sequence[Operation], outcomes: Sequence[OperationOutcome]) -> bytes:
     return b"".join(
         encode_result(item.result) + item.data.ljust(_HANDLE_SIZE, b"\0") for item in outcomes
     )

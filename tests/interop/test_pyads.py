@@ -255,6 +255,24 @@ def test_notifications_on_change_and_cyclic(served, watcher):
     assert served.device.notifications.stats().notifications == 0
 
 
+def test_notification_that_the_server_ends_leaves_the_others_alone(plc, served, watcher):
+    ended = watcher.add("count", pyads.NotificationAttrib(4), pyads.PLCTYPE_UDINT)
+    kept = watcher.add("motor.speed", pyads.NotificationAttrib(4), pyads.PLCTYPE_REAL)
+    wait_until(lambda: ended and kept)
+    with served.server.lock:
+        served.store.broken["count"] = AdsError.NOT_FOUND
+        served.store.set("motor.speed", 2.5)
+    wait_until(lambda: len(kept) == 2)
+    wait_until(lambda: served.device.notifications.stats().ended == 1)
+    with served.server.lock:
+        served.store.set("motor.speed", 3.5)
+    wait_until(lambda: [value for *_, value in kept] == [1.5, 2.5, 3.5])
+    assert len(ended) == 1
+    with pytest.raises(pyads.ADSError) as refused:
+        plc.del_device_notification(*watcher.handles.pop(0))
+    assert refused.value.err_code == AdsError.NOTIFICATION_HANDLE
+
+
 def test_symbol_that_updates_itself(plc, served):
     symbol = plc.get_symbol("motor.speed", auto_update=True)
     wait_until(lambda: symbol.value == 1.5)

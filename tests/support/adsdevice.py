@@ -9,7 +9,8 @@ from eap.aoe.ads_io import IoDevice, IoDeviceType, IoSpace
 from eap.aoe.ads_master import MasterSpace, SlaveState
 from eap.aoe.ads_operation import AdsRefusedError, WriteControl
 from eap.aoe.ads_state import OP, SAFEOP, al_state_for, states_of
-from eap.aoe.ads_symbols import SymbolSpace, SymbolTable, Variable
+from eap.aoe.ads_symbol_table import SymbolTable, Variable
+from eap.aoe.ads_symbols import SymbolSpace
 from eap.aoe.ads_system import SystemSpace
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, AdsSystemState, device_name

@@ -9,7 +9,8 @@ from struct import Struct
 from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_request import MAX_ANSWER
-from eap.aoe.ads_symbols import SymbolSpace, SymbolTable, Variable
+from eap.aoe.ads_symbol_table import SymbolTable, Variable
+from eap.aoe.ads_symbols import SymbolSpace
 from eap.aoe.way import Way
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name

@@ -6,7 +6,7 @@ from eap.aoe.ads_operation import (
     AdsRefusedError,
     DeleteNotification,
     Operation,
-    Outcome,
+    OperationOutcome,
     Read,
     ReadDeviceInfo,
     ReadState,
@@ -43,4 +43,4 @@ def test_what_counts_as_a_change(operation: Operation, *, changes: bool) -> None
 def test_refusal_says_its_result() -> None:
     assert str(AdsRefusedError(AdsError.SIZE)) == "SIZE"
     assert str(AdsRefusedError(AdsError.SIZE, "too long")) == "SIZE: too long"
-    assert Outcome() == (AdsError.NONE, b"", "")
+    assert OperationOutcome() == (AdsError.NONE, b"", "")

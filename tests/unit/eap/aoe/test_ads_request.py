@@ -8,7 +8,7 @@ from eap.aoe.ads_operation import (
     AdsRefusedError,
     DeleteNotification,
     Operation,
-    Outcome,
+    OperationOutcome,
     Read,
     ReadDeviceInfo,
     ReadState,
@@ -58,24 +58,40 @@ def test_every_vector_is_expected_to_be_something() -> None:
 @pytest.mark.parametrize(
     ("command", "outcome", "body"),
     [
-        (AmsCommand.READ_DEVICE_INFO, Outcome(data=bytes(20)), bytes(24)),
-        (AmsCommand.READ, Outcome(data=b"abc"), bytes.fromhex("00000000 03000000") + b"abc"),
-        (AmsCommand.WRITE, Outcome(), bytes(4)),
-        (AmsCommand.READ_STATE, Outcome(data=b"\5\0\1\0"), bytes.fromhex("00000000 05000100")),
-        (AmsCommand.WRITE_CONTROL, Outcome(AdsError.STATE), bytes.fromhex("12070000")),
+        (AmsCommand.READ_DEVICE_INFO, OperationOutcome(data=bytes(20)), bytes(24)),
+        (
+            AmsCommand.READ,
+            OperationOutcome(data=b"abc"),
+            bytes.fromhex("00000000 03000000") + b"abc",
+        ),
+        (AmsCommand.WRITE, OperationOutcome(), bytes(4)),
+        (
+            AmsCommand.READ_STATE,
+            OperationOutcome(data=b"\5\0\1\0"),
+            bytes.fromhex("00000000 05000100"),
+        ),
+        (AmsCommand.WRITE_CONTROL, OperationOutcome(AdsError.STATE), bytes.fromhex("12070000")),
         (
             AmsCommand.ADD_NOTIFICATION,
-            Outcome(data=b"\7\0\0\0"),
+            OperationOutcome(data=b"\7\0\0\0"),
             bytes.fromhex("00000000 07000000"),
         ),
-        (AmsCommand.DELETE_NOTIFICATION, Outcome(), bytes(4)),
-        (AmsCommand.READ_WRITE, Outcome(data=b""), bytes(8)),
-        (AmsCommand.READ, Outcome(AdsError.BUSY), bytes.fromhex("08070000 00000000")),
-        (AmsCommand.ADD_NOTIFICATION, Outcome(AdsError.SIZE), bytes.fromhex("05070000 00000000")),
-        (AmsCommand.READ_STATE, Outcome(AdsError.BUSY), bytes.fromhex("08070000 00000000")),
+        (AmsCommand.DELETE_NOTIFICATION, OperationOutcome(), bytes(4)),
+        (AmsCommand.READ_WRITE, OperationOutcome(data=b""), bytes(8)),
+        (AmsCommand.READ, OperationOutcome(AdsError.BUSY), bytes.fromhex("08070000 00000000")),
+        (
+            AmsCommand.ADD_NOTIFICATION,
+            OperationOutcome(AdsError.SIZE),
+            bytes.fromhex("05070000 00000000"),
+        ),
+        (
+            AmsCommand.READ_STATE,
+            OperationOutcome(AdsError.BUSY),
+            bytes.fromhex("08070000 00000000"),
+        ),
     ],
 )
-def test_answers_of_single_operations(command: int, outcome: Outcome, body: bytes) -> None:
+def test_answers_of_single_operations(command: int, outcome: OperationOutcome, body: bytes) -> None:
     assert parse_request(command, bytes(40)).encode_answer([outcome]) == body
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from eap.aoe.ads_operation import (
     AdsRefusedError,
     DeleteNotification,
-    Outcome,
+    OperationOutcome,
     Read,
     ReadWrite,
     Write,
@@ -49,7 +49,11 @@ def body_of(answer: bytes) -> bytes:
 def test_sum_read_pads_what_could_not_be_read() -> None:
     request = parse_sum(G.SUM_READ, reads(2, 3, 1))
     assert request.operations == (Read(G.DATA, 0, 2), Read(G.DATA, 1, 3), Read(G.DATA, 2, 1))
-    outcomes = [Outcome(data=b"ab"), Outcome(AdsError.INDEX_OFFSET), Outcome(data=b"c")]
+    outcomes = [
+        OperationOutcome(data=b"ab"),
+        OperationOutcome(AdsError.INDEX_OFFSET),
+        OperationOutcome(data=b"c"),
+    ]
     assert body_of(request.encode_answer(outcomes)) == (
         bytes.fromhex("00000000 03070000 00000000") + b"ab\0\0\0c"
     )
@@ -59,9 +63,9 @@ def test_sum_read_without_a_count_has_no_results_of_its_own() -> None:
     data = b"".join(reads(2, 3))
     request = parse_request(AmsCommand.READ_WRITE, read_write(G.SUM_READ, 0, 5, data))
     assert len(request.operations) == 2
-    good = [Outcome(data=b"ab"), Outcome(data=b"cde")]
+    good = [OperationOutcome(data=b"ab"), OperationOutcome(data=b"cde")]
     assert body_of(request.encode_answer(good)) == b"abcde"
-    bad = [Outcome(data=b"ab"), Outcome(AdsError.BUSY)]
+    bad = [OperationOutcome(data=b"ab"), OperationOutcome(AdsError.BUSY)]
     assert request.encode_answer(bad) == struct.pack("<II", AdsError.BUSY, 5) + b"ab\0\0\0"
 
 
@@ -69,7 +73,7 @@ def test_sum_write_takes_the_data_from_behind_the_list() -> None:
     items = [struct.pack("<3I", G.DATA, 0, 2), struct.pack("<3I", G.DATA, 8, 1)]
     request = parse_sum(G.SUM_WRITE, items, b"abc")
     assert request.operations == (Write(G.DATA, 0, b"ab"), Write(G.DATA, 8, b"c"))
-    answer = request.encode_answer([Outcome(AdsError.ACCESS), Outcome()])
+    answer = request.encode_answer([OperationOutcome(AdsError.ACCESS), OperationOutcome()])
     assert body_of(answer) == bytes.fromhex("04070000 00000000")
 
 
@@ -80,12 +84,14 @@ def test_sum_read_write_returns_lengths() -> None:
         ReadWrite(G.SYMBOL_HANDLE, 0, 4, b"ab"),
         ReadWrite(G.DATA, 8, 9, b"c"),
     )
-    answer = request.encode_answer([Outcome(data=b"1234"), Outcome(AdsError.ACCESS)])
+    answer = request.encode_answer(
+        [OperationOutcome(data=b"1234"), OperationOutcome(AdsError.ACCESS)]
+    )
     assert body_of(answer) == bytes.fromhex("00000000 04000000 04070000 00000000") + b"1234"
 
 
 def test_the_two_extended_reads_differ_in_their_padding() -> None:
-    outcomes = [Outcome(data=b"a"), Outcome(AdsError.BUSY)]
+    outcomes = [OperationOutcome(data=b"a"), OperationOutcome(AdsError.BUSY)]
     asked = parse_sum(G.SUM_READ_EX, reads(2, 1)).encode_answer(outcomes)
     assert body_of(asked) == bytes.fromhex("00000000 02000000 08070000 01000000") + b"a\0\0"
     returned = parse_sum(G.SUM_READ_EX_2, reads(2, 1)).encode_answer(outcomes)
@@ -95,11 +101,15 @@ def test_the_two_extended_reads_differ_in_their_padding() -> None:
 def test_sums_of_notifications() -> None:
     request = parse_sum(G.SUM_ADD_NOTIFICATION, [NOTE.encode(), NOTE.encode()])
     assert request.operations == (NOTE, NOTE)
-    answer = request.encode_answer([Outcome(data=b"\7\0\0\0"), Outcome(AdsError.SIZE)])
+    answer = request.encode_answer(
+        [OperationOutcome(data=b"\7\0\0\0"), OperationOutcome(AdsError.SIZE)]
+    )
     assert body_of(answer) == bytes.fromhex("00000000 07000000 05070000 00000000")
     request = parse_sum(G.SUM_DELETE_NOTIFICATION, [b"\1\0\0\0", b"\2\0\0\0"])
     assert request.operations == (DeleteNotification(1), DeleteNotification(2))
-    answer = request.encode_answer([Outcome(), Outcome(AdsError.NOTIFICATION_HANDLE)])
+    answer = request.encode_answer(
+        [OperationOutcome(), OperationOutcome(AdsError.NOTIFICATION_HANDLE)]
+    )
     assert body_of(answer) == bytes.fromhex("00000000 14070000")
 
 
@@ -111,7 +121,7 @@ def test_sum_commands_do_not_nest() -> None:
 
 def test_answer_must_fit_where_the_client_has_room() -> None:
     request = parse_sum(G.SUM_READ, reads(4), room=7)
-    answer = request.encode_answer([Outcome(data=b"abcd")])
+    answer = request.encode_answer([OperationOutcome(data=b"abcd")])
     assert answer == struct.pack("<II", AdsError.SIZE, 0)
 
 
@@ -151,7 +161,7 @@ def test_anything_is_taken_apart_or_refused(command, noise: bytes, group: int, c
     except AdsRefusedError as exc:
         answer = encode_refusal(command, exc.result)
     else:
-        outcomes = [Outcome(AdsError.BUSY)] * len(request.operations)
+        outcomes = [OperationOutcome(AdsError.BUSY)] * len(request.operations)
         answer = request.encode_answer(outcomes)
     assert 4 <= len(answer) <= MAX_ANSWER + 8
 
@@ -162,9 +172,9 @@ def test_where_lengths_come_back_only_what_was_read_counts(group: int) -> None:
     items = [struct.pack("<4I", G.DATA, 0, 0xFFFF_FFFF, 0)[: struct.calcsize(form)]] * 3
     request = parse_sum(group, items, room=0xFFFF_FFFF)
     outcomes = Outcomes(request)
-    outcomes.add(Outcome(data=b"ab"))
-    outcomes.add(Outcome(data=bytes(MAX_ANSWER - 25)))
-    outcomes.add(Outcome(data=bytes(MAX_ANSWER - 26)))
+    outcomes.add(OperationOutcome(data=b"ab"))
+    outcomes.add(OperationOutcome(data=bytes(MAX_ANSWER - 25)))
+    outcomes.add(OperationOutcome(data=bytes(MAX_ANSWER - 26)))
     body = body_of(outcomes.encode())
     assert len(body) == MAX_ANSWER
     heads = struct.unpack_from("<6I", body)
