@@ -113,14 +113,6 @@ class EapStateMachine:
         self._show()
         return self.status
 
-    def fall_back(self, fault: DeviceFault) -> StateResult:
-        """Note that nothing runs any more, because of *fault*: back to PreOp without actions."""
-        if self._device.state is not DeviceState.INIT:
-            self._device.request(Request.PREOP)
-        self._fault = fault
-        self._show()
-        return self.status
-
     def _walk(self, wanted: DeviceState) -> None:
         device, actions = self._device, self._actions
         while device.state < wanted:

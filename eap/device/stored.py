@@ -1,4 +1,4 @@
-"""The configuration of a dictionary as a whole: out and in again, as octets, JSON or bytes.
+"""The configuration of a dictionary as a whole: out and in again, as octets or for JSON.
 
 Everything is kept that a client can write in PreOp, by index and sub-index; what is live, computed
 or given at the start is not.  A configuration is taken back whole or not at all.
@@ -75,13 +75,6 @@ def adopt(dictionary: EapDictionary, wanted: EapDictionary) -> None:
     _put_all(dictionary, changed)
 
 
-def copy(dictionary: EapDictionary) -> EapDictionary:
-    """Return another dictionary with the same configuration, for which nothing runs."""
-    other = dictionary.blank()
-    _put_all(other, configuration(dictionary))
-    return other
-
-
 def dump(dictionary: EapDictionary) -> dict[str, Any]:
     """Return the configuration as plain values for JSON."""
     objects = {
@@ -118,20 +111,6 @@ def load(dictionary: EapDictionary, plain: object) -> None:
         restore(dictionary, kept)
     except SdoAbortError as exc:
         raise StoredError(f"stored configuration: {exc}") from None
-
-
-def encode(dictionary: EapDictionary) -> bytes:
-    """Return the configuration as bytes: JSON, for files."""
-    return msgspec.json.encode(dump(dictionary))
-
-
-def decode(dictionary: EapDictionary, data: bytes) -> None:
-    """Take back what :func:`encode` gave; raise StoredError as :func:`load` does."""
-    try:
-        plain = msgspec.json.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError) as exc:
-        raise StoredError(f"no stored configuration: {exc}") from None
-    load(dictionary, plain)
 
 
 def _is_kept(entry: Entry) -> bool:

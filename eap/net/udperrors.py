@@ -31,7 +31,6 @@ ICMP_ERRNOS = frozenset(
 
 _EXTENDED_ERROR = struct.Struct("@IBBBxII")  # errno, origin, type, code, info, data
 _CONTROL_SIZE = 512
-_ADDRESS = slice(_EXTENDED_ERROR.size + 4, _EXTENDED_ERROR.size + 8)
 _ORIGIN_ICMP = 2
 _UNREACHABLE = 3
 _TIME_EXCEEDED = 11
@@ -48,8 +47,6 @@ class UdpError(NamedTuple):
     """Whether it did not arrive, because nobody listens there or because of the way there."""
     reason: str
     """The errno's name, such as ECONNREFUSED."""
-    teller: str
-    """IPv4 address of who told; this machine itself if it looked for the host in vain."""
 
 
 def enable_errors(sock: socket.socket) -> None:
@@ -80,5 +77,4 @@ def _parse(data: bytes, address: tuple[str, int]) -> UdpError:
         origin == _ORIGIN_ICMP
         and (kind == _TIME_EXCEEDED or (kind == _UNREACHABLE and code != _TOO_LARGE)),
         errno.errorcode.get(number, str(number)),
-        socket.inet_ntoa(data[_ADDRESS]) if origin == _ORIGIN_ICMP else "",
     )

@@ -93,8 +93,8 @@ class _Sent:
     """The words of TxFrames and TxPDs.
 
     Where a frame goes is forgotten when it is sent elsewhere, and then, or when it is monitored in
-    another way, who is there.  A frame that is
-    no more what it was gives the count of its cycles as a whole to its old PDs.
+    another way, who is there.  A frame that is no more what it was gives the count of its cycles as
+    a whole to its old PDs.
     """
 
     def __init__(self, old: ImageLayout, new: ImageLayout) -> None:

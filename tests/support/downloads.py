@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from eap.device.eap_dictionary import EapDictionary
+from eap.device.stored import adopt
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.eap1000 import row_of
@@ -24,6 +25,13 @@ def write(
     else:
         data = int(value).to_bytes(width(index, subindex, dictionary), "little")
     dictionary.download(index, subindex, data, state)
+
+
+def copy(dictionary: EapDictionary) -> EapDictionary:
+    """Return another dictionary with the same configuration, for which nothing runs."""
+    other = dictionary.blank()
+    adopt(other, dictionary)
+    return other
 
 
 def width(index: int, subindex: int, dictionary: EapDictionary) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import platform
 import shutil
@@ -91,8 +90,3 @@ def pm_qos(*, on: bool) -> Iterator[None]:
         yield
     finally:
         os.close(fd)
-
-
-def set_timer_slack(slack_ns: int) -> None:
-    """Let timers of this thread be late by no more than *slack_ns*."""
-    ctypes.CDLL(None).prctl(29, slack_ns, 0, 0, 0)  # PR_SET_TIMERSLACK

@@ -45,7 +45,6 @@ class EngineBus:
     Attributes:
         is_up: Whether the bus has been brought up, wherever its slaves are now.
         tasks: What somebody has asked for and waits for.
-        send_errors: Frames that the interface did not take.
     """
 
     def __init__(
@@ -62,7 +61,6 @@ class EngineBus:
         self.faults = SlaveFaults()
         self.is_up = False
         self.tasks: set[Task[Any]] = set()
-        self.send_errors = 0
         self._settings = settings
         self._is_slow = cycle_ns > _LONG_CYCLE_NS
         self._ties = BusTies(spec, image, memory_of)
@@ -216,7 +214,6 @@ class EngineBus:
                 self._port.send(frame)
                 self._wire_fault = ""
             except EnvironmentalError as exc:
-                self.send_errors += 1
                 self._wire_fault = str(exc)
 
     def _is_busy(self) -> bool:

@@ -23,7 +23,6 @@ from eap.od.profiles.table import (
 
 PROFILE = 5001
 """Of modular devices; the vendor's description of its own EAP device says 5002."""
-OTHER_PROFILE = 5002
 MODULE_PROFILE = 1000
 
 NAME = "STRING(255)"

@@ -49,11 +49,6 @@ class EntryRow(NamedTuple):
     changeable: bool = False
     """Whether it can be written in SafeOp and Op too once its object says so."""
 
-    @property
-    def is_config(self) -> bool:
-        """Whether it belongs to the configuration that is written in PreOp."""
-        return self.access & Access.WRITE_ANY == Access.WRITE_PREOP
-
     def numbered(self, subindex: int) -> str:
         """Return the name of the entry at *subindex*."""
         return self.name.format(n=subindex - self.subindex) if self.last else self.name

@@ -11,7 +11,7 @@ from eap.device.difference import compare
 from eap.device.eap_read import read_back
 from eap.device.eap_state import EapStateMachine
 from eap.device.fault import DeviceFault, FaultCode
-from eap.device.stored import configuration, decode, encode
+from eap.device.stored import configuration, dump, load
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
@@ -159,16 +159,6 @@ def test_what_cannot_run_stays_in_preop_with_the_object_in_the_status(actions):
     assert udp.upload(0xF100, 3, PREOP) == b""
 
 
-def test_what_no_longer_runs_falls_back(machine, actions):
-    machine.request(OPER)
-    actions.done.clear()
-    fault = DeviceFault(FaultCode.NOT_RUNNING, "killed")
-    assert machine.fall_back(fault) == (PRE, fault)
-    assert actions.done == []
-    idle = EapStateMachine(lambda: BLANK, actions)
-    assert idle.fall_back(fault).state is INIT
-
-
 @given(st.lists(st.tuples(st.integers(0, 9), st.sampled_from(["", *"ab"])), max_size=20))
 def test_sending_and_receiving_are_on_in_their_states_whatever_is_asked(requests):
     actions = Actions()
@@ -264,11 +254,11 @@ class DeviceMachine(RuleBasedStateMachine):
 
     @rule()
     def restart(self) -> None:
-        kept = {name: encode(each) for name, each in self.ports.items()}
+        kept = {name: dump(each) for name, each in self.ports.items()}
         self.ports = empty()
         for name, each in self.ports.items():
-            decode(each, kept[name])
-            assert encode(each) == kept[name]
+            load(each, kept[name])
+            assert dump(each) == kept[name]
         before = self.engine
         self.engine = Actions()
         self.start(self.machine.status.state)

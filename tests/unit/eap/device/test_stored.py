@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 
@@ -8,10 +9,7 @@ from eap.device.stored import (
     StoredError,
     adopt,
     configuration,
-    copy,
-    decode,
     dump,
-    encode,
     load,
     restore,
 )
@@ -19,18 +17,18 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.eap1000keys import Frame, Tx, Var
 from eap.pd.spec import StationSpec
-from tests.support.downloads import OP, receiver, sender, variable, write
+from tests.support.downloads import OP, copy, receiver, sender, variable, write
 from tests.support.stations import BLANK, empty, filled, stations
 
 
 @settings(max_examples=30)
 @given(stations())
-def test_what_is_encoded_comes_back_whole(station: StationSpec):
+def test_what_is_dumped_comes_back_whole(station: StationSpec):
     for name, each in filled(station).items():
         other = empty()[name]
-        decode(other, encode(each))
+        load(other, msgspec.json.decode(msgspec.json.encode(dump(each))))
         assert configuration(other) == configuration(each)
-        assert encode(other) == encode(each)
+        assert dump(other) == dump(each)
 
 
 def test_a_mapping_that_is_being_written_is_kept_as_it_is(udp):
@@ -117,8 +115,6 @@ def test_what_no_dictionary_has_is_refused_and_changes_nothing(udp, code, kept):
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "no stored configuration"),
-        (b"\xff", "no stored configuration"),
         (b"[]", "no stored configuration"),
         (b'{"version": 1}', "no stored configuration"),
         (b'{"version": 2, "profile": 1000, "objects": {}}', "version 2, this release knows 1"),
@@ -131,10 +127,10 @@ def test_what_no_dictionary_has_is_refused_and_changes_nothing(udp, code, kept):
 )
 def test_what_is_no_configuration_is_refused_with_the_reason(udp, data, reason):
     sender(udp)
-    before = encode(udp)
+    before = dump(udp)
     with pytest.raises(StoredError, match=reason):
-        decode(udp, data)
-    assert encode(udp) == before
+        load(udp, msgspec.json.decode(data))
+    assert dump(udp) == before
 
 
 def test_the_plain_form_is_for_json(udp):

@@ -8,7 +8,7 @@ from eap.codec import datatypes
 from eap.od.model import Access, ObjectCode
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000keys import Derived, Live
-from eap.od.profiles.table import OWN_TYPE, UNITS
+from eap.od.profiles.table import CONFIG, OWN_TYPE, UNITS
 
 ENTRIES = [(row, entry) for row in profile.ALL for entry in row.entries]
 
@@ -30,7 +30,7 @@ def test_every_entry_is_named_described_and_of_a_type(row, entry):
         if entry.default is not None:
             kind.encode(entry.default)
     assert not (entry.live and entry.derived)
-    assert not entry.changeable or entry.is_config
+    assert not entry.changeable or entry.access == CONFIG
     if entry.live:
         assert entry.live in set(Live)
     if entry.derived:

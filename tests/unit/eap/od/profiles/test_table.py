@@ -39,7 +39,6 @@ def test_rows_say_where_their_content_comes_from():
         EntryRow(1, "a", "UINT", RW, "d"),
     )
     assert [row.access for row in rows] == [CONFIG, RO, RO, RO, RW]
-    assert [row.is_config for row in rows] == [True, False, False, False, False]
     assert (rows[0].default, rows[2].live, rows[2].unit, rows[3].derived) == (
         3, "value", "ms", "count",
     )  # fmt: skip
