@@ -50,7 +50,7 @@ class Outcome(StrEnum):
     LOOP = "loop"
     """It ran in a circle; if it was a request it was answered with an error."""
     LATE = "late"
-    """An answer that nobody waits for, or not any more."""
+    """An answer or a notification that nobody waits for, or not any more."""
     DROPPED = "dropped"
     """Nothing was answered: broken, doubled, or of the kind that has no answer."""
 

@@ -48,6 +48,7 @@ class InFlight:
     def __init__(self) -> None:
         self._by_id: dict[int, Pending] = {}
         self._by_way: dict[Way, dict[int, Pending]] = {}
+        self._by_door: dict[str, int] = {}
         self._by_time: dict[int, OrderedDict[int, Pending]] = {}
         self._asked: dict[tuple[Way, bytes, int], int] = {}
         self._abandoned: OrderedDict[int, None] = OrderedDict()
@@ -69,6 +70,10 @@ class InFlight:
         """Return how many came by *way*."""
         return len(self._by_way.get(way, ()))
 
+    def count_of_door(self, door: str) -> int:
+        """Return how many came by any connection of *door*."""
+        return self._by_door.get(door, 0)
+
     def add(self, pending: Pending) -> None:
         """Remember a request."""
         way = pending.came_by
@@ -76,6 +81,7 @@ class InFlight:
         self._by_id[key] = pending
         if way is not None:
             self._by_way.setdefault(way, {})[key] = pending
+            self._by_door[way.door] = self._by_door.get(way.door, 0) + 1
             self._asked[way, pending.onward, pending.header.invoke_id] = key
         else:
             self._abandoned[key] = None
@@ -153,6 +159,7 @@ class InFlight:
         del of_way[pending.invoke_id]
         if not of_way:
             del self._by_way[way]
+        self._by_door[way.door] -= 1
         asked = way, pending.onward, pending.header.invoke_id
         if self._asked.get(asked) == pending.invoke_id:
             del self._asked[asked]

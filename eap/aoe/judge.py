@@ -30,6 +30,8 @@ class Limits(NamedTuple):
     """Requests that wait, of all connections."""
     per_connection: int = 512
     """Requests of one connection that wait."""
+    per_door: int = 2048
+    """Requests of all connections of a door: a flood by one leaves room for the others."""
     timeout_ns: int = 4_500_000_000
     """How long an answer may take: an error comes back before clients lose patience at 5 s."""
 
@@ -116,6 +118,9 @@ class Judge:
         """Say whether too many requests wait for one more."""
         if self._in_flight.count(way) >= self._limits.per_connection:
             text = f"{self._limits.per_connection} requests of the connection wait already"
+            return Refusal(AdsError.MAILBOX_FULL, text)
+        if self._in_flight.count_of_door(way.door) >= self._limits.per_door:
+            text = f"{self._limits.per_door} requests by {way.door} wait already"
             return Refusal(AdsError.MAILBOX_FULL, text)
         if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
             text = f"{self._limits.in_flight} requests wait already"

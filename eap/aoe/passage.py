@@ -78,6 +78,9 @@ class Passage:
                 return list(replies)
         route = self._judge.find_route(header, way)
         if isinstance(route, Refusal):
+            if header.command == AmsCommand.NOTIFICATION and route.error == AdsError.TARGET_MACHINE:
+                text = "nobody here asked for it, or not any more"
+                return self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
             return self._refuser.refuse(header, way, route, now_ns)
         onward = _ADDRESSES.pack(
             route.to_real(header.target), header.target_port,
@@ -111,7 +114,8 @@ class Passage:
         if surplus is not None:
             actions += self._end(surplus, now_ns)
         if pending.came_by is None:
-            self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
+            if header.command != AmsCommand.DELETE_NOTIFICATION:  # most of those are our own
+                self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
             return actions
         asked = pending.header
         back = _ADDRESSES.pack(asked.source, asked.source_port, asked.target, asked.target_port)

@@ -31,10 +31,12 @@ def test_request_is_found_until_it_is_taken_out() -> None:
     assert waiting.get(1) is first
     assert 1 in waiting
     assert (len(waiting), waiting.count(ONE)) == (2, 1)
+    assert [waiting.count_of_door(door) for door in ("tcp", "link")] == [2, 0]
     assert waiting.is_asked(ONE, b"addresses", 7)
     assert waiting.pop(1) is first
     assert waiting.pop(1) is None
     assert (len(waiting), waiting.count(ONE)) == (1, 0)
+    assert waiting.count_of_door("tcp") == 1
     assert not waiting.is_asked(ONE, b"addresses", 7)
     assert waiting.is_asked(TWO, b"addresses", 7)
 

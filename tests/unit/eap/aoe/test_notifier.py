@@ -44,7 +44,7 @@ def test_notification_that_nobody_asked_for_goes_nowhere() -> None:
     assert station.give(NOTICE._replace(body=stream((5, {1: b""}))), SECOND_LINK) == []
     assert station.give(NOTICE._replace(body=b"short"), LINK) == []
     assert [outcome for outcome, _ in station.events()] == [
-        Outcome.FAILED, Outcome.FAILED, Outcome.DROPPED
+        Outcome.LATE, Outcome.LATE, Outcome.DROPPED
     ]  # fmt: skip
 
 
@@ -87,6 +87,7 @@ def test_closed_connection_ends_its_notifications_at_the_server() -> None:
     assert (action.hop, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\1\0\0\0")
     assert (end.target, end.source) == (FAR_DEVICE, CLIENT)
     assert station.give(end.answer(), LINK) == []
+    assert station.events() == []
     assert station.router.stats().in_flight == 0
     station.router.hop_down(*LINK, "gone", 1)
     assert station.router.stats().subscriptions == 0

@@ -285,6 +285,16 @@ def test_requests_that_wait_are_limited() -> None:
     assert station.router.stats().in_flight == 3
 
 
+def test_flood_by_one_door_leaves_room_for_the_others() -> None:
+    station = Station([route(FAR, LINK)], limits=Limits(per_door=2))
+    for number in range(2):
+        station.forwarded(ASKED, Way("segment", str(number)))
+    there = Way("segment", "2")
+    assert station.replied(ASKED, there) == (there, ASKED.answer(b"", 4))
+    assert "2 requests by segment wait already" in station.events()[0][1]
+    assert station.forwarded(ASKED, ONE)
+
+
 def test_route_by_a_door_that_is_not_there_is_answered() -> None:
     station = Station([route(FAR, Way("nowhere", "1"), "island")])
     assert station.replied(ASKED, ONE) == (ONE, ASKED.answer(b"", 0x1B))
