@@ -22,7 +22,8 @@ Row = Mapping[str, Any]
 
 _GOOD, _BAD, _DIM = "green", "bold red", "dim"
 _STATE_STYLE = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
-_STATE_STYLE |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM}
+_OFF = "off"
+_STATE_STYLE |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM, _OFF: _DIM}
 _HUNG_AFTER_US = 2_000_000
 _HUNG_AFTER_CYCLES = 10
 _NET_ID_DOTS = 5
@@ -163,20 +164,21 @@ def _process_data(stations: Sequence[Row]) -> RenderableType:
             table.add_row("", Text(station["name"], style="bold"))
         for row in pd["tx"]:
             why = row.get("last_reason") or next(reversed(row["reason"]), "silent")
-            table.add_row("→", row["name"], _REASONS.get(why, why), str(row["sent"]))
+            shown = _OFF if station["state"] == "PREOP" else _REASONS.get(why, why)
+            table.add_row("→", row["name"], _state(shown), str(row["sent"]))
         for row in pd["rx"]:
-            table.add_row(*_received(row))
+            table.add_row(*_received(row, _OFF if station["state"] in _STATES else row["state"]))
     return table
 
 
-def _received(row: Row) -> tuple[RenderableType, ...]:
+def _received(row: Row, state: str) -> tuple[RenderableType, ...]:
     lost, quality, age = row["lost"], row["quality"], row["age_us"]
     times = row.get("response_us") or row["jitter_us"]
     spread = [times[key] for key in ("p50", "p99", "max")]
     return (
         "←",
         row["name"],
-        _state(row["state"]),
+        _state(state),
         str(row["received"]),
         Text("unknown", style=_DIM) if lost is None else Text(str(lost), style=_BAD * bool(lost)),
         words.quality(quality),

@@ -91,7 +91,16 @@ def show(kind: DataType, name: str, octets: bytes) -> str | None:
         return to_text(form, kind, octets)
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, float):
+        value = _short(kind, value)
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _short(kind: DataType, value: float) -> float:
+    """Return the number with the fewest digits that *kind* stores as *value*: 0.1 of a REAL."""
+    shorter = (float(f"{value:.{digits}g}") for digits in range(6, 10))
+    octets = kind.encode(value)
+    return next((each for each in shorter if kind.encode(each) == octets), value)
 
 
 def _form(kind: DataType, name: str) -> Form:

@@ -96,7 +96,10 @@ def test_processes_and_stations() -> None:
     ],
 )
 def test_a_station_that_was_left_in_another_state(state: str, meaning: str) -> None:
-    text = " ".join(show(document(state=state)).split())
+    shown = show(document(state=state, tx=[tx("speed")], rx=[rx("left")]))
+    assert ("→ speed off" in row_of(shown, "speed")) == (state == "PREOP")
+    assert "← left off" in row_of(shown, "left")
+    text = " ".join(shown.split())
     assert f"Worth a look mixer: in {state}, as was asked for last: {meaning}" in text
 
 

@@ -36,6 +36,23 @@ def test_plain(kind, name, octets, value):
 
 
 @pytest.mark.parametrize(
+    ("kind", "value", "text"),
+    [
+        ("REAL", 2.01, "2.01"),
+        ("REAL", 0.0, "0.0"),
+        ("REAL", 16777217.0, "16777216.0"),
+        ("REAL", 3.4028234663852886e38, "3.4028235e+38"),
+        ("REAL", math.inf, "inf"),
+        ("LREAL", 2.01, "2.01"),
+        ("LREAL", 1 / 3, "0.3333333333333333"),
+    ],
+)
+def test_numbers_are_shown_with_as_many_digits_as_they_have(kind, value, text):
+    parsed = datatypes.parse(kind)
+    assert show(parsed, "Level", parsed.encode(value)) == text
+
+
+@pytest.mark.parametrize(
     ("kind", "text", "octets"),
     [
         ("BLOCK(6)", "01-01-05-04-00-00", "010105040000"),
