@@ -8,7 +8,6 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from eap.codec.datatypes import DataType, Value
 from eap.device.eap_content import COUNTED, PORT
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_mapping import data_budget, frame_budget, place
@@ -127,7 +126,7 @@ class PortReader:
                     name=value(Var.NAME),
                     type=kind.text,
                     writer=Writer[WrittenBy(value(Var.WRITER)).name] if is_sent else Writer.ENGINE,
-                    default=_default(kind, value(Var.DEFAULT)) if given else None,
+                    default=kind.to_plain(value(Var.DEFAULT)) if given else None,
                     unit=value(Var.UNIT),
                     comment=value(Var.COMMENT),
                 ),
@@ -279,11 +278,6 @@ class PortReader:
         if asked not in self._dictionary:
             raise self.fault(FaultCode.MISSING_OBJECT, f"PD 0x{asked:04X}", index, subindex)
         return self._dictionary.name_of(asked)
-
-
-def _default(kind: DataType, value: Value) -> Any:
-    """Return a default as a specification has it."""
-    return kind.to_plain(value)
 
 
 def _known_mac(octets: bytes) -> str:

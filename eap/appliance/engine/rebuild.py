@@ -173,7 +173,7 @@ class Rebuilds:
             return
         thread.join()
         self._thread = None
-        sys.setswitchinterval(_SWITCH_S)
+        sys.setswitchinterval(_USUAL_SWITCH_S)
         if job.is_stale:
             self._begin(job)
         elif self._waiting:
@@ -201,7 +201,7 @@ class Rebuilds:
         job.work(lambda: os.eventfd_write(self._done, 1))
 
 
-_SWITCH_S = sys.getswitchinterval()
+_USUAL_SWITCH_S = sys.getswitchinterval()
 
 
 def _read(request: Configure) -> StationSpec:
