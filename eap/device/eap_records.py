@@ -120,13 +120,14 @@ class PortReader:
             is_sent = index <= profile.TX_VARIABLE.last
             kind = self._dictionary[index].entries[Var.DEFAULT].kind
             given = value(Var.DEFAULT_GIVEN)
+            default: Any = kind.to_plain(value(Var.DEFAULT)) if given else None
             yield (
                 index,
                 VariableSpec(
                     name=value(Var.NAME),
                     type=kind.text,
                     writer=Writer[WrittenBy(value(Var.WRITER)).name] if is_sent else Writer.ENGINE,
-                    default=kind.to_plain(value(Var.DEFAULT)) if given else None,
+                    default=default,
                     unit=value(Var.UNIT),
                     comment=value(Var.COMMENT),
                 ),
