@@ -21,9 +21,11 @@ class Pending:
         onward: Source and target of the packet that went on, 16 octets.
         at_ns: When it came.
         deadline_ns: When its time is up.
+        handles: How many notifications it asks for.
     """
 
-    __slots__ = ("at_ns", "came_by", "deadline_ns", "header", "invoke_id", "onward", "route")
+    __slots__ = ("at_ns", "came_by", "deadline_ns", "handles", "header", "invoke_id", "onward",
+                 "route")  # fmt: skip
 
     def __init__(
         self, invoke_id: int, header: AmsHeader, came_by: Way | None, route: Route | None,
@@ -36,6 +38,7 @@ class Pending:
         self.onward = onward
         self.at_ns = at_ns
         self.deadline_ns = deadline_ns
+        self.handles = 0
 
 
 class InFlight:

@@ -9,13 +9,17 @@ from eap.aoe.action import Reply
 from eap.aoe.inflight import Pending
 from eap.aoe.outlet import Outlet
 from eap.aoe.routes import Route
-from eap.aoe.subscriptions import Subscription, Subscriptions, divide
+from eap.aoe.subscriptions import MAX_PER_WAY, Subscription, Subscriptions, divide
 from eap.aoe.way import Way
+from eap.codec.ads import AdsReadWrite, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.ids import NetId
 
 _ADDRESSES = struct.Struct("<6sH6sH")
-_RESULT = struct.Struct("<II")  # result, handle
+_GRANTED = struct.Struct("<II")  # result, handle
+_HANDLE = 4
+_SUM_HEAD = 8
+"""Octets of result and length before the answers to the items of a sum command."""
 
 
 class Notifier:
@@ -29,38 +33,46 @@ class Notifier:
         self.subscriptions = Subscriptions()
         self._outlet = outlet
 
-    def follow_request(self, header: AmsHeader, body: bytes, onward: bytes, way: Way) -> None:
-        """Note that a client wants no more of a notification."""
-        if header.command != AmsCommand.DELETE_NOTIFICATION or len(body) < 4:
-            return
-        handle = int.from_bytes(body[:4], "little")
-        found = self.subscriptions.find(onward, handle)
-        if found is not None and found[0] == way:
-            self.subscriptions.remove(onward, handle)
+    def follow_request(self, pending: Pending, body: bytes, way: Way) -> None:
+        """Note how many notifications a client asks for, or which it wants no more."""
+        command, group, count = pending.header.command, 0, 0
+        if command == AmsCommand.READ_WRITE and len(body) >= AdsReadWrite.SIZE:
+            head = AdsReadWrite.decode(body)
+            group, count = head.group, min(head.offset, MAX_PER_WAY)
+        if command == AmsCommand.ADD_NOTIFICATION:
+            pending.handles = 1
+        elif group == IndexGroup.SUM_ADD_NOTIFICATION:
+            pending.handles = count
+        elif command == AmsCommand.DELETE_NOTIFICATION:
+            self._delete(pending.onward, body[:_HANDLE], way)
+        elif group == IndexGroup.SUM_DELETE_NOTIFICATION:
+            start = AdsReadWrite.SIZE
+            self._delete(pending.onward, body[start : start + count * _HANDLE], way)
 
-    def follow_answer(
-        self, pending: Pending, header: AmsHeader, body: bytes
-    ) -> Subscription | None:
-        """Note a notification that was granted; return one that its server should end."""
-        if header.command != AmsCommand.ADD_NOTIFICATION or header.error_code:
-            return None
-        if len(body) < _RESULT.size or pending.route is None:
-            return None
-        result, handle = _RESULT.unpack_from(body)
-        if result:
-            return None
+    def follow_answer(self, pending: Pending, header: AmsHeader, body: bytes) -> list[Subscription]:
+        """Note the notifications that were granted; return those that their server should end."""
+        if not pending.handles or header.error_code or pending.route is None:
+            return []
         asked = pending.header
         server = bytes(asked.target) + asked.target_port.to_bytes(2, "little")
-        granted = Subscription(pending.onward, handle, pending.route, server)
-        if pending.came_by is None:
-            return granted
-        return self.subscriptions.add(pending.came_by, granted)
+        start = 0 if header.command == AmsCommand.ADD_NOTIFICATION else _SUM_HEAD
+        granted = body[start : start + pending.handles * _GRANTED.size]
+        surplus = []
+        for result, handle in _GRANTED.iter_unpack(granted[: _whole(granted)]):
+            if result:
+                continue
+            given = Subscription(pending.onward, handle, pending.route, server)
+            way = pending.came_by
+            oldest = given if way is None else self.subscriptions.add(way, given)
+            if oldest is not None:
+                surplus.append(oldest)
+        return surplus
 
     def hand_on(self, header: AmsHeader, body: bytes, is_hop: Callable[[Way], bool]) -> list[Reply]:
         """Return what the clients get of a notification; nothing if nobody here asked for it.
 
         Raises:
-            TruncatedError: it is shorter than it says.
+            CodecError: it is shorter or longer than it says.
         """
         onward = _ADDRESSES.pack(
             header.source, header.source_port, header.target, header.target_port
@@ -81,6 +93,17 @@ class Notifier:
             )
             replies.append(self._outlet.reply(way, encode_packet(head, part)))
         return replies
+
+    def _delete(self, onward: bytes, handles: bytes, way: Way) -> None:
+        for at in range(0, len(handles) - _HANDLE + 1, _HANDLE):
+            handle = int.from_bytes(handles[at : at + _HANDLE], "little")
+            found = self.subscriptions.find(onward, handle)
+            if found is not None and found[0] == way:
+                self.subscriptions.remove(onward, handle)
+
+
+def _whole(granted: bytes) -> int:
+    return len(granted) // _GRANTED.size * _GRANTED.size
 
 
 def request_to_end(subscription: Subscription) -> tuple[AmsHeader, bytes, Route]:

@@ -69,7 +69,7 @@ class Passage:
         """Pass a request on that is for nobody here, or refuse it.
 
         Raises:
-            TruncatedError: it is a notification shorter than it says.
+            CodecError: it is a notification shorter or longer than it says.
         """
         if header.command == AmsCommand.NOTIFICATION:
             body = data[AmsHeader.SIZE :]
@@ -91,7 +91,7 @@ class Passage:
         pending = self._admit(header, data, onward, way, route, now_ns)
         if not isinstance(pending, Pending):
             return pending
-        self.notifier.follow_request(header, data[AmsHeader.SIZE :], onward, way)
+        self.notifier.follow_request(pending, data[AmsHeader.SIZE :], way)
         return [self._forward(pending.invoke_id, data, onward, route)]
 
     def wait_for_service(
@@ -110,8 +110,7 @@ class Passage:
         if self._prober is not None and pending.route is not None:
             self._prober.hear(pending.route.hop, now_ns)
         actions: list[Action] = []
-        surplus = self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :])
-        if surplus is not None:
+        for surplus in self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :]):
             actions += self._end(surplus, now_ns)
         if pending.came_by is None:
             if header.command != AmsCommand.DELETE_NOTIFICATION:  # most of those are our own
@@ -268,7 +267,7 @@ class Passage:
         why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", hop)
         took_ns = now_ns - pending.at_ns
         actions = self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
-        if pending.route is not None and pending.header.command == AmsCommand.ADD_NOTIFICATION:
+        if pending.handles:
             # If it is granted after all, somebody has to end it.
             pending.came_by, pending.at_ns = None, now_ns
             pending.deadline_ns = now_ns + self._limits.timeout_ns
@@ -276,7 +275,9 @@ class Passage:
         return actions
 
     def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
-        """Ask the server to end a notification, for nobody."""
+        """Ask the server to end a notification, for nobody and if there is room to wait for it."""
+        if len(self.in_flight) >= self._limits.in_flight and not self.in_flight.make_room():
+            return []
         header, body, route = request_to_end(subscription)
         invoke_id = self._ids.take(self.in_flight)
         deadline_ns = now_ns + self._limits.timeout_ns

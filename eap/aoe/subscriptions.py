@@ -7,20 +7,16 @@ asked for it.  So requests for notifications that pass are remembered with their
 
 from __future__ import annotations
 
-import struct
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 from eap.aoe.routes import Route
 from eap.aoe.way import Way
-from eap.errors import TruncatedError
+from eap.codec.adsnotification import Sample, Stamp, decode_notification, encode_notification
 
 MAX_PER_WAY = 1024
 """Notifications of one connection; the oldest makes room."""
-_HEAD = struct.Struct("<II")  # octets behind the first field, stamps
-_STAMP = struct.Struct("<QI")  # FILETIME, samples
-_SAMPLE = struct.Struct("<II")  # handle, octets
 
 
 class Subscription(NamedTuple):
@@ -87,30 +83,6 @@ class Subscriptions:
                 self.remove(*key)
 
 
-class _Sample(NamedTuple):
-    time: int
-    handle: int
-    octets: bytes
-    """With the handle and the length."""
-
-
-def _samples(body: bytes) -> Iterator[_Sample]:
-    try:
-        _, stamps = _HEAD.unpack_from(body)
-        at = _HEAD.size
-        for _ in range(stamps):
-            time, samples = _STAMP.unpack_from(body, at)
-            at += _STAMP.size
-            for _ in range(samples):
-                handle, length = _SAMPLE.unpack_from(body, at)
-                octets, at = body[at : at + _SAMPLE.size + length], at + _SAMPLE.size + length
-                yield _Sample(time, handle, octets)
-    except struct.error as exc:
-        raise TruncatedError(str(exc), layout="Notification") from None
-    if at > len(body):
-        raise TruncatedError("the last sample is cut", layout="Notification")
-
-
 def divide(
     body: bytes, onward: bytes, subscriptions: Subscriptions, is_hop: Callable[[Way], bool]
 ) -> dict[tuple[Way, bytes], bytes]:
@@ -119,25 +91,23 @@ def divide(
     A handle that nobody has is left out, or that was given by another hop than *is_hop* says.
 
     Raises:
-        TruncatedError: the notification is shorter than it says.
+        CodecError: the notification is shorter or longer than it says.
     """
-    parts: dict[tuple[Way, bytes], list[_Sample]] = {}
+    parts: dict[tuple[Way, bytes], list[tuple[int, Sample]]] = {}
     count = 0
-    for sample in _samples(body):
-        count += 1
-        found = subscriptions.find(onward, sample.handle)
-        if found is not None and is_hop(found[1].route.hop):
-            parts.setdefault((found[0], found[1].server), []).append(sample)
+    for stamp in decode_notification(body):
+        for sample in stamp.samples:
+            count += 1
+            found = subscriptions.find(onward, sample.handle)
+            if found is not None and is_hop(found[1].route.hop):
+                parts.setdefault((found[0], found[1].server), []).append((stamp.time, sample))
     if len(parts) == 1 and count == len(next(iter(parts.values()))):
         return dict.fromkeys(parts, body)
     return {key: _join(samples) for key, samples in parts.items()}
 
 
-def _join(samples: list[_Sample]) -> bytes:
-    stamps: dict[int, list[bytes]] = {}
-    for sample in samples:
-        stamps.setdefault(sample.time, []).append(sample.octets)
-    content = b"".join(
-        _STAMP.pack(time, len(octets)) + b"".join(octets) for time, octets in stamps.items()
-    )
-    return _HEAD.pack(len(content) + 4, len(stamps)) + content
+def _join(samples: list[tuple[int, Sample]]) -> bytes:
+    stamps: dict[int, list[Sample]] = {}
+    for time, sample in samples:
+        stamps.setdefault(time, []).append(sample)
+    return encode_notification(Stamp(time, tuple(each)) for time, each in stamps.items())

@@ -6,7 +6,7 @@ import struct
 from typing import NamedTuple
 
 _AMS = struct.Struct("<6sH6sHHHIII")
-READ, ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION = 2, 6, 7, 8
+READ, ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, READ_WRITE = 2, 6, 7, 8, 9
 
 
 class Ams(NamedTuple):

@@ -1,10 +1,20 @@
 from __future__ import annotations
 
+import struct
+
 from eap.aoe.action import Outcome
+from eap.aoe.judge import Limits
 from eap.aoe.routes import Route
 from eap.aoe.way import Way
 from eap.ids import NetId
-from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams, parse
+from tests.support.ams import (
+    ADD_NOTIFICATION,
+    DELETE_NOTIFICATION,
+    NOTIFICATION,
+    READ_WRITE,
+    Ams,
+    parse,
+)
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, SECOND_LINK, Station, route
 from tests.unit.eap.aoe.test_subscriptions import stream
 
@@ -78,6 +88,31 @@ def test_deleted_notification_is_forgotten_by_its_client_only() -> None:
     assert station.router.stats().subscriptions == 1
     station.forwarded(delete, ONE)
     assert station.router.stats().subscriptions == 0
+
+
+def test_sum_commands_are_followed() -> None:
+    station = Station([route(FAR, LINK)])
+    sum_add = struct.pack("<IIII", 0xF085, 3, 24, 120) + bytes(120)
+    add = ADD._replace(command=READ_WRITE, body=sum_add)
+    answer = granted(1) + granted(0, 0x702) + granted(3)
+    body = struct.pack("<II", 0, len(answer)) + answer + b"tail"
+    station.replied(station.forwarded(add, ONE).answer(body), LINK)
+    notice = NOTICE._replace(body=stream((5, {1: b"a", 3: b"b"})))
+    assert station.replied(notice, LINK) == (ONE, notice)
+    for handles in (b"\1\0\0\0\x09\0\0\0", b"\3\0\0\0\3\0"):
+        delete = struct.pack("<IIII", 0xF086, 2, 8, 8) + handles
+        station.forwarded(add._replace(body=delete), ONE)
+    assert station.router.stats().subscriptions == 0
+    station.forwarded(add._replace(body=b"short"), ONE)
+    station.forwarded(add._replace(body=struct.pack("<IIII", 0xF080, 3, 24, 0)), ONE)
+
+
+def test_nothing_is_ended_when_there_is_no_room_to_wait_for_it() -> None:
+    station = Station([route(FAR, LINK)], limits=Limits(in_flight=1))
+    station.replied(station.forwarded(ADD, ONE).answer(granted(1)), LINK)
+    station.forwarded(ADD, TWO)
+    assert station.router.connection_closed(*ONE, 1) == []
+    assert station.router.stats().in_flight == 1
 
 
 def test_closed_connection_ends_its_notifications_at_the_server() -> None:
