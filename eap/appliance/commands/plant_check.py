@@ -24,10 +24,10 @@ def check_plant(path: Path) -> tuple[LoadResult, tuple[Finding, ...]]:
         line = result.lines.get(place, 0)
         for port, reason in _misfits(station):
             message = (
-                f"station {station.name} does not fit into the object dictionary of {port}"
-                f" ({reason}): it runs, and cannot be changed while it does"
+                f"station {station.name}, port {port}: {reason}; it runs, but cannot be changed"
+                " while it does"
             )
-            expected = "no more than a dictionary holds, see docs/features.md"
+            expected = "no more than an object dictionary holds"
             warnings.append(Finding(str(path), line, place, message, expected))
     return result, tuple(warnings)
 

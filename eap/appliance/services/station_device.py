@@ -70,6 +70,7 @@ class StationDevice:
             for name, each in self.dictionaries.items()
         }
         self._incomplete: DeviceFault | None = None
+        self._is_written = False
         try:
             fill_all(self.dictionaries, keeper.objects)
         except DeviceFault as exc:
@@ -203,6 +204,7 @@ class StationDevice:
         runs = self._machine.status.state is not DeviceState.PREOP
         before = stored.configuration(dictionary) if runs else {}
         result = write()
+        self._is_written = self._is_written or self._requested is None
         if self._requested is not None:
             fault = (await self._go(self._requested)).fault
             if fault is not None:
@@ -227,7 +229,8 @@ class StationDevice:
 
     async def _lead(self, state: DeviceState, wanted: DeviceState) -> None:
         self._checked = self.spec
-        if state is DeviceState.PREOP and wanted is not state:
+        is_untouched = self._incomplete is not None and not self._is_written
+        if state is DeviceState.PREOP and wanted is not state and not is_untouched:
             self._checked = spec = self._read_back()
             await self._keeper.change(spec, dump_all(self.dictionaries))
         await self._keeper.change_state(wanted)

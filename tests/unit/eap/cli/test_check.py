@@ -43,7 +43,7 @@ def test_a_plant_that_is_well(plant: Path) -> None:
     plant.write_text(PLANT.replace("[speed]", f"[{', '.join(['speed'] * 255)}]"))
     result = CliRunner().invoke(main, ["check", str(plant)])
     assert (result.exit_code, result.stdout.count("\n"), result.stderr.count("\n")) == (0, 1, 1)
-    assert result.stderr.startswith(f"warning: {plant}:3: station mixer does not fit")
+    assert result.stderr.startswith(f"warning: {plant}:3: station mixer, port eap0: 0x")
     result = CliRunner().invoke(main, ["check", str(plant), "--json"])
     assert (result.exit_code, result.stderr) == (0, "")
     assert [each["line"] for each in json.loads(result.stdout)["warnings"]] == [3]

@@ -48,7 +48,8 @@ def test_what_does_not_fit_is_said_with_its_line(tmp_path: Path, more: dict, rea
     result, (warning,) = check_plant(path)
     assert result.plant
     assert (warning.file, warning.line, warning.path) == (str(path), 8, "stations[1]")
-    assert "station oven does not fit into the object dictionary of eap0" in warning.message
+    assert warning.message.startswith("station oven, port eap0: 0x")
+    assert "does not fit into the dictionary" in warning.message
     assert reason in warning.message
 
 

@@ -316,6 +316,10 @@ def test_what_does_not_fit_into_dictionaries_runs_but_is_not_changed_by_download
 
     async def script():
         await device.request_state(2)
+        assert await device.request_state(8) == (8, None)
+        assert engine.spec == crowded
+        await device.request_state(2)
+        await write(device, TXPD, Tx.PD_ID, 77)
         refused = await device.request_state(8)
         assert refused.fault.code == FaultCode.NO_ROOM
         await device.apply(spec)
