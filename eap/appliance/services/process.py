@@ -7,6 +7,7 @@ here, the engine goes on: the two share images, and pairs of sockets on which it
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import signal
@@ -110,6 +111,7 @@ class Services:
             handover.plant, handover.stations, handover.states, images, engine, RELEASE
         )
         link.on_restart.append(devices.engine_has_restarted)
+        gc.freeze()  # what a collection would go through again and again, while clients wait
         return devices
 
     def _methods(self, images: dict[str, StationImage], buses: Buses, devices: Devices) -> Methods:
