@@ -38,6 +38,20 @@ class Refusal(StrEnum):
     """An Ethernet frame of a VLAN that no port names."""
     LOCAL_OVERFLOW = auto()
     """Stations on one Ethernet interface sent each other more than they took."""
+    AMS_FULL = auto()
+    """More AMS/TCP connections than there is room for."""
+    AMS_TYPE = auto()
+    """An AMS/TCP connection went on with what is no AMS packet, and was closed."""
+    AMS_LENGTH = auto()
+    """An AMS packet too long, or of another length than its header says; it was answered so."""
+    AMS_SLOW = auto()
+    """An AMS/TCP connection left a packet unfinished, or took no answers, and was closed."""
+    AMS_UNASKED = auto()
+    """An answer came by AMS/TCP, and nobody had asked."""
+    AMS_ACCESS = auto()
+    """More than a read was wanted by AMS/TCP from another host."""
+    AMS_DISCOVERY = auto()
+    """A datagram came to UDP 48899 that asks for nothing that there is."""
 
 
 _REFUSALS = tuple(Refusal)

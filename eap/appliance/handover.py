@@ -31,6 +31,10 @@ class SocketKind(StrEnum):
     """One listener, for services."""
     ARP = "arp"
     """One AF_PACKET socket for services, that asks for subscribers in one VLAN of an interface."""
+    AMS_TCP = "ams_tcp"
+    """One listener, for services; the ports of an address share it."""
+    AMS_UDP = "ams_udp"
+    """One socket for services, on which tools ask for the routers at an address."""
 
 
 class PortName(Record, frozen=True, order=True):

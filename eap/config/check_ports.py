@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable, Iterator
 from ipaddress import IPv4Address
 
+from eap.codec.amsdiscovery import AMS_UDP_PORT
+from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.check_buses import INTERFACE, check_bus_port
 from eap.config.destination import is_group, takes_tcp
@@ -145,6 +147,7 @@ def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
         report.add(f"{port.at}.broadcast", f"port {port.name} listens to UDP broadcasts", only)
     if port.tcp and uri.scheme not in {"udp", "tcp"}:
         report.add(f"{port.at}.tcp", f"port {port.name} takes type 4 from TCP", only)
+    _check_ams(port, uri, report)
     if port.mac and uri.scheme != "ethernet":
         report.add(f"{port.at}.mac", f"port {port.name} has a MAC address", only)
     elif port.mac and not _is_station(port.mac):
@@ -158,6 +161,17 @@ def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
                 f"a multicast address ({kind})" if uri.scheme in {"udp", "ethernet"} else only
             )
             report.add(f"{port.at}.join[{position}]", f"{group!r} cannot be joined", expected)
+
+
+def _check_ams(port: Port, uri: InterfaceUri, report: Report) -> None:
+    path = f"{port.at}.ams"
+    if uri.scheme not in {"udp", "tcp"}:
+        if path in report.lines:
+            message = f"port {port.name} says whether AMS is served at its IP address"
+            report.add(path, message, f"it only on udp:// and tcp://: {uri.scheme}:// has none")
+    elif port.ams and uri.port in {AMS_TCP_PORT, AMS_UDP_PORT}:
+        message = f"port number {uri.port} belongs to AMS"
+        report.add(f"{port.at}.interface", message, "another one, or ams: false")
 
 
 def _check_addresses(index: Index, report: Report) -> None:

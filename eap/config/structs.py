@@ -58,6 +58,7 @@ class Port(Section, frozen=True):
     tcp: bool = False
     wake: Wake = Wake.CYCLE
     eap_sm: bool = False
+    ams: bool = True
     mac: str = ""
     bus: str = ""
     target: BusTarget = BusTarget.OP
@@ -70,6 +71,7 @@ class Port(Section, frozen=True):
         "tcp",
         "wake",
         "eap_sm",
+        "ams",
         "mac",
     )
     BUS_KEYS: ClassVar[tuple[str, ...]] = ("bus", "target", "clocks")

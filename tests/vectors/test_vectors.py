@@ -13,7 +13,7 @@ from devicebus.wire.datagram import (
     encode_frame,
     iter_datagrams,
 )
-from eap.codec import ams, mailbox, pd
+from eap.codec import ams, amsdiscovery, mailbox, pd
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.wire import WireStruct
 from eap.errors import TruncatedError
@@ -22,6 +22,7 @@ from tests.support.vectors import FOLDER, Vector, load_all, load_datagrams
 FRAMES = [v for v in load_all("ethernet", "frame") if not v.error]
 MESSAGES = load_all("mailbox")
 PACKETS = load_all("ams")
+DISCOVERIES = load_all("ams_discovery")
 
 
 def by_name(vectors: list[Vector]) -> pytest.MarkDecorator:
@@ -152,7 +153,15 @@ def test_captured_datagram(fields: dict) -> None:
     assert (read, bytes(read_data), wkc) == (header, data, fields["wkc"])
 
 
+@by_name(DISCOVERIES)
+def test_ams_discovery(vector: Vector) -> None:
+    read = amsdiscovery.decode_discovery(vector.octets)
+    assert_fields(read.header, vector.fields["header"])
+    assert [[tag, data.hex()] for tag, data in read.tags] == vector.fields["tags"]
+    assert amsdiscovery.encode_discovery(read.header, read.tags) == vector.octets
+
+
 def test_every_file_is_used() -> None:
-    used = {v.name.partition("/")[0] for v in FRAMES + MESSAGES + PACKETS} | {"type1_datagrams"}
-    later = {"ams_discovery"}  # no codec of this project reads AMS discovery yet
-    assert used | later == {path.stem for path in FOLDER.glob("*.yaml")}
+    all_used = FRAMES + MESSAGES + PACKETS + DISCOVERIES
+    used = {v.name.partition("/")[0] for v in all_used} | {"type1_datagrams"}
+    assert used == {path.stem for path in FOLDER.glob("*.yaml")}

@@ -22,8 +22,9 @@ from eap.ids import NetId
 
 DEVICE_PORT = 0xFFFF
 """AMS port of an EAP device."""
-MAX_WAITING = 64
-"""Requests of one station that wait for their turn."""
+MAX_WAITING = 256
+"""Requests of one station that wait for their turn: one each of all that may connect by AMS/TCP,
+and as many by other ways."""
 
 Services: TypeAlias = Callable[[int, bytes], Awaitable[AmsAnswer]]
 """Answers the command of a request with the data behind its header."""
@@ -92,6 +93,35 @@ class AoeDesk:
         await self._waiting.join()
 
 
+def dispatch(
+    desks: Sequence[AoeDesk],
+    header: AmsHeader,
+    body: bytes,
+    finish: Callable[[AmsAnswer], None],
+    *,
+    for_all: bool = False,
+) -> None:
+    """Have the first of *desks* that is meant answer a request, now or later.
+
+    Args:
+        desks: Of the stations that may be meant.
+        header: Of the request.
+        body: What follows the header.
+        finish: Called once with the answer, or with the reason why nobody answers.
+        for_all: Whether it came by multicast: then it is not called if no station is meant.
+    """
+    error = AdsError.TARGET_MACHINE
+    for desk in desks:
+        found = desk.find(header)
+        if not isinstance(found, AdsError):
+            desk.put(header, body, found, finish)
+            return
+        if found is not AdsError.TARGET_MACHINE:
+            error = found
+    if not (for_all and error is AdsError.TARGET_MACHINE):
+        finish(AmsAnswer(error_code=error))
+
+
 class AoeDoor:
     """Where packets come in, by one socket or one connection.
 
@@ -137,16 +167,7 @@ class AoeDoor:
         def finish(answer: AmsAnswer) -> None:
             self._answer(header, answer, reply)
 
-        error = AdsError.TARGET_MACHINE
-        for desk in self._desks:
-            found = desk.find(header)
-            if not isinstance(found, AdsError):
-                desk.put(header, body, found, finish)
-                return
-            if found is not AdsError.TARGET_MACHINE:
-                error = found
-        if not (for_all and error is AdsError.TARGET_MACHINE):
-            finish(AmsAnswer(error_code=error))
+        dispatch(self._desks, header, body, finish, for_all=for_all)
 
     def _answer(self, header: AmsHeader, answer: AmsAnswer, reply: Reply) -> None:
         if header.state_flags & StateFlags.NO_RETURN:

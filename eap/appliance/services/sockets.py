@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from time import monotonic_ns
 
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
+from eap.appliance.services.ams_door import AmsDoor
 from eap.appliance.services.aoe_desk import AoeDesk
 from eap.appliance.services.intake import FrameIntake, watch_channel
 from eap.appliance.services.mailbox_intake import MailboxIntake, judge
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, NetId
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
@@ -26,7 +28,7 @@ def open_doors(
     counters: DiscardCounters,
     link: socket.socket,
     resources: ExitStack,
-) -> list[TcpDoor]:
+) -> list[TcpDoor | AmsDoor]:
     """Take frames from all sockets of *handover*, as long as the running loop lives.
 
     Args:
@@ -58,7 +60,7 @@ class _Sockets:
         self._now_ns = monotonic_ns()
         self._unicast: dict[PortName, UdpChannel] = {}
 
-    def open(self, link: socket.socket) -> list[TcpDoor]:
+    def open(self, link: socket.socket) -> list[TcpDoor | AmsDoor]:
         by_kind: dict[SocketKind, list[SharedSocket]] = {kind: [] for kind in SocketKind}
         for shared in self._handover.sockets:
             by_kind[shared.kind].append(shared)
@@ -68,7 +70,12 @@ class _Sockets:
             self._watch_group(shared)
         for shared in by_kind[SocketKind.PACKET]:
             self._watch_interface(shared)
-        return [self._door(shared, link) for shared in by_kind[SocketKind.TCP]]
+        for shared in by_kind[SocketKind.AMS_UDP]:
+            self._watch_discovery(shared)
+        doors: list[TcpDoor | AmsDoor] = []
+        doors += [self._door(shared, link) for shared in by_kind[SocketKind.TCP]]
+        doors += [self._ams_door(shared) for shared in by_kind[SocketKind.AMS_TCP]]
+        return doors
 
     def _channel(self, shared: SharedSocket) -> UdpChannel:
         channel = UdpChannel(socket.socket(fileno=shared.services_fd), self._batch)
@@ -125,20 +132,38 @@ class _Sockets:
                 intake.mailbox = mailbox.take
         watch_channel(port)
 
+    def _watch_discovery(self, shared: SharedSocket) -> None:
+        names = _stations_of(shared)
+        routers = [
+            RouterName(station.name, NetId.parse(station.net_id))
+            for station in self._handover.stations
+            if station.name in names
+        ]
+        AmsDiscovery(self._socket(shared), routers, self._refuser(names)).watch()
+
+    def _ams_door(self, shared: SharedSocket) -> AmsDoor:
+        stations = _stations_of(shared)
+        return AmsDoor(self._socket(shared), self._desks_of(stations), self._refuser(stations))
+
     def _door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
         stations = _stations_of(shared)
+        return TcpDoor(
+            self._socket(shared),
+            tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
+            link,
+            self._refuser(stations),
+            self._desks_of(stations),
+        )
 
+    def _socket(self, shared: SharedSocket) -> socket.socket:
+        return self._resources.enter_context(socket.socket(fileno=shared.services_fd))
+
+    def _refuser(self, stations: Sequence[str]) -> Callable[[Refusal], None]:
         def refuse(reason: Refusal) -> None:
             for station in stations:
                 self._counters.count(station, reason)
 
-        return TcpDoor(
-            self._resources.enter_context(socket.socket(fileno=shared.services_fd)),
-            tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
-            link,
-            refuse,
-            self._desks_of(stations),
-        )
+        return refuse
 
     def _takes_tcp(self, name: PortName) -> bool:
         port = self._handover.port(name)

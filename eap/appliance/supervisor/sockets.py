@@ -21,12 +21,14 @@ from eap.appliance.supervisor.bus_sockets import open_buses, open_message_pair
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
+from eap.net.amssocket import open_ams_listener, open_ams_socket
 from eap.net.packetsocket import open_arp, open_packet_pair
 from eap.net.tcp import open_tcp_listener
 from eap.net.udpsocket import open_udp_group_pair, open_udp_pair
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 BROADCAST = "255.255.255.255"
+EVERY_ADDRESS = "0.0.0.0"  # noqa: S104  what a plant file may say
 CONTROL_BACKLOG = 64
 _ORDER = tuple(SocketKind)
 
@@ -34,11 +36,18 @@ _ORDER = tuple(SocketKind)
 def plan_sockets(stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
     """Return what has to be opened for *stations*, each socket once, in fixed order."""
     owners: dict[SharedSocket, list[PortName]] = {}
-    for station in stations:
-        for port in station.ports:
-            if port.kind is PortKind.EAP:
-                for wanted in _sockets_of(port):
-                    owners.setdefault(wanted, []).append(PortName(station.name, port.name))
+    ports = [(station.name, port) for station in stations for port in station.ports]
+    ports = [(station, port) for station, port in ports if port.kind is PortKind.EAP]
+    for station, port in ports:
+        for wanted in _sockets_of(port):
+            owners.setdefault(wanted, []).append(PortName(station, port.name))
+    ams = [(PortName(station, port.name), _ams_address(port)) for station, port in ports]
+    every = any(address == EVERY_ADDRESS for _, address in ams)
+    for name, address in ams:
+        if address:
+            for kind in (SocketKind.AMS_TCP, SocketKind.AMS_UDP):
+                wanted = SharedSocket(kind, EVERY_ADDRESS if every else address)
+                owners.setdefault(wanted, []).append(name)
     planned = [
         msgspec.structs.replace(wanted, owners=tuple(names)) for wanted, names in owners.items()
     ]
@@ -59,6 +68,12 @@ def _sockets_of(port: PortSpec) -> Iterator[SharedSocket]:
             yield SharedSocket(SocketKind.GROUP, uri.host, number, group=BROADCAST)
     if uri.scheme in {"udp", "tcp"}:
         yield SharedSocket(SocketKind.TCP, uri.host, number)
+
+
+def _ams_address(port: PortSpec) -> str:
+    """Return where AMS routers listen for *port*, nothing if nowhere."""
+    uri = InterfaceUri.parse(port.interface)
+    return uri.host if port.ams and uri.scheme in {"udp", "tcp"} else ""
 
 
 class SharedSockets:
@@ -119,18 +134,28 @@ def _existing(*descriptors: int) -> list[int]:
 
 
 def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:
-    if planned.kind is SocketKind.TCP:
-        listener = opened.enter_context(open_tcp_listener(planned.address, planned.port))
-        return msgspec.structs.replace(planned, services_fd=listener.fileno())
-    if planned.kind is SocketKind.ARP:
-        sock = opened.enter_context(open_arp(planned.address))
-        return msgspec.structs.replace(planned, services_fd=sock.fileno())
+    if (single := _open_single(planned)) is not None:
+        opened.enter_context(single)
+        return msgspec.structs.replace(planned, services_fd=single.fileno())
     engine, services = _open_pair(planned)
     opened.enter_context(engine)
     opened.enter_context(services)
     return msgspec.structs.replace(
         planned, engine_fd=engine.fileno(), services_fd=services.fileno()
     )
+
+
+def _open_single(planned: SharedSocket) -> socket.socket | None:
+    """Open what services alone gets; return None for a pair."""
+    if planned.kind is SocketKind.TCP:
+        return open_tcp_listener(planned.address, planned.port)
+    if planned.kind is SocketKind.ARP:
+        return open_arp(planned.address)
+    if planned.kind is SocketKind.AMS_TCP:
+        return open_ams_listener(planned.address)
+    if planned.kind is SocketKind.AMS_UDP:
+        return open_ams_socket(planned.address)
+    return None
 
 
 def _open_pair(planned: SharedSocket) -> tuple[socket.socket, socket.socket]:

@@ -53,6 +53,10 @@ def test_a_port_that_cannot_be_is_one_finding(findings, edits, finding):
         ("ethernet://eth0", ", tcp: true", "port eap0 takes type 4 from TCP"),
         ("ethernet://eth0", ", join: [239.1.1.1]", "'239.1.1.1' cannot be joined"),
         ("loop://line", ", join: [239.1.1.1]", "'239.1.1.1' cannot be joined"),
+        ("ethernet://eth0", ", ams: true", "port eap0 says whether AMS is served at its IP addr"),
+        ("loop://line", ", ams: false", "port eap0 says whether AMS is served at its IP address"),
+        ("udp://127.0.9.1:48899", "", "port number 48899 belongs to AMS; another one, or ams: f"),
+        ("tcp://127.0.9.1:48898", "", "port number 48898 belongs to AMS; another one, or ams: f"),
     ],
 )
 def test_options_belong_to_their_kind_of_interface(findings, uri, more, finding):

@@ -10,7 +10,7 @@ import pytest
 
 from eap.appliance.discards import DiscardCounters
 from eap.appliance.engine.build import EnginePlant
-from eap.appliance.handover import Handover, PortName, SocketKind
+from eap.appliance.handover import NO_DESCRIPTOR, Handover, PortName
 from eap.appliance.passing import PassedConnection
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.supervisor.sockets import SharedSockets
@@ -88,7 +88,7 @@ def shared(tmp_path):
         return [
             msgspec.structs.replace(each, engine_fd=socket.dup(each.engine_fd))
             for each in sockets.descriptions
-            if each.kind is not SocketKind.TCP
+            if each.engine_fd != NO_DESCRIPTOR
         ]
 
     yield open_for

@@ -13,7 +13,7 @@ import pytest
 from eap.appliance.handover import NO_DESCRIPTOR, PortName, SocketKind
 from eap.appliance.supervisor.sockets import SharedSockets, plan_sockets
 from eap.errors import EnvironmentalError
-from eap.pd.spec import BusPortSpec, PortKind, PortSpec
+from eap.pd.spec import BusPortSpec, PortKind, PortSpec, StationSpec
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
 LEFT, RIGHT = PortName("left", "eap0"), PortName("right", "eap0")
@@ -26,7 +26,41 @@ def test_a_udp_port_needs_a_pair_and_a_listener():
         (SocketKind.UDP, "127.9.2.2", 34980, (RIGHT,)),
         (SocketKind.TCP, "127.9.2.1", 34980, (LEFT,)),
         (SocketKind.TCP, "127.9.2.2", 34980, (RIGHT,)),
+        (SocketKind.AMS_TCP, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_TCP, "127.9.2.2", 0, (RIGHT,)),
+        (SocketKind.AMS_UDP, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_UDP, "127.9.2.2", 0, (RIGHT,)),
     ]
+
+
+def ams_of(*stations: StationSpec) -> list[tuple[str, str, tuple[PortName, ...]]]:
+    kinds = (SocketKind.AMS_TCP, SocketKind.AMS_UDP)
+    return [(s.kind, s.address, s.owners) for s in plan_sockets(stations) if s.kind in kinds]
+
+
+def test_stations_of_one_address_share_what_ams_needs():
+    lodger = right(eap_port(2, "tcp://127.9.2.1:5000"))
+    assert ams_of(left(), lodger) == [
+        (SocketKind.AMS_TCP, "127.9.2.1", (LEFT, RIGHT)),
+        (SocketKind.AMS_UDP, "127.9.2.1", (LEFT, RIGHT)),
+    ]
+    assert ams_of(left(eap_port(1, ams=False)), lodger) == [
+        (SocketKind.AMS_TCP, "127.9.2.1", (RIGHT,)),
+        (SocketKind.AMS_UDP, "127.9.2.1", (RIGHT,)),
+    ]
+
+
+def test_who_listens_at_every_address_shares_it_with_all():
+    everywhere = right(eap_port(2, "udp://0.0.0.0:5000"))
+    assert ams_of(left(), everywhere) == [
+        (SocketKind.AMS_TCP, "0.0.0.0", (LEFT, RIGHT)),
+        (SocketKind.AMS_UDP, "0.0.0.0", (LEFT, RIGHT)),
+    ]
+
+
+def test_no_ams_without_an_ip_address():
+    without = (eap_port(1, ams=False), eap_port(1, "loop://line"), eap_port(1, "ethernet://eth0"))
+    assert [ams_of(left(port)) for port in without] == [[], [], []]
 
 
 def test_groups_and_broadcasts_have_their_own():
@@ -38,6 +72,8 @@ def test_groups_and_broadcasts_have_their_own():
         (SocketKind.GROUP, "239.1.1.2", 5000),
         (SocketKind.GROUP, "255.255.255.255", 5000),
         (SocketKind.TCP, "", 5000),
+        (SocketKind.AMS_TCP, "", 0),
+        (SocketKind.AMS_UDP, "", 0),
     ]
 
 
@@ -55,7 +91,7 @@ def test_stations_share_an_ethernet_interface():
 
 def test_what_stays_in_the_engine_needs_none():
     assert plan_sockets([left(eap_port(1, "loop://line"))]) == ()
-    tcp_only = plan_sockets([left(eap_port(1, "tcp://127.9.2.1"))])
+    tcp_only = plan_sockets([left(eap_port(1, "tcp://127.9.2.1", ams=False))])
     assert [s.kind for s in tcp_only] == [SocketKind.TCP]
 
 
@@ -70,7 +106,8 @@ def test_all_are_opened_and_described(tmp_path):
     port = eap_port(1, join=("239.1.1.1",), broadcast=True)
     with SharedSockets([left(port)], tmp_path / "control") as shared:
         for described in shared.descriptions:
-            assert (described.engine_fd == NO_DESCRIPTOR) == (described.kind is SocketKind.TCP)
+            of_both = described.kind in {SocketKind.UDP, SocketKind.GROUP}
+            assert (described.engine_fd != NO_DESCRIPTOR) == of_both
             assert described.services_fd != NO_DESCRIPTOR
         inherited = {*shared.engine_descriptors(), *shared.services_descriptors()}
         assert len(inherited) == open_descriptors() - before

@@ -1,0 +1,215 @@
+"""AMS/TCP 48898 and UDP 48899 at the addresses of running stations.
+
+The client is written apart from our codec.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import struct
+import time
+from typing import Self
+
+import pytest
+
+from tests.support import aoe
+from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.vectors import load
+
+pytestmark = pytest.mark.net
+
+LEFT, RIGHT = "127.9.48.1", "127.9.48.2"
+FIRST, SECOND, THIRD = f"{LEFT}.2.1", f"{LEFT}.2.2", f"{RIGHT}.2.1"
+PLANT = f"""\
+plant: doors
+defaults: {{cycle_us: 10000}}
+stations:
+  - name: left
+    net_id: {LEFT}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{LEFT}", net_id: {FIRST}}}
+  - name: lodger
+    net_id: {LEFT}.1.2
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{LEFT}:5000", net_id: {SECOND}}}
+  - name: right
+    net_id: {RIGHT}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{RIGHT}", net_id: {THIRD}}}
+"""
+ALONE = f"""\
+plant: alone
+stations:
+  - name: left
+    net_id: {LEFT}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{LEFT}", net_id: {FIRST}}}
+"""
+ADD_ROUTE, SERVER_INFO = (vector.octets for vector in load("ams_discovery"))
+
+
+class AmsClient:
+    """Speaks AMS/TCP with a station."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.create_connection((address, 48898), timeout=5)
+        self._number = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+    def send(self, packet: bytes) -> None:
+        self.socket.sendall(struct.pack("<HI", 0, len(packet)) + packet)
+
+    def receive(self) -> tuple[int, bytes]:
+        """Return error and data of the next packet."""
+        (length,) = struct.unpack("<2xI", self._exactly(6))
+        packet = self._exactly(length)
+        assert struct.unpack_from("<I", packet, 28) == (self._number,)
+        return int.from_bytes(packet[24:28], "little"), packet[32:]
+
+    def ask(self, target: str, command: int, body: bytes) -> tuple[int, bytes]:
+        self._number += 1
+        self.send(aoe.packet(target, command, body, invoke_id=self._number))
+        return self.receive()
+
+    def net_id(self, target: str) -> str:
+        """Return the NetID that a port's own dictionary says."""
+        error, data = self.ask(target, aoe.READ, aoe.read_body(0xF920 << 16 | 1))
+        assert (error, data[:8]) == (0, struct.pack("<II", 0, 6))
+        return ".".join(map(str, data[8:]))
+
+    def _exactly(self, size: int) -> bytes:
+        data = self.socket.recv(size, socket.MSG_WAITALL)
+        assert len(data) == size
+        return data
+
+
+def discover(address: str, question: bytes, count: int) -> list[bytes]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.settimeout(5)
+        client.sendto(question, (address, 48899))
+        return [client.recv(400) for _ in range(count)]
+
+
+@pytest.fixture
+def appliance(farm: Plants) -> Appliance:
+    wait_until(lambda: all(map(is_free, (LEFT, RIGHT))))
+    return farm.run(farm.write(PLANT))
+
+
+def is_free(address: str) -> bool:
+    with socket.socket() as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((address, 48898))
+        except OSError:
+            return False
+    return True
+
+
+def test_every_dictionary_of_an_address_by_one_connection(appliance: Appliance) -> None:
+    with AmsClient(LEFT) as client, AmsClient(RIGHT) as other:
+        assert [client.net_id(target) for target in (FIRST, SECOND, FIRST)] == [
+            FIRST,
+            SECOND,
+            FIRST,
+        ]
+        assert other.net_id(THIRD) == THIRD
+        assert client.ask(THIRD, aoe.READ_STATE, b"") == (7, b"")
+        assert client.ask(f"{LEFT}.1.1", aoe.READ_STATE, b"") == (6, b"")
+        wanted = struct.pack("<H", 2)
+        written = client.ask(FIRST, aoe.WRITE, aoe.write_body(0xF200 << 16 | 1, wanted))
+        assert written == (0, bytes(4))
+        assert client.net_id(FIRST) == FIRST
+    assert [appliance.station(name)["state"] for name in ("left", "lodger")] == ["PREOP", "OP"]
+
+
+def test_routers_are_found_by_address(appliance: Appliance) -> None:
+    found = {answer[12:18] for answer in discover(LEFT, SERVER_INFO, 2)}
+    assert found == {aoe.net_id(f"{LEFT}.1.{n}") for n in (1, 2)}
+    (answer,) = discover(RIGHT, SERVER_INFO, 1)
+    assert answer[12:18] == aoe.net_id(f"{RIGHT}.1.1")
+    (answer,) = discover(RIGHT, ADD_ROUTE, 1)
+    assert answer[8:12] == b"\6\0\0\x80"
+    assert answer[-8:] == b"\1\0\4\0\1\7\0\0"
+
+
+def test_listeners_outlive_services(appliance: Appliance) -> None:
+    with AmsClient(LEFT) as client:
+        assert client.net_id(FIRST) == FIRST
+        services = appliance.pid("services")
+        os.kill(services, signal.SIGKILL)
+        with AmsClient(LEFT) as next_client:  # accepted when services is back
+            next_client.socket.settimeout(15)
+            assert next_client.net_id(FIRST) == FIRST
+        assert client.socket.recv(1) == b""
+    assert appliance.pid("services") != services
+
+
+def test_bad_clients_are_counted_and_the_others_served(appliance: Appliance) -> None:
+    with AmsClient(RIGHT) as good:
+        with AmsClient(RIGHT) as bad:
+            bad.socket.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            assert bad.socket.recv(1) == b""
+        with AmsClient(RIGHT) as bad:
+            bad.send(aoe.packet(THIRD, aoe.READ, b"") + b"more than it says")
+            bad._number = 1
+            assert bad.receive() == (0xE, b"")
+            bad.send(aoe.packet(THIRD, aoe.READ, b"", flags=5))
+            assert good.net_id(THIRD) == THIRD
+        idle = [socket.create_connection((RIGHT, 48898)) for _ in range(200)]
+        wait_until(lambda: "ams_full" in appliance.station("right")["discarded"])
+        assert good.net_id(THIRD) == THIRD
+        for connection in idle:
+            connection.close()
+        for _ in range(5):
+            discover(RIGHT, SERVER_INFO, 1)
+    discarded = appliance.station("right")["discarded"]
+    assert [discarded[f"ams_{name}"] for name in ("type", "length", "unasked")] == [1, 1, 1]
+    assert 72 <= discarded["ams_full"] <= 74
+    assert appliance.station("left")["discarded"] == {}
+
+
+def test_flood_leaves_memory_and_engine_alone(appliance: Appliance) -> None:
+    """Clients that send ahead without reading, and one that is answered all the same."""
+    before = appliance.status()["processes"]["services"]["rss"]
+    packet = aoe.packet(FIRST, aoe.WRITE, aoe.write_body(0x2000 << 16, bytes(200_000)))
+    flood = struct.pack("<HI", 0, len(packet)) + packet
+    crowd = [socket.create_connection((LEFT, 48898)) for _ in range(20)]
+    try:
+        for each in crowd:
+            each.setblocking(False)
+        end = time.monotonic() + 1.5
+        with AmsClient(LEFT) as good:
+            while time.monotonic() < end:
+                for each in crowd:
+                    try:
+                        each.send(flood)
+                    except BlockingIOError:
+                        pass
+                    except OSError:
+                        continue
+                assert good.net_id(FIRST) == FIRST
+        grown = appliance.status()["processes"]["services"]["rss"] - before
+        assert grown < 32 << 20
+    finally:
+        for each in crowd:
+            each.close()
+    assert appliance.status()["processes"]["engine"]["restarts"] == 0
+
+
+def test_port_that_is_taken_is_named_with_what_to_do(farm: Plants) -> None:
+    wait_until(lambda: is_free(LEFT))
+    with socket.create_server((LEFT, 48898)):
+        code, _, text = farm.start(farm.write(ALONE)).finish()
+        assert code == 2
+        assert f"TCP {LEFT}:48898 is in use by process {os.getpid()}" in text
+        assert "`ams: false`" in text
+        without = ALONE.replace("}\n", ", ams: false}\n")
+        farm.run(farm.write(without, "without.yaml"))

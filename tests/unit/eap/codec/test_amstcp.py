@@ -1,0 +1,34 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec.amstcp import AmsTcpHeader, decode_prefix, encode_with_prefix
+from eap.errors import MalformedError, TruncatedError
+
+
+@given(st.binary(min_size=32, max_size=200), st.binary(max_size=5))
+def test_prefix_round_trip(packet: bytes, before: bytes) -> None:
+    octets = encode_with_prefix(packet)
+    assert octets == b"\0\0" + len(packet).to_bytes(4, "little") + packet
+    assert decode_prefix(before + octets, len(before)) == len(packet)
+
+
+@given(st.integers(0, 5))
+def test_every_prefix_of_it_is_truncated(size: int) -> None:
+    with pytest.raises(TruncatedError, match="AmsTcpHeader"):
+        decode_prefix(AmsTcpHeader(0, 32).encode()[:size])
+
+
+@pytest.mark.parametrize(
+    ("header", "text"),
+    [
+        (AmsTcpHeader(0x1000, 40), "reserved is 0x1000, expected 0"),
+        (AmsTcpHeader(0, 31), "length 31, expected 32 or more"),
+        (AmsTcpHeader(0, 0), "length 0, expected 32 or more"),
+    ],
+)
+def test_what_is_no_packet_is_refused(header: AmsTcpHeader, text: str) -> None:
+    with pytest.raises(MalformedError, match=text):
+        decode_prefix(header.encode())
