@@ -50,7 +50,7 @@ class Change(msgspec.Struct, frozen=True):
     data: bytes
     """What is to be written."""
     interim: bool = False
-    """Whether it only makes way for a change that follows."""
+    """Whether people see no difference: it makes way for others, or repeats what they undo."""
 
 
 def compare(old: EapDictionary, new: EapDictionary) -> list[Change]:
@@ -203,15 +203,18 @@ class _Comparison:
         octets = after if data is None else data
         later = self._new_dictionary if index in self._new else self._old_dictionary
         shown = after if data is None or not interim else data
+        old_text = _text(self._old_dictionary, index, subindex, before)
+        new_text = "" if goes else _text(later, index, subindex, shown)
+        is_again = kind is ChangeKind.CHANGED and old_text == new_text  # of a variable's other type
         return Change(
             kind,
             index,
             subindex,
             self._title(index) if goes else self._name(index, subindex),
-            _text(self._old_dictionary, index, subindex, before),
-            "" if goes else _text(later, index, subindex, shown),
+            old_text,
+            new_text,
             octets or b"",
-            interim,
+            interim or is_again,
         )
 
     def _title(self, index: int) -> str:

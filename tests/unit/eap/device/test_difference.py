@@ -6,7 +6,7 @@ from eap.device.difference import compare
 from eap.device.stored import configuration
 from eap.od.model import OdState
 from eap.od.profiles.eap1000 import RX_PD, TX_PD
-from eap.od.profiles.eap1000keys import Frame, Rx, Tx
+from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import copy, mapping, receiver, sender, tx_pd, variable, write
 from tests.support.stations import empty, filled, stations
@@ -127,6 +127,20 @@ def test_pds_that_refer_to_each_other_are_let_go_before_both_go(udp):
     for change in changes:
         write(udp, change.index, change.subindex, change.data)
     assert not udp.members(TX_PD, RX_PD)
+
+
+def test_a_default_that_a_variable_keeps_with_another_type_is_no_change_to_people(udp):
+    variable(udp, 0x6000, "level")
+    new = copy(udp)
+    write(new, 0x6000, Var.TYPE_NAME, "UDINT")
+    for dictionary, octets in ((udp, b"\x32\0"), (new, b"\x32\0\0\0")):
+        write(dictionary, 0x6000, Var.DEFAULT_GIVEN, 1)
+        write(dictionary, 0x6000, Var.DEFAULT, octets)
+    assert [(c.subindex, c.old, c.new, c.interim) for c in compare(udp, new)] == [
+        (Var.TYPE_NAME, "UINT", "UDINT", False),
+        (Var.DEFAULT_GIVEN, "true", "true", True),
+        (Var.DEFAULT, "50", "50", True),
+    ]
 
 
 def test_a_mapping_that_is_empty_is_as_good_as_none(udp):
