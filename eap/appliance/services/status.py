@@ -72,21 +72,6 @@ def appliance_status(
         buses: What the engine says of its buses, of none if it does not answer.
     """
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
-    stations = []
-    for image in images:
-        station = station_status(image, monotonic_ns(), time_ns())
-        station["cycle_age_us"] = _cycle_age_us(image)
-        for port in station["ports"]:
-            if port["kind"] == PortKind.BUS:
-                report = buses.get(PortName(station["name"], port["name"]))
-                port.update(bus_document(report), link=bus_link(report))
-            else:
-                port["link"] = link_state(port["interface"])
-        counts = station["discarded"]
-        for by_station in discarded:
-            for reason, count in by_station.get(image.layout.station, {}).items():
-                counts[reason] = counts.get(reason, 0) + count
-        stations.append(station)
     engine = _process(info.engine, meter, now_ns)
     engine["realtime"] = info.engine.report.get("realtime", {})
     if report := next(iter(buses.values()), None):
@@ -104,8 +89,28 @@ def appliance_status(
         "version": VERSION,
         "plant": info.plant,
         "processes": processes,
-        "stations": stations,
+        "stations": [_station(image, discarded, buses) for image in images],
     }
+
+
+def _station(
+    image: Image,
+    discarded: Sequence[Mapping[str, Mapping[str, int]]],
+    buses: Mapping[PortName, BusReport],
+) -> dict[str, Any]:
+    station = station_status(image, monotonic_ns(), time_ns())
+    station["cycle_age_us"] = _cycle_age_us(image)
+    for port in station["ports"]:
+        if port["kind"] == PortKind.BUS:
+            report = buses.get(PortName(station["name"], port["name"]))
+            port.update(bus_document(report), link=bus_link(report))
+        else:
+            port["link"] = link_state(port["interface"])
+    counts = station["discarded"]
+    for by_station in discarded:
+        for reason, count in by_station.get(image.layout.station, {}).items():
+            counts[reason] = counts.get(reason, 0) + count
+    return station
 
 
 def _cycle_age_us(image: Image) -> int | None:
