@@ -2,7 +2,8 @@
 
 Rules: the top level holds only what ``docs/architecture.md`` allows; modules stay under 400 lines;
 every module of the two packages has its own unit test file, and every unit test file its module;
-nothing that is true of one machine only is committed; unfinished work names its issue.
+nothing that is true of one machine only is committed; unfinished work names its issue; the files that
+pages in ``docs/`` name exist.
 
     python tools/check_tree.py [ROOT]
 
@@ -54,6 +55,7 @@ FORBIDDEN = (
     (re.compile(r"\.\./shared\b"), "a file beside the repository", "a file of the repository"),
 )
 UNFINISHED = re.compile(r"\b(?:TO[D]O|FIX[M]E)\b(?!\W{0,3}#\d)")
+NAMED = re.compile(r"`((?:tests|config|eap|devicebus|docs|tools)/[\w./-]*\w)/?`")
 CODE_SUFFIXES = frozenset({"", ".py", ".sh", ".toml", ".yaml"})
 
 
@@ -112,7 +114,10 @@ def check(root: Path) -> list[Violation]:
     for name in files:
         data = (root / name).read_bytes()
         if b"\0" not in data:
-            found += check_text(name, data.decode(errors="replace"))
+            text = data.decode(errors="replace")
+            found += check_text(name, text)
+            if name.suffix == ".md" and name.parts[0] == "docs":
+                found += check_named(root, name, text)
     return sorted(found)
 
 
@@ -158,6 +163,14 @@ def check_text(name: PurePosixPath, text: str) -> Iterator[Violation]:
                 yield Violation(name, number, f"{what} ({match[0]})", expected)
         if name.suffix in CODE_SUFFIXES and (match := UNFINISHED.search(line)):
             yield Violation(name, number, f"{match[0]} without an issue", f"{match[0]} #12 or none")
+
+
+def check_named(root: Path, page: PurePosixPath, text: str) -> Iterator[Violation]:
+    """Yield the files and folders of the tree that a page names and that do not exist."""
+    for number, line in enumerate(text.splitlines(), 1):
+        for match in NAMED.finditer(line):
+            if not (root / match[1]).exists():
+                yield Violation(page, number, f"{match[1]} does not exist", "where it is now")
 
 
 def main(arguments: list[str]) -> int:

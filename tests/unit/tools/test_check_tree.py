@@ -51,6 +51,15 @@ def test_a_foreign_directory_is_reported_once(tmp_path):
     ]
 
 
+def test_pages_name_files_that_exist(tmp_path):
+    grow(tmp_path, "tools/demo.py", "eap/pd/__init__.py")
+    text = "`tools/demo.py`, `eap/pd/` show it\n`make demo` and `tests/unit/eap/test_gone.py`, too"
+    grow(tmp_path, "docs/features.md", text=text)
+    assert found(tmp_path) == [
+        "docs/features.md:2: tests/unit/eap/test_gone.py does not exist, expected where it is now"
+    ]
+
+
 def test_unit_test_without_its_module(tmp_path):
     grow(tmp_path, "tests/unit/eap/test_gone.py", "tests/unit/tools/test_gone.py")
     assert found(tmp_path) == [
