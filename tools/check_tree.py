@@ -2,8 +2,8 @@
 
 Rules: the top level holds only what ``docs/architecture.md`` allows; modules stay under 400 lines;
 every module of the two packages has its own unit test file, and every unit test file its module;
-nothing that is true of one machine only is committed; unfinished work names its issue; the files that
-pages in ``docs/`` name exist.
+nothing that is true of one machine only is committed; unfinished work names its issue; the files
+that pages in ``docs/`` name exist.
 
     python tools/check_tree.py [ROOT]
 
