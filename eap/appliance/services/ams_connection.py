@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from eap.aoe.answer import AmsAnswer, response_to
 from eap.aoe.stream import PacketCutter, Piece, TooLong
 from eap.appliance.discards import Refusal
-from eap.appliance.services.aoe_desk import AoeDesk, dispatch
+from eap.appliance.services.aoe_desk import AoeDesk, find_desk
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 from eap.codec.amstcp import encode_with_prefix
@@ -70,9 +70,7 @@ class AmsConnection:
             while (piece := await self._next_piece()) is not None:
                 packet = await self._answer(piece)
                 if packet is not None:
-                    self._writer.write(encode_with_prefix(packet))
-                    async with asyncio.timeout(self._patience_s):
-                        await self._writer.drain()
+                    await self._send(packet)
         except MalformedError as exc:
             logger.debug("AMS/TCP connection closed: %s", exc)
             self._refuse(Refusal.AMS_TYPE)
@@ -84,15 +82,27 @@ class AmsConnection:
     async def _next_piece(self) -> Piece | None:
         """Return what comes next, None at the end; a silence between packets may last."""
         deadline: float | None = None
-        while (piece := self._cutter.next_piece()) is None:
+        if (piece := self._cutter.next_piece()) is not None:
+            await asyncio.sleep(0)  # others first: who sends ahead has had an answer just now
+        while piece is None:
             if self._cutter.has_begun and deadline is None:
                 deadline = asyncio.get_running_loop().time() + self._patience_s
-            async with asyncio.timeout_at(deadline):
+            if deadline is None:
                 data = await self._reader.read(_CHUNK)
+            else:
+                async with asyncio.timeout_at(deadline):
+                    data = await self._reader.read(_CHUNK)
             if not data:
                 return None
             self._cutter.receive(data)
+            piece = self._cutter.next_piece()
         return piece
+
+    async def _send(self, packet: bytes) -> None:
+        self._writer.write(encode_with_prefix(packet))
+        if self._writer.transport.get_write_buffer_size():  # mostly the kernel takes it at once
+            async with asyncio.timeout(self._patience_s):
+                await self._writer.drain()
 
     async def _answer(self, piece: Piece) -> bytes | None:
         """Return the packet that goes back, None for what has no answer."""
@@ -116,14 +126,11 @@ class AmsConnection:
     async def _ask(self, header: AmsHeader, body: bytes) -> AmsAnswer:
         if header.command == AmsCommand.FRAGMENT:
             return AmsAnswer(error_code=AdsError.COMMAND)  # these belong to mailboxes
-        answered: asyncio.Future[AmsAnswer] = asyncio.get_running_loop().create_future()
-
-        def finish(answer: AmsAnswer) -> None:
-            if not answered.done():  # the connection may be gone meanwhile
-                answered.set_result(answer)
-
-        dispatch(self._desks, header, body, finish)
-        return await answered
+        found = find_desk(self._desks, header)
+        if isinstance(found, AdsError):
+            return AmsAnswer(error_code=found)
+        desk, services = found
+        return await desk.ask(header, body, services)
 
     def _deny(self, header: AmsHeader) -> AmsAnswer:
         self._refuse(Refusal.AMS_ACCESS)

@@ -22,9 +22,8 @@ from eap.ids import NetId
 
 DEVICE_PORT = 0xFFFF
 """AMS port of an EAP device."""
-MAX_WAITING = 256
-"""Requests of one station that wait for their turn: one each of all that may connect by AMS/TCP,
-and as many by other ways."""
+MAX_WAITING = 64
+"""Requests of one station that came by frames and wait for their turn."""
 
 Services: TypeAlias = Callable[[int, bytes], Awaitable[AmsAnswer]]
 """Answers the command of a request with the data behind its header."""
@@ -53,6 +52,7 @@ class AoeDesk:
         self._devices = devices
         self._machines = frozenset(machines)
         self._waiting: asyncio.Queue[_Request] = asyncio.Queue(MAX_WAITING)
+        self._turn = asyncio.Lock()
 
     def find(self, header: AmsHeader) -> Services | AdsError:
         """Return who answers a request, or why nobody does."""
@@ -80,46 +80,33 @@ class AoeDesk:
         """Answer requests until cancelled."""
         while True:
             request = await self._waiting.get()
-            try:
-                answer = await request.services(request.header.command, request.body)
-            except Exception:
-                logger.exception("AoE request from %s failed", request.header.source)
-                answer = AmsAnswer(error_code=AdsError.INTERNAL)
-            request.finish(answer)
+            request.finish(await self.ask(request.header, request.body, request.services))
             self._waiting.task_done()
+
+    async def ask(self, header: AmsHeader, body: bytes, services: Services) -> AmsAnswer:
+        """Have *services* answer a request when its turn comes; who may wait waits here."""
+        async with self._turn:
+            try:
+                return await services(header.command, body)
+            except Exception:
+                logger.exception("AoE request from %s failed", header.source)
+                return AmsAnswer(error_code=AdsError.INTERNAL)
 
     async def wait_idle(self) -> None:
         """Wait until nothing waits."""
         await self._waiting.join()
 
 
-def dispatch(
-    desks: Sequence[AoeDesk],
-    header: AmsHeader,
-    body: bytes,
-    finish: Callable[[AmsAnswer], None],
-    *,
-    for_all: bool = False,
-) -> None:
-    """Have the first of *desks* that is meant answer a request, now or later.
-
-    Args:
-        desks: Of the stations that may be meant.
-        header: Of the request.
-        body: What follows the header.
-        finish: Called once with the answer, or with the reason why nobody answers.
-        for_all: Whether it came by multicast: then it is not called if no station is meant.
-    """
+def find_desk(desks: Sequence[AoeDesk], header: AmsHeader) -> tuple[AoeDesk, Services] | AdsError:
+    """Return which of *desks* is meant and who answers there, or why nobody does."""
     error = AdsError.TARGET_MACHINE
     for desk in desks:
         found = desk.find(header)
         if not isinstance(found, AdsError):
-            desk.put(header, body, found, finish)
-            return
+            return desk, found
         if found is not AdsError.TARGET_MACHINE:
             error = found
-    if not (for_all and error is AdsError.TARGET_MACHINE):
-        finish(AmsAnswer(error_code=error))
+    return error
 
 
 class AoeDoor:
@@ -167,7 +154,12 @@ class AoeDoor:
         def finish(answer: AmsAnswer) -> None:
             self._answer(header, answer, reply)
 
-        dispatch(self._desks, header, body, finish, for_all=for_all)
+        found = find_desk(self._desks, header)
+        if not isinstance(found, AdsError):
+            desk, services = found
+            desk.put(header, body, services, finish)
+        elif not (for_all and found is AdsError.TARGET_MACHINE):
+            finish(AmsAnswer(error_code=found))
 
     def _answer(self, header: AmsHeader, answer: AmsAnswer, reply: Reply) -> None:
         if header.state_flags & StateFlags.NO_RETURN:

@@ -8,9 +8,12 @@ import struct
 
 import pytest
 
+from eap.aoe.answer import AmsAnswer
 from eap.appliance.discards import Refusal
 from eap.appliance.services import ams_door
 from eap.appliance.services.ams_door import AmsDoor, is_this_host
+from eap.appliance.services.aoe_desk import AoeDesk
+from eap.ids import NetId
 from tests.support import aoe
 
 pytestmark = pytest.mark.net
@@ -29,15 +32,15 @@ async def hear(reader) -> bytes:
     return (await reader.readexactly(length))[37:][::-1]
 
 
-def play(script, *, patience_s: float = 5) -> list[Refusal]:
+def play(script, *, patience_s: float = 5, desks=()) -> list[Refusal]:
     """Run ``script(connect, listener)`` while a door serves two stations."""
     refused: list[Refusal] = []
 
     async def run():
         with socket.create_server(("127.0.0.1", 0)) as listener:
-            desks = [aoe.echoing_desk(target) for target in TARGETS]
-            door = AmsDoor(listener, desks, refused.append, patience_s=patience_s)
-            serving = [asyncio.ensure_future(each.serve()) for each in (door, *desks)]
+            there = desks or [aoe.echoing_desk(target) for target in TARGETS]
+            door = AmsDoor(listener, there, refused.append, patience_s=patience_s)
+            serving = [asyncio.ensure_future(each.serve()) for each in (door, *there)]
 
             async def connect():
                 return await asyncio.open_connection(*listener.getsockname())
@@ -67,6 +70,30 @@ def test_each_answer_goes_back_on_the_connection_of_its_question():
         await asyncio.gather(*(client(connect, name) for name in range(20)))
 
     assert play(script) == []
+
+
+def test_who_sends_ahead_lets_others_in_between():
+    served = []
+
+    async def note(command: int, data: bytes) -> AmsAnswer:
+        served.append(data)
+        return await aoe.echo(command, data)
+
+    async def script(connect, listener):
+        greedy, writer = await connect()
+        reader, other = await connect()
+        writer.write(question(b"greedy") * 500)
+        other.write(question(b"other"))
+        assert await hear(reader) == b"other"
+        for _ in range(500):
+            assert await hear(greedy) == b"greedy"
+        writer.close()
+        other.close()
+
+    target = NetId.parse(TARGETS[0])
+    assert play(script, desks=[AoeDesk({target: note}, {target})]) == []
+    assert len(served) == 501
+    assert served.index(b"other") < 250
 
 
 def test_client_that_dies_leaves_the_others_alone():

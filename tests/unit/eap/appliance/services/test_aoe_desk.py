@@ -203,3 +203,37 @@ def test_cancelled_while_it_serves():
     with suppress(asyncio.CancelledError):
         talk.tell(request())
     assert talk.packets == []
+
+
+def test_those_who_may_wait_take_turns_with_those_who_may_not():
+    under_way = []
+
+    async def slow(command: int, data: bytes) -> AmsAnswer:
+        under_way.append(data)
+        await asyncio.sleep(0.01)
+        assert under_way == [data]
+        under_way.clear()
+        if data == b"bad":
+            raise ZeroDivisionError
+        return AmsAnswer(data)
+
+    async def script():
+        desk = AoeDesk({EAP0: slow}, {EAP0})
+        header, _ = decode_packet(request())
+        serving = asyncio.ensure_future(desk.serve())
+        answers = []
+        desk.put(header, b"put", slow, answers.append)
+        answers += await asyncio.gather(
+            *(desk.ask(header, body, slow) for body in (b"a", b"bad", b"b"))
+        )
+        await desk.wait_idle()
+        serving.cancel()
+        return answers
+
+    answers = asyncio.run(script())
+    assert sorted(answers, key=lambda answer: answer.data) == [
+        AmsAnswer(error_code=AdsError.INTERNAL),
+        AmsAnswer(b"a"),
+        AmsAnswer(b"b"),
+        AmsAnswer(b"put"),
+    ]
