@@ -16,6 +16,7 @@ import pytest
 
 from tests.support import aoe
 from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.namespaces import cable
 from tests.support.vectors import load
 
 pytestmark = pytest.mark.net
@@ -53,8 +54,10 @@ ADD_ROUTE, SERVER_INFO = (vector.octets for vector in load("ams_discovery"))
 class AmsClient:
     """Speaks AMS/TCP with a station."""
 
-    def __init__(self, address: str) -> None:
-        self.socket = socket.create_connection((address, 48898), timeout=5)
+    def __init__(self, address: str, sock: socket.socket | None = None) -> None:
+        self.socket = sock or socket.socket()
+        self.socket.settimeout(5)
+        self.socket.connect((address, 48898))
         self._number = 0
 
     def __enter__(self) -> Self:
@@ -213,3 +216,21 @@ def test_port_that_is_taken_is_named_with_what_to_do(farm: Plants) -> None:
         assert "`ams: false`" in text
         without = ALONE.replace("}\n", ", ams: false}\n")
         farm.run(farm.write(without, "without.yaml"))
+
+
+@pytest.mark.root
+def test_other_hosts_read_and_do_not_write(farm: Plants) -> None:
+    with cable(addresses=True) as (here, there):
+        address = "10.88.164.1"
+        plant = farm.write(ALONE.replace(LEFT, address))
+        appliance = farm.run(plant, prefix=here.prefix)
+        target = f"{address}.2.1"
+        write = aoe.write_body(0xF200 << 16 | 1, struct.pack("<H", 2))
+        with AmsClient(address, there.socket(socket.AF_INET, socket.SOCK_STREAM)) as client:
+            assert client.net_id(target) == target
+            assert client.ask(target, aoe.WRITE, write) == (0x723, b"")
+            assert client.net_id(target) == target
+        assert appliance.station("left")["discarded"] == {"ams_access": 1}
+        with AmsClient(address, here.socket(socket.AF_INET, socket.SOCK_STREAM)) as client:
+            assert client.ask(target, aoe.WRITE, write) == (0, bytes(4))
+        assert appliance.station("left")["state"] == "PREOP"
