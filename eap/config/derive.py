@@ -252,6 +252,7 @@ def _port(index: Index, station: Station, port: Port) -> PortSpec:
         tcp=port.tcp,
         wake=port.wake,
         eap_sm=port.eap_sm,
+        profile=port.profile,
         ams=port.ams,
     )
 

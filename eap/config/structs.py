@@ -58,6 +58,7 @@ class Port(Section, frozen=True):
     tcp: bool = False
     wake: Wake = Wake.CYCLE
     eap_sm: bool = False
+    profile: U16 = 0
     ams: bool = True
     mac: str = ""
     bus: str = ""
@@ -71,6 +72,7 @@ class Port(Section, frozen=True):
         "tcp",
         "wake",
         "eap_sm",
+        "profile",
         "ams",
         "mac",
     )

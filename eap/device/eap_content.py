@@ -27,7 +27,6 @@ TRANSPORTS = ("udp", "ethernet", "tcp", "loop")
 class Identity(NamedTuple):
     """What a device says of itself."""
 
-    profile_number: int = profile.PROFILE
     module_profile: int = profile.MODULE_PROFILE
     device_name: str = "EAP appliance"
     hardware_version: str = ""
@@ -65,7 +64,7 @@ class EapContent(EapObjects):
     def _set_fixed(self) -> None:
         who, uri = self.identity, self.uri
         fixed = {
-            (0x1000, 0): who.module_profile << 16 | who.profile_number,
+            (0x1000, 0): who.module_profile << 16 | (self.port.profile or profile.PROFILE),
             (0x1008, 0): who.device_name,
             (0x1009, 0): who.hardware_version,
             (0x100A, 0): who.software_version,

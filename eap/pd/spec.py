@@ -345,6 +345,8 @@ class PortSpec(Record, frozen=True):
     wake: Wake = Wake.CYCLE
     eap_sm: bool = False
     """Whether the frames sent carry the device's state in the EAP SM octet."""
+    profile: int = 0
+    """Device profile that the port's dictionary names in 0x1000; 0 is that of modular devices."""
     ams: bool = True
     """Whether AMS/TCP and UDP 48899 are served at the port's IP address, if it has one."""
     bus: BusPortSpec | None = None

@@ -205,6 +205,7 @@ def _port(draw: st.DrawFn, port: PortSpec) -> PortSpec:
         tcp=is_udp and draw(st.booleans()),
         wake=draw(st.sampled_from(Wake)),
         eap_sm=draw(st.booleans()),
+        profile=draw(st.sampled_from((0, 5002))),
     )
 
 

@@ -27,8 +27,9 @@ def test_identity_and_port_are_shown(udp, ethernet):
 
 
 def test_identity_can_be_another():
-    identity = Identity(profile_number=5002, device_name="oven", vendor=2, serial=77)
-    dictionary = EapDictionary(BLANK, "eap0", identity=identity)
+    identity = Identity(device_name="oven", vendor=2, serial=77)
+    station = replace(BLANK, ports=(replace(BLANK.ports[0], profile=5002), *BLANK.ports[1:]))
+    dictionary = EapDictionary(station, "eap0", identity=identity)
     assert _read(dictionary, 0x1000, 0) == 1000 << 16 | 5002
     assert dictionary.upload(0x1008, 0, PREOP) == b"oven"
     assert dictionary.upload_complete(0x1018, 1, PREOP) == struct.pack("<4I", 2, 0, 0, 77)
