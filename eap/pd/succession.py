@@ -162,7 +162,7 @@ class _Received:
         """By RxPD of the new image: where its account is, as in RxWord.ACCOUNT."""
         first_of: dict[object, int] = {}
         for index, was, account, place in self._heirs:
-            judged = account, _hears_another(was, place), _judged(place)
+            judged = account, _begins_anew(was, place), _judged(place)
             self._owners[index] = first_of.setdefault(judged, place.words)
         self._plan_accounts()
 
@@ -190,7 +190,7 @@ class _Received:
         for index, was, account, place in self._heirs:
             owner = self._owners[index]
             sources[owner] = account
-            if _hears_another(was, place):
+            if _begins_anew(was, place):
                 self._strangers.add(owner)
         size = RxWord.SIZE - ACCOUNT_START
         self._accounts = [
@@ -204,8 +204,13 @@ def _schedules(layout: ImageLayout, frame: str) -> set[tuple[str, bool, bool]]:
     return {(pd.name, pd.by_schedule, pd.cyclic) for pd in layout.tx if pd.frame == frame}
 
 
-def _hears_another(was: RxPlace, place: RxPlace) -> bool:
-    return (was.publisher, was.port) != (place.publisher, place.port)
+def _begins_anew(was: RxPlace, place: RxPlace) -> bool:
+    """Whether the next frame cannot be compared with the last one.
+
+    It comes from another sender, or from one that changes its rate: whether the gap between these
+    two is of the old rate or of the new one, nobody knows.
+    """
+    return (was.publisher, was.port, was.step) != (place.publisher, place.port, place.step)
 
 
 def _judged(place: RxPlace) -> tuple[object, ...]:

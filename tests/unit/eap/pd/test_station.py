@@ -796,6 +796,23 @@ def succeed_with_values(before: Station, spec: StationSpec, now_ns: int = 0) -> 
     return after
 
 
+def test_a_gap_at_a_change_of_rate_is_of_the_old_rate_or_the_new_and_no_loss():
+    slow = RxPdSpec("r", "eap0", 9, ("x",), PEER, step=2, sender_cycle_us=1000)
+    made, _ = assemble(station(variables=received("x:UINT"), subscriptions=(slow,)))
+    made.start(0)
+    take = made.takers["eap0"]
+    for cycle in (2, 4):
+        frame = octets([(9, b"\0\0")], cycle=cycle)
+        take(memoryview(frame), len(frame), cycle * MS, From(""))
+    fast = msgspec.structs.replace(slow, step=1)
+    after = succeed(made, msgspec.structs.replace(made.spec, subscriptions=(fast,)))
+    for cycle in (6, 7, 9):  # the sender changed after its cycle 5; then one is lost
+        frame = octets([(9, b"\0\0")], cycle=cycle)
+        take(memoryview(frame), len(frame), cycle * MS, From(""))
+    (row,) = station_status(after.image, 9 * MS)["pd"]["rx"]
+    assert (row["received"], row["lost"]) == (5, 1)
+
+
 def test_below_op_nothing_is_received_and_below_safeop_nothing_sent():
     made, wire = assemble(moody())
     made.start(0, DeviceState.PREOP)

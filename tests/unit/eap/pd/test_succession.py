@@ -188,7 +188,7 @@ def check_accounts(old: Image, new: Image) -> None:
 
 
 def stays(was: RxPlace, place: RxPlace) -> bool:
-    return was.publisher == place.publisher
+    return (was.publisher, was.step) == (place.publisher, place.step)
 
 
 def judged(place: RxPlace) -> tuple[object, ...]:
