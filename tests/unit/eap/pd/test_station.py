@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 
-import msgspec
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -18,8 +16,6 @@ from eap.net.loopback import LoopbackChannel, LoopbackLines
 from eap.pd.device import DeviceState
 from eap.pd.engine import Engine
 from eap.pd.image import Image
-from eap.pd.link import OutFrame
-from eap.pd.presence import Presence
 from eap.pd.report import station_status
 from eap.pd.spec import (
     CounterSource,
@@ -35,8 +31,7 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import WAKE_FOR_CYCLES, Station
-from eap.pd.succession import ImageSuccession
-from eap.pd.words import FrameWord, StationWord
+from eap.pd.words import StationWord
 from tests.support.cyclic import (
     MS,
     OWN,
@@ -56,6 +51,12 @@ from tests.support.cyclic import (
     station,
     written,
 )
+from tests.support.stations import (
+    addressed,
+    assemble,
+    moody,
+    sent_ids,
+)
 
 THIRD = "5.99.99.99.1.1"
 
@@ -74,30 +75,6 @@ def forwarder() -> StationSpec:
         ),
         frames=(TxFrameSpec("f", "eap0", "10.0.0.1", (TxPdSpec("out", 1, ("r", "n", "x")),)),),
     )
-
-
-class Watched(Wire):
-    """A wire that notes whether the engine's variables were marked as changing."""
-
-    image: Image
-
-    def drain(self, now_ns: int) -> int:
-        count = super().drain(now_ns)
-        self.log.append("changing" if self.image.words[StationWord.ENGINE_SEQUENCE] % 2 else "calm")
-        return count
-
-    def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
-        self.log.append("changing" if self.image.words[StationWord.ENGINE_SEQUENCE] % 2 else "calm")
-        return super().send(frames, now_ns)
-
-
-def assemble(spec: StationSpec, image: Image | None = None) -> tuple[Station, Watched]:
-    wire = Watched()
-    wire.image = image or image_of(spec)
-    made = Station(spec, wire.image, lambda: wire.log.append("wake"))
-    wire.takers.append(made.takers["eap0"])
-    made.connect("eap0", wire)
-    return made, wire
 
 
 def last_values(wire: Wire) -> tuple[int, ...]:
@@ -587,20 +564,6 @@ PairMachine.TestCase.settings = settings(max_examples=50, stateful_step_count=30
 TestPairMachine = PairMachine.TestCase
 
 
-def addressed() -> StationSpec:
-    """Sends to a port whose address it learns, and to one address."""
-    port = msgspec.structs.replace(eap_port(), interface="ethernet://eth0")
-    pds = (TxPdSpec("p", 1, ("x",)), TxPdSpec("q", 2, ("x",)))
-    return station(
-        ports=(port,),
-        variables=written("x:UINT"),
-        frames=(
-            TxFrameSpec("by-id", "eap0", PEER, pds[:1]),
-            TxFrameSpec("by-mac", "eap0", "02:00:00:00:00:05", pds[1:]),
-        ),
-    )
-
-
 def test_frames_to_a_net_id_go_where_its_own_frames_come_from():
     spec = addressed()
     made, wire = assemble(spec)
@@ -614,203 +577,6 @@ def test_frames_to_a_net_id_go_where_its_own_frames_come_from():
     assert sorted(pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame)) == [1, 2]
     by_id, by_mac = station_status(made.image, 0)["frames"]
     assert (by_id["address"], by_mac["address"]) == ("02:00:00:00:00:07", "02:00:00:00:00:05")
-
-
-def succeed(before: Station, spec: StationSpec) -> Station:
-    """Configure a station anew between two cycles, as the engine does."""
-    images = ImageSuccession(before.image, image_of(spec))
-    images.carry_words()
-    after = Station(spec, images._new, lambda: None)
-    after.prepare_to_follow(before)
-    images.settle()
-    images.carry_words()
-    after.follow(before, 0)
-    return after
-
-
-def test_a_station_configured_anew_keeps_the_addresses_that_it_learned():
-    made, wire = assemble(addressed())
-    made.start(0)
-    take, frame = made.takers["eap0"], octets([(9, b"\0\0")])
-    take(memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
-    by_id, by_mac = made.spec.frames
-    moved = msgspec.structs.replace(by_mac, destination="02:00:00:00:00:06")
-    after = succeed(made, msgspec.structs.replace(made.spec, frames=(by_id, moved)))
-    wire.sent.clear()
-    after.cycle(2 * MS, 2 * MS)
-    assert len(wire.sent) == 2
-    addresses = [row["address"] for row in station_status(after.image, 0)["frames"]]
-    assert addresses == ["02:00:00:00:00:07", "02:00:00:00:00:06"]
-
-    take(memoryview(frame), len(frame), SECOND, From("02:00:00:00:00:08"))
-    assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:08"
-
-
-def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
-    made, _ = assemble(addressed())
-    made.start(0)
-    frame = octets([(9, b"\0\0")])
-    made.takers["eap0"](memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
-    made.image.words[made.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
-    by_id, by_mac = made.spec.frames
-    moved = msgspec.structs.replace(by_id, destination=THIRD)
-    after = succeed(made, msgspec.structs.replace(made.spec, frames=(moved, by_mac)))
-    (row, _) = station_status(after.image, 0)["frames"]
-    assert (row["address"], row["subscriber"]) == (None, "unknown")
-    other = octets([(9, b"\0\0")], publisher=THIRD)
-    after.takers["eap0"](memoryview(other), len(other), MS, From("02:00:00:00:00:09"))
-    assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:09"
-
-    after.image.words[after.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
-    same = succeed(after, after.spec)
-    assert station_status(same.image, 0)["frames"][0]["subscriber"] == "missing"
-    watched = msgspec.structs.replace(moved, monitor_interval_ms=1000)
-    after = succeed(same, msgspec.structs.replace(made.spec, frames=(watched, by_mac)))
-    row = station_status(after.image, 0)["frames"][0]
-    assert (row["address"], row["subscriber"]) == ("02:00:00:00:00:09", "unknown")
-
-    empty = succeed(after, msgspec.structs.replace(made.spec, frames=()))
-    empty.takers["eap0"](memoryview(other), len(other), 2 * SECOND, From("02:00:00:00:00:0a"))
-    assert station_status(empty.image, 0)["frames"] == []
-
-
-def moody() -> StationSpec:
-    """Sends by change, by event, and what asks; receives answers and something with a time-out."""
-    return station(
-        variables=(
-            *written("x:UINT", "y:UINT"),
-            *(VariableSpec(name, "UINT", Writer.ENGINE) for name in ("a", "r")),
-        ),
-        frames=(
-            TxFrameSpec(
-                "f",
-                "eap0",
-                "10.0.0.1",
-                (
-                    TxPdSpec("change", 1, ("x",), trigger=TriggerSpec(on_change=OnChangeSpec())),
-                    TxPdSpec("event", 2, ("y",), trigger=TriggerSpec(event=True)),
-                ),
-            ),
-            TxFrameSpec("q", "eap0", "10.0.0.1", (TxPdSpec("ask", 3, ("y",)),)),
-        ),
-        subscriptions=(
-            RxPdSpec("answer", "eap0", 4, ("a",), PEER, poll_request="ask"),
-            RxPdSpec("in", "eap0", 7, ("r",), PEER, timeout_ms=3, substitute=Substitute.ZERO),
-        ),
-    )
-
-
-def sent_ids(wire: Watched) -> list[int]:
-    """Return what was sent since the last look."""
-    ids = sorted(pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame))
-    wire.sent.clear()
-    return ids
-
-
-def set_value(image: Image, name: str, value: int) -> None:
-    with image.writing(Writer.APPLICATION):
-        image.write(name, value)
-
-
-def test_triggers_go_on_in_a_station_configured_anew():
-    made, wire = assemble(moody())
-    made.start(0)
-    made.cycle(MS, MS)
-    assert sent_ids(wire) == [1, 3]
-    set_value(made.image, "event.VarCtrl", 2)
-    made.cycle(2 * MS, 2 * MS)
-    assert sent_ids(wire) == [2, 3]
-    after = succeed_with_values(made, made.spec)
-    after.cycle(3 * MS, 3 * MS)
-    assert sent_ids(wire) == [3]  # neither the data nor the bit has changed
-    set_value(after.image, "x", 5)
-    after.cycle(4 * MS, 4 * MS)
-    assert sent_ids(wire) == [1, 3]
-    wire.refuse = True
-    set_value(after.image, "event.VarCtrl", 0)
-    after.cycle(5 * MS, 5 * MS)
-    set_value(after.image, "event.VarCtrl", 2)
-    after.cycle(6 * MS, 6 * MS)
-    wire.refuse = False
-    wire.sent.clear()
-    last = succeed_with_values(after, after.spec)
-    last.cycle(7 * MS, 7 * MS)
-    assert sent_ids(wire) == [2, 3]  # the event that could not be sent
-
-
-def test_a_pd_that_is_another_one_now_is_sent_though_its_data_is_the_same():
-    made, wire = assemble(moody())
-    made.start(0)
-    made.cycle(MS, MS)
-    first, second = made.spec.frames
-    change, event = first.pds
-    renewed = msgspec.structs.replace(change, version=9)
-    frames = (msgspec.structs.replace(first, pds=(renewed, event)), second)
-    wire.sent.clear()
-    after = succeed_with_values(made, msgspec.structs.replace(made.spec, frames=frames))
-    after.cycle(2 * MS, 2 * MS)
-    assert sent_ids(wire) == [1, 3]
-
-
-def test_a_question_is_answered_across_a_change():
-    made, _ = assemble(moody())
-    made.start(0)
-    made.cycle(MS, MS)
-    after = succeed_with_values(made, made.spec)
-    give(after.takers["eap0"], octets([(4, b"\1\0")], cycle=1), MS + 300_000)
-    status = station_status(after.image, SECOND)["pd"]["rx"][0]
-    assert (status["received"], status["response_us"]["max"]) == (1, 300)
-
-
-def test_time_outs_go_on_and_new_ones_begin():
-    made, wire = assemble(moody())
-    made.start(0)
-    wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
-    made.cycle(MS, MS)
-    after = succeed_with_values(made, made.spec, 2 * MS)
-    after.cycle(3 * MS, 3 * MS)
-    assert after.image.read("r") == 5
-    after.cycle(5 * MS, 5 * MS)
-    assert after.image.read("r") == 0
-    answer, stale = made.spec.subscriptions
-    without = msgspec.structs.replace(stale, timeout_ms=0, substitute=Substitute.HOLD)
-    spec = msgspec.structs.replace(made.spec, subscriptions=(answer, without))
-    last = succeed_with_values(after, spec, 5 * MS)
-    last.cycle(SECOND, SECOND)
-    assert station_status(last.image, SECOND)["pd"]["rx"][1]["timeouts"] == 1
-
-
-def succeed_with_values(before: Station, spec: StationSpec, now_ns: int = 0) -> Station:
-    """Configure a station anew, its variables included."""
-    image = image_of(spec)
-    images = ImageSuccession(before.image, image)
-    images.carry_words()
-    images.carry_values(before.inputs.memory)
-    after = Station(spec, image, lambda: None)
-    after.prepare_to_follow(before)
-    images.settle()
-    images.carry_words()
-    before.inputs.refresh()
-    images.carry_values(before.inputs.memory)
-    after.follow(before, now_ns)
-    return after
-
-
-def test_a_gap_at_a_change_of_rate_is_of_the_old_rate_or_the_new_and_no_loss():
-    slow = RxPdSpec("r", "eap0", 9, ("x",), PEER, step=2, sender_cycle_us=1000)
-    made, _ = assemble(station(variables=received("x:UINT"), subscriptions=(slow,)))
-    made.start(0)
-    take = made.takers["eap0"]
-    for cycle in (2, 4):
-        frame = octets([(9, b"\0\0")], cycle=cycle)
-        take(memoryview(frame), len(frame), cycle * MS, From(""))
-    fast = msgspec.structs.replace(slow, step=1)
-    after = succeed(made, msgspec.structs.replace(made.spec, subscriptions=(fast,)))
-    for cycle in (6, 7, 9):  # the sender changed after its cycle 5; then one is lost
-        frame = octets([(9, b"\0\0")], cycle=cycle)
-        take(memoryview(frame), len(frame), cycle * MS, From(""))
-    (row,) = station_status(after.image, 9 * MS)["pd"]["rx"]
-    assert (row["received"], row["lost"]) == (5, 1)
 
 
 def test_below_op_nothing_is_received_and_below_safeop_nothing_sent():
@@ -838,18 +604,3 @@ def test_below_op_nothing_is_received_and_below_safeop_nothing_sent():
     assert station_status(made.image, SECOND)["discarded"] == {"suppressed": 4}
     with pytest.raises(LocalProtocolError, match="INIT cannot be requested"):
         made.go(DeviceState.INIT, SECOND)
-
-
-def test_what_was_replaced_can_be_taken_apart():
-    made, wire = assemble(moody())
-    made.start(0)
-    wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
-    made.cycle(MS, MS)
-    after = succeed_with_values(made, made.spec)
-    made.dissolve()
-    assert made.image.places == {}
-    wire.sent.clear()
-    wire.waiting.append((octets([(7, b"\6\0")], cycle=2), 2 * MS))
-    after.cycle(2 * MS, 2 * MS)
-    assert after.image.read("r") == 6
-    assert sent_ids(wire) == [3]

@@ -1,20 +1,23 @@
-"""What the image of a changed station keeps: counters, accounts and values."""
+"""What a station that is configured anew keeps: counters, accounts, values, addresses, triggers."""
 
 from __future__ import annotations
 
 import random
 from typing import Any
 
+import msgspec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace, TxPlace
+from eap.pd.presence import Presence
 from eap.pd.report import account_word, station_status
 from eap.pd.spec import (
     OnChangeSpec,
     RxPdSpec,
     StationSpec,
+    Substitute,
     TriggerSpec,
     TxFrameSpec,
     TxPdSpec,
@@ -24,7 +27,26 @@ from eap.pd.spec import (
 from eap.pd.station import Station
 from eap.pd.succession import ImageSuccession
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
-from tests.support.cyclic import MS, PEER, SECOND, give, image_of, octets, received, station
+from tests.support.cyclic import (
+    MS,
+    PEER,
+    SECOND,
+    From,
+    give,
+    image_of,
+    octets,
+    received,
+    station,
+)
+from tests.support.stations import (
+    addressed,
+    assemble,
+    moody,
+    sent_ids,
+    set_value,
+    succeed,
+    succeed_with_values,
+)
 
 THIRD = "5.99.99.99.1.1"
 VALUES: dict[str, list[Any]] = {
@@ -211,3 +233,149 @@ def test_accounts_that_have_parted_are_noticed():
     assert succession.is_current
     give(made.takers["eap0"], octets([(1, b"\3\0")], cycle=2), 2 * MS)
     assert not succession.is_current
+
+
+def test_a_station_configured_anew_keeps_the_addresses_that_it_learned():
+    made, wire = assemble(addressed())
+    made.start(0)
+    take, frame = made.takers["eap0"], octets([(9, b"\0\0")])
+    take(memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
+    by_id, by_mac = made.spec.frames
+    moved = msgspec.structs.replace(by_mac, destination="02:00:00:00:00:06")
+    after = succeed(made, msgspec.structs.replace(made.spec, frames=(by_id, moved)))
+    wire.sent.clear()
+    after.cycle(2 * MS, 2 * MS)
+    assert len(wire.sent) == 2
+    addresses = [row["address"] for row in station_status(after.image, 0)["frames"]]
+    assert addresses == ["02:00:00:00:00:07", "02:00:00:00:00:06"]
+
+    take(memoryview(frame), len(frame), SECOND, From("02:00:00:00:00:08"))
+    assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:08"
+
+
+def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
+    made, _ = assemble(addressed())
+    made.start(0)
+    frame = octets([(9, b"\0\0")])
+    made.takers["eap0"](memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
+    made.image.words[made.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
+    by_id, by_mac = made.spec.frames
+    moved = msgspec.structs.replace(by_id, destination=THIRD)
+    after = succeed(made, msgspec.structs.replace(made.spec, frames=(moved, by_mac)))
+    (row, _) = station_status(after.image, 0)["frames"]
+    assert (row["address"], row["subscriber"]) == (None, "unknown")
+    other = octets([(9, b"\0\0")], publisher=THIRD)
+    after.takers["eap0"](memoryview(other), len(other), MS, From("02:00:00:00:00:09"))
+    assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:09"
+
+    after.image.words[after.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
+    same = succeed(after, after.spec)
+    assert station_status(same.image, 0)["frames"][0]["subscriber"] == "missing"
+    watched = msgspec.structs.replace(moved, monitor_interval_ms=1000)
+    after = succeed(same, msgspec.structs.replace(made.spec, frames=(watched, by_mac)))
+    row = station_status(after.image, 0)["frames"][0]
+    assert (row["address"], row["subscriber"]) == ("02:00:00:00:00:09", "unknown")
+
+    empty = succeed(after, msgspec.structs.replace(made.spec, frames=()))
+    empty.takers["eap0"](memoryview(other), len(other), 2 * SECOND, From("02:00:00:00:00:0a"))
+    assert station_status(empty.image, 0)["frames"] == []
+
+
+def test_triggers_go_on_in_a_station_configured_anew():
+    made, wire = assemble(moody())
+    made.start(0)
+    made.cycle(MS, MS)
+    assert sent_ids(wire) == [1, 3]
+    set_value(made.image, "event.VarCtrl", 2)
+    made.cycle(2 * MS, 2 * MS)
+    assert sent_ids(wire) == [2, 3]
+    after = succeed_with_values(made, made.spec)
+    after.cycle(3 * MS, 3 * MS)
+    assert sent_ids(wire) == [3]  # neither the data nor the bit has changed
+    set_value(after.image, "x", 5)
+    after.cycle(4 * MS, 4 * MS)
+    assert sent_ids(wire) == [1, 3]
+    wire.refuse = True
+    set_value(after.image, "event.VarCtrl", 0)
+    after.cycle(5 * MS, 5 * MS)
+    set_value(after.image, "event.VarCtrl", 2)
+    after.cycle(6 * MS, 6 * MS)
+    wire.refuse = False
+    wire.sent.clear()
+    last = succeed_with_values(after, after.spec)
+    last.cycle(7 * MS, 7 * MS)
+    assert sent_ids(wire) == [2, 3]  # the event that could not be sent
+
+
+def test_a_pd_that_is_another_one_now_is_sent_though_its_data_is_the_same():
+    made, wire = assemble(moody())
+    made.start(0)
+    made.cycle(MS, MS)
+    first, second = made.spec.frames
+    change, event = first.pds
+    renewed = msgspec.structs.replace(change, version=9)
+    frames = (msgspec.structs.replace(first, pds=(renewed, event)), second)
+    wire.sent.clear()
+    after = succeed_with_values(made, msgspec.structs.replace(made.spec, frames=frames))
+    after.cycle(2 * MS, 2 * MS)
+    assert sent_ids(wire) == [1, 3]
+
+
+def test_a_question_is_answered_across_a_change():
+    made, _ = assemble(moody())
+    made.start(0)
+    made.cycle(MS, MS)
+    after = succeed_with_values(made, made.spec)
+    give(after.takers["eap0"], octets([(4, b"\1\0")], cycle=1), MS + 300_000)
+    status = station_status(after.image, SECOND)["pd"]["rx"][0]
+    assert (status["received"], status["response_us"]["max"]) == (1, 300)
+
+
+def test_time_outs_go_on_and_new_ones_begin():
+    made, wire = assemble(moody())
+    made.start(0)
+    wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
+    made.cycle(MS, MS)
+    after = succeed_with_values(made, made.spec, 2 * MS)
+    after.cycle(3 * MS, 3 * MS)
+    assert after.image.read("r") == 5
+    after.cycle(5 * MS, 5 * MS)
+    assert after.image.read("r") == 0
+    answer, stale = made.spec.subscriptions
+    without = msgspec.structs.replace(stale, timeout_ms=0, substitute=Substitute.HOLD)
+    spec = msgspec.structs.replace(made.spec, subscriptions=(answer, without))
+    last = succeed_with_values(after, spec, 5 * MS)
+    last.cycle(SECOND, SECOND)
+    assert station_status(last.image, SECOND)["pd"]["rx"][1]["timeouts"] == 1
+
+
+def test_a_gap_at_a_change_of_rate_is_of_the_old_rate_or_the_new_and_no_loss():
+    slow = RxPdSpec("r", "eap0", 9, ("x",), PEER, step=2, sender_cycle_us=1000)
+    made, _ = assemble(station(variables=received("x:UINT"), subscriptions=(slow,)))
+    made.start(0)
+    take = made.takers["eap0"]
+    for cycle in (2, 4):
+        frame = octets([(9, b"\0\0")], cycle=cycle)
+        take(memoryview(frame), len(frame), cycle * MS, From(""))
+    fast = msgspec.structs.replace(slow, step=1)
+    after = succeed(made, msgspec.structs.replace(made.spec, subscriptions=(fast,)))
+    for cycle in (6, 7, 9):  # the sender changed after its cycle 5; then one is lost
+        frame = octets([(9, b"\0\0")], cycle=cycle)
+        take(memoryview(frame), len(frame), cycle * MS, From(""))
+    (row,) = station_status(after.image, 9 * MS)["pd"]["rx"]
+    assert (row["received"], row["lost"]) == (5, 1)
+
+
+def test_what_was_replaced_can_be_taken_apart():
+    made, wire = assemble(moody())
+    made.start(0)
+    wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
+    made.cycle(MS, MS)
+    after = succeed_with_values(made, made.spec)
+    made.dissolve()
+    assert made.image.places == {}
+    wire.sent.clear()
+    wire.waiting.append((octets([(7, b"\6\0")], cycle=2), 2 * MS))
+    after.cycle(2 * MS, 2 * MS)
+    assert after.image.read("r") == 6
+    assert sent_ids(wire) == [3]
