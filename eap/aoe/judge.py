@@ -63,28 +63,37 @@ class Judge:
         self._in_flight = in_flight
         self._limits = limits
         self._prober = prober
-        self._down: set[Way] = set()
-        self._closed: set[str] = set()
+        self._down: dict[Way, str] = {}
+        self._closed: dict[str, str] = {}
 
-    def hop_down(self, door: str, address: str | None) -> None:
-        """Refuse what would go to *address* by *door*, or to any address."""
+    def hop_down(self, door: str, address: str | None, text: str) -> None:
+        """Refuse what would go to *address* by *door*, or to any address; *text* says why."""
         if address is None:
-            self._closed.add(door)
+            self._closed[door] = text
         else:
-            self._down.add(Way(door, address))
+            self._down[Way(door, address)] = text
 
     def hop_up(self, door: str, address: str | None) -> None:
         """Take back what :meth:`hop_down` was told with the same arguments."""
         if address is None:
-            self._closed.discard(door)
+            self._closed.pop(door, None)
         else:
-            self._down.discard(Way(door, address))
+            self._down.pop(Way(door, address), None)
 
     def is_down(self, hop: Way) -> bool:
         """Say whether nothing can go to *hop* now."""
         if hop in self._down or hop.door in self._closed:
             return True
         return self._prober is not None and self._prober.is_dead(hop)
+
+    def why_down(self, hop: Way) -> str:
+        """Return in words why nothing can go to *hop* now; empty if it can."""
+        if hop.door not in self._doors:
+            return f"this station has no door {hop.door}"
+        if why := self._down.get(hop) or self._closed.get(hop.door):
+            return why
+        is_dead = self._prober is not None and self._prober.is_dead(hop)
+        return "it does not answer" if is_dead else ""
 
     def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
         """Return how a request goes on that is for nobody here."""
@@ -112,7 +121,7 @@ class Judge:
         if known.onward != onward or known.header.command != header.command:
             return None
         text = f"it was passed on from here already: routes to {header.target} run in a circle"
-        return Refusal(AdsError.TARGET_MACHINE, text, route.hop, Outcome.LOOP)
+        return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
 
     def find_room(self, way: Way) -> Refusal | None:
         """Say whether too many requests wait for one more."""
@@ -131,14 +140,14 @@ class Judge:
         back = self._table.find(header.source)
         if back is not None and back[1] >= _PREFIX and back[0].is_unidirectional:
             text = f"route {back[0].name} is unidirectional: nothing may be asked from there"
-            return Refusal(AdsError.ACCESS_DENIED, text)
+            return Refusal(AdsError.ACCESS_DENIED, text, back[0])
         hop = route.hop
         if hop.door not in self._doors:
             text = f"route {route.name} is by {hop.door}, which this station does not have"
-            return Refusal(AdsError.HOST_UNREACHABLE, text)
+            return Refusal(AdsError.HOST_UNREACHABLE, text, route)
         if hop.door == way.door and (hop == way or not self._doors[hop.door].is_hub):
             text = f"route {route.name} leads back to where it came from"
-            return Refusal(AdsError.TARGET_MACHINE, text, hop, Outcome.LOOP)
+            return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
         if self.is_down(hop):
-            return Refusal(AdsError.HOST_UNREACHABLE, f"{route.name} ({hop}) is down", hop)
+            return Refusal(AdsError.HOST_UNREACHABLE, f"{route.name} ({hop}) is down", route)
         return None

@@ -149,7 +149,7 @@ class Passage:
 
     def hop_down(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop, and refuse what will be for it."""
-        self._judge.hop_down(door, address)
+        self._judge.hop_down(door, address, text)
         return self.hop_lost(door, address, text, now_ns)
 
     def hop_lost(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
@@ -164,6 +164,10 @@ class Passage:
     def hop_up(self, door: str, address: str | None) -> None:
         """Pass requests on to a hop again."""
         self._judge.hop_up(door, address)
+
+    def why_down(self, hop: Way) -> str:
+        """Return in words why nothing can go to *hop* now; empty if it can."""
+        return self._judge.why_down(hop)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
@@ -196,7 +200,7 @@ class Passage:
         allowed = self._limits.timeout_ns
         if route is not None:
             allowed = route.timeout_ns or allowed
-            self._record.hops.of(route.hop).ask(len(data))
+            self._record.routes.of(route.key, now_ns).ask(len(data))
         pending = Pending(invoke_id, header, way, route, onward, now_ns, now_ns + allowed)
         self.in_flight.add(pending)
         return pending
@@ -213,7 +217,7 @@ class Passage:
         else:
             invoke_id = self._ids.take(self.in_flight)
         self._passed.add(invoke_id, onward)
-        self._record.hops.of(route.hop).ask(len(data))
+        self._record.routes.of(route.key, now_ns).ask(len(data))
         return [self._forward(invoke_id, data, onward, route)]
 
     def _forward(self, invoke_id: int, data: bytes, onward: bytes, route: Route) -> Action:
@@ -238,12 +242,20 @@ class Passage:
         route = pending.route
         took_ns = now_ns - pending.at_ns
         hop, text = None, ""
-        self._record.connections.of(way).answer(len(packet), took_ns)
         if route is not None:
             hop = route.hop
-            self._record.hops.of(hop).answer(len(packet), took_ns)
+            traffic = self._record.routes.of(route.key, now_ns)
             if error_code:
-                text = f"error 0x{error_code:x} from {route.name} ({hop}) or from behind it"
+                error = AdsError.words_of(error_code)
+                text = f"{error} from {route.name} ({hop}) or from behind it"
+                traffic.fail(text)
+            traffic.answer(len(packet), took_ns)
+        connection = self._record.connections.of(way, now_ns)
+        if error_code:
+            connection.fail(
+                text or f"{AdsError.words_of(error_code)} from a service of this station"
+            )
+        connection.answer(len(packet), took_ns)
         self._record.enter(
             Trace(now_ns, Outcome.ANSWERED, way, hop, pending.header, error_code, took_ns, text)
         )
@@ -252,19 +264,16 @@ class Passage:
     def _fail(self, pending: Pending, text: str, now_ns: int) -> list[Action]:
         if pending.route is None or pending.came_by is None:
             return []
-        hop = pending.route.hop
-        why = Refusal(AdsError.HOST_UNREACHABLE, f"{pending.route.name} ({hop}): {text}", hop)
+        route = pending.route
+        why = Refusal(AdsError.HOST_UNREACHABLE, f"{route.name} ({route.hop}): {text}", route)
         took_ns = now_ns - pending.at_ns
         return self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
 
     def _time_out(self, pending: Pending, now_ns: int) -> list[Action]:
         allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
-        if pending.route is None:
-            who, hop = "its service", None
-        else:
-            hop = pending.route.hop
-            who = f"{pending.route.name} ({hop})"
-        why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", hop)
+        route = pending.route
+        who = "its service" if route is None else f"{route.name} ({route.hop})"
+        why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route)
         took_ns = now_ns - pending.at_ns
         actions = self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
         if pending.handles:

@@ -22,6 +22,8 @@ SYSTEM_PORT = 10000
 """AMS port of the system service, which routers have."""
 MISSES = 2
 """Questions without an answer that make a hop a dead one."""
+_BUSY = 5
+"""A hop that answers requests is asked only every so many turns: how long its router takes."""
 _SPACING_NS = 10_000_000
 """Between two probes at least, on the average: many hops are asked less often."""
 
@@ -38,7 +40,8 @@ class Probe(NamedTuple):
 class _Hop:
     """What is known of one hop."""
 
-    __slots__ = ("asked_at_ns", "heard_at_ns", "is_down", "misses", "number", "target")
+    __slots__ = ("asked_at_ns", "heard_at_ns", "is_down", "misses", "number", "round_trip_ns",
+                 "target")  # fmt: skip
 
     def __init__(self, number: int, target: NetId) -> None:
         self.number = number
@@ -47,6 +50,14 @@ class _Hop:
         self.heard_at_ns = -1
         self.misses = 0
         self.is_down = False
+        self.round_trip_ns: int | None = None
+
+    def is_due(self, now_ns: int, interval_ns: int) -> bool:
+        """Say whether to ask it, when its turn has come."""
+        if self.is_down or self.heard_at_ns < 0 or self.asked_at_ns is None:
+            return True
+        is_busy = now_ns - self.heard_at_ns < interval_ns
+        return now_ns - self.asked_at_ns >= interval_ns * (_BUSY if is_busy else 1)
 
 
 class Prober:
@@ -111,12 +122,25 @@ class Prober:
         if hop is None or hop.door != way.door or not (is_shared or hop == way):
             return
         self.hear(hop, now_ns)
-        self._hops[hop].is_down = False
+        known = self._hops[hop]
+        known.is_down = False
+        if known.asked_at_ns is not None:
+            known.round_trip_ns = now_ns - known.asked_at_ns
 
     def is_dead(self, hop: Way) -> bool:
         """Say whether a hop does not answer."""
         known = self._hops.get(hop)
         return known is not None and known.is_down
+
+    def is_heard(self, hop: Way) -> bool:
+        """Say whether a hop is asked, and has ever answered anything."""
+        known = self._hops.get(hop)
+        return known is not None and known.heard_at_ns >= 0
+
+    def round_trip_ns(self, hop: Way) -> int | None:
+        """Return how long a hop took to answer last; None if it is not asked or does not."""
+        known = self._hops.get(hop)
+        return None if known is None or known.is_down else known.round_trip_ns
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`probes_due` has something; at once if the routes changed."""
@@ -136,7 +160,7 @@ class Prober:
             hop = self._hops[way]
             if way in self._paused or way.door in self._closed:
                 hop.asked_at_ns = None
-            elif hop.is_down or now_ns - hop.heard_at_ns >= interval_ns or hop.heard_at_ns < 0:
+            elif hop.is_due(now_ns, interval_ns):
                 yield self._ask(way, hop, now_ns)
 
     def _ask(self, way: Way, hop: _Hop, now_ns: int) -> Probe:

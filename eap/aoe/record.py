@@ -7,6 +7,7 @@ from collections import deque
 import msgspec
 
 from eap.aoe.action import Outcome, Trace
+from eap.aoe.routes import RouteKey
 from eap.aoe.traffic import TrafficTable
 from eap.aoe.way import Way
 from eap.codec.ams import AmsCommand, AmsHeader
@@ -24,15 +25,15 @@ class Record:
         latest: The latest traces, the oldest first.
         counts: Packets by what became of them.
         connections: What was asked from each, which have not been closed.
-        hops: What was asked of each.
+        routes: What went by each.
         missed: Traces that nobody took in time.
     """
 
     def __init__(self) -> None:
         self.latest: deque[Trace] = deque(maxlen=MAX_LATEST)
         self.counts = dict.fromkeys(Outcome, 0)
-        self.connections = TrafficTable()
-        self.hops = TrafficTable()
+        self.connections: TrafficTable[Way] = TrafficTable()
+        self.routes: TrafficTable[RouteKey] = TrafficTable()
         self.missed = 0
         self._events: deque[Trace] = deque()
 

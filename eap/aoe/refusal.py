@@ -8,6 +8,7 @@ from eap.aoe.action import Action, Outcome, Trace
 from eap.aoe.answer import AmsAnswer, response_to
 from eap.aoe.outlet import Outlet
 from eap.aoe.record import Record, describe
+from eap.aoe.routes import Route
 from eap.aoe.way import Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
@@ -20,8 +21,8 @@ class Refusal(NamedTuple):
 
     error: AdsError
     text: str
-    hop: Way | None = None
-    """Where it stopped, unless here."""
+    route: Route | None = None
+    """Whose hop it stopped at, unless here."""
     outcome: Outcome = Outcome.FAILED
 
 
@@ -42,15 +43,15 @@ class Refuser:
     ) -> list[Action]:
         """Answer the request with *header*, as it came by *way*; None if nobody waits."""
         text = f"{describe(header, way)}: {why.text}"
-        self._record.enter(
-            Trace(at_ns, why.outcome, way, why.hop, header, why.error, took_ns, text)
-        )
-        if why.hop is not None:
-            self._record.hops.of(why.hop).fail(why.text)
+        hop = None
+        if why.route is not None:
+            hop = why.route.hop
+            self._record.routes.of(why.route.key, at_ns).fail(why.text)
+        self._record.enter(Trace(at_ns, why.outcome, way, hop, header, why.error, took_ns, text))
         if way is None or not wants_answer(header):
             return []
         packet = response_to(header, AmsAnswer(error_code=why.error))
-        traffic = self._record.connections.of(way)
+        traffic = self._record.connections.of(way, at_ns)
         traffic.fail(why.text)
         traffic.answer(len(packet), took_ns)
         return [self._outlet.reply(way, packet)]

@@ -17,7 +17,8 @@ from eap.aoe.prober import MISSES, Prober
 from eap.aoe.reassembly import Reassembly
 from eap.aoe.record import Record, Stats
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
-from eap.aoe.routes import RouteTable
+from eap.aoe.report import ConnectionReport, RouteReport, report_route
+from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
@@ -158,6 +159,15 @@ class Router:
         """Take the oldest trace of what was not simply answered."""
         return self.record.next_event()
 
+    def report(self, route: Route) -> RouteReport:
+        """Return what is known of one of the routes."""
+        traffic = self.record.routes.get(route.key)
+        return report_route(route, self._passage.why_down(route.hop), traffic, self._prober)
+
+    def connections(self) -> list[ConnectionReport]:
+        """Return who asks, or asked and is still connected."""
+        return [ConnectionReport(*each) for each in self.record.connections.snapshot().items()]
+
     def stats(self) -> Stats:
         """Return what is going on, and what was."""
         return Stats(
@@ -190,7 +200,7 @@ class Router:
         ports = self._devices.get(header.target)
         if ports is None and for_all:
             return []
-        self.record.connections.of(way).ask(len(data))
+        self.record.connections.of(way, now_ns).ask(len(data), header.source)
         if header.source in self._devices and not self._outlet.doors[way.door].is_this_host:
             text = f"it comes back to where it began: {header.source} is of this station"
             why = Refusal(AdsError.TARGET_MACHINE, text, outcome=Outcome.LOOP)

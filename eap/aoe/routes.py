@@ -35,6 +35,10 @@ class Origin(IntEnum):
     """The station itself told of it, or answered a scan; such a route expires."""
 
 
+RouteKey: TypeAlias = tuple[NetId, Way]
+"""NetID and hop of a route."""
+
+
 class Route(msgspec.Struct, frozen=True):
     """One route.
 
@@ -72,6 +76,11 @@ class Route(msgspec.Struct, frozen=True):
             raise ValueError(f"{self.name}: {self.octets} octets to match, expected 6, 5, 4 or 0")
         if self.real is not None and not self.octets:
             raise ValueError(f"{self.name}: a default route has no virtual NetID")
+
+    @property
+    def key(self) -> RouteKey:
+        """What tells it from all others of a table."""
+        return self.net_id, self.hop
 
     def to_real(self, target: NetId) -> NetId:
         """Return the NetID that *target* has over there."""
@@ -114,7 +123,7 @@ class RouteTable:
 
     def __init__(self, routes: Collection[Route] = ()) -> None:
         self.version = 0
-        self._routes: dict[tuple[NetId, Way], _Ranked] = {}
+        self._routes: dict[RouteKey, _Ranked] = {}
         self._by_prefix: dict[bytes, list[_Ranked]] = {}
         self._translated: dict[Way, list[Route]] = {}
         self._learned = 0
@@ -134,7 +143,7 @@ class RouteTable:
 
         A learned one takes the place of learned ones only.
         """
-        key = route.net_id, route.hop
+        key = route.key
         before = self._routes.get(key)
         rank = route.origin.value, self._number
         if before is not None:
@@ -201,7 +210,7 @@ class RouteTable:
         over = [route for at_ns, route in times if at_ns <= now_ns]
         self._next_expiry = min((at_ns for at_ns, _ in times if at_ns > now_ns), default=None)
         for route in over:
-            self.remove(route.net_id, route.hop)
+            self.remove(*route.key)
         return over
 
     def warnings(self, own: Collection[NetId] = ()) -> list[str]:

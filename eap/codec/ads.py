@@ -65,6 +65,24 @@ class AdsError(IntEnum):
         """Return the name of a code, or its number for one that nothing here sends."""
         return cls(code).name if code in cls._value2member_map_ else f"0x{code:x}"
 
+    @classmethod
+    def words_of(cls, code: int) -> str:
+        """Return a code with what it means, for people."""
+        text = _WORDS.get(code)
+        return f"error 0x{code:x} ({text or cls.name_of(code)})" if code else "no error"
+
+
+_WORDS: dict[int, str] = {
+    AdsError.MAILBOX_FULL: "too much waits there already",
+    AdsError.TARGET_PORT: "nothing has that AMS port",
+    AdsError.TARGET_MACHINE: "no route to that NetID",
+    AdsError.HOST_UNREACHABLE: "the link is down",
+    AdsError.SERVICE: "it does not know that service",
+    AdsError.ACCESS: "user or password is wrong",
+    AdsError.TIMEOUT: "no answer in time",
+    AdsError.ACCESS_DENIED: "access rules forbid it",
+}
+
 
 class AdsState(IntEnum):
     """ADSSTATE of AdsDef.h."""

@@ -44,14 +44,17 @@ def test_hops_go_down_and_up() -> None:
     judge, _, route = make()
     way = Way("tcp", "2")
     for address in ("1", None):
-        judge.hop_down("tcp", address)
+        judge.hop_down("tcp", address, "cut")
         assert judge.is_down(TCP)
+        assert judge.why_down(TCP) == "cut"
         refusal = judge.find_route(ASKED, way)
-        assert refusal == Refusal(AdsError.HOST_UNREACHABLE, "far (1 by tcp) is down", TCP)
+        assert refusal == Refusal(AdsError.HOST_UNREACHABLE, "far (1 by tcp) is down", route)
         judge.hop_up("tcp", address)
         assert judge.find_route(ASKED, way) == route
-    judge.hop_down("tcp", "3")
+    judge.hop_down("tcp", "3", "cut")
     assert not judge.is_down(TCP)
+    assert judge.why_down(TCP) == ""
+    assert judge.why_down(Way("gone", "1")) == "this station has no door gone"
 
 
 def test_circle_has_addresses_and_command_of_what_waits() -> None:

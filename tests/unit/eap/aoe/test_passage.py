@@ -51,7 +51,10 @@ def test_error_from_behind_the_hop_is_passed_back_and_named() -> None:
     onward = station.forwarded(ASKED, ONE)
     assert station.replied(onward.answer(b"", 6), LINK) == (ONE, ASKED.answer(b"", 6))
     assert station.events() == [
-        (Outcome.ANSWERED, f"error 0x6 from island ({LINK}) or from behind it")
+        (
+            Outcome.ANSWERED,
+            f"error 0x6 (nothing has that AMS port) from island ({LINK}) or from behind it",
+        )
     ]
 
 

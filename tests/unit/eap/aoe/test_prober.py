@@ -74,11 +74,23 @@ def test_hop_that_misses_two_questions_is_dead_and_lives_when_it_answers() -> No
 def test_answers_to_requests_are_signs_of_life() -> None:
     station = probing()
     tick(station, 0)
-    for number in range(1, 6):
+    for number in range(1, 5):
         onward = station.forwarded(ASKED, TCP)
         station.now_ns += 1
         station.replied(onward.answer(), LINK)
         assert tick(station, number * SECOND) == ([], [])
+
+
+def test_busy_hop_is_asked_now_and_then_for_its_time() -> None:
+    station = probing()
+    tick(station, 0)
+    asked = 0
+    for number in range(1, 11):
+        onward = station.forwarded(ASKED, TCP)
+        station.now_ns += 1
+        station.replied(onward.answer(), LINK)
+        asked += len(tick(station, number * SECOND)[0])
+    assert asked == 2
 
 
 def test_answer_from_elsewhere_is_no_sign_of_life() -> None:

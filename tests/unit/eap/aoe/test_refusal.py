@@ -6,6 +6,7 @@ from eap.aoe.action import Outcome
 from eap.aoe.outlet import Outlet
 from eap.aoe.record import Record
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
+from eap.aoe.routes import Route
 from eap.aoe.way import Door, Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
@@ -16,7 +17,8 @@ from tests.support.aoerouter import only_reply
 WAY, HOP = Way("tcp", "1"), Way("link", "6")
 ASKED = Ams("6.1.1.1.1.1:1", "7.1.1.1.1.1:2")
 HEADER = AmsHeader.decode(ASKED.octets())
-WHY = Refusal(AdsError.HOST_UNREACHABLE, "the cable is cut", HOP)
+ROUTE = Route(NetId.parse("6.1.1.1.1.1"), "far", HOP)
+WHY = Refusal(AdsError.HOST_UNREACHABLE, "the cable is cut", ROUTE)
 
 
 def test_refusal_is_answered_counted_and_traced() -> None:
@@ -28,8 +30,8 @@ def test_refusal_is_answered_counted_and_traced() -> None:
     assert trace[:4] == (9, Outcome.FAILED, WAY, HOP)
     assert (trace.error_code, trace.took_ns) == (0x1B, 4)
     assert trace.text == f"READ of {ASKED.target} for {ASKED.source} ({WAY}): the cable is cut"
-    assert record.connections.of(WAY).last_error == "the cable is cut"
-    assert record.hops.of(HOP).errors == 1
+    assert record.connections.of(WAY, 9).last_error == "the cable is cut"
+    assert record.routes.of(ROUTE.key, 9).errors == 1
 
 
 def test_nobody_is_answered_when_nobody_waits() -> None:

@@ -171,16 +171,18 @@ def test_what_passes_is_counted() -> None:
     station.now_ns = 700
     (reply,) = station.give(onward.answer(b"1234"), LINK)
     assert isinstance(reply, Reply)
-    client = station.router.record.connections.of(TCP)
-    hop = station.router.record.hops.of(LINK)
-    for traffic in (client, hop):
+    (client,) = station.router.connections()
+    hop = station.router.report(*station.table)
+    assert (client.way, hop.route.hop) == (TCP, LINK)
+    assert client.traffic.sources == (NetId.parse(CLIENT.partition(":")[0]),)
+    for traffic in (client.traffic, hop.traffic):
         assert (traffic.requests, traffic.answers, traffic.errors) == (1, 1, 0)
         assert (traffic.octets_asked, traffic.octets_answered) == (34, 36)
         assert traffic.round_trip_ns == 700
     assert station.router.stats().counts[Outcome.ANSWERED] == 1
     assert station.router.record.latest[-1].took_ns == 700
     station.router.connection_closed(*TCP, 800)
-    assert TCP not in station.router.record.connections.snapshot()
+    assert station.router.connections() == []
 
 
 class Client:

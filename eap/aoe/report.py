@@ -1,0 +1,56 @@
+"""Routes and connections as people want to see them: state, time, figures, what was wrong last."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from eap.aoe.prober import Prober
+from eap.aoe.routes import Route
+from eap.aoe.traffic import Traffic
+from eap.aoe.way import Way
+
+
+class RouteState(StrEnum):
+    """Whether a request would go on."""
+
+    UP = "up"
+    DOWN = "down"
+    UNKNOWN = "unknown"
+    """Nothing speaks against it, and nothing was answered yet."""
+
+
+class RouteReport(NamedTuple):
+    """One route.
+
+    *why* says what is wrong with one that is down.  *round_trip_ns* is that of its next hop, and
+    None while that is not known.
+    """
+
+    route: Route
+    state: RouteState
+    why: str
+    round_trip_ns: int | None
+    traffic: Traffic
+
+
+class ConnectionReport(NamedTuple):
+    """Who asks."""
+
+    way: Way
+    traffic: Traffic
+
+
+def report_route(
+    route: Route, why_down: str, traffic: Traffic | None, prober: Prober | None
+) -> RouteReport:
+    """Return what is known of a route; *why_down* is empty unless nothing can go there."""
+    known = traffic or Traffic()
+    round_trip_ns = None if prober is None else prober.round_trip_ns(route.hop)
+    if why_down:
+        return RouteReport(route, RouteState.DOWN, why_down, None, known)
+    if round_trip_ns is None and known.answers:
+        round_trip_ns = known.round_trip_ns
+    is_up = known.is_answered or (prober is not None and prober.is_heard(route.hop))
+    state = RouteState.UP if is_up else RouteState.UNKNOWN
+    return RouteReport(route, state, "", round_trip_ns, known)
