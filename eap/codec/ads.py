@@ -162,6 +162,16 @@ class IndexGroup(IntEnum):
     OBJECT_DESCRIPTION = 0xF3FD
     ENTRY_DESCRIPTION = 0xF3FE
     """Offset: index in the high word, bits 8 to 15 value info, bits 0 to 7 subindex."""
+    FOE_OPEN_READ = 0xF401
+    """With the file's name; answered with a handle, which the others of FoE take as offset."""
+    FOE_OPEN_WRITE = 0xF402
+    FOE_CLOSE = 0xF403
+    FOE_READ = 0xF404
+    FOE_WRITE = 0xF405
+    FOE_PROGRESS = 0xF406
+    SOE = 0xF420
+    """Offset: number of the IDN, drive, and which elements of it."""
+    VOE = 0xF430
 
 
 class AdsRange(WireStruct, frozen=True):
