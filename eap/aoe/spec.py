@@ -1,6 +1,7 @@
 """What a plant file says of a station's routing and access, complete and checked.
 
-Plain values only, as in ``eap.pd.spec``: they cross from the supervisor to services as JSON.
+Plain values only, as in ``eap.pd.spec``: they cross from the supervisor to services as JSON.  An
+empty text or tuple stands for "none" or "any" where a field says so.
 """
 
 from __future__ import annotations
@@ -9,9 +10,74 @@ from enum import StrEnum
 
 import msgspec
 
+DEFAULT_TARGET = "default"
+"""Name of a route that takes what no other one does."""
+
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all specifications."""
+
+
+class DoorKind(StrEnum):
+    """How packets come in and go out."""
+
+    UDP = "udp"
+    """Type 5 by UDP."""
+    TCP = "tcp"
+    """Type 5 by TCP."""
+    ETHERNET = "ethernet"
+    """Type 5 by EtherType 0x88A4."""
+    AMS_TCP = "ams-tcp"
+    MQTT = "mqtt"
+    LOCAL = "local"
+    """Programs of this appliance."""
+
+
+class HopSpec(Record, frozen=True):
+    """Where packets go from here.
+
+    Attributes:
+        kind: Of the door.
+        port: The station's own EAP port that they leave by (UDP, TCP, Ethernet), or the name of
+            the network (MQTT); empty for AMS/TCP.
+        address: ``ADDRESS:PORT`` (UDP, TCP), ``HOST:PORT`` (AMS/TCP, where a host may have a
+            name), a MAC address or the NetID of the port that has it (Ethernet), or the NetID of a
+            router (MQTT).
+    """
+
+    kind: DoorKind
+    port: str
+    address: str
+
+
+class RouteSpec(Record, frozen=True, kw_only=True):
+    """One route.
+
+    Attributes:
+        name: As people call it: a station, or what the plant file says.
+        net_id: Of the station, as it really is there; the next one's for a default route.
+        hop: Where packets for it go.
+        octets: How many octets of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
+            default route.
+        router: NetID of the router at the next hop, which is asked whether it is alive; empty if it
+            is not known, then *net_id* is.
+        virtual: NetID by which it is known here instead of *net_id*; empty for none.
+        is_unidirectional: Whether nothing may be asked from there.
+        timeout_ms: How long an answer may take; 0 for as long as usual.
+        is_probed: Whether the next hop is asked from time to time whether it is alive.
+        is_derived: Whether it follows from the ports of the plant, and nobody wrote it.
+    """
+
+    name: str
+    net_id: str
+    hop: HopSpec
+    octets: int = 4
+    router: str = ""
+    virtual: str = ""
+    is_unidirectional: bool = False
+    timeout_ms: int = 0
+    is_probed: bool = True
+    is_derived: bool = False
 
 
 class AccessService(StrEnum):
@@ -73,3 +139,94 @@ class AccessRule(Record, frozen=True):
     targets: tuple[AccessTarget, ...] = ()
     services: tuple[AccessService, ...] = ()
     objects: tuple[ObjectRange, ...] = ()
+
+
+class AmsUser(Record, frozen=True):
+    """Who may add a route from elsewhere; the first line of *password_file* is the password."""
+
+    name: str
+    password_file: str
+    """Absolute path; read whenever it is needed."""
+
+
+class TlsSpec(Record, frozen=True):
+    """How a connection is kept secret; paths are absolute, PEM.
+
+    Attributes:
+        ca: Certificates of those who may vouch for the other end; empty for those of the system.
+        certificate: That this end shows; empty for none.
+        key: Of that certificate.
+        check_name: Whether the certificate of the other end has to name its host.
+    """
+
+    ca: str = ""
+    certificate: str = ""
+    key: str = ""
+    check_name: bool = True
+
+
+class MqttSpec(Record, frozen=True, kw_only=True):
+    """A broker by which stations reach each other.
+
+    Attributes:
+        network: First level of the topics.
+        host: Name or address of the broker.
+        port: Its TCP port.
+        user: Empty for none.
+        password_file: Absolute path; its first line is the password.
+        tls: None for none.
+        client_id: Empty for one that is made up.
+        no_retain: Whether routers tell of themselves when somebody new does, and leave nothing
+            retained at the broker.
+        is_unidirectional: Whether nothing may be asked from there.
+        qos: Quality of service of what is sent, 0 to 2.
+        is_prefixed: Whether packets are sent with the prefix of AMS/TCP in front.
+    """
+
+    network: str
+    host: str
+    port: int = 1883
+    user: str = ""
+    password_file: str = ""
+    tls: TlsSpec | None = None
+    client_id: str = ""
+    no_retain: bool = False
+    is_unidirectional: bool = False
+    qos: int = 0
+    is_prefixed: bool = False
+
+
+class RoutingSpec(Record, frozen=True, kw_only=True):
+    """All that the router of a station is told.
+
+    Attributes:
+        routes: Those of the plant file in its order, then the derived ones.
+        mqtt: Brokers.
+        access: Rules; behind them stand the usual ones: this host may do anything, others read.
+        users: Who may add routes by UDP 48899; without any only who is on this host.
+        learn: Whether routes are learned from what stations tell by MQTT, and from scans.
+    """
+
+    routes: tuple[RouteSpec, ...] = ()
+    mqtt: tuple[MqttSpec, ...] = ()
+    access: tuple[AccessRule, ...] = ()
+    users: tuple[AmsUser, ...] = ()
+    learn: bool = True
+
+
+class DirectoryPort(Record, frozen=True):
+    """A port by name; *slaves* are station addresses by the names of the slaves."""
+
+    name: str
+    is_bus: bool
+    net_id: str
+    interface: str
+    slaves: dict[str, int] = {}
+
+
+class DirectoryStation(Record, frozen=True):
+    """A station by name, whether it runs here or not."""
+
+    name: str
+    net_id: str
+    ports: tuple[DirectoryPort, ...]

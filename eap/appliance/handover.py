@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import msgspec
 
+from eap.aoe.spec import DirectoryStation, RoutingSpec
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortSpec, Record, StationSpec
 
@@ -145,6 +146,10 @@ class Handover(Handed, frozen=True):
     """To which each station is brought, Op if it is not here."""
     first_state: DeviceState = DeviceState.OP
     """Of stations that were never asked for another one."""
+    routing: dict[str, RoutingSpec] = msgspec.field(default_factory=dict)
+    """What the router of each station is told; nothing for one that is not here."""
+    directory: tuple[DirectoryStation, ...] = ()
+    """The names of everything in the plant, of the stations that run elsewhere too."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from eap.config.check_ports import check_ports
 from eap.config.derive import derive
+from eap.config.derive_routing import derive_directory, derive_routing
 from eap.config.finding import Report
 from eap.config.index import Index
 from eap.config.load import LoadResult, Plant
@@ -41,7 +42,8 @@ def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
     check_ports(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)
-    return LoadResult(Plant(name, derive(index, Path())), ())
+    plant = Plant(name, derive(index, Path()), derive_routing(index), derive_directory(index))
+    return LoadResult(plant, ())
 
 
 def _router(net_id: str) -> str:

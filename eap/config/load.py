@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from eap.aoe.spec import DirectoryStation, RoutingSpec
 from eap.config.bus import DescribeBus
 from eap.config.check_buses import describe_buses
 from eap.config.check_links import check_links
@@ -17,6 +18,7 @@ from eap.config.check_subscribe import check_subscribe
 from eap.config.check_variables import check_variables
 from eap.config.convert import convert
 from eap.config.derive import derive
+from eap.config.derive_routing import derive_directory, derive_routing
 from eap.config.document import read
 from eap.config.finding import Finding, Report
 from eap.config.index import Index
@@ -28,6 +30,10 @@ class Plant(msgspec.Struct, frozen=True):
 
     name: str
     stations: tuple[StationSpec, ...]
+    routing: Mapping[str, RoutingSpec] = {}
+    """What the router of each station is told."""
+    directory: tuple[DirectoryStation, ...] = ()
+    """The names of everything in the plant."""
 
 
 class LoadResult(msgspec.Struct, frozen=True):
@@ -58,4 +64,10 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     check_links(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)
-    return LoadResult(Plant(plant_file.plant, derive(index, path.parent)), (), report.lines)
+    plant = Plant(
+        plant_file.plant,
+        derive(index, path.parent),
+        derive_routing(index),
+        derive_directory(index),
+    )
+    return LoadResult(plant, (), report.lines)

@@ -20,6 +20,7 @@ from time import monotonic_ns
 import msgspec
 from msgspec.structs import replace
 
+from eap.aoe.spec import RoutingSpec
 from eap.appliance.handover import EngineOptions, Handover, SegmentHandover
 from eap.appliance.plantfile import load_plant, require_own_buses
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
@@ -64,7 +65,7 @@ def run(
     subset = [station.name for station in chosen] if stations else []
     info = make_info(plant.name, str(plant_file.resolve()), chosen)
     with _claim(folder_name(plant.name, subset)) as folder:
-        return _run(info, chosen, folder, options)
+        return _run(info, replace(plant, stations=chosen), folder, options)
 
 
 def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> int:
@@ -84,7 +85,7 @@ def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> 
                     "station %s starts blank; --resume goes on with what it was configured to be",
                     station.name,
                 )
-        return _run(info, plant.stations, folder, options, DeviceState.PREOP)
+        return _run(info, plant, folder, options, DeviceState.PREOP)
 
 
 def _claim(folder: str) -> ApplianceFolder:
@@ -94,17 +95,18 @@ def _claim(folder: str) -> ApplianceFolder:
 
 def _run(
     info: ApplianceInfo,
-    stations: tuple[StationSpec, ...],
+    plant: Plant,
     folder: ApplianceFolder,
     options: EngineOptions,
     first_state: DeviceState = DeviceState.OP,
 ) -> int:
+    stations = plant.stations
     settle(info.plant, stations, first_state)
     if info.plant_file:
         _tell_what_is_kept(info.plant, stations)
     with SharedSockets(stations, folder.control_socket) as sockets:
         supervisor = Supervisor(
-            info, stations, folder, sockets, options=options, first_state=first_state
+            info, plant, folder, sockets, options=options, first_state=first_state
         )
         return supervisor.run()
 
@@ -145,12 +147,15 @@ def _choose(plant: Plant, wanted: Sequence[str]) -> tuple[StationSpec, ...]:
 
 
 class Supervisor:
-    """Runs engine, services and simulated buses of *stations* until told to stop."""
+    """Runs engine, services and simulated buses of the stations of *plant* until told to stop.
+
+    Other stations are in its directory only.
+    """
 
     def __init__(
         self,
         info: ApplianceInfo,
-        stations: tuple[StationSpec, ...],
+        plant: Plant,
         folder: ApplianceFolder,
         sockets: SharedSockets,
         *,
@@ -170,11 +175,13 @@ class Supervisor:
             folder=str(folder.path),
             plant=info.plant,
             plant_file=info.plant_file,
-            stations=stations,
+            stations=plant.stations,
             sockets=sockets.descriptions,
             buses=sockets.buses,
             options=options,
             first_state=first_state,
+            routing=_own_routing(plant),
+            directory=plant.directory,
         )
         self._given = _given_to_segments(self._segments, common)
         self._given[self._engine] = (
@@ -333,6 +340,11 @@ def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> A
 
 def _process_info(child: Child) -> ProcessInfo:
     return ProcessInfo(child.pid, child.restarts, child.report)
+
+
+def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:
+    names = {station.name for station in plant.stations}
+    return {name: routing for name, routing in plant.routing.items() if name in names}
 
 
 def _given_to_segments(

@@ -3,7 +3,19 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
+from eap.aoe.spec import (
+    AccessRule,
+    AccessService,
+    AccessTarget,
+    AmsUser,
+    DoorKind,
+    HopSpec,
+    MqttSpec,
+    ObjectRange,
+    RouteSpec,
+    RoutingSpec,
+    TlsSpec,
+)
 
 
 def test_rules_survive_the_way_to_another_process():
@@ -20,3 +32,15 @@ def test_rules_survive_the_way_to_another_process():
 def test_what_no_rule_has_is_refused():
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(b'{"name": "x", "alow": true}', type=AccessRule)
+
+
+def test_what_a_router_is_told_comes_out_of_json_as_it_went_in():
+    hop = HopSpec(DoorKind.AMS_TCP, "", "plc.example:48898")
+    whole = RoutingSpec(
+        routes=(RouteSpec(name="plc", net_id="5.1.2.3.1.1", hop=hop, virtual="10.0.0.9.1.1"),),
+        mqtt=(MqttSpec(network="plant", host="broker", tls=TlsSpec(ca="/ca.pem")),),
+        access=(AccessRule("all"),),
+        users=(AmsUser("engineer", "/secrets/engineer"),),
+        learn=False,
+    )
+    assert msgspec.json.decode(msgspec.json.encode(whole), type=RoutingSpec) == whole

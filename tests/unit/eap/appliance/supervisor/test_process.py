@@ -12,6 +12,7 @@ from eap.appliance.handover import EngineOptions
 from eap.appliance.runtime import ApplianceFolder, find_appliances
 from eap.appliance.supervisor.process import Supervisor, make_info, run
 from eap.appliance.supervisor.sockets import SharedSockets
+from eap.config.load import Plant
 from eap.errors import ConfigError
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec
 
@@ -55,7 +56,9 @@ def test_a_child_that_cannot_start_ends_all_with_its_exit_code(stations, capfd):
         with SharedSockets(stations, folder.control_socket) as sockets:
             folder.image("left").mkdir()  # no image can be made here
             info = make_info("demo", "demo.yaml", stations)
-            assert Supervisor(info, stations, folder, sockets, options=options).run() == 2
+            assert (
+                Supervisor(info, Plant("x", stations), folder, sockets, options=options).run() == 2
+            )
         engine, services = folder.read_info().engine.pid, folder.read_info().services.pid
     out, err = capfd.readouterr()
     assert out == ""
@@ -78,7 +81,10 @@ def test_a_segment_that_cannot_start_ends_all_with_its_exit_code(tmp_path, stati
     with ApplianceFolder.claim("demo") as folder:
         with SharedSockets([station], folder.control_socket) as sockets:
             info = make_info("demo", "demo.yaml", [station])
-            assert Supervisor(info, (station,), folder, sockets, options=options).run() == 2
+            assert (
+                Supervisor(info, Plant("x", (station,)), folder, sockets, options=options).run()
+                == 2
+            )
         assert list(folder.read_info().segments) == ["left/bus0"]
     out, err = capfd.readouterr()
     assert out == ""
