@@ -94,12 +94,12 @@ class AdsRefusedError(Exception):
 def is_change(operation: Operation) -> bool:
     """Say whether an operation changes anything but what a client keeps of its own.
 
-    A ReadWrite does, unless its group is known to look something up by a name.
+    A ReadWrite does, unless its group is known to look something up by a name, or to read a file.
     """
     if isinstance(operation, ReadWrite):
         return operation.group not in _LOOKUPS
     if isinstance(operation, Write):
-        return operation.group != IndexGroup.RELEASE_HANDLE
+        return operation.group not in _RELEASES
     return isinstance(operation, WriteControl)
 
 
@@ -110,5 +110,11 @@ _LOOKUPS = frozenset(
         IndexGroup.SYMBOL_BY_NAME,
         IndexGroup.SYMBOL_ENTRY_BY_NAME,
         IndexGroup.DATA_TYPE_BY_NAME,
+        IndexGroup.FOE_OPEN_READ,
+        IndexGroup.FOE_READ,
+        IndexGroup.FOE_PROGRESS,
+        IndexGroup.FOE_CLOSE,
     )
 )
+_RELEASES = frozenset((IndexGroup.RELEASE_HANDLE, IndexGroup.FOE_CLOSE))
+"""Whoever has a handle was granted it before."""

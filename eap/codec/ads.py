@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from eap.codec.wire import WireStruct, octets16, u8, u16, u32
+from eap.codec.wire import WireStruct, bit, bits3, bits4, bits6, octets16, u8, u16, u32
 
 
 class AdsError(IntEnum):
@@ -113,7 +113,8 @@ class IndexGroup(IntEnum):
     """Index groups with a meaning of their own.
 
     Those of a slave are of ETG.1020, AoE; those of symbols and sums of AdsDef.h; those of a master
-    and of the I/O server as Beckhoff documents them for TwinCAT.
+    and of the I/O server as Beckhoff documents them for TwinCAT; FoE, SoE and VoE as in Ads.h of
+    its SDK.
     """
 
     ADDRESS = 0x0001
@@ -163,15 +164,18 @@ class IndexGroup(IntEnum):
     ENTRY_DESCRIPTION = 0xF3FE
     """Offset: index in the high word, bits 8 to 15 value info, bits 0 to 7 subindex."""
     FOE_OPEN_READ = 0xF401
-    """With the file's name; answered with a handle, which the others of FoE take as offset."""
+    """ReadWrite, offset: a password; a file name is written, a handle of four octets read."""
     FOE_OPEN_WRITE = 0xF402
+    """Likewise."""
     FOE_CLOSE = 0xF403
+    """Of this and the next three the offset is a handle."""
     FOE_READ = 0xF404
     FOE_WRITE = 0xF405
     FOE_PROGRESS = 0xF406
     SOE = 0xF420
-    """Offset: number of the IDN, drive, and which elements of it."""
+    """Offset: see :class:`SoePlace`."""
     VOE = 0xF430
+    """Written: a message with its VoE header."""
 
 
 class AdsRange(WireStruct, frozen=True):
@@ -180,6 +184,32 @@ class AdsRange(WireStruct, frozen=True):
     group: u32
     offset: u32
     length: u32
+
+
+class SdoPlace(WireStruct, frozen=True):
+    """The offset that names an entry at SDO; ``encode`` gives its four octets.
+
+    *is_slow* allows a slave ten times as long, which Ads.h calls an extended time-out.
+    """
+
+    subindex: u8
+    is_complete: bit = 0
+    is_slow: bit = 0
+    reserved: bits6 = 0
+    index: u16 = 0
+
+
+class SoePlace(WireStruct, frozen=True):
+    """The offset that names elements of an IDN at SOE.
+
+    *is_command*: a procedure command is to be executed.
+    """
+
+    idn: u16
+    elements: u8
+    drive: bits3 = 0
+    is_command: bit = 0
+    reserved: bits4 = 0
 
 
 class AdsReadWrite(WireStruct, frozen=True):

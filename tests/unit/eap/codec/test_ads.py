@@ -15,13 +15,16 @@ from eap.codec.ads import (
     AdsSystemState,
     AdsWriteControl,
     IndexGroup,
+    SdoPlace,
+    SoePlace,
     device_name,
     encode_result,
 )
 from eap.errors import TruncatedError
 from tests.support.records import records
 
-RECORDS = (AdsRange, AdsReadWrite, AdsDeviceInfo, AdsStates, AdsWriteControl, AdsSystemState)
+RECORDS = (AdsRange, AdsReadWrite, AdsDeviceInfo, AdsStates, AdsWriteControl, AdsSystemState,
+           SdoPlace, SoePlace)  # fmt: skip
 
 
 def test_read_request_of_the_vector() -> None:
@@ -53,6 +56,13 @@ def test_device_info_has_a_name_of_16_octets() -> None:
 def test_system_state_has_16_octets() -> None:
     state = AdsSystemState(5, 1, restart_index=7, version=3, revision=1, build=4024)
     assert state.encode() == bytes.fromhex("0500 0100 0700 0301 b80f 0000 0000 0000")
+
+
+def test_offsets_of_objects_and_idns() -> None:
+    place = SdoPlace(subindex=3, is_complete=1, is_slow=1, index=0x1018)
+    assert int.from_bytes(place.encode(), "little") == 0x1018_0303
+    place = SoePlace(idn=0x8032, elements=0x41, drive=7, is_command=1)
+    assert int.from_bytes(place.encode(), "little") == 0x0F41_8032
 
 
 def test_codes_have_names() -> None:
