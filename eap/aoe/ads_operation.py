@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, TypeAlias
 
-from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.ads import AdsError
 from eap.codec.adsnotification import AddNotification
 
 
@@ -89,32 +89,3 @@ class AdsRefusedError(Exception):
         super().__init__(f"{result.name}: {why}" if why else result.name)
         self.result = result
         self.why = why
-
-
-def is_change(operation: Operation) -> bool:
-    """Say whether an operation changes anything but what a client keeps of its own.
-
-    A ReadWrite does, unless its group is known to look something up by a name, or to read a file.
-    """
-    if isinstance(operation, ReadWrite):
-        return operation.group not in _LOOKUPS
-    if isinstance(operation, Write):
-        return operation.group not in _RELEASES
-    return isinstance(operation, WriteControl)
-
-
-_LOOKUPS = frozenset(
-    (
-        IndexGroup.SYMBOL_HANDLE,
-        IndexGroup.VALUE_BY_NAME,
-        IndexGroup.SYMBOL_BY_NAME,
-        IndexGroup.SYMBOL_ENTRY_BY_NAME,
-        IndexGroup.DATA_TYPE_BY_NAME,
-        IndexGroup.FOE_OPEN_READ,
-        IndexGroup.FOE_READ,
-        IndexGroup.FOE_PROGRESS,
-        IndexGroup.FOE_CLOSE,
-    )
-)
-_RELEASES = frozenset((IndexGroup.RELEASE_HANDLE, IndexGroup.FOE_CLOSE))
-"""Whoever has a handle was granted it before."""
