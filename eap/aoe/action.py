@@ -47,6 +47,8 @@ class Outcome(StrEnum):
     ANSWERED = "answered"
     FAILED = "failed"
     """The router itself answered, with an error."""
+    DENIED = "denied"
+    """Access rules forbid it, or items of it."""
     LOOP = "loop"
     """It ran in a circle; if it was a request it was answered with an error."""
     LATE = "late"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 
+from eap.aoe.judged import Judged
 from eap.aoe.routes import Route
 from eap.aoe.way import Way
 from eap.codec.ams import AmsHeader
@@ -22,10 +23,11 @@ class Pending:
         at_ns: When it came.
         deadline_ns: When its time is up.
         handles: How many notifications it asks for.
+        judged: What access rules say of it, where its answer matters to them.
     """
 
-    __slots__ = ("at_ns", "came_by", "deadline_ns", "handles", "header", "invoke_id", "onward",
-                 "route")  # fmt: skip
+    __slots__ = ("at_ns", "came_by", "deadline_ns", "handles", "header", "invoke_id", "judged",
+                 "onward", "route")  # fmt: skip
 
     def __init__(
         self, invoke_id: int, header: AmsHeader, came_by: Way | None, route: Route | None,
@@ -39,6 +41,7 @@ class Pending:
         self.at_ns = at_ns
         self.deadline_ns = deadline_ns
         self.handles = 0
+        self.judged: Judged | None = None
 
 
 class InFlight:

@@ -11,9 +11,11 @@ import struct
 
 from eap.aoe.action import Action, Outcome, Trace
 from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.gate import Gate, exchange_body
 from eap.aoe.inflight import InFlight, Pending
 from eap.aoe.invoke import InvokeIds, is_marked
 from eap.aoe.judge import Judge, Limits
+from eap.aoe.judged import Judged
 from eap.aoe.notifier import Notifier, request_to_end
 from eap.aoe.outlet import Outlet
 from eap.aoe.passed import Passed
@@ -48,6 +50,7 @@ class Passage:
         outlet: Outlet,
         refuser: Refuser,
         record: Record,
+        gate: Gate,
         *,
         first_invoke_id: int,
         limits: Limits,
@@ -59,6 +62,7 @@ class Passage:
         self._outlet = outlet
         self._refuser = refuser
         self._record = record
+        self._gate = gate
         self._limits = limits
         self._prober = prober
         self._ids = InvokeIds(first_invoke_id)
@@ -76,30 +80,37 @@ class Passage:
             replies = self.notifier.hand_on(header, body, lambda hop: self._is_from(hop, way))
             if replies:
                 return list(replies)
-        route = self._judge.find_route(header, way)
-        if isinstance(route, Refusal):
-            if header.command == AmsCommand.NOTIFICATION and route.error == AdsError.TARGET_MACHINE:
+        found = self._let_on(header, data, way, now_ns)
+        if isinstance(found, Refusal):
+            if header.command == AmsCommand.NOTIFICATION and found.error == AdsError.TARGET_MACHINE:
                 text = "nobody here asked for it, or not any more"
                 return self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
-            return self._refuser.refuse(header, way, route, now_ns)
+            return self._refuser.refuse(header, way, found, now_ns)
+        route, data, judged = found
         onward = _ADDRESSES.pack(
             route.to_real(header.target), header.target_port,
             self._table.to_virtual(header.source, way), header.source_port,
         )  # fmt: skip
         if not wants_answer(header):
+            if judged is not None:
+                self._gate.give_up(judged)
             return self._pass_once(header, data, onward, way, route, now_ns)
         pending = self._admit(header, data, onward, way, route, now_ns)
         if not isinstance(pending, Pending):
             return pending
+        pending.judged = judged
         self.notifier.follow_request(pending, data[AmsHeader.SIZE :], way)
         return [self._forward(pending.invoke_id, data, onward, route)]
 
     def wait_for_service(
-        self, header: AmsHeader, data: bytes, way: Way, now_ns: int
+        self, header: AmsHeader, data: bytes, way: Way, judged: Judged | None, now_ns: int
     ) -> int | list[Action]:
         """Remember a request that a service of this station gets; return its ticket, or refuse."""
         pending = self._admit(header, data, data[: _ADDRESSES.size], way, None, now_ns)
-        return pending.invoke_id if isinstance(pending, Pending) else pending
+        if not isinstance(pending, Pending):
+            return pending
+        pending.judged = judged
+        return pending.invoke_id
 
     def take_answer(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
         """Send an answer back to who asked, unless it is late or comes from somewhere else."""
@@ -117,6 +128,10 @@ class Passage:
                 self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
             return actions
         asked = pending.header
+        if pending.judged is not None:
+            body = data[AmsHeader.SIZE :]
+            body = self._gate.take_answer(pending.judged, header.error_code, body)
+            data = exchange_body(data, body)
         back = _ADDRESSES.pack(asked.source, asked.source_port, asked.target, asked.target_port)
         number = asked.invoke_id.to_bytes(4, "little")
         packet = back + data[_ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
@@ -129,6 +144,9 @@ class Passage:
         if pending is None or pending.route is not None or pending.came_by is None:
             return []
         self.in_flight.pop(ticket)
+        if pending.judged is not None:
+            body = self._gate.take_answer(pending.judged, answer.error_code, answer.data)
+            answer = answer._replace(data=body)
         packet = response_to(pending.header, answer)
         return self._send_back(pending, pending.came_by, packet, answer.error_code, now_ns)
 
@@ -140,6 +158,7 @@ class Passage:
     def connection_closed(self, way: Way, now_ns: int) -> list[Action]:
         """Forget who waits at *way*, and end their notifications."""
         for pending in self.in_flight.abandon(way):
+            self._give_up(pending)
             if pending.route is None:
                 self.in_flight.pop(pending.invoke_id)
         actions: list[Action] = []
@@ -181,6 +200,16 @@ class Passage:
             if pending.came_by is not None:
                 actions += self._time_out(pending, now_ns)
         return actions
+
+    def _let_on(
+        self, header: AmsHeader, data: bytes, way: Way, now_ns: int
+    ) -> tuple[Route, bytes, Judged | None] | Refusal:
+        """Return by which route a request goes on, and as what."""
+        route = self._judge.find_route(header, way)
+        if isinstance(route, Refusal):
+            return route
+        through = self._gate.let_through(header, data, way, now_ns, route.name)
+        return through if isinstance(through, Refusal) else (route, *through)
 
     def _admit(
         self, header: AmsHeader, data: bytes, onward: bytes, way: Way, route: Route | None,
@@ -266,22 +295,31 @@ class Passage:
             return []
         route = pending.route
         why = Refusal(AdsError.HOST_UNREACHABLE, f"{route.name} ({route.hop}): {text}", route)
-        took_ns = now_ns - pending.at_ns
-        return self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
+        return self._refuse(pending, why, now_ns)
 
     def _time_out(self, pending: Pending, now_ns: int) -> list[Action]:
         allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
         route = pending.route
         who = "its service" if route is None else f"{route.name} ({route.hop})"
         why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route)
-        took_ns = now_ns - pending.at_ns
-        actions = self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
+        actions = self._refuse(pending, why, now_ns)
         if pending.handles:
             # If it is granted after all, somebody has to end it.
             pending.came_by, pending.at_ns = None, now_ns
             pending.deadline_ns = now_ns + self._limits.timeout_ns
             self.in_flight.add(pending)
         return actions
+
+    def _refuse(self, pending: Pending, why: Refusal, now_ns: int) -> list[Action]:
+        """Answer a request that nothing came back for."""
+        self._give_up(pending, why.error)
+        took_ns = now_ns - pending.at_ns
+        return self._refuser.refuse(pending.header, pending.came_by, why, now_ns, took_ns)
+
+    def _give_up(self, pending: Pending, error_code: int | None = None) -> None:
+        if pending.judged is not None:
+            self._gate.give_up(pending.judged, error_code)
+            pending.judged = None
 
     def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
         """Ask the server to end a notification, for nobody and if there is room to wait for it."""

@@ -24,6 +24,8 @@ class Refusal(NamedTuple):
     route: Route | None = None
     """Whose hop it stopped at, unless here."""
     outcome: Outcome = Outcome.FAILED
+    body: bytes = b""
+    """Of the answer, where that has the error and not the AMS header."""
 
 
 def wants_answer(header: AmsHeader) -> bool:
@@ -50,7 +52,7 @@ class Refuser:
         self._record.enter(Trace(at_ns, why.outcome, way, hop, header, why.error, took_ns, text))
         if way is None or not wants_answer(header):
             return []
-        packet = response_to(header, AmsAnswer(error_code=why.error))
+        packet = response_to(header, AmsAnswer(why.body, 0 if why.body else why.error))
         traffic = self._record.connections.of(way, at_ns)
         traffic.fail(why.text)
         traffic.answer(len(packet), took_ns)

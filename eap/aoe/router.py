@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 
+from eap.aoe.access import AccessList
 from eap.aoe.action import Action, Deliver, Outcome, Reply, Trace
 from eap.aoe.answer import AmsAnswer
+from eap.aoe.gate import Gate
 from eap.aoe.judge import Limits
 from eap.aoe.outlet import Outlet
 from eap.aoe.passage import Passage
@@ -40,9 +42,11 @@ class Router:
         first_invoke_id: Another one at each start, see :class:`~eap.aoe.invoke.InvokeIds`.
         limits: How much it takes on.
         prober: Finds dead hops; without one only doors tell of them.
+        access: Who may do what; without rules others than this host only read.
 
     Attributes:
         record: What it did.
+        gate: What it had changed, and what it refused.
     """
 
     def __init__(
@@ -54,8 +58,10 @@ class Router:
         first_invoke_id: int,
         limits: Limits | None = None,
         prober: Prober | None = None,
+        access: AccessList | None = None,
     ) -> None:
         self.record = Record()
+        self.gate = Gate(access or AccessList(), self.record)
         self._table = table
         self._outlet = Outlet(doors)
         self._refuser = Refuser(self._outlet, self.record)
@@ -63,7 +69,7 @@ class Router:
         self._devices: dict[NetId, Container[int]] = {}
         self._fragments = Reassembly()
         self._passage = Passage(
-            net_id, table, self._outlet, self._refuser, self.record,
+            net_id, table, self._outlet, self._refuser, self.record, self.gate,
             first_invoke_id=first_invoke_id, limits=limits or Limits(), prober=prober,
         )  # fmt: skip
 
@@ -225,8 +231,14 @@ class Router:
         if header.target_port not in ports:
             text = f"nothing has port {header.target_port} of {header.target}"
             return self._refuser.refuse(header, way, Refusal(AdsError.TARGET_PORT, text), now_ns)
+        through = self.gate.let_through(header, data, way, now_ns)
+        if isinstance(through, Refusal):
+            return self._refuser.refuse(header, way, through, now_ns)
+        data, judged = through
         body = data[AmsHeader.SIZE :]
         if not wants_answer(header):
+            if judged is not None:
+                self.gate.give_up(judged)
             return [Deliver(_NOBODY, header, body, way)]
-        ticket = self._passage.wait_for_service(header, data, way, now_ns)
+        ticket = self._passage.wait_for_service(header, data, way, judged, now_ns)
         return [Deliver(ticket, header, body, way)] if isinstance(ticket, int) else ticket

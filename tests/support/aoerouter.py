@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from eap.aoe.access import AccessList
 from eap.aoe.action import Action, Deliver, Forward, Outcome, Reply
 from eap.aoe.judge import Limits
 from eap.aoe.prober import Prober
 from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
+from eap.aoe.spec import AccessRule
 from eap.aoe.way import Door, Way
 from eap.ids import NetId
 from tests.support.ams import Ams, parse
@@ -29,6 +31,8 @@ DOORS = (
     Door("narrow", room=60),
 )
 
+ANYTHING = AccessRule("anything")
+
 
 def route(net_id: str, hop: Way, name: str = "", **more: object) -> Route:
     return Route(NetId.parse(net_id), name or f"to {net_id}", hop, **more)
@@ -38,13 +42,15 @@ class Station:
     """A router; what it wants done is taken apart."""
 
     def __init__(self, routes: Iterable[Route] = (), *, first_id: int = 1000,
-                 limits: Limits | None = None, is_probing: bool = False) -> None:  # fmt: skip
+                 limits: Limits | None = None, is_probing: bool = False,
+                 rules: Iterable[AccessRule] = (ANYTHING,)) -> None:  # fmt: skip
         self.table = RouteTable([*routes])
         net_id = NetId.parse(ROUTER)
         prober = Prober(net_id, self.table) if is_probing else None
         self.router = Router(
-            net_id, self.table, DOORS, first_invoke_id=first_id, limits=limits, prober=prober
-        )
+            net_id, self.table, DOORS, first_invoke_id=first_id, limits=limits, prober=prober,
+            access=AccessList([*rules]),
+        )  # fmt: skip
         self.router.add_device(NetId.parse(ROUTER), {10000})
         self.router.add_device(NetId.parse("5.1.1.1.2.1"), {65535})
         self.now_ns = 0

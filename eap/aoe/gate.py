@@ -1,0 +1,145 @@
+"""The gate of a router: what goes in or on by the access rules, item by item in a sum command.
+
+Whoever keeps an audit takes from here what was changed and what was refused.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from eap.aoe.access import AccessList, Grants
+from eap.aoe.action import Outcome, Trace
+from eap.aoe.ads_operation import AdsRefusedError, OperationOutcome
+from eap.aoe.ads_part import has_results
+from eap.aoe.ads_request import encode_refusal, parse_request
+from eap.aoe.judged import AuditEntry, Judged
+from eap.aoe.record import Record, describe
+from eap.aoe.refusal import Refusal
+from eap.aoe.spec import AccessService
+from eap.aoe.way import Way
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsCommand, AmsHeader
+
+MAX_ENTRIES = 4096
+"""Entries of the audit that wait for somebody who writes them down; the oldest makes room."""
+_READS = frozenset(
+    (
+        AmsCommand.READ_DEVICE_INFO,
+        AmsCommand.READ,
+        AmsCommand.READ_STATE,
+        AmsCommand.ADD_NOTIFICATION,
+        AmsCommand.DELETE_NOTIFICATION,
+    )
+)
+_LENGTH = 20
+"""Where the header says how long the body is."""
+
+
+class Gate:
+    """Judges requests.
+
+    Args:
+        access: The rules.
+        record: Where refusals of items are remembered; the router itself does it for whole ones.
+
+    Attributes:
+        missed: Entries of the audit that nobody took in time.
+    """
+
+    def __init__(self, access: AccessList, record: Record) -> None:
+        self.missed = 0
+        self._access = access
+        self._record = record
+        self._entries: deque[AuditEntry] = deque()
+
+    def next_entry(self) -> AuditEntry | None:
+        """Take the oldest entry of the audit."""
+        return self._entries.popleft() if self._entries else None
+
+    def let_through(
+        self, header: AmsHeader, data: bytes, way: Way, now_ns: int, route: str = ""
+    ) -> tuple[bytes, Judged | None] | Refusal:
+        """Return a request as it goes in or on, and what to do with its answer, or refuse it.
+
+        Args:
+            header: As it came.
+            data: All of the packet.
+            way: That it came by.
+            now_ns: The time on the monotonic clock.
+            route: Name of the route that it would go on by.
+        """
+        if header.command == AmsCommand.NOTIFICATION:
+            return data, None  # nobody gets one who has not asked for it
+        grants = self._access.grants(way, header.source, header.target, header.target_port)
+        if grants.may_read and header.command in _READS:
+            return data, None
+        try:
+            request = parse_request(header.command, data[AmsHeader.SIZE :])
+        except AdsRefusedError as exc:
+            return _judge_unreadable(header, grants, exc) or (data, None)
+        verdicts = tuple(map(grants.judge, request.operations))
+        judged = Judged(way, header, route, request, verdicts)
+        if judged.refused:
+            return self._refuse(judged, now_ns) or (
+                exchange_body(data, judged.encode_part()),
+                judged,
+            )
+        is_read = all(each.service is AccessService.READ for each in verdicts)
+        return data, None if is_read else judged
+
+    def take_answer(self, judged: Judged, error_code: int, body: bytes) -> bytes:
+        """Return the body of the answer that the client gets to all it asked for."""
+        body, entry = judged.take_answer(error_code, body)
+        self._enter(entry)
+        return body
+
+    def give_up(self, judged: Judged, error_code: int | None = None) -> None:
+        """Take note that nothing came back; *error_code* is what the client got, if anything."""
+        self._enter(judged.give_up(error_code))
+
+    def _refuse(self, judged: Judged, now_ns: int) -> Refusal | None:
+        """Refuse a request as a whole, unless some of its items may be done."""
+        request, text = judged.request, _describe(judged)
+        count = len(judged.verdicts)
+        if has_results(request) and len(judged.refused) < count:
+            header, way, code = judged.header, judged.way, AdsError.ACCESS_DENIED
+            text = f"{describe(header, way)}: {text}"
+            self._record.enter(Trace(now_ns, Outcome.DENIED, way, None, header, code, 0, text))
+            return None
+        self.give_up(judged, AdsError.ACCESS_DENIED)
+        body = b""
+        if has_results(request):
+            body = request.encode_answer([OperationOutcome(AdsError.ACCESS_DENIED)] * count)
+        return Refusal(AdsError.ACCESS_DENIED, text, outcome=Outcome.DENIED, body=body)
+
+    def _enter(self, entry: AuditEntry) -> None:
+        if not entry.operations:
+            return
+        if len(self._entries) >= MAX_ENTRIES:
+            self._entries.popleft()
+            self.missed += 1
+        self._entries.append(entry)
+
+
+def exchange_body(data: bytes, body: bytes) -> bytes:
+    """Return a packet with another body."""
+    length = len(body).to_bytes(4, "little")
+    return data[:_LENGTH] + length + data[_LENGTH + 4 : AmsHeader.SIZE] + body
+
+
+def _judge_unreadable(header: AmsHeader, grants: Grants, why: AdsRefusedError) -> Refusal | None:
+    """Let through what nobody here understands, for those who may send anything."""
+    if grants.may(AccessService.RAW):
+        return None
+    text = "the request cannot be read"
+    if why.result is AdsError.COMMAND:
+        return Refusal(why.result, text)
+    return Refusal(why.result, text, body=encode_refusal(header.command, why.result))
+
+
+def _describe(judged: Judged) -> str:
+    first = judged.refused[0]
+    text = f"{first.service} refused: {first.why}"
+    if len(judged.verdicts) == 1:
+        return text
+    return f"{len(judged.refused)} of {len(judged.verdicts)} items refused, the first: {text}"
