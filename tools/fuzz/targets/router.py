@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from eap.aoe.access import AccessList
 from eap.aoe.action import Deliver, Forward, Reply
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
+from eap.aoe.spec import AccessRule, ObjectRange
 from eap.aoe.way import Door, Way
 from eap.codec.ams import AmsHeader, decode_packet
 from eap.ids import NetId
@@ -16,6 +18,7 @@ _FAR = NetId.parse("6.1.1.1.1.1")
 _CLIENTS = (Way("tcp", "1"), Way("segment", "2"))
 _LINK = Way("link", "6")
 _NET_IDS = (_OWN, _FAR, NetId.parse("6.1.1.1.9.9"), NetId.parse("9.9.9.9.9.9"))
+_OBJECTS = AccessRule("objects", objects=(ObjectRange(0, 0x7FFF),))
 _CLIENT_IDS = (NetId.parse("7.1.1.1.1.1"), NetId.parse("7.1.1.1.1.2"), _OWN, _FAR)
 
 
@@ -26,6 +29,7 @@ def fuzz_one(data: bytes) -> None:
         RouteTable([Route(_FAR, "far", _LINK)]),
         [Door("tcp", is_stream=True), Door("segment", room=60), Door("link", room=200)],
         first_invoke_id=1,
+        access=AccessList([AccessRule("wide", doors=("tcp",)), _OBJECTS]),
     )
     router.add_device(_OWN, {1, 2, 3})
     _give(router, data, _CLIENTS[0])
