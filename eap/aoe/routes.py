@@ -1,8 +1,10 @@
 """Routes: by which door and to which address a NetID is reached.
 
 The route with the longest match is taken: all six octets, five, four, then a default route.  Of two
-that match alike the one of the plant file comes first, then those that were added, then those that
-were learned; among equals the older one.
+that match alike the one of the plant file comes first, then those that were added; among equals the
+older one.  A learned route is taken only where none of these matches, however well it does itself,
+but before a default route: whoever tells of a NetID must not draw packets away from where they
+were meant to go.
 """
 
 from __future__ import annotations
@@ -184,11 +186,17 @@ class RouteTable:
     def find(self, target: NetId) -> tuple[Route, int] | None:
         """Return the route to *target*, and how many octets of its NetID match."""
         by_prefix = self._by_prefix
+        learned = None
         for level in _LEVELS:
+            if not level and learned is not None:
+                return learned
             ranked = by_prefix.get(target[:level])
             if ranked:
-                return ranked[0].route, level
-        return None
+                route = ranked[0].route
+                if route.origin is not Origin.LEARNED:
+                    return route, level
+                learned = learned or (route, level)
+        return learned
 
     def to_virtual(self, source: NetId, hop: Way) -> NetId:
         """Return the NetID by which *source*, met at *hop*, is known here."""

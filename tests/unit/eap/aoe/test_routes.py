@@ -54,6 +54,16 @@ def test_learned_route_never_replaces_a_configured_one() -> None:
     assert table.expire(9) == []
 
 
+def test_learned_route_is_no_way_around_a_configured_one_however_well_it_matches() -> None:
+    table = RouteTable([route("5.1.1.1.1.1", A), route("0.0.0.0.0.0", C, octets=0)])
+    for net_id in ("5.1.1.1.2.1", "6.1.1.1.1.1"):
+        table.add(route(net_id, B, origin=Origin.LEARNED))
+    assert hop_of(table, "5.1.1.1.2.1") == A
+    assert hop_of(table, "6.1.1.1.1.1") == B
+    table.remove(NetId.parse("5.1.1.1.1.1"), A)
+    assert hop_of(table, "5.1.1.1.2.1") == B
+
+
 def test_learned_routes_expire_unless_they_are_told_again() -> None:
     table = RouteTable([route("5.1.1.1.1.1", A)])
     assert table.next_timeout() is None
@@ -146,12 +156,17 @@ def test_found_is_what_a_search_through_all_finds(
                 return level
         return 0 if each.octets == 0 else -1
 
+    def goes_before_default(each: Route) -> int:
+        if match(each) == 0:
+            return 0
+        return 1 if each.origin is Origin.LEARNED else 2
+
     fits = [each for each in table if match(each) >= 0]
     found = table.find(target)
     if not fits:
         assert found is None
         return
-    best = max(fits, key=lambda each: (match(each), -each.origin))
+    best = max(fits, key=lambda each: (goes_before_default(each), match(each), -each.origin))
     assert found is not None
     assert (match(found[0]), found[0].origin) == (match(best), best.origin)
     assert found[1] == match(best)
