@@ -6,14 +6,12 @@ from collections.abc import Callable
 
 from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_notifications import Client
-from eap.aoe.ads_objects import ObjectSpace, slave_result
-from eap.aoe.ads_request import encode_refusal
+from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_name
 from eap.codec.ams import AmsCommand
 from eap.ids import NetId
-from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 
@@ -30,21 +28,15 @@ class AdsServices:
         dictionary: What is read and written.
         state: Says in which state the device is now.
         name: Of the device; 15 octets of it are told.
-        result_of: The result that tells of a refused SDO.
     """
 
     def __init__(
-        self,
-        dictionary: ObjectDictionary,
-        state: Callable[[], OdState],
-        name: str,
-        result_of: Callable[[SdoAbortError], AdsError] = slave_result,
+        self, dictionary: ObjectDictionary, state: Callable[[], OdState], name: str
     ) -> None:
-        self._result_of = result_of
         self._device = AdsDevice(
             AdsDeviceInfo(1, 0, 0, device_name(name)),
             lambda: AdsStates(AdsState.RUN, 0),
-            [ObjectSpace(dictionary, state, result_of)],
+            [ObjectSpace(dictionary, state)],
         )
 
     def answer(self, command: int, data: bytes) -> AmsAnswer:
@@ -52,7 +44,3 @@ class AdsServices:
         if command not in _SERVICES:
             return AmsAnswer(error_code=AdsError.SERVICE)
         return self._device.answer(command, data, _ANYBODY, 0)
-
-    def refuse(self, command: int, abort: SdoAbortError) -> AmsAnswer:
-        """Return the answer to *command* that tells of a refused SDO."""
-        return AmsAnswer(encode_refusal(command, self._result_of(abort)))

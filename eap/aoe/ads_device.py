@@ -17,7 +17,7 @@ from eap.aoe.ads_operation import (
     Write,
     WriteControl,
 )
-from eap.aoe.ads_request import Outcomes, encode_refusal, parse_request
+from eap.aoe.ads_request import Outcomes, take_request
 from eap.aoe.ads_space import AdsSpace
 from eap.aoe.ads_state import DeviceDataSpace, States
 from eap.aoe.answer import AmsAnswer
@@ -81,19 +81,16 @@ class AdsDevice:
             now_ns: The time on the monotonic clock.
             judge: Looks at each operation, also at those of a sum command.
         """
-        try:
-            request = parse_request(command, body)
-        except AdsRefusedError as exc:
-            if exc.result is AdsError.COMMAND:
-                return AmsAnswer(error_code=exc.result)
-            return AmsAnswer(encode_refusal(command, exc.result))
+        request = take_request(command, body)
+        if isinstance(request, AmsAnswer):
+            return request
         outcomes = Outcomes(request)
         for operation in request.operations:
             reason = judge(operation)
             outcomes.add(
                 OperationOutcome(reason) if reason else self.perform(operation, client, now_ns)
             )
-        return AmsAnswer(outcomes.encode())
+        return outcomes.answer()
 
     def perform(self, operation: Operation, client: Client, now_ns: int) -> OperationOutcome:
         """Do one operation."""

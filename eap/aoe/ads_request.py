@@ -1,8 +1,8 @@
 """ADS requests taken apart into operations, and the answers put together again.
 
 Beckhoff ADS specification, commands 1 to 7 and 9.  Whoever cannot answer at once, because a bus
-lies between, does what ``AdsDevice.answer`` does in steps of its own: ``parse_request``, one
-outcome for each operation into ``Outcomes``, ``encode``.
+lies between, does what ``AdsDevice.answer`` does in steps of its own: ``take_request``, one
+outcome for each operation into ``Outcomes``, ``answer``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from eap.aoe.ads_operation import (
     WriteControl,
 )
 from eap.aoe.ads_sum import SUM_COMMANDS, asked_length, padded, parse_delete, parse_read, taken
+from eap.aoe.answer import AmsAnswer
 from eap.codec.ads import (
     AdsError,
     AdsRange,
@@ -37,6 +38,8 @@ MAX_ANSWER = 1 << 20
 """Octets of the longest answer; a sum command that asks for more is refused as a whole."""
 _HEAD_SIZE = 8
 """Octets of a result and of what stands beside it in the answer of a sum command."""
+_REASONS = 3
+"""That are told of one request, for a sum command may have thousands."""
 
 
 class AdsRequest(NamedTuple):
@@ -78,6 +81,7 @@ class Outcomes:
         self._request = request
         self._room = MAX_ANSWER - _HEAD_SIZE * len(request.operations)
         self._outcomes: list[OperationOutcome] = []
+        self._reasons: list[str] = []
 
     def add(self, outcome: OperationOutcome) -> None:
         """Take the outcome of the next operation."""
@@ -85,10 +89,25 @@ class Outcomes:
             outcome = OperationOutcome(AdsError.NO_MEMORY)
         self._room -= len(outcome.data)
         self._outcomes.append(outcome)
+        if outcome.why:
+            self._reasons.append(outcome.why)
 
-    def encode(self) -> bytes:
-        """Return the body of the answer; there is an outcome for every operation."""
-        return self._request.encode_answer(self._outcomes)
+    def answer(self) -> AmsAnswer:
+        """Return the answer; there is an outcome for every operation."""
+        reasons = self._reasons[:_REASONS]
+        if len(self._reasons) > _REASONS:
+            reasons.append(f"and {len(self._reasons) - _REASONS} more")
+        return AmsAnswer(self._request.encode_answer(self._outcomes), why="; ".join(reasons))
+
+
+def take_request(command: int, body: bytes) -> AdsRequest | AmsAnswer:
+    """Take a request apart; return the answer to one that is none."""
+    try:
+        return parse_request(command, body)
+    except AdsRefusedError as exc:
+        if exc.result is AdsError.COMMAND:
+            return AmsAnswer(error_code=exc.result)
+        return AmsAnswer(encode_refusal(command, exc.result))
 
 
 def parse_request(command: int, body: bytes) -> AdsRequest:

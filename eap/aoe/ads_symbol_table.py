@@ -135,6 +135,13 @@ class SymbolTable:
             raise AdsRefusedError(AdsError.SYMBOL_NOT_FOUND)
         return self._symbols[index]
 
+    def successor_of(self, symbol: Symbol) -> Symbol:
+        """Return what *symbol* of an older table is here; refuse with SYMBOL_VERSION."""
+        index = self._indexes.get(symbol.variable.name)
+        if index is None or self._symbols[index].type != symbol.type:
+            raise AdsRefusedError(AdsError.SYMBOL_VERSION)
+        return self._symbols[index]
+
     def at(self, offset: int) -> tuple[Symbol, int]:
         """Return the symbol that *offset* lies in, and how far; refuse with INDEX_OFFSET."""
         index = bisect_right(self._offsets, offset) - 1

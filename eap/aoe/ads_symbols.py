@@ -55,7 +55,10 @@ class SymbolSpace(AdsSpace):
         self._store = store
 
     def replace(self, table: SymbolTable, store: VariableStore) -> None:
-        """Go over to another configuration; what watches the old one ends."""
+        """Go over to another configuration.
+
+        Who watches what is in both, with one type, goes on watching; what is gone ends.
+        """
         self._table = table
         self._store = store
 
@@ -85,7 +88,7 @@ class SymbolSpace(AdsSpace):
         if start:
             raise AdsRefusedError(AdsError.SIZE)
         if not symbol.variable.is_writable:
-            raise AdsRefusedError(AdsError.ACCESS)
+            raise AdsRefusedError(AdsError.ACCESS, f"{symbol.variable.name} is only read")
         self._store.write(symbol.variable.name, symbol.type.from_client(data))
 
     def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
@@ -118,8 +121,9 @@ class SymbolSpace(AdsSpace):
         table = self._table
 
         def source() -> bytes:
+            nonlocal symbol, table
             if table is not self._table:
-                raise AdsRefusedError(AdsError.SYMBOL_VERSION)
+                symbol, table = self._table.successor_of(symbol), self._table
             return self._value(symbol)[start : start + length]
 
         return source

@@ -13,6 +13,8 @@ class AmsAnswer(NamedTuple):
     data: bytes = b""
     error_code: int = 0
     """Of the AMS header: why the request reached nobody."""
+    why: str = ""
+    """For people, where results inside *data* refuse something: what, and why."""
 
 
 def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:

@@ -20,7 +20,7 @@ from eap.aoe.notifier import Notifier, request_to_end
 from eap.aoe.outlet import Outlet
 from eap.aoe.passed import Passed
 from eap.aoe.prober import Prober
-from eap.aoe.record import Record
+from eap.aoe.record import Record, describe
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.subscriptions import Subscription
@@ -148,7 +148,9 @@ class Passage:
             body = self._gate.take_answer(pending.judged, answer.error_code, answer.data)
             answer = answer._replace(data=body)
         packet = response_to(pending.header, answer)
-        return self._send_back(pending, pending.came_by, packet, answer.error_code, now_ns)
+        return self._send_back(
+            pending, pending.came_by, packet, answer.error_code, now_ns, answer.why
+        )
 
     def send_failed(self, ticket: int, text: str, now_ns: int) -> list[Action]:
         """Answer a request that its door could not send."""
@@ -266,11 +268,13 @@ class Passage:
         return hop == way or (hop.door == way.door and self._outlet.doors[way.door].is_shared)
 
     def _send_back(
-        self, pending: Pending, way: Way, packet: bytes, error_code: int, now_ns: int
-    ) -> list[Action]:
+        self, pending: Pending, way: Way, packet: bytes, error_code: int, now_ns: int,
+        why: str = "",
+    ) -> list[Action]:  # fmt: skip
         route = pending.route
         took_ns = now_ns - pending.at_ns
-        hop, text = None, ""
+        hop = None
+        text = f"{describe(pending.header, way)}: {why}" if why else ""
         if route is not None:
             hop = route.hop
             traffic = self._record.routes.of(route.key, now_ns)

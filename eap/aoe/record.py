@@ -45,7 +45,7 @@ class Record:
         """Remember what became of a packet."""
         self.counts[trace.outcome] += 1
         self.latest.append(trace)
-        if trace.outcome is Outcome.ANSWERED and not trace.error_code:
+        if trace.outcome is Outcome.ANSWERED and not trace.error_code and not trace.text:
             return
         if len(self._events) >= MAX_EVENTS:
             self._events.popleft()

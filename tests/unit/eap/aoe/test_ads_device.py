@@ -11,6 +11,7 @@ from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import Read, Write
 from eap.aoe.ads_request import MAX_ANSWER
 from eap.aoe.ads_space import AdsSpace
+from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.codec.ads import AdsError, AdsState, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
@@ -94,7 +95,7 @@ def test_refusals_are_results(bench, command: int, form: str, values, result: in
 
 @pytest.mark.parametrize("command", [0, AmsCommand.NOTIFICATION, 0x1234])
 def test_unknown_commands_are_an_error_of_the_header(bench, command: int) -> None:
-    assert bench.ask(command) == (b"", AdsError.COMMAND)
+    assert bench.ask(command) == AmsAnswer(error_code=AdsError.COMMAND)
 
 
 def test_notifications_are_added_told_and_deleted(bench) -> None:

@@ -16,7 +16,8 @@ from eap.aoe.ads_operation import (
     Write,
     WriteControl,
 )
-from eap.aoe.ads_request import parse_request
+from eap.aoe.ads_request import Outcomes, parse_request, take_request
+from eap.aoe.answer import AmsAnswer
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand, decode_packet
@@ -115,3 +116,18 @@ def test_requests_that_are_too_short(command: int, body: bytes) -> None:
 def test_commands_that_ask_for_nothing(command: int) -> None:
     with pytest.raises(AdsRefusedError, match="COMMAND"):
         parse_request(command, bytes(64))
+
+
+def test_what_is_no_request_is_answered_at_once() -> None:
+    assert take_request(AmsCommand.READ, bytes(11)) == AmsAnswer(b"\5\7\0\0" + bytes(4))
+    assert take_request(0, b"") == AmsAnswer(error_code=AdsError.COMMAND)
+    assert take_request(AmsCommand.READ_STATE, b"") == parse_request(AmsCommand.READ_STATE, b"")
+
+
+def test_the_first_reasons_are_told() -> None:
+    items = struct.pack("<4I", G.SUM_READ, 5, 100, 60) + bytes(60)
+    outcomes = Outcomes(parse_request(AmsCommand.READ_WRITE, items))
+    outcomes.add(OperationOutcome())
+    for number in range(4):
+        outcomes.add(OperationOutcome(AdsError.ACCESS, why=f"reason {number}"))
+    assert outcomes.answer().why == "reason 0; reason 1; reason 2; and 1 more"

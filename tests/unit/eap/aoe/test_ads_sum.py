@@ -175,7 +175,7 @@ def test_where_lengths_come_back_only_what_was_read_counts(group: int) -> None:
     outcomes.add(OperationOutcome(data=b"ab"))
     outcomes.add(OperationOutcome(data=bytes(MAX_ANSWER - 25)))
     outcomes.add(OperationOutcome(data=bytes(MAX_ANSWER - 26)))
-    body = body_of(outcomes.encode())
+    body = body_of(outcomes.answer().data)
     assert len(body) == MAX_ANSWER
     heads = struct.unpack_from("<6I", body)
     assert heads == (0, 2, AdsError.NO_MEMORY, 0, 0, MAX_ANSWER - 26)

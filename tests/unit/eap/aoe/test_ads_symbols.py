@@ -3,8 +3,9 @@ from __future__ import annotations
 import pytest
 
 from eap.aoe.ads_operation import AdsRefusedError
-from eap.aoe.ads_symbol_table import SymbolTable
+from eap.aoe.ads_symbol_table import SymbolTable, Variable
 from eap.aoe.ads_symbols import SymbolSpace
+from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import (
     AdsType,
@@ -128,16 +129,26 @@ def test_elements_of_a_list_are_read_by_offset(space) -> None:
 def test_handles_of_an_older_table_are_refused_as_such(space, store) -> None:
     old = handle(space, "count")
     version = space.watch(G.SYMBOL_VERSION, 0, 1)
-    value = space.watch(G.VALUE_BY_HANDLE, old, 4)
-    assert (version(), value()) == (b"\1", (70_000).to_bytes(4, "little"))
+    assert version() == b"\1"
     space.replace(SymbolTable(variables(store)[:2], 0x102), store)
     assert (version(), space.read(G.SYMBOL_VERSION, 0, 9)) == (b"\2", b"\2")
-    for attempt in (value, lambda: space.read(G.VALUE_BY_HANDLE, old, 4)):
-        with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
-            attempt()
+    with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
+        space.read(G.VALUE_BY_HANDLE, old, 4)
     space.write(G.RELEASE_HANDLE, 0, old.to_bytes(4, "little"))
     with pytest.raises(AdsRefusedError, match="SYMBOL_NOT_FOUND"):
         handle(space, "count")
+
+
+def test_watching_goes_on_with_what_is_in_the_next_table_too(space, store) -> None:
+    value = space.watch(G.VALUE_BY_HANDLE, handle(space, "count"), 4)
+    space.replace(SymbolTable(reversed(variables(store)), 2), store)
+    store.set("count", 5)
+    assert value() == b"\5\0\0\0"
+    other = [Variable("count", datatypes.parse("UINT"))]
+    for without in (other, []):
+        space.replace(SymbolTable(without, 3), store)
+        with pytest.raises(AdsRefusedError, match="SYMBOL_VERSION"):
+            value()
 
 
 @pytest.mark.parametrize("number", [1 << 24, (1 << 24) + len(VALUES) + 1])

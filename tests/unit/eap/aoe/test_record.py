@@ -7,8 +7,8 @@ from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 
 
-def trace(at_ns: int, outcome: Outcome = Outcome.FAILED, error: int = 7) -> Trace:
-    return Trace(at_ns, outcome, None, None, None, error, 0, "")
+def trace(at_ns: int, outcome: Outcome = Outcome.FAILED, error: int = 7, text: str = "") -> Trace:
+    return Trace(at_ns, outcome, None, None, None, error, 0, text)
 
 
 def test_what_was_simply_answered_is_no_event() -> None:
@@ -16,9 +16,10 @@ def test_what_was_simply_answered_is_no_event() -> None:
     record.enter(trace(1, Outcome.ANSWERED, 0))
     record.enter(trace(2, Outcome.ANSWERED, 6))
     record.enter(trace(3))
-    assert [each.at_ns for each in iter(record.next_event, None)] == [2, 3]
-    assert [each.at_ns for each in record.latest] == [1, 2, 3]
-    assert (record.counts[Outcome.ANSWERED], record.counts[Outcome.FAILED]) == (2, 1)
+    record.enter(trace(4, Outcome.ANSWERED, 0, "0x2000:00: object does not exist"))
+    assert [each.at_ns for each in iter(record.next_event, None)] == [2, 3, 4]
+    assert [each.at_ns for each in record.latest] == [1, 2, 3, 4]
+    assert (record.counts[Outcome.ANSWERED], record.counts[Outcome.FAILED]) == (3, 1)
 
 
 def test_traces_are_limited() -> None:

@@ -44,6 +44,14 @@ def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
     assert station.events() == []
 
 
+def test_what_a_service_says_of_a_refusal_is_kept() -> None:
+    station = Station()
+    delivered = station.delivered(Ams(DEVICE, CLIENT), TCP)
+    why = "0x2000:00: object does not exist (0x06020000)"
+    station.router.receive_answer(delivered.ticket, AmsAnswer(b"data", why=why), 5)
+    assert station.events() == [(Outcome.ANSWERED, f"READ of {DEVICE} for {CLIENT} ({TCP}): {why}")]
+
+
 @pytest.mark.parametrize(
     ("target", "error", "text"),
     [
