@@ -38,7 +38,8 @@ class Variable(NamedTuple):
     name: str
     type: DataType
     comment: str = ""
-    is_writable: bool = False
+    read_only: str = ""
+    """Why clients do not write it, as what follows its name; empty if they do."""
 
 
 class Symbol(NamedTuple):
@@ -50,7 +51,7 @@ class Symbol(NamedTuple):
 
     def describe(self) -> bytes:
         """Return its entry."""
-        flags = 0 if self.variable.is_writable else SymbolFlag.READ_ONLY
+        flags = SymbolFlag.READ_ONLY if self.variable.read_only else 0
         return encode_entry(
             SymbolEntry(
                 self.place,

@@ -87,8 +87,9 @@ class SymbolSpace(AdsSpace):
         symbol, start = self._find(group, offset)
         if start:
             raise AdsRefusedError(AdsError.SIZE)
-        if not symbol.variable.is_writable:
-            raise AdsRefusedError(AdsError.ACCESS, f"{symbol.variable.name} is only read")
+        if symbol.variable.read_only:
+            why = f"{symbol.variable.name} {symbol.variable.read_only}"
+            raise AdsRefusedError(AdsError.ACCESS, why)
         self._store.write(symbol.variable.name, symbol.type.from_client(data))
 
     def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:

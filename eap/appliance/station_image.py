@@ -76,6 +76,19 @@ class StationImage:
             if not file.retired:
                 return
 
+    def write_once(self, writer: Writer, values: Mapping[str, Any]) -> None:
+        """Write *values* at once, as the region's writer for just as long as that takes.
+
+        Raises:
+            WriterConflictError: someone else is it.
+            ValueError, ImageError: as :meth:`write` does.
+        """
+        self.acquire_writer(writer)
+        try:
+            self.write(writer, values)
+        finally:
+            self.release_writer(writer)
+
     def catch_up(self) -> bool:
         """Look for a newer image where none was announced; return whether there is one."""
         if not self._file.has_lost_its_name:

@@ -61,10 +61,17 @@ class Image:
 
     def read(self, name: str) -> Any:
         """Return one variable's value; raise ImageError if there is none of that name."""
+        return datatypes.parse(self._place(name).type).decode(self.load(name), 0)
+
+    def load(self, name: str, *, attempts: int = READ_ATTEMPTS) -> bytes:
+        """Return one variable's octets, as :meth:`encode` does those of a value.
+
+        Raises:
+            ImageError: there is none of that name; TornReadError, if it is only for now.
+        """
         place = self._place(name)
         first, last = place.bit_offset // 8, _end_octet(place)
-        data = self._stable_copy(place.writer, first, last)
-        return _decode(place, data, 8 * first)
+        return take(place, self._stable_copy(place.writer, first, last, attempts), 8 * first)
 
     def read_all(self) -> dict[str, Any]:
         """Return all variables; those of one writer belong to one moment."""
@@ -133,9 +140,11 @@ class Image:
         except KeyError:
             raise ImageError(f"station {self.layout.station} has no variable {name!r}") from None
 
-    def _stable_copy(self, writer: Writer, first: int, last: int) -> bytes:
+    def _stable_copy(
+        self, writer: Writer, first: int, last: int, attempts: int = READ_ATTEMPTS
+    ) -> bytes:
         words, sequence = self.words, self.layout.regions[writer].sequence
-        for _ in range(READ_ATTEMPTS):
+        for _ in range(attempts):
             before = words[sequence]
             if not before % 2:
                 data = bytes(self.memory[first:last])
@@ -216,10 +225,15 @@ def _end_octet(place: VariablePlace) -> int:
     return -(-(place.bit_offset + datatypes.parse(place.type).bit_length) // 8)
 
 
-def _decode(place: VariablePlace, data: bytes, first_bit: int) -> Any:
+def take(place: VariablePlace, data: bytes, first_bit: int) -> bytes:
+    """Return the octets of a variable out of *data*, a copy of the image from *first_bit* on."""
     kind = datatypes.parse(place.type)
     offset, bit = divmod(place.bit_offset - first_bit, 8)
     if not kind.is_bits:
-        return kind.decode(data, offset)
+        return data[offset : offset + kind.size]
     word = int.from_bytes(data[offset : offset + 2], "little") >> bit
-    return kind.decode(bytes((word & (1 << kind.bit_length) - 1,)), 0)
+    return bytes((word & (1 << kind.bit_length) - 1,))
+
+
+def _decode(place: VariablePlace, data: bytes, first_bit: int) -> Any:
+    return datatypes.parse(place.type).decode(take(place, data, first_bit), 0)

@@ -62,7 +62,7 @@ class DictStore:
 
 def variables(store: DictStore) -> list[Variable]:
     return [
-        Variable(name, kind, f"comment of {name}", is_writable=name != READ_ONLY)
+        Variable(name, kind, f"comment of {name}", "counts" if name == READ_ONLY else "")
         for name, kind in store.types.items()
     ]
 

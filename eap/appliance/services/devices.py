@@ -9,13 +9,21 @@ from contextlib import suppress
 from functools import partial
 from time import monotonic_ns
 
+from eap.aoe.ads_notifications import Client
+from eap.aoe.ads_operation import DeleteNotification, Operation
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.way import Way
 from eap.appliance.services.aoe_desk import AoeDesk
+from eap.appliance.services.eap_ads import EapAds, device_info
 from eap.appliance.services.image_values import ImageValues
+from eap.appliance.services.image_variables import StationSymbols
 from eap.appliance.services.sources import SourcePlayer
 from eap.appliance.services.station_device import StationDevice
 from eap.appliance.services.station_keeper import StationEngine, StationKeeper
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
+from eap.codec.ads import AdsError
+from eap.codec.adsnotification import AddNotification
 from eap.device.eap_content import Identity
 from eap.errors import ImageError
 from eap.ids import NetId
@@ -72,7 +80,7 @@ class Devices:
             )
             device = StationDevice(keeper, ImageValues(image), identity)
             self.by_station[name] = device
-            self.desks[name] = _desk(station, device)
+            self.desks[name] = _desk(station, device, image, release)
 
     async def serve(self) -> None:
         """Serve all of them until cancelled.
@@ -110,7 +118,26 @@ def _runs(image: StationImage) -> bool:
     return bool(ran_at_ns) and monotonic_ns() - ran_at_ns < _LATELY_NS
 
 
-def _desk(station: StationSpec, device: StationDevice) -> AoeDesk:
+def _desk(
+    station: StationSpec, device: StationDevice, image: StationImage, release: str
+) -> AoeDesk:
     net_ids = {port.name: NetId.parse(port.net_id) for port in station.ports}
-    answering = {net_ids[port]: partial(device.answer, port) for port in device.dictionaries}
+    symbols = StationSymbols(image)
+    answering = {}
+    for port in device.dictionaries:
+        info = device_info(f"{station.name}/{port}", release)
+        ads = EapAds(device, port, symbols, info)
+        answering[net_ids[port]] = partial(_answer, ads)
     return AoeDesk(answering, {NetId.parse(station.net_id), *net_ids.values()})
+
+
+_ANYBODY = Client(Way("", ""), NetId(bytes(6)), 0)
+
+
+async def _answer(ads: EapAds, command: int, body: bytes) -> AmsAnswer:
+    return await ads.answer(command, body, _ANYBODY, judge=_without_notifications)
+
+
+def _without_notifications(operation: Operation) -> AdsError:
+    is_told = isinstance(operation, AddNotification | DeleteNotification)
+    return AdsError.SERVICE if is_told else AdsError.NONE

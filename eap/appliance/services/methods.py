@@ -123,15 +123,11 @@ class Methods:
         places = _places(station.image, wanted.values)
         values = {place.name: _checked(place, wanted.values[place.name]) for place in places}
         try:
-            station.acquire_writer(Writer.APPLICATION)
+            station.write_once(Writer.APPLICATION, values)
         except WriterConflictError as exc:
             raise ControlError(str(exc), code=ErrorCode.REFUSED) from None
-        try:
-            station.write(Writer.APPLICATION, values)
         except ValueError as exc:  # another type, since the station was configured anew
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
-        finally:
-            station.release_writer(Writer.APPLICATION)
         return {"written": len(values)}
 
     def _ask_to_stop(self, params: dict[str, Any]) -> dict[str, Any]:

@@ -13,16 +13,12 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from devicebus.mailbox.ads_services import AdsServices
-from eap.aoe.answer import AmsAnswer
 from eap.appliance.configuration import Configuration
 from eap.appliance.device_change import Plan, dump_all, eap_ports, fill_all, make_plan
 from eap.appliance.device_change import plan_rollback as make_rollback
 from eap.appliance.device_plan import find_refusals
-from eap.appliance.services.ads_result import ads_result
 from eap.appliance.services.jobs import Jobs
 from eap.appliance.services.station_keeper import StationKeeper
-from eap.codec.ams import AmsCommand
 from eap.device import stored
 from eap.device.eap_content import Identity
 from eap.device.eap_dictionary import EapDictionary
@@ -36,7 +32,6 @@ from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
 _CONTROL = 0xF200
-_WRITES = frozenset((AmsCommand.WRITE, AmsCommand.READ_WRITE))
 _STATES = frozenset((DeviceState.PREOP, DeviceState.SAFEOP, DeviceState.OP))
 
 ResultT = TypeVar("ResultT")
@@ -64,10 +59,6 @@ class StationDevice:
         self.dictionaries = {
             name: EapDictionary(keeper.spec, name, values, identity)
             for name in eap_ports(keeper.spec)
-        }
-        self._ads = {
-            name: AdsServices(each, self.od_state, identity.device_name, ads_result)
-            for name, each in self.dictionaries.items()
         }
         self._incomplete: DeviceFault | None = None
         self._is_written = False
@@ -133,19 +124,16 @@ class StationDevice:
             else:
                 dictionary.download(index, subindex, data, self.od_state())
 
-        await self._jobs.do(lambda: self._write(dictionary, write))
+        await self.change(port, write)
 
-    async def answer(self, port: str, command: int, data: bytes) -> AmsAnswer:
-        """Answer an ADS request."""
-        ads, dictionary = self._ads[port], self.dictionaries[port]
-        if command not in _WRITES:
-            return ads.answer(command, data)
-        try:
-            return await self._jobs.do(
-                lambda: self._write(dictionary, lambda: ads.answer(command, data))
-            )
-        except SdoAbortError as exc:
-            return ads.refuse(command, exc)
+    async def change(self, port: str, write: Callable[[], ResultT]) -> ResultT:
+        """Have *write* change the dictionary of *port*, and do what follows; return its result.
+
+        Raises:
+            SdoAbortError: it, or the engine, refuses; nothing has changed.
+            ControlError: too many changes wait already.
+        """
+        return await self._jobs.do(lambda: self._write(self.dictionaries[port], write))
 
     async def request_state(self, wanted: int) -> StateResult:
         """Go to the state numbered *wanted* as far as possible."""

@@ -116,3 +116,15 @@ def test_variable_that_went_meanwhile_is_told(station, move):
     move(without="running")
     with pytest.raises(ImageError, match="no variable 'running'"):
         station.write(Writer.APPLICATION, {"running": True})
+
+
+def test_writer_for_one_write_leaves_the_place_to_others(station, path):
+    station.write_once(Writer.APPLICATION, {"running": True})
+    with open_image(path) as other:
+        assert other.image.read("running") is True
+        other.acquire_writer(Writer.APPLICATION)
+        with pytest.raises(WriterConflictError):
+            station.write_once(Writer.APPLICATION, {"running": False})
+    with pytest.raises(ValueError, match="BOOL"):
+        station.write_once(Writer.APPLICATION, {"running": 2})
+    station.acquire_writer(Writer.APPLICATION)

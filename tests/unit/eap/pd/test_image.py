@@ -48,6 +48,8 @@ def test_what_is_written_is_read_and_nothing_else_changes(data):
         expected[f"v{i}"] = value
     assert image.read_all() == expected
     assert {name: image.read(name) for name in names} == expected
+    octets = {name: image.encode(name, value) for name, value in expected.items()}
+    assert {name: image.load(name) for name in names} == octets
 
 
 STORED = ("BOOL", "BIT3", "SINT", "USINT", "INT", "UINT24", "UDINT", "LINT", "REAL", "LREAL")

@@ -6,8 +6,6 @@ import pytest
 from msgspec.structs import replace
 
 from eap.appliance.store import Store, effective
-from eap.codec.ads import AdsError
-from eap.codec.ams import AmsCommand
 from eap.device.fault import FaultCode
 from eap.device.stored import dump
 from eap.errors import EngineGoneError, EngineRefusedError
@@ -15,7 +13,6 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000keys import Tx
 from eap.pd.device import DeviceState
 from eap.pd.spec import TriggerSpec, TxFrameSpec, TxPdSpec, VariableSpec
-from tests.support import aoe
 from tests.support.stationengine import make_device, while_serving
 
 TXPD, FRAME, CONTROL, STATUS = 0xD000, 0x8000, 0xF200, 0xF100
@@ -278,31 +275,6 @@ def test_rollback_goes_back_and_forth(spec):
     again, engine = make_device(wanted)
     while_serving(again, again.roll_back)
     assert engine.spec == spec
-
-
-def test_ads(spec):
-    device, engine = make_device(spec)
-
-    async def script():
-        async def ask(command, body):
-            return await device.answer("eap0", command, body)
-
-        read = await ask(AmsCommand.READ, aoe.read_body(TXPD << 16 | Tx.PD_ID))
-        assert read.data == bytes(4) + b"\2\0\0\0" + b"\7\0"
-        refused = await ask(AmsCommand.WRITE, aoe.write_body(TXPD << 16 | Tx.PD_ID, b"\1\0"))
-        assert refused.data == AdsError.STATE.to_bytes(4, "little")
-        for state in (b"\2\0", b"\x08\0"):
-            assert (
-                await ask(AmsCommand.WRITE, aoe.write_body(CONTROL << 16 | 1, state))
-            ).data == bytes(4)
-            assert engine.state == state[0]
-        engine.failure = EngineRefusedError("no")
-        await ask(AmsCommand.WRITE, aoe.write_body(CONTROL << 16 | 1, b"\4\0"))
-        engine.failure = EngineRefusedError("no")
-        refused = await ask(AmsCommand.WRITE, aoe.write_body(CONTROL << 16 | 1, b"\x08\0"))
-        assert refused.data == AdsError.STATE.to_bytes(4, "little")
-
-    while_serving(device, script)
 
 
 def test_what_does_not_fit_into_dictionaries_runs_but_is_not_changed_by_downloads(spec, caplog):

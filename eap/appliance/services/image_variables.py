@@ -1,0 +1,108 @@
+"""The variables of a running station as ADS symbols, in its process image.
+
+Every variable is one: those of EAP, those of slaves, and the control words of frames and PDs.
+Clients write those that belong to the application.  A new layout is a new version of the symbols.
+"""
+
+from __future__ import annotations
+
+from eap.aoe.ads_operation import AdsRefusedError
+from eap.aoe.ads_space import AdsSpace, Source
+from eap.aoe.ads_symbol_table import SymbolTable, Variable
+from eap.aoe.ads_symbols import SymbolSpace
+from eap.appliance.station_image import StationImage
+from eap.codec import datatypes
+from eap.codec.ads import AdsError
+from eap.errors import ImageError, TornReadError, WriterConflictError
+from eap.net.image_file import ImageFile
+from eap.pd.image import Image
+from eap.pd.layout import VariablePlace
+from eap.pd.spec import Writer
+
+_ATTEMPTS = 10
+"""At a consistent copy, a tenth of a millisecond apart: a client may ask again, others wait."""
+
+
+class ImageVariables:
+    """The values in one image; fits VariableStore by its shape.
+
+    Args:
+        station: Whose image it is.
+        image: Of one layout.
+    """
+
+    def __init__(self, station: StationImage, image: Image) -> None:
+        self._station = station
+        self._image = image
+
+    def read(self, name: str) -> bytes:
+        """Return the octets of a value; refuse with BUSY while its writer is in the middle."""
+        try:
+            return self._image.load(name, attempts=_ATTEMPTS)
+        except TornReadError as exc:
+            raise AdsRefusedError(AdsError.BUSY, str(exc)) from None
+
+    def write(self, name: str, octets: bytes) -> None:
+        """Store a value; refuse with BUSY while another program writes, with VALUE what is none."""
+        kind = datatypes.parse(self._image.places[name].type)
+        try:
+            self._station.write_once(Writer.APPLICATION, {name: kind.decode(octets, 0)})
+        except WriterConflictError as exc:
+            raise AdsRefusedError(AdsError.BUSY, str(exc)) from None
+        except ValueError as exc:
+            raise AdsRefusedError(AdsError.VALUE, f"{name}: {exc}") from None
+        except ImageError as exc:  # it got a new layout just now
+            raise AdsRefusedError(AdsError.SYMBOL_VERSION, str(exc)) from None
+
+
+class StationSymbols(AdsSpace):
+    """The symbols of one station, as its newest image has them."""
+
+    groups = SymbolSpace.groups
+
+    def __init__(self, station: StationImage) -> None:
+        self._station = station
+        self._file = station.file
+        self._space = SymbolSpace(*self._configuration(self._file))
+
+    def look(self) -> SymbolSpace:
+        """Go over to the newest image; return the symbols there, or refuse with NOT_READY."""
+        try:
+            file = self._station.file
+        except ImageError as exc:
+            raise AdsRefusedError(AdsError.NOT_READY, str(exc)) from None
+        if file is not self._file:
+            self._file = file
+            self._space.replace(*self._configuration(file))
+        return self._space
+
+    def read(self, group: int, offset: int, length: int) -> bytes:
+        """Return what the newest symbols say."""
+        return self.look().read(group, offset, length)
+
+    def write(self, group: int, offset: int, data: bytes) -> None:
+        """Write to the newest image."""
+        self.look().write(group, offset, data)
+
+    def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
+        """Return what belongs to a name."""
+        return self.look().read_write(group, offset, length, data)
+
+    def watch(self, group: int, offset: int, length: int) -> Source:
+        """Return what gives a value."""
+        return self.look().watch(group, offset, length)
+
+    def _configuration(self, file: ImageFile) -> tuple[SymbolTable, ImageVariables]:
+        variables = map(_variable, file.image.layout.variables)
+        store = ImageVariables(self._station, file.image)
+        return SymbolTable(variables, file.generation), store
+
+
+def _variable(place: VariablePlace) -> Variable:
+    unit = f"[{place.unit}]" if place.unit else ""
+    return Variable(
+        place.name,
+        datatypes.parse(place.type),
+        " ".join(filter(None, (place.comment, unit))),
+        "" if place.writer is Writer.APPLICATION else f"is written by the {place.writer}",
+    )
