@@ -55,8 +55,8 @@ with one, two:
         lambda: own(one) == first,
         lambda: own(two) == second,
         lambda: one.read(0xF302, 0x10000000, pyads.PLCTYPE_UDINT) == 1000 << 16 | 5001,
-        lambda: one.read_device_info()[0] == "EAP station tow",
-        lambda: two.read_state() == (5, 0),
+        lambda: one.read_device_info()[0] == "tower/eap0",
+        lambda: two.read_state() == (5, 8),
     )
     print("asking", flush=True)
     wrong = sum(not pick.choice(questions)() for _ in range(int(count)))
@@ -92,7 +92,7 @@ def end(client: subprocess.Popen[str]) -> None:
 def test_reads_and_writes(appliance: Appliance) -> None:
     assert pyads.pyads_ex.adsGetNetIdForPLC(ADDRESS) == ROUTER
     with pyads.Connection(FIRST, DEVICE, ADDRESS) as device:
-        assert device.read_device_info()[0] == "EAP station tow"
+        assert device.read_device_info()[0] == "tower/eap0"
         assert device.read_state()[0] == 5
         assert device.read(SDO, 0xD000 << 16 | Tx.PD_ID, pyads.PLCTYPE_UINT) == 77
         device.write(SDO, 0xF2000001, 2, pyads.PLCTYPE_UINT)

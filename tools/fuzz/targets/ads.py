@@ -46,7 +46,7 @@ class _Store:
 
 def _device() -> AdsDevice:
     store = _Store()
-    variables = [Variable(name, kind, is_writable=True) for name, kind in store.types.items()]
+    variables = [Variable(name, kind) for name, kind in store.types.items()]
     return AdsDevice(
         AdsDeviceInfo(1, 0, 0, device_name("fuzzed")),
         lambda: AdsStates(AdsState.RUN, 8),

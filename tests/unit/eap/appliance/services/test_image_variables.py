@@ -91,5 +91,5 @@ def test_new_layout_is_a_new_version(symbols, stations, files):
 def test_image_that_cannot_be_opened_is_not_ready(symbols, files):
     files["left"].path.unlink()
     files["left"].retire()
-    with pytest.raises(AdsRefusedError, match="NOT_READY: .*no process image"):
+    with pytest.raises(AdsRefusedError, match=r"NOT_READY: .*no process image"):
         symbols.read(G.SYMBOL_VERSION, 0, 1)
