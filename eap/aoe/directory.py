@@ -1,0 +1,110 @@
+"""Names of a plant and the AMS addresses behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
+from typing import NamedTuple
+
+from eap.aoe.ads_system import SYSTEM_PORT
+from eap.aoe.spec import DirectoryPort, DirectoryStation
+from eap.ids import NetId
+
+DEVICE_PORT = 0xFFFF
+"""AMS port of an EAP device, of a master, and of the dictionary of a router."""
+_MAX_PORT = 0xFFFF
+
+
+class AmsAddress(NamedTuple):
+    """Whom an ADS request is for."""
+
+    net_id: NetId
+    port: int
+
+    def __str__(self) -> str:
+        return f"{self.net_id}:{self.port}"
+
+
+class Directory:
+    """All stations of a plant, with their ports and slaves."""
+
+    def __init__(self, stations: Sequence[DirectoryStation]) -> None:
+        self.stations = {station.name: station for station in stations}
+        self._names = {
+            AmsAddress(NetId.parse(station.net_id), SYSTEM_PORT): station.name
+            for station in stations
+        }
+        self._net_ids = {NetId.parse(station.net_id): station.name for station in stations}
+        for station in stations:
+            for port in station.ports:
+                self._enter(f"{station.name}/{port.name}", port)
+
+    def find(self, text: str) -> AmsAddress:
+        """Return the address of ``STATION``, ``STATION/PORT[/SLAVE]`` or ``NETID[:PORT]``.
+
+        A station stands for the system service of its router.
+
+        Raises:
+            ValueError: there is no such name here, or it is no name; the message says what is.
+        """
+        if text.count(".") == 5 and "/" not in text:
+            return _parse(text)
+        name, _, rest = text.partition("/")
+        station = self.stations.get(name)
+        if station is None:
+            raise ValueError(f"no station {name!r} in this plant{_near(name, self.stations)}")
+        if not rest:
+            return AmsAddress(NetId.parse(station.net_id), SYSTEM_PORT)
+        port_name, slash, slave = rest.partition("/")
+        ports = {port.name: port for port in station.ports}
+        port = ports.get(port_name)
+        if port is None:
+            hint = _near(port_name, ports) or f"; it has {', '.join(ports) or 'none'}"
+            raise ValueError(f"station {name} has no port {port_name!r}{hint}")
+        number = _slave(f"{name}/{port_name}", port, slave) if slash else DEVICE_PORT
+        return AmsAddress(NetId.parse(port.net_id), number)
+
+    def name_of(self, net_id: NetId, port: int) -> str:
+        """Return who has an address, as people call it; empty if nobody here knows."""
+        known = self._names.get(AmsAddress(net_id, port))
+        if known is not None:
+            return known
+        owner = self._net_ids.get(net_id)
+        return "" if owner is None else f"{owner}:{port}"
+
+    def station_of(self, net_id: NetId) -> str:
+        """Return the station that has a NetID, also one of its ports; empty if nobody here does."""
+        return self._net_ids.get(net_id, "").partition("/")[0]
+
+    def _enter(self, name: str, port: DirectoryPort) -> None:
+        net_id = NetId.parse(port.net_id)
+        self._net_ids.setdefault(net_id, name)
+        self._names[AmsAddress(net_id, DEVICE_PORT)] = name
+        for slave, number in port.slaves.items():
+            self._names[AmsAddress(net_id, number)] = f"{name}/{slave}"
+
+
+def _parse(text: str) -> AmsAddress:
+    net_id, colon, port = text.partition(":")
+    if not colon:
+        return AmsAddress(NetId.parse(net_id), DEVICE_PORT)
+    if not (port.isascii() and port.isdigit() and int(port) <= _MAX_PORT):
+        raise ValueError(f"{port!r} in {text!r} is no AMS port (0 to {_MAX_PORT})")
+    return AmsAddress(NetId.parse(net_id), int(port))
+
+
+def _slave(owner: str, port: DirectoryPort, slave: str) -> int:
+    if not port.is_bus:
+        raise ValueError(f"{owner} is no bus port, so there are no slaves behind it")
+    if slave in port.slaves:
+        return port.slaves[slave]
+    if slave.isascii() and slave.isdigit() and 0 < int(slave) < DEVICE_PORT:
+        return int(slave)
+    known = ", ".join(f"{name} ({number})" for name, number in port.slaves.items())
+    hint = _near(slave, port.slaves) or (f"; they are {known}" if known else "")
+    raise ValueError(f"no slave {slave!r} behind {owner}{hint}")
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    found = get_close_matches(name, list(known), n=1)
+    return f", did you mean {found[0]}?" if found else ""
