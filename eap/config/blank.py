@@ -42,7 +42,9 @@ def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
     check_ports(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)
-    plant = Plant(name, derive(index, Path()), derive_routing(index), derive_directory(index))
+    plant = Plant(
+        name, derive(index, Path()), derive_routing(index, Path()), derive_directory(index)
+    )
     return LoadResult(plant, ())
 
 

@@ -161,16 +161,11 @@ class _Converter:
     ) -> dict[str, Node]:
         """Return the entries with known keys, after reporting the others."""
         given = {name: node for name, (_, node) in entries.items() if name in keys}
-        later: dict[str, str] = getattr(kind.cls, "LATER", {})
         shown = [name for name in keys if name != "variable"]
         for name, (line, node) in entries.items():
             if name in keys or (kind.cls is PlantFile and name.startswith("x-")):
                 continue
             where = f"{path}.{name}" if path else name
-            if name in later:
-                message = f"{name} ({later[name]}): this version does not know them yet"
-                self._report.add(where, message, "the key to be left out", line=line)
-                continue
             missing = [each for each in shown if each not in given]
             hint = near(name, missing)
             self._report.add(where, f"unknown key {name!r}{hint}", one_of(shown), line=line)

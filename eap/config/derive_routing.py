@@ -3,23 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
-from eap.aoe.spec import DirectoryPort, DirectoryStation, HopSpec, RouteSpec, RoutingSpec
+from eap.aoe.spec import (
+    AmsUser,
+    DirectoryPort,
+    DirectoryStation,
+    DoorKind,
+    HopSpec,
+    RouteSpec,
+    RoutingSpec,
+)
+from eap.config.brokers import broker_spec, brokers_of, shared_network
 from eap.config.index import Index
 from eap.config.neighbours import find_hop
+from eap.config.reach import net_ids_of, reach, without_prefix
+from eap.config.routes import next_hop
+from eap.config.rules import access_rules
 from eap.config.structs import Station
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import PortKind
 
-_COMMON = 4
-"""Octets that all NetIDs of a station usually have in common."""
 
-
-def derive_routing(index: Index) -> dict[str, RoutingSpec]:
-    """Return by its name what the router of each station is told."""
-    loose = _without_prefix(index)
+def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
+    """Return by its name what the router of each station is told; files are in *folder*."""
+    loose = without_prefix(index)
     return {
-        station.name: RoutingSpec(routes=tuple(_derived(index, station, loose)))
+        station.name: RoutingSpec(
+            routes=(*_written(index, station, loose), *_derived(index, station, loose)),
+            mqtt=tuple(broker_spec(each, folder) for each in brokers_of(station)),
+            access=tuple(access_rules(index, station, loose)),
+            users=tuple(
+                AmsUser(user.name, str((folder / user.password_file).resolve()))
+                for user in station.users
+            ),
+            learn=station.learn,
+        )
         for station in index.plant.stations
     }
 
@@ -50,35 +69,44 @@ def _slaves(index: Index, station: Station, port: str) -> dict[str, int]:
     return {slave.name: slave.station for slave in bus.slaves} if bus else {}
 
 
+def _written(index: Index, station: Station, loose: set[str]) -> Iterator[RouteSpec]:
+    for route in station.routes:
+        if route.mqtt:
+            continue
+        hop, router = next_hop(index, station, route)
+        for net_id, octets in reach(index, route, router, loose):
+            yield RouteSpec(
+                name=route.to,
+                net_id=net_id,
+                hop=hop,
+                octets=octets,
+                router=router,
+                virtual=str(NetId.parse(route.virtual)) if route.virtual else "",
+                is_unidirectional=route.unidirectional,
+                timeout_ms=route.timeout_ms,
+                is_probed=route.probe and any(NetId.parse(router or net_id)),
+            )
+
+
 def _derived(index: Index, station: Station, loose: set[str]) -> Iterator[RouteSpec]:
-    """Yield routes to the stations that share an interface with *station*."""
+    """Yield routes to the stations that share an interface or a broker with *station*."""
+    written = {route.to for route in station.routes}
     for target in index.plant.stations:
-        if target is not station and (hop := find_hop(index, station, target)) is not None:
-            yield from _routes_to(target, hop, is_loose=target.name in loose)
-
-
-def _routes_to(target: Station, hop: HopSpec, *, is_loose: bool) -> Iterator[RouteSpec]:
-    router = str(NetId.parse(target.net_id))
-    net_ids, octets = [router], _COMMON
-    if is_loose:
-        net_ids += [str(NetId.parse(port.net_id)) for port in target.ports]
-        octets = len(NetId.parse(router))
-    for net_id in net_ids:
-        yield RouteSpec(
-            name=target.name, net_id=net_id, hop=hop, octets=octets, router=router, is_derived=True
-        )
-
-
-def _without_prefix(index: Index) -> set[str]:
-    """Return the stations whose NetIDs have no four octets to themselves."""
-    owners: dict[bytes, set[str]] = {}
-    for station in index.plant.stations:
-        for prefix in _prefixes(station):
-            owners.setdefault(prefix, set()).add(station.name)
-    shared = {name for names in owners.values() if len(names) > 1 for name in names}
-    return shared | {s.name for s in index.plant.stations if len(_prefixes(s)) > 1}
-
-
-def _prefixes(station: Station) -> set[bytes]:
-    net_ids = [station.net_id, *(port.net_id for port in station.ports)]
-    return {NetId.parse(text)[:_COMMON] for text in net_ids}
+        if target is station or target.name in written:
+            continue
+        router = str(NetId.parse(target.net_id))
+        hop = find_hop(index, station, target)
+        network = "" if hop else shared_network(station, target)
+        if network:
+            hop = HopSpec(DoorKind.MQTT, network, router)
+        if hop is None:
+            continue
+        for net_id, octets in net_ids_of(target, loose):
+            yield RouteSpec(
+                name=target.name,
+                net_id=net_id,
+                hop=hop,
+                octets=octets,
+                router=router,
+                is_derived=True,
+            )

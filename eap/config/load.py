@@ -9,11 +9,13 @@ import msgspec
 
 from eap.aoe.spec import DirectoryStation, RoutingSpec
 from eap.config.bus import DescribeBus
+from eap.config.check_access import check_access
 from eap.config.check_buses import describe_buses
 from eap.config.check_links import check_links
 from eap.config.check_polls import check_polls
 from eap.config.check_ports import check_ports
 from eap.config.check_publish import check_publish
+from eap.config.check_routes import check_routes
 from eap.config.check_subscribe import check_subscribe
 from eap.config.check_variables import check_variables
 from eap.config.convert import convert
@@ -62,12 +64,14 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     check_subscribe(index, report)
     check_polls(index, report)
     check_links(index, report)
+    check_routes(index, report, path.parent)
+    check_access(index, report, path.parent)
     if findings := report.findings():
         return LoadResult(None, findings)
     plant = Plant(
         plant_file.plant,
         derive(index, path.parent),
-        derive_routing(index),
+        derive_routing(index, path.parent),
         derive_directory(index),
     )
     return LoadResult(plant, (), report.lines)

@@ -20,6 +20,8 @@ DeviceCycle = Annotated[int, Meta(ge=100, le=60_000_000)]
 Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
 MAX_BITS = 8 * 0xFFFF
 """Of the largest variable."""
+MAX_PATIENCE_MS = 600_000
+"""How long an answer may take at most."""
 BitOffset = Annotated[int, Meta(ge=0, le=MAX_BITS - 1)]
 Plain: TypeAlias = bool | int | float | str | list[bool | int | float]
 
@@ -29,8 +31,6 @@ class Section(msgspec.Struct, frozen=True, kw_only=True):
 
     at: str = ""
 
-    LATER: ClassVar[dict[str, str]] = {}
-    """Keys of later versions, and what they are for."""
     SHORT: ClassVar[str] = ""
     """The key that a bare text in place of the section stands for."""
 
@@ -158,6 +158,81 @@ class Link(Section, frozen=True):
     swap: bool = False
 
 
+class Tls(Section, frozen=True):
+    """How a connection is kept secret; files by their paths from the plant file on."""
+
+    ca: str = ""
+    certificate: str = ""
+    key: str = ""
+    check_name: bool = True
+
+
+class Route(Section, frozen=True):
+    """A route of a station, or with *mqtt* a broker by which it reaches others."""
+
+    to: str = ""
+    via: str = ""
+    port: str = ""
+    ams_tcp: str = ""
+    net_id: str = ""
+    octets: Annotated[int, Meta(ge=4, le=6)] | None = None
+    virtual: str = ""
+    unidirectional: bool = False
+    timeout_ms: Annotated[int, Meta(ge=0, le=MAX_PATIENCE_MS)] = 0
+    probe: bool = True
+    mqtt: str = ""
+    network: str = ""
+    user: str = ""
+    password_file: str = ""
+    tls: Tls | None = None
+    client_id: str = ""
+    no_retain: bool = False
+    qos: Annotated[int, Meta(ge=0, le=2)] = 0
+    prefix: bool = False
+
+    ROUTE_KEYS: ClassVar[tuple[str, ...]] = (
+        "to",
+        "via",
+        "port",
+        "ams_tcp",
+        "net_id",
+        "octets",
+        "virtual",
+        "timeout_ms",
+        "probe",
+    )
+    MQTT_KEYS: ClassVar[tuple[str, ...]] = (
+        "network",
+        "user",
+        "password_file",
+        "tls",
+        "client_id",
+        "no_retain",
+        "qos",
+        "prefix",
+    )
+
+
+class Access(Section, frozen=True):
+    """A rule: who may do what, or may not."""
+
+    name: str = ""
+    allow: tuple[str, ...] = ()
+    deny: tuple[str, ...] = ()
+    networks: tuple[str, ...] = msgspec.field(name="from", default=())
+    net_ids: tuple[str, ...] = ()
+    doors: tuple[str, ...] = ()
+    to: tuple[str, ...] = ()
+    objects: tuple[str, ...] = ()
+
+
+class User(Section, frozen=True):
+    """Who may add routes from elsewhere."""
+
+    name: str
+    password_file: str
+
+
 class Station(Section, frozen=True):
     """A router with its ports, and what the station sends and receives."""
 
@@ -172,11 +247,10 @@ class Station(Section, frozen=True):
     publish: tuple[Publish, ...] = ()
     subscribe: tuple[Subscribe, ...] = ()
     links: tuple[Link, ...] = ()
-
-    LATER: ClassVar[dict[str, str]] = {
-        "routes": "routes of the AoE router",
-        "access": "access rules",
-    }
+    routes: tuple[Route, ...] = ()
+    learn: bool = True
+    access: tuple[Access, ...] = ()
+    users: tuple[User, ...] = ()
 
 
 class Defaults(Section, frozen=True):

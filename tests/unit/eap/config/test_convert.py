@@ -36,8 +36,6 @@ from eap.config.finding import Report
         ("variables: {a: REAL, b: UDINT}", "variables: [a, b]", "21: variables is a list; a map"),
         ("variables: {a: REAL, b: UDINT}", "variables: {a: REAL, b: {}}", "21: b has no type; th"),
         ("variables: [speed, count]", "variables: speed", "15: variables is 'speed'; a list"),
-        ("    sources:", "    routes: []\n    sources:", "10: routes (routes of the AoE router)"),
-        ("    sources:", "    access: []\n    sources:", "10: access (access rules): this version"),
         ("plant: pair", "plant: pair\ny-note: 1", "2: unknown key 'y-note'; one of plant,"),
     ],
 )

@@ -2,7 +2,15 @@ from __future__ import annotations
 
 import pytest
 
-from eap.aoe.spec import DirectoryPort, DirectoryStation, DoorKind, HopSpec, RouteSpec
+from eap.aoe.spec import (
+    AccessRule,
+    AmsUser,
+    DirectoryPort,
+    DirectoryStation,
+    DoorKind,
+    HopSpec,
+    RouteSpec,
+)
 
 LEFT_PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
 BUS = "{name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}"
@@ -55,3 +63,55 @@ def test_the_directory_names_all_ports_and_slaves(plant):
             DirectoryPort("bus0", True, "127.0.9.1.3.1", "sim://line.yaml", {"valves": 1001}),
         ),
     )
+
+
+def routes(*items):
+    return LEFT_PORT, f"{LEFT_PORT}\n    routes: [{', '.join(items)}]"
+
+
+def test_a_route_that_is_written_stands_for_the_derived_ones(plant):
+    item = "{to: right, virtual: 9.9.9.9.1.1, unidirectional: true, timeout_ms: 50, probe: false}"
+    assert plant(routes(item)).routing["left"].routes == (
+        RouteSpec(
+            name="right",
+            net_id="127.0.9.2.1.1",
+            hop=HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980"),
+            router="127.0.9.2.1.1",
+            virtual="9.9.9.9.1.1",
+            is_unidirectional=True,
+            timeout_ms=50,
+            is_probed=False,
+        ),
+    )
+
+
+def test_what_is_written_comes_first_and_a_router_that_nobody_knows_is_not_asked(plant):
+    found = plant(routes("{to: default, via: 127.0.9.77}")).routing["left"].routes
+    assert [(route.name, route.octets, route.is_derived) for route in found] == [
+        ("default", 0, False),
+        ("right", 4, True),
+    ]
+    assert not found[0].is_probed
+
+
+def test_stations_that_share_but_a_network_reach_each_other_by_its_broker(plant):
+    broker = "    routes: [{mqtt: mqtt://b, network: n}]"
+    right = '"udp://127.0.9.2", net_id: 127.0.9.2.2.1}'
+    told = plant(
+        ("to: 127.0.9.2}", "to: 239.1.1.1}"),
+        (LEFT_PORT, LEFT_PORT.replace("udp://127.0.9.1", "udp://10.0.0.1") + f"\n{broker}"),
+        (right, f"{right}\n{broker}"),
+    ).routing["left"]
+    assert [route.hop for route in told.routes] == [HopSpec(DoorKind.MQTT, "n", "127.0.9.2.1.1")]
+    assert [each.host for each in told.mqtt] == ["b"]
+
+
+def test_rules_users_and_learning_are_told(plant, tmp_path):
+    more = """
+    access: [{name: a, allow: [all]}]
+    learn: false
+    users: [{name: me, password_file: line.yaml}]"""
+    told = plant((LEFT_PORT, LEFT_PORT + more)).routing["left"]
+    assert told.access == (AccessRule("a"),)
+    assert told.users == (AmsUser("me", str(tmp_path / "line.yaml")),)
+    assert not told.learn

@@ -1,0 +1,149 @@
+"""Checks of routes: where they lead, and which NetIDs two of them claim."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from eap.aoe.spec import DEFAULT_TARGET
+from eap.config.check_brokers import check_brokers
+from eap.config.finding import Report, near, one_of
+from eap.config.index import Index
+from eap.config.reach import COMMON, WHOLE, prefixes, reach, without_prefix
+from eap.config.routes import MQTT, MisfitError, next_hop, target_of
+from eap.config.structs import Route, Station
+from eap.ids import NetId
+
+_OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four numbers"
+
+
+def check_routes(index: Index, report: Report, folder: Path) -> None:
+    """Report every route and broker that cannot be as it is; files are in *folder*."""
+    loose = without_prefix(index)
+    for station in index.plant.stations:
+        claimed: dict[tuple[bytes, int], Route] = {}
+        for route in station.routes:
+            _check_keys(route, report)
+            if not route.mqtt:
+                _check_route(index, station, route, report)
+                _check_claims(index, (station, route), claimed, loose, report)
+    check_brokers(index, report, folder)
+
+
+def _check_keys(route: Route, report: Report) -> None:
+    """Report keys of routes at brokers, and the other way round."""
+    if f"{route.at}.mqtt" in report.lines:
+        what, others, expected = "a broker", Route.ROUTE_KEYS, Route.MQTT_KEYS
+    else:
+        what, others, expected = "a route without mqtt", Route.MQTT_KEYS, Route.ROUTE_KEYS
+    for key in others:
+        if f"{route.at}.{key}" in report.lines:
+            report.add(f"{route.at}.{key}", f"{key} does not belong to {what}", one_of(expected))
+    if not route.to and not route.mqtt:
+        report.add(route.at, "route has neither to nor mqtt", "to: STATION, or mqtt: URL")
+
+
+def _check_route(index: Index, station: Station, route: Route, report: Report) -> None:
+    if route.to == station.name:
+        report.add(f"{route.at}.to", f"route of {station.name} to itself", "another station")
+        return
+    if not route.to or route.to in report.broken:
+        return
+    _check_net_id(index, route, report)
+    if not (route.via or route.ams_tcp or route.net_id or _is_known(index, route)):
+        return  # told already, and what it leads to would say how
+    try:
+        next_hop(index, station, route)
+    except MisfitError as exc:
+        path = f"{route.at}.{exc.key}" if exc.key else route.at
+        report.add(path, str(exc), exc.expected)
+    except ValueError:
+        pass  # a NetID or an interface that is a finding of its own
+
+
+def _check_net_id(index: Index, route: Route, report: Report) -> None:
+    is_default, known = route.to == DEFAULT_TARGET, _is_known(index, route)
+    path = f"{route.at}.net_id"
+    names_router = is_default and route.via.startswith(MQTT)  # the one that takes the rest
+    if known and route.net_id and not names_router:
+        what = "a default route" if is_default else f"{route.to} is a station of this plant, it"
+        report.add(path, f"{what} needs no net_id", "none")
+    elif not known and not route.net_id:
+        hint = near(route.to, index.stations)
+        message = f"no station {route.to!r} in this plant{hint}, and no net_id"
+        report.add(f"{route.at}.to", message, "a station, default, or a net_id of who is meant")
+    if known and route.octets is not None:
+        report.add(f"{route.at}.octets", f"octets of the route to {route.to!r}", "it with a net_id")
+    if is_default and route.virtual:
+        report.add(f"{route.at}.virtual", "a default route has no virtual NetID", "none")
+    for key, text in (("net_id", route.net_id), ("virtual", route.virtual)):
+        if text and not _is_usable(text):
+            message = f"{key}: {text!r} is not an AMS NetID of a station"
+            report.add(f"{route.at}.{key}", message, "six numbers such as 5.23.91.23.1.1")
+
+
+def _is_known(index: Index, route: Route) -> bool:
+    return route.to == DEFAULT_TARGET or target_of(index, route) is not None
+
+
+def _is_usable(text: str) -> bool:
+    try:
+        return any(NetId.parse(text))
+    except ValueError:
+        return False
+
+
+def _check_claims(
+    index: Index,
+    sent: tuple[Station, Route],
+    claimed: dict[tuple[bytes, int], Route],
+    loose: set[str],
+    report: Report,
+) -> None:
+    """Report NetIDs that belong to somebody else, or to another route of the station."""
+    station, route = sent
+    try:
+        claims = reach(index, route, "", loose)
+        if route.virtual and route.to != DEFAULT_TARGET:
+            claims = [(route.virtual, octets) for _, octets in claims]
+        keys = [(NetId.parse(net_id)[:octets], octets) for net_id, octets in claims]
+    except ValueError:
+        return  # a finding of its own
+    for key in keys:
+        if key in claimed:
+            _report_doubled(claimed[key], route, report)
+            return
+        claimed[key] = route
+    if route.to != DEFAULT_TARGET and (route.virtual or target_of(index, route) is None):
+        where = f"{route.at}.{'virtual' if route.virtual else 'net_id'}"
+        _check_owners(index, station, where, keys, report)
+
+
+def _report_doubled(first: Route, route: Route, report: Report) -> None:
+    line = report.line_of(first.at)
+    if first.to == route.to:
+        report.add(route.at, f"a second route to {route.to!r} (first in line {line})", "one")
+        return
+    key = "virtual" if route.virtual else "net_id"
+    message = f"the route to {first.to!r} (line {line}) is for the same NetIDs"
+    report.add(f"{route.at}.{key}", message, "other NetIDs, or octets: 5 or 6 on both")
+
+
+def _check_owners(
+    index: Index, station: Station, path: str, keys: list[tuple[bytes, int]], report: Report
+) -> None:
+    for prefix, octets in keys:
+        for owner in index.plant.stations:
+            texts = [owner.net_id, *(port.net_id for port in owner.ports)]
+            is_taken = any(_begins(text, prefix) for text in texts)
+            if is_taken or (octets == COMMON and prefix in prefixes(owner)):
+                whose = "this station" if owner is station else f"station {owner.name}"
+                shown = ".".join(map(str, prefix)) + ".x" * (WHOLE - octets)
+                report.add(path, f"NetID {shown} is one of {whose}", _OTHER_NET_ID)
+                return
+
+
+def _begins(text: str, prefix: bytes) -> bool:
+    try:
+        return NetId.parse(text).startswith(prefix)
+    except ValueError:
+        return False

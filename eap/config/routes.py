@@ -1,0 +1,217 @@
+"""Routes of a plant file: from what people write to door, address and next router."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+from typing import NamedTuple
+
+from eap.aoe.spec import DEFAULT_TARGET, DoorKind, HopSpec
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ethercat import EAP_PORT
+from eap.config.brokers import brokers_of, find_network
+from eap.config.finding import near, one_of
+from eap.config.hosts import HOST, parse_host
+from eap.config.index import Index
+from eap.config.neighbours import find_hop
+from eap.config.structs import Route, Station
+from eap.ids import Destination, DestinationKind, InterfaceUri, NetId
+from eap.pd.spec import PortKind
+
+VIA = "STATION/PORT, mqtt:NETWORK, an IPv4 address, tcp:// and one, a MAC address or a NetID"
+MQTT = "mqtt:"
+"""Begin of a ``via`` that names a network."""
+_SCHEMES = {
+    DestinationKind.IP: ("udp",),
+    DestinationKind.TCP: ("tcp", "udp"),
+    DestinationKind.MAC: ("ethernet",),
+    DestinationKind.NET_ID: ("ethernet",),
+}
+_KINDS = {
+    DestinationKind.IP: DoorKind.UDP,
+    DestinationKind.TCP: DoorKind.TCP,
+    DestinationKind.MAC: DoorKind.ETHERNET,
+    DestinationKind.NET_ID: DoorKind.ETHERNET,
+}
+
+
+class MisfitError(ValueError):
+    """A key of a section cannot be what it is.
+
+    Attributes:
+        key: Which one.
+        expected: What it could be.
+    """
+
+    def __init__(self, key: str, message: str, expected: str) -> None:
+        super().__init__(message)
+        self.key = key
+        self.expected = expected
+
+
+class NextHop(NamedTuple):
+    """Where a route leads first, and the NetID of the router there, empty if it is not known."""
+
+    hop: HopSpec
+    router: str
+
+
+def target_of(index: Index, route: Route) -> Station | None:
+    """Return the station of the plant that *route* leads to, None for anything else."""
+    return None if route.to == DEFAULT_TARGET else index.stations.get(route.to)
+
+
+def next_hop(index: Index, station: Station, route: Route) -> NextHop:
+    """Return where *route* of *station* leads first.
+
+    Raises:
+        MisfitError: there is no such way.
+    """
+    if route.ams_tcp and route.via:
+        raise MisfitError("via", f"route {route.to!r} has via and ams_tcp", "one of the two")
+    if route.port and (route.ams_tcp or route.via.startswith(MQTT)):
+        message = f"route {route.to!r} leaves by no port of its own"
+        raise MisfitError("port", message, "port only for type 5 (via an address or STATION/PORT)")
+    if route.ams_tcp:
+        return _by_ams_tcp(index, station, route)
+    if route.via.startswith(MQTT):
+        return _by_mqtt(index, station, route)
+    _check_own_port(index, station, route)
+    if not route.via:
+        return _direct(index, station, route)
+    if "/" in route.via and "://" not in route.via:
+        return _by_station(index, station, route)
+    return _by_address(index, station, route)
+
+
+def _check_own_port(index: Index, station: Station, route: Route) -> None:
+    if route.port and index.eap_port(station, route.port) is None:
+        names = [port.name for port in station.ports if port.kind is PortKind.EAP]
+        message = f"station {station.name} has no EAP port {route.port!r}{near(route.port, names)}"
+        raise MisfitError("port", message, one_of(names))
+
+
+def _direct(index: Index, station: Station, route: Route) -> NextHop:
+    target = target_of(index, route)
+    if target is None:
+        raise MisfitError("", f"route {route.to!r} has no via and no ams_tcp", f"via: {VIA}")
+    hop = find_hop(index, station, target, own=route.port)
+    if hop is None:
+        message = f"{station.name} and {target.name} share no interface"
+        raise MisfitError("to", message, "via: a station between them, or ams_tcp:")
+    return NextHop(hop, _net_id(target))
+
+
+def _other_port(index: Index, station: Station, text: str, key: str) -> tuple[Station, str]:
+    """Return the station and the port that ``STATION/PORT`` names."""
+    name, _, port = text.partition("/")
+    other = index.stations.get(name)
+    if other is None:
+        hint = near(name, index.stations)
+        raise MisfitError(key, f"no station {name!r} in this plant{hint}", one_of(index.stations))
+    if other is station:
+        raise MisfitError(key, f"{text} is of station {name} itself", "a port of another station")
+    if index.eap_port(other, port) is None:
+        names = [f"{name}/{each.name}" for each in other.ports if each.kind is PortKind.EAP]
+        raise MisfitError(key, f"station {name} has no EAP port {port!r}", one_of(names))
+    return other, port
+
+
+def _by_station(index: Index, station: Station, route: Route) -> NextHop:
+    other, port = _other_port(index, station, route.via, "via")
+    hop = find_hop(index, station, other, own=route.port, other=port)
+    if hop is None:
+        own = f"port {route.port}" if route.port else "any port"
+        message = f"{route.via} cannot be reached from {own} of {station.name}"
+        raise MisfitError("via", message, "ports that are both of IP, or both of Ethernet")
+    return NextHop(hop, _net_id(other))
+
+
+def _by_ams_tcp(index: Index, station: Station, route: Route) -> NextHop:
+    if "/" in route.ams_tcp:
+        other, port = _other_port(index, station, route.ams_tcp, "ams_tcp")
+        uri = index.uris.get((other.name, port))
+        if uri is None or uri.scheme not in {"udp", "tcp"} or not index.ports[other.name, port].ams:
+            message = f"{route.ams_tcp} does not serve AMS/TCP"
+            raise MisfitError("ams_tcp", message, "a port on udp:// or tcp:// without ams: false")
+        return NextHop(_ams_tcp(uri.host, AMS_TCP_PORT), _net_id(other))
+    try:
+        host, number = parse_host(route.ams_tcp, AMS_TCP_PORT)
+    except ValueError as exc:
+        raise MisfitError("ams_tcp", f"ams_tcp: {exc}", f"{HOST}, or STATION/PORT") from None
+    target = target_of(index, route)
+    return NextHop(_ams_tcp(host, number), _net_id(target) if target else "")
+
+
+def _ams_tcp(host: str, port: int) -> HopSpec:
+    return HopSpec(DoorKind.AMS_TCP, "", f"{host}:{port}")
+
+
+def _by_mqtt(index: Index, station: Station, route: Route) -> NextHop:
+    """``mqtt:NETWORK``: to the target itself; ``mqtt:NETWORK/STATION``: to who passes it on."""
+    network, _, name = route.via.removeprefix(MQTT).partition("/")
+    if find_network(station, network) is None:
+        known = [f"{MQTT}{each.network}" for each in brokers_of(station)]
+        message = f"station {station.name} is in no MQTT network {network!r}"
+        raise MisfitError("via", message, one_of(known))
+    other = index.stations.get(name) if name else target_of(index, route)
+    if name and other is None:
+        hint = near(name, index.stations)
+        raise MisfitError("via", f"no station {name!r} in this plant{hint}", one_of(index.stations))
+    if other is not None and find_network(other, network) is None:
+        message = f"station {other.name} is in no MQTT network {network!r}"
+        raise MisfitError("via", message, "a network that both are in")
+    router = _net_id(other) if other is not None else _foreign_router(route)
+    return NextHop(HopSpec(DoorKind.MQTT, network, router), router)
+
+
+def _foreign_router(route: Route) -> str:
+    try:
+        return str(NetId.parse(route.net_id))
+    except ValueError:
+        message = f"route {route.to!r} does not say which router of the network takes it"
+        raise MisfitError("via", message, "mqtt:NETWORK/STATION, or a net_id") from None
+
+
+def _by_address(index: Index, station: Station, route: Route) -> NextHop:
+    try:
+        destination = Destination.parse(route.via)
+    except ValueError as exc:
+        raise MisfitError("via", f"via: {exc}", VIA) from None
+    if destination.is_group:
+        raise MisfitError("via", f"{route.via} is a group", "the address of one station")
+    schemes = _SCHEMES[destination.kind]
+    ports = {
+        port.name: uri
+        for port in station.ports
+        if index.eap_port(station, port.name) is port and route.port in {"", port.name}
+        if (uri := index.uris.get((station.name, port.name))) and uri.scheme in schemes
+    }
+    if not ports:
+        own = f"port {route.port}" if route.port else f"station {station.name}"
+        message = f"{route.via} cannot be reached from {own}"
+        raise MisfitError("via", message, f"a port on {' or '.join(schemes)}://")
+    port = _nearest(ports, destination, route)
+    target = target_of(index, route)
+    address = destination.host
+    if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
+        address += f":{destination.port or EAP_PORT}"
+    hop = HopSpec(_KINDS[destination.kind], port, address)
+    return NextHop(hop, _net_id(target) if target else "")
+
+
+def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: Route) -> str:
+    """Return the port whose network *destination* is in."""
+    if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
+        there = int(IPv4Address(destination.host))
+        return min(ports, key=lambda name: int(IPv4Address(ports[name].host)) ^ there)
+    if len(ports) > 1:
+        message = f"route {route.to!r} does not say by which Ethernet interface"
+        raise MisfitError("port", message, one_of(ports))
+    return next(iter(ports))
+
+
+def _net_id(station: Station) -> str:
+    try:
+        return str(NetId.parse(station.net_id))
+    except ValueError:
+        return ""  # a finding of its own

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import pytest
+
+from eap.aoe.spec import DoorKind, HopSpec
+from eap.config.routes import MisfitError, next_hop, target_of
+from eap.config.structs import Route
+
+RIGHT = "127.0.9.2.1.1"
+LEFT_PORT = '- {name: eap0, kind: eap, interface: "udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+RIGHT_PORT = '- {name: eap0, kind: eap, interface: "udp://127.0.9.2", net_id: 127.0.9.2.2.1}'
+MORE = (
+    LEFT_PORT,
+    (
+        f"{LEFT_PORT}\n"
+        '      - {name: eth0, kind: eap, interface: "ethernet://eth0", net_id: 127.0.9.1.4.1}\n'
+        '      - {name: far, kind: eap, interface: "udp://10.0.0.1", net_id: 127.0.9.1.5.1}\n'
+        '      - {name: bus0, kind: bus, interface: "ethernet://eth9", net_id: 127.0.9.1.3.1}\n'
+        "    routes: [{mqtt: mqtt://a, network: plant}, {mqtt: mqtt://b, network: alone}]"
+    ),
+)
+THEIRS = RIGHT_PORT, f"{RIGHT_PORT}\n    routes: [{{mqtt: mqtt://a, network: plant}}]"
+
+
+@pytest.fixture
+def follow(index):
+    """Return the next hop of a route of the left station."""
+
+    def of(route):
+        plant = index(MORE, THEIRS)
+        return next_hop(plant, plant.stations["left"], route)
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("route", "hop", "router"),
+    [
+        (Route(to="right"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="right", port="eap0"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="x", via="right/eap0"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="x", via="10.0.0.9"), (DoorKind.UDP, "far", "10.0.0.9:34980"), ""),
+        (Route(to="x", via="10.0.0.9:1"), (DoorKind.UDP, "far", "10.0.0.9:1"), ""),
+        (Route(to="x", via="10.0.0.9", port="eap0"), (DoorKind.UDP, "eap0", "10.0.0.9:34980"), ""),
+        (Route(to="x", via="tcp://127.0.0.9"), (DoorKind.TCP, "eap0", "127.0.0.9:34980"), ""),
+        (Route(to="x", via="02-00-00-00-00-0A"), (DoorKind.ETHERNET, "eth0", "02:00:00:00:00:0a"),
+         ""),
+        (Route(to="x", via="5.1.2.3.1.1"), (DoorKind.ETHERNET, "eth0", "5.1.2.3.1.1"), ""),
+        (Route(to="right", via="127.0.9.2"), (DoorKind.UDP, "eap0", "127.0.9.2:34980"), RIGHT),
+        (Route(to="x", ams_tcp="plc"), (DoorKind.AMS_TCP, "", "plc:48898"), ""),
+        (Route(to="right", ams_tcp="h:1"), (DoorKind.AMS_TCP, "", "h:1"), RIGHT),
+        (Route(to="x", ams_tcp="right/eap0"), (DoorKind.AMS_TCP, "", "127.0.9.2:48898"), RIGHT),
+        (Route(to="right", via="mqtt:plant"), (DoorKind.MQTT, "plant", RIGHT), RIGHT),
+        (Route(to="default", via="mqtt:plant/right"), (DoorKind.MQTT, "plant", RIGHT), RIGHT),
+        (Route(to="x", net_id="5.1.2.3.1.1", via="mqtt:alone"),
+         (DoorKind.MQTT, "alone", "5.1.2.3.1.1"), "5.1.2.3.1.1"),
+    ],
+)  # fmt: skip
+def test_a_route_leads_to_its_next_hop(follow, route, hop, router):
+    assert follow(route) == (HopSpec(*hop), router)
+
+
+@pytest.mark.parametrize(
+    ("route", "key", "message"),
+    [
+        (Route(to="x"), "", "route 'x' has no via and no ams_tcp"),
+        (Route(to="right", port="far"), "to", "left and right share no interface"),
+        (Route(to="x", via="a/b", ams_tcp="h"), "via", "route 'x' has via and ams_tcp"),
+        (Route(to="x", ams_tcp="h", port="eap0"), "port", "route 'x' leaves by no port of its own"),
+        (Route(to="x", via="mqtt:plant", port="eap0"), "port", "route 'x' leaves by no port of it"),
+        (
+            Route(to="x", via="1.1.1.1", port="eap9"),
+            "port",
+            "station left has no EAP port 'eap9', ",
+        ),
+        (Route(to="x", via="1.1.1.1", port="bus0"), "port", "station left has no EAP port 'bus0'"),
+        (Route(to="x", via="1.1.1.1", port="eth0"), "via", "1.1.1.1 cannot be reached from port e"),
+        (Route(to="x", via="rigth/eap0"), "via", "no station 'rigth' in this plant, did you mean"),
+        (Route(to="x", via="left/eap0"), "via", "left/eap0 is of station left itself"),
+        (Route(to="x", via="right/eap7"), "via", "station right has no EAP port 'eap7'"),
+        (Route(to="x", via="right/eap0", port="eth0"), "via", "right/eap0 cannot be reached from "),
+        (Route(to="x", via="right/eap0", port="far"), "via", "right/eap0 cannot be reached from p"),
+        (Route(to="x", via="what"), "via", "via: 'what' is not an IPv4 address"),
+        (Route(to="x", via="239.1.1.1"), "via", "239.1.1.1 is a group"),
+        (Route(to="x", ams_tcp="1.2.3"), "ams_tcp", "ams_tcp: '1.2.3' is not the IPv4 address"),
+        (Route(to="x", ams_tcp="right/no"), "ams_tcp", "station right has no EAP port 'no'"),
+        (Route(to="x", via="mqtt:what"), "via", "station left is in no MQTT network 'what'"),
+        (Route(to="x", via="mqtt:plant/who"), "via", "no station 'who' in this plant"),
+        (Route(to="right", via="mqtt:alone"), "via", "station right is in no MQTT network 'alone'"),
+        (Route(to="default", via="mqtt:plant"), "via", "route 'default' does not say which router"),
+    ],
+)
+def test_a_way_that_there_is_not_says_why(follow, route, key, message):
+    with pytest.raises(MisfitError) as caught:
+        follow(route)
+    assert caught.value.key == key
+    assert str(caught.value).startswith(message)
+
+
+def test_ams_tcp_is_where_a_port_serves_it(index):
+    plant = index((RIGHT_PORT, RIGHT_PORT.replace("}", ", ams: false}")))
+    with pytest.raises(MisfitError, match="right/eap0 does not serve AMS/TCP"):
+        next_hop(plant, plant.stations["left"], Route(to="x", ams_tcp="right/eap0"))
+
+
+def test_of_several_ethernet_interfaces_one_has_to_be_named(index):
+    ports = LEFT_PORT.replace("udp://127.0.9.1", "ethernet://a")
+    ports += (
+        f"\n      {ports}".replace("eap0", "eap1").replace("//a", "//b").replace("2.1}", "9.1}")
+    )
+    plant = index((LEFT_PORT, ports))
+    with pytest.raises(MisfitError, match="does not say by which Ethernet interface"):
+        next_hop(plant, plant.stations["left"], Route(to="x", via="5.1.2.3.1.1"))
+
+
+def test_a_default_route_leads_to_no_station(index):
+    plant = index(("name: right", "name: default"))
+    assert target_of(plant, Route(to="default")) is None
+    assert target_of(plant, Route(to="left")) is plant.stations["left"]

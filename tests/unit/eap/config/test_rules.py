@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import pytest
+
+from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
+from eap.config.routes import MisfitError
+from eap.config.rules import (
+    access_rules,
+    parse_network,
+    parse_objects,
+    parse_services,
+    parse_source,
+    parse_target,
+)
+
+LEFT_PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+BUS = "- {name: bus0, kind: bus, interface: sim://line.yaml, net_id: 127.0.9.1.3.1}"
+OPEN_BUS = '- {name: bus1, kind: bus, interface: "ethernet://eth9", net_id: 127.0.9.1.4.1}'
+
+
+@pytest.fixture
+def plant(index):
+    return index((LEFT_PORT, f"{LEFT_PORT}\n      {BUS}\n      {OPEN_BUS}"))
+
+
+def test_a_rule_says_what_its_texts_stand_for(index):
+    access = (
+        "access: [{deny: [write], from: [10.0.0.7/24], net_ids: [left], doors: [mqtt],"
+        " to: [5.1.2.3:851], objects: [0x6000-0x6FFF]}, {name: rest, allow: [all]}]"
+    )
+    plant = index((LEFT_PORT, f"{LEFT_PORT}\n    {access}"))
+    writes = AccessService.WRITE, AccessService.CONTROL, AccessService.FILES, AccessService.RAW
+    assert list(access_rules(plant, plant.stations["left"], set())) == [
+        AccessRule(
+            "1",
+            allow=False,
+            networks=("10.0.0.0/24",),
+            net_ids=("127.0.9.1",),
+            doors=("mqtt",),
+            targets=(AccessTarget("5.1.2.3", 851),),
+            services=writes,
+            objects=(ObjectRange(0x6000, 0x6FFF),),
+        ),
+        AccessRule("rest"),
+    ]
+
+
+def test_write_is_all_that_is_no_reading():
+    assert AccessService.READ not in parse_services(("write",))
+    assert parse_services(("read", "files", "read")) == (AccessService.READ, AccessService.FILES)
+    assert len(parse_services(("read", "write"))) == len(AccessService)
+    assert parse_services(("read", "all")) == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "targets"),
+    [
+        ("left", [("127.0.9.1", None)]),
+        ("left:10000", [("127.0.9.1", 10000)]),
+        ("left/eap0", [("127.0.9.1.2.1", None)]),
+        ("left/eap0:65535", [("127.0.9.1.2.1", 65535)]),
+        ("left/bus0/valves", [("127.0.9.1.3.1", 1001)]),
+        ("left/bus0/1001", [("127.0.9.1.3.1", 1001)]),
+        ("left/bus1/1007", [("127.0.9.1.4.1", 1007)]),
+        ("5.1.2.3", [("5.1.2.3", None)]),
+        ("5.1.2.3.4.5:1", [("5.1.2.3.4.5", 1)]),
+    ],
+)
+def test_a_target_is_named_or_numbered(plant, text, targets):
+    assert parse_target(plant, text, set()) == [AccessTarget(*each) for each in targets]
+
+
+def test_a_station_without_a_prefix_is_all_its_net_ids(plant):
+    found = parse_target(plant, "left", {"left"})
+    assert [each.net_id for each in found] == [
+        "127.0.9.1.1.1",
+        "127.0.9.1.2.1",
+        "127.0.9.1.3.1",
+        "127.0.9.1.4.1",
+    ]
+    assert parse_source(plant, "left", {"left"}) == [each.net_id for each in found]
+    assert parse_source(plant, "5.1.2.3.9", {"left"}) == ["5.1.2.3.9"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lefd", "no station 'lefd' in this plant, did you mean 'left'?"),
+        ("left/bus", "station left has no port 'bus', did you mean 'bus1'?"),
+        ("left/eap0/1001", "left/eap0 has no slaves"),
+        ("left/bus0/valve", "bus left/bus0 has no slave 'valve', did you mean 'valves'?"),
+        ("left/bus0/1002", "bus left/bus0 has no slave '1002'"),
+        ("left:65536", "'65536' is no AMS port"),
+        ("left:x", "'x' is no AMS port"),
+        ("5.1.2", "'5.1.2' is no NetID, nor the first numbers of one"),
+        ("5.1.2.256", "'5.1.2.256' is no NetID"),
+        ("5.1.2.3.4.5.6", "'5.1.2.3.4.5.6' is no NetID"),
+    ],
+)
+def test_a_target_that_there_is_not_says_so(plant, text, message):
+    with pytest.raises(MisfitError) as caught:
+        parse_target(plant, text, set())
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("text", "objects"),
+    [
+        ("0x6040", (0x6040, 0x6040)),
+        ("24640", (0x6040, 0x6040)),
+        ("0x8000:1", (0x8000, 0x8000, 1, 1)),
+        ("0x8000:0xFF", (0x8000, 0x8000, 0xFF, 0xFF)),
+        ("0x6000-0x6FFF", (0x6000, 0x6FFF)),
+    ],
+)
+def test_objects_are_one_or_many(text, objects):
+    assert parse_objects(text) == ObjectRange(*objects)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "'' names no objects"),
+        ("6040h", "'6040h' names no objects"),
+        ("65536", "'65536' names no objects"),
+        ("0x8000:256", "'0x8000:256' names no objects"),
+        ("0x6000-0x5000", "'0x6000-0x5000' ends before it begins"),
+    ],
+)
+def test_what_names_no_objects_says_so(text, message):
+    with pytest.raises(MisfitError, match=message):
+        parse_objects(text)
+
+
+def test_a_network_is_one_of_ipv4():
+    assert parse_network("10.0.0.5") == "10.0.0.5/32"
+    assert parse_network("10.1.2.3/8") == "10.0.0.0/8"
+    with pytest.raises(MisfitError, match=r"'10\.0\.0\.0/33' is no IPv4 network"):
+        parse_network("10.0.0.0/33")
+
+
+def test_access_that_there_is_not_is_told():
+    with pytest.raises(MisfitError, match=r"no access is called 'wirte', did you mean 'write'\?"):
+        parse_services(("wirte",))
