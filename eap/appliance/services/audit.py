@@ -1,0 +1,234 @@
+"""The audit: who had what changed, and what was refused, one JSON object a line.
+
+Rule 1: a line is in the file before its client has its answer, so a kill loses the request in hand.
+Rule 2: who floods is told of by numbers, and others' lines are written all the same.
+Rule 3: the file never has more than a few megabytes more than it may; the oldest goes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import logging
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from time import monotonic, time
+from typing import Any, TypeAlias
+
+import msgspec
+
+from eap.aoe.access import place_of
+from eap.aoe.ads_operation import Operation, WriteControl
+from eap.aoe.directory import Directory
+from eap.aoe.judged import AuditedOperation, AuditEntry
+from eap.aoe.way import Way
+from eap.codec.ads import AdsError, IndexGroup
+from eap.od.abort import entry_name
+
+MAX_OCTETS = 8 << 20
+"""Of the file before it is put aside."""
+KEPT = 4
+"""Older files."""
+BURST = 500
+"""Lines that a client may cause at once, and a tenth of it in each second for long."""
+DOOR_BURST = 5000
+"""Likewise, of all clients of a door, whose addresses may be made up."""
+_MAX_CLIENTS = 1024
+_PLAIN = 8
+"""Octets of a value that is written as it is; of longer ones there is a digest."""
+_TELL_AFTER_S = 1.0
+
+_Client: TypeAlias = tuple[str, str, str]
+"""Station, door, and address without its TCP port."""
+
+logger = logging.getLogger(__name__)
+
+
+class Allowance:
+    """How many lines somebody may still cause; *burst* at once.
+
+    Attributes:
+        skipped: Lines that were left out.
+    """
+
+    def __init__(self, burst: int, now: float) -> None:
+        self.skipped = 0
+        self._burst = burst
+        self._left = float(burst)
+        self._at = now
+
+    def take(self, now: float) -> bool:
+        """Say whether there is one more."""
+        self._left = min(self._burst, self._left + (now - self._at) * self._burst / 10)
+        self._at = now
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class Audit:
+    """The audit of a plant's stations on this host.
+
+    Args:
+        path: Of the file; older ones lie beside it, with ``.1`` and so on behind their names.
+        directory: Names of targets.
+        clock: In seconds, for rates.
+        now: Unix time in seconds.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        directory: Directory,
+        *,
+        clock: Callable[[], float] = monotonic,
+        now: Callable[[], float] = time,
+    ) -> None:
+        self.path = path
+        self._directory = directory
+        self._clock = clock
+        self._now = now
+        self._clients: OrderedDict[_Client, Allowance] = OrderedDict()
+        self._doors: dict[tuple[str, str], Allowance] = {}
+        self._is_failing = False
+
+    async def serve(self) -> None:
+        """Tell what was left out, until cancelled."""
+        while True:
+            await asyncio.sleep(_TELL_AFTER_S)
+            self.tell_skipped()
+
+    def write(self, station: str, entries: Iterable[AuditEntry]) -> None:
+        """Write down what a station did, or refused."""
+        lines = []
+        for entry in entries:
+            client = self._client(station, entry.way)
+            door = self._door(station, entry.way.door)
+            head = self._head(station, entry)
+            now = self._clock()
+            for each in entry.operations:
+                if client.take(now) and door.take(now):
+                    lines.append(head | _words(each))
+                else:
+                    client.skipped += 1
+        if lines:
+            self._append(lines)
+
+    def tell_skipped(self) -> None:
+        """Write how many lines were left out, for each client that had some."""
+        lines = []
+        for (station, door, address), allowance in self._clients.items():
+            if allowance.skipped:
+                head = {"time": self._time(), "station": station, "door": door, "from": address}
+                lines.append(head | {"skipped": allowance.skipped})
+                allowance.skipped = 0
+        if lines:
+            self._append(lines)
+
+    def _client(self, station: str, way: Way) -> Allowance:
+        key = station, way.door, way.connection.partition(":")[0]
+        client = self._clients.pop(key, None) or Allowance(BURST, self._clock())
+        if len(self._clients) >= _MAX_CLIENTS:
+            self.tell_skipped()
+            self._clients.popitem(last=False)
+        self._clients[key] = client
+        return client
+
+    def _door(self, station: str, name: str) -> Allowance:
+        if (station, name) not in self._doors:
+            self._doors[station, name] = Allowance(DOOR_BURST, self._clock())
+        return self._doors[station, name]
+
+    def _head(self, station: str, entry: AuditEntry) -> dict[str, Any]:
+        header = entry.header
+        return {
+            "time": self._time(),
+            "station": station,
+            "door": entry.way.door,
+            "from": entry.way.connection,
+            "source": f"{header.source}:{header.source_port}",
+            "target": f"{header.target}:{header.target_port}",
+            "name": self._directory.name_of(header.target, header.target_port),
+            "route": entry.route,
+        }
+
+    def _time(self) -> str:
+        return datetime.fromtimestamp(self._now(), UTC).isoformat(timespec="milliseconds")
+
+    def _append(self, lines: list[dict[str, Any]]) -> None:
+        data = b"".join(msgspec.json.encode(line) + b"\n" for line in lines)
+        try:
+            self._write(data)
+        except OSError as exc:
+            if not self._is_failing:
+                logger.warning("audit %s cannot be written: %s", self.path, exc.strerror)
+            self._is_failing = True
+        else:
+            self._is_failing = False
+
+    def _write(self, data: bytes) -> None:
+        """Append *data*; the file is opened each time, for it may have been moved away."""
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+        try:
+            fd = os.open(self.path, flags, 0o640)
+        except FileNotFoundError:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(self.path, flags, 0o640)
+        with os.fdopen(fd, "wb", buffering=0) as file:
+            file.write(data)
+            if os.fstat(fd).st_size >= MAX_OCTETS:
+                self._rotate(fd)
+
+    def _rotate(self, fd: int) -> None:
+        """Put the file aside, unless another appliance of the plant does just that."""
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
+        if os.fstat(fd).st_ino != self.path.stat().st_ino:
+            return
+        names = [self.path.with_name(f"{self.path.name}.{number}") for number in range(1, KEPT + 1)]
+        for older, newer in zip(reversed(names[1:]), reversed(names[:-1]), strict=True):
+            if newer.exists():
+                newer.replace(older)
+        self.path.replace(names[0])
+
+
+def _words(each: AuditedOperation) -> dict[str, Any]:
+    verdict, result = each.verdict, each.result
+    return dict(_what(each.operation)) | {
+        "service": verdict.service,
+        "allowed": verdict.is_allowed,
+        "why": verdict.why,
+        "result": result,
+        "error": "" if not result else AdsError.words_of(result),
+    }
+
+
+def _what(operation: Operation) -> Iterator[tuple[str, Any]]:
+    """Yield what was to be done."""
+    yield "operation", type(operation).__name__
+    group, offset = place_of(operation)
+    if group is not None:
+        yield "group", f"0x{group:X}"
+        yield "offset", f"0x{offset:X}"
+    if group == IndexGroup.SDO:
+        whole = " (complete access)" if offset & 0xFF00 else ""
+        yield "object", entry_name(offset >> 16, offset & 0xFF) + whole
+    if isinstance(operation, WriteControl):
+        yield "states", [operation.ads_state, operation.device_state]
+    data = getattr(operation, "data", None)
+    if data is None:
+        return
+    yield "length", len(data)
+    if group == IndexGroup.FOE_OPEN_WRITE:
+        yield "file", data.rstrip(b"\0").decode("latin-1")[:256]
+    elif len(data) <= _PLAIN:
+        yield "value", data.hex()
+    else:
+        yield "sha256", sha256(data).hexdigest()[:16]

@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eap.aoe.access import Verdict
+from eap.aoe.ads_operation import Operation, ReadWrite, Write, WriteControl
+from eap.aoe.directory import Directory
+from eap.aoe.judged import AuditedOperation, AuditEntry
+from eap.aoe.spec import AccessService, DirectoryPort, DirectoryStation
+from eap.aoe.way import Way
+from eap.appliance.services import audit as module
+from eap.appliance.services.audit import BURST, KEPT, Audit
+from eap.codec.ads import IndexGroup
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+
+LAPTOP = Way("ams-tcp", "10.0.0.5:49152")
+HEADER = AmsHeader(
+    NetId.parse("5.1.1.1.3.1"), 1001, NetId.parse("192.168.0.9.1.1"), 30000, 3, 4, invoke_id=1
+)
+NAMES = Directory(
+    [
+        DirectoryStation(
+            "island-01",
+            "5.1.1.1.1.1",
+            (DirectoryPort("bus0", True, "5.1.1.1.3.1", "sim://x", {"drive": 1001}),),
+        )
+    ]
+)
+WRITE = Write(IndexGroup.SDO, 0x8000_0001, b"\1\2\3\4")
+ALLOWED = Verdict(AccessService.WRITE, True, "rule drives allows it")
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def audit(tmp_path: Path, clock: Clock) -> Audit:
+    path = tmp_path / "plant" / "audit.jsonl"
+    return Audit(path, NAMES, clock=clock, now=lambda: 1_700_000_000.25)
+
+
+def entry(
+    operation: Operation = WRITE,
+    result: int | None = 0,
+    *,
+    verdict: Verdict = ALLOWED,
+    count: int = 1,
+    way: Way = LAPTOP,
+) -> AuditEntry:
+    return AuditEntry(way, HEADER, "", (AuditedOperation(operation, verdict, result),) * count)
+
+
+def lines(audit: Audit) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in audit.path.read_text().splitlines()]
+
+
+def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
+    audit.write("island-01", [entry(result=0x706)])
+    assert lines(audit) == [
+        {
+            "time": "2023-11-14T22:13:20.250+00:00",
+            "station": "island-01",
+            "door": "ams-tcp",
+            "from": "10.0.0.5:49152",
+            "source": "192.168.0.9.1.1:30000",
+            "target": "5.1.1.1.3.1:1001",
+            "name": "island-01/bus0/drive",
+            "route": "",
+            "operation": "Write",
+            "group": "0xF302",
+            "offset": "0x80000001",
+            "object": "0x8000:01",
+            "length": 4,
+            "value": "01020304",
+            "service": "write",
+            "allowed": True,
+            "why": "rule drives allows it",
+            "result": 0x706,
+            "error": "error 0x706 (VALUE)",
+        }
+    ]
+
+
+@pytest.mark.parametrize(
+    ("operation", "said"),
+    [
+        (WriteControl(5, 8, b""), {"states": [5, 8], "length": 0, "value": ""}),
+        (
+            Write(IndexGroup.SDO, 0x8000_0100, bytes(9)),
+            {"object": "0x8000:00 (complete access)", "length": 9, "sha256": "3e7077fd2f66d689"},
+        ),
+        (ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 4, b"a.bin\0"), {"file": "a.bin", "length": 6}),
+    ],
+)
+def test_what_was_to_be_done(audit: Audit, operation: Operation, said: dict[str, Any]) -> None:
+    audit.write("island-01", [entry(operation)])
+    (line,) = lines(audit)
+    assert line | said == line
+
+
+def test_a_refusal(audit: Audit) -> None:
+    denied = Verdict(AccessService.WRITE, False, "no rule allows it, and other hosts only read")
+    audit.write("island-01", [entry(result=0x723, verdict=denied)])
+    (line,) = lines(audit)
+    assert not line["allowed"]
+    assert line["error"] == "error 0x723 (access rules forbid it)"
+
+
+def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: Clock) -> None:
+    audit.write("island-01", [entry(count=BURST + 20)])
+    audit.write("island-01", [entry(way=Way("ams-tcp", "10.0.0.6:1"))])
+    assert len(lines(audit)) == BURST + 1
+    audit.tell_skipped()
+    audit.tell_skipped()
+    assert lines(audit)[BURST + 1 :] == [
+        {
+            "time": "2023-11-14T22:13:20.250+00:00",
+            "station": "island-01",
+            "door": "ams-tcp",
+            "from": "10.0.0.5",
+            "skipped": 20,
+        }
+    ]
+    clock.now += 1
+    audit.write("island-01", [entry(count=BURST)])
+    assert len(lines(audit)) == BURST + 2 + BURST // 10
+
+
+def test_a_flood_from_many_addresses_is_bounded_by_its_door(audit: Audit) -> None:
+    for number in range(12):
+        way = Way("udp:eap0", f"10.0.0.{number}:34980")
+        audit.write("island-01", [entry(way=way, count=BURST)])
+    audit.write("island-01", [entry()])
+    assert len(lines(audit)) == module.DOOR_BURST + 1
+
+
+def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None:
+    audit.write("island-01", [entry(count=BURST + 1)])
+    for number in range(1100):
+        way = Way("ams-tcp", f"10.1.{number // 250}.{number % 250}:1")
+        audit.write("island-01", [entry(way=way)])
+    assert [line["skipped"] for line in lines(audit) if "skipped" in line] == [1]
+
+
+def test_old_files_go(audit: Audit, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_OCTETS", 1000)
+    for number in range(20):
+        audit.write(f"island-{number}", [entry()])
+    names = sorted(path.name for path in audit.path.parent.iterdir())
+    older = [f"audit.jsonl.{number}" for number in range(1, KEPT + 1)]
+    assert [name for name in names if name != "audit.jsonl"] == older
+    kept = [json.loads(audit.path.with_name(name).read_text().splitlines()[0]) for name in older]
+    numbers = [int(line["station"].partition("-")[2]) for line in kept]
+    assert numbers == sorted(numbers, reverse=True)
+
+
+def test_a_disk_that_is_full_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "plant").mkdir()
+    audit = Audit(tmp_path / "plant", NAMES)
+    with caplog.at_level(logging.WARNING):
+        audit.write("island-01", [entry()])
+        audit.write("island-01", [entry()])
+    assert [each.getMessage() for each in caplog.records] == [
+        f"audit {tmp_path / 'plant'} cannot be written: Is a directory"
+    ]
