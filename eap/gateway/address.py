@@ -1,0 +1,74 @@
+"""Whom a mailbox address means: the master, a slave, several slaves, or one somewhere else.
+
+ETG.8200 has station addresses and 0 for the master.  Beside them stand what its implementations
+do: bit 15 marks what is for a slave in any case, 0xFFFF is for all of them, and virtual addresses
+of the plant file lead to slaves of any station.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, TypeAlias
+
+from eap.ids import NetId
+
+MASTER_ADDRESS = 0
+ALL_SLAVES = 0xFFFF
+VIRTUAL_BIT = 0x8000
+
+
+class Master(NamedTuple):
+    """The dictionary of the master itself."""
+
+
+class Slave(NamedTuple):
+    """A slave on the gateway's own bus."""
+
+    station: int
+    """Its station address."""
+
+
+class RemoteSlave(NamedTuple):
+    """A slave, or with port 0xFFFF the master, of another bus; reached by AoE."""
+
+    net_id: NetId
+    port: int
+
+
+class Group(NamedTuple):
+    """Several that each answer for themselves; nobody knows beforehand who does not."""
+
+    members: tuple[int, ...]
+    """Station addresses, or virtual ones."""
+
+
+Destination: TypeAlias = Master | Slave | RemoteSlave | Group
+
+
+class AddressMap:
+    """What the addresses of a gateway mean.
+
+    Args:
+        virtual: Addresses of the plant file.  They go before station addresses, so that a slave
+            that was exchanged can be found where tools look for it; 0 and 0xFFFF stay what they
+            are.
+    """
+
+    def __init__(self, virtual: Mapping[int, Slave | RemoteSlave | Group] | None = None) -> None:
+        self._virtual = dict(virtual or {})
+
+    def resolve(self, address: int, stations: tuple[int, ...]) -> Destination:
+        """Return whom *address* means; *stations* are the slaves there are.
+
+        A station address that nobody has is returned as such: to say so is for who asks there.
+        """
+        if address == MASTER_ADDRESS:
+            return Master()
+        if address == ALL_SLAVES:
+            return Group(stations)
+        found = self._virtual.get(address)
+        if found is not None:
+            return found
+        if address & VIRTUAL_BIT and address not in stations:
+            return Slave(address & ~VIRTUAL_BIT)
+        return Slave(address)

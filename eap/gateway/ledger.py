@@ -1,0 +1,149 @@
+"""What is known of the clients of a gateway: what they wait for, and how much they may ask.
+
+A client that hears nothing asks again with the same octets.  As long as its first request waits,
+the second is no other one, and both are answered once; afterwards the same octets are a new
+request, because real clients poll with a constant counter.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+from eap.aoe.way import Way
+
+_S = 1_000_000_000
+
+
+class ClientLimits(NamedTuple):
+    """How much a gateway takes on."""
+
+    in_flight: int = 32
+    """Requests of one client that wait."""
+    rate: int = 0
+    """Requests of one client in a second, after a burst of as many; 0 for any number."""
+    clients: int = 256
+    """Of one gateway; the one that has been silent longest is forgotten for another."""
+    in_flight_in_all: int = 512
+    """Requests of all clients that wait."""
+
+
+class Admission(Enum):
+    """What becomes of a request."""
+
+    TAKEN = "taken"
+    REPEATED = "repeated"
+    """The same one waits already: its answer is on the way."""
+    CROWDED = "crowded"
+    """Too much waits, or too many came in too short a time."""
+
+
+class Counts:
+    """What a gateway did for one client.
+
+    Attributes:
+        requests: That were taken.
+        repeated: That waited already, or whose last answer went out once more.
+        errors: Answered by the gateway itself, with an error.
+    """
+
+    __slots__ = ("errors", "repeated", "requests")
+
+    def __init__(self) -> None:
+        self.requests = self.repeated = self.errors = 0
+
+
+class _Client:
+    __slots__ = ("counts", "credit", "last_ns", "waiting")
+
+    def __init__(self, credit: float, now_ns: int) -> None:
+        self.counts = Counts()
+        self.waiting: set[bytes] = set()
+        self.credit = credit
+        self.last_ns = now_ns
+
+
+class Ledger:
+    """All clients of a gateway.
+
+    Args:
+        limits: How much it takes on.
+    """
+
+    def __init__(self, limits: ClientLimits | None = None) -> None:
+        self._limits = limits or ClientLimits()
+        self._clients: dict[Way, _Client] = {}
+        self._in_flight = 0
+
+    def admit(self, way: Way, frame: bytes, now_ns: int) -> Admission:
+        """Decide on a request; one that is taken waits until :meth:`answered`.
+
+        Args:
+            way: Connection, or address, of the client.
+            frame: All octets of the request.
+            now_ns: The time on the monotonic clock.
+        """
+        client = self._client(way, now_ns)
+        if client is None:
+            return Admission.CROWDED
+        if frame in client.waiting:
+            client.counts.repeated += 1
+            return Admission.REPEATED
+        limits = self._limits
+        is_full = len(client.waiting) >= limits.in_flight
+        if is_full or self._in_flight >= limits.in_flight_in_all or not self._pay(client, now_ns):
+            client.counts.errors += 1
+            return Admission.CROWDED
+        client.waiting.add(frame)
+        client.counts.requests += 1
+        self._in_flight += 1
+        return Admission.TAKEN
+
+    def answered(self, way: Way, frame: bytes) -> None:
+        """Note that a request waits no more, however it ended."""
+        client = self._clients.get(way)
+        if client is not None and frame in client.waiting:
+            client.waiting.discard(frame)
+            self._in_flight -= 1
+
+    def counts_of(self, way: Way) -> Counts | None:
+        """Return what was done for a client that is known."""
+        client = self._clients.get(way)
+        return client.counts if client else None
+
+    def forget(self, way: Way) -> None:
+        """Forget a client whose connection is closed."""
+        client = self._clients.pop(way, None)
+        if client is not None:
+            self._in_flight -= len(client.waiting)
+
+    def table(self) -> dict[Way, Counts]:
+        """Return all clients that are known, the one that asked last at the end."""
+        return {way: client.counts for way, client in self._clients.items()}
+
+    def _client(self, way: Way, now_ns: int) -> _Client | None:
+        client = self._clients.pop(way, None)
+        if client is None:
+            if len(self._clients) >= self._limits.clients and not self._make_room():
+                return None
+            client = _Client(self._limits.rate, now_ns)
+        self._clients[way] = client  # at the end: who is at the front has been silent longest
+        return client
+
+    def _make_room(self) -> bool:
+        for way, client in self._clients.items():
+            if not client.waiting:
+                del self._clients[way]
+                return True
+        return False
+
+    def _pay(self, client: _Client, now_ns: int) -> bool:
+        rate = self._limits.rate
+        if not rate:
+            return True
+        earned = client.credit + (now_ns - client.last_ns) * rate / _S
+        client.credit, client.last_ns = min(rate, earned), now_ns
+        if client.credit < 1:
+            return False
+        client.credit -= 1
+        return True

@@ -1,0 +1,101 @@
+"""What a mailbox request does, in the terms that access rules judge by (ETG.8200, ETG.1020).
+
+A plant file has one list of rules, whichever way somebody comes: here requests of the mailbox
+protocols become the operations that an ADS client would ask for to have the same done.
+"""
+
+from __future__ import annotations
+
+from eap.aoe.ads_operation import Operation, Read, ReadWrite, Write
+from eap.codec.ads import IndexGroup
+from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.eoe import EoeType
+from eap.codec.foe import FoeOpcode
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoHeader, SdoRequest
+from eap.codec.sdoinfo import SdoInfoOpcode
+from eap.codec.soe import SoeHeader, SoeOpcode
+
+_COMPLETE = 0x100
+_RAW = ReadWrite(IndexGroup.VOE, 0, 0, b"")
+"""What cannot be looked into."""
+_EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
+
+
+def operation_of(kind: MailboxType, body: bytes) -> Operation | None:
+    """Return what a request does; None for a step of a transfer that was judged at its start.
+
+    AoE is for the router, which judges it itself.
+    """
+    match kind:
+        case MailboxType.COE:
+            return _of_coe(body)
+        case MailboxType.SOE:
+            return _of_soe(body)
+        case MailboxType.FOE:
+            return _of_foe(body)
+        case MailboxType.EOE if body and body[0] & 0x0F in _EOE_READS:
+            return Read(IndexGroup.OBJECT_LIST, 0, 0)
+    return _RAW
+
+
+def sdo(index: int, subindex: int, *, complete: bool, data: bytes | None = None) -> Operation:
+    """Return the upload of an entry or object, or with *data* its download."""
+    offset = index << 16 | (_COMPLETE if complete else subindex)
+    if data is None:
+        return Read(IndexGroup.SDO, offset, 0)
+    return Write(IndexGroup.SDO, offset, data)
+
+
+def idn(number: int, drive: int, data: bytes | None = None) -> Operation:
+    """Return reading an element of an IDN, or with *data* writing it."""
+    offset = drive << 24 | number
+    if data is None:
+        return Read(IndexGroup.SOE, offset, 0)
+    return Write(IndexGroup.SOE, offset, data)
+
+
+def _of_coe(body: bytes) -> Operation | None:
+    service = body[1] >> 4 if len(body) >= CoeHeader.SIZE else 0
+    if service == CoeService.SDO_INFORMATION and len(body) > CoeHeader.SIZE:
+        return _of_info(body)
+    if service != CoeService.SDO_REQUEST or len(body) < CoeHeader.SIZE + 4:
+        return _RAW if service != CoeService.SDO_REQUEST else None
+    command, index, subindex = body[2], int.from_bytes(body[3:5], "little"), body[5]
+    specifier, complete = command >> 5, bool(command & 0x10)
+    if specifier == SdoRequest.UPLOAD:
+        return sdo(index, subindex, complete=complete)
+    if specifier == SdoRequest.DOWNLOAD:
+        data = body[CoeHeader.SIZE + SdoHeader.SIZE :]
+        return sdo(index, subindex, complete=complete, data=data)
+    return None
+
+
+def _of_info(body: bytes) -> Operation:
+    opcode = body[2] & 0x7F
+    index = int.from_bytes(body[6:8], "little") << 16
+    if opcode == SdoInfoOpcode.OBJECT_REQUEST:
+        return Read(IndexGroup.OBJECT_DESCRIPTION, index, 0)
+    if opcode == SdoInfoOpcode.ENTRY_REQUEST:
+        return Read(IndexGroup.ENTRY_DESCRIPTION, index | int.from_bytes(body[8:9], "little"), 0)
+    return Read(IndexGroup.OBJECT_LIST, index, 0)
+
+
+def _of_soe(body: bytes) -> Operation:
+    if len(body) < SoeHeader.SIZE:
+        return _RAW
+    opcode, drive, number = body[0] & 0x07, body[0] >> 5, int.from_bytes(body[2:4], "little")
+    if opcode == SoeOpcode.READ_REQUEST:
+        return idn(number, drive)
+    if opcode == SoeOpcode.WRITE_REQUEST:
+        return idn(number, drive, body[SoeHeader.SIZE :])
+    return _RAW
+
+
+def _of_foe(body: bytes) -> Operation | None:
+    opcode = body[0] if body else 0
+    if opcode == FoeOpcode.READ:
+        return ReadWrite(IndexGroup.FOE_OPEN_READ, 0, 0, body[6:])
+    if opcode == FoeOpcode.WRITE:
+        return ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 0, body[6:])
+    return None

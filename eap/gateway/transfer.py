@@ -1,0 +1,263 @@
+"""Transfers that take several messages: which of a client's requests belong together (ETG.1000.6).
+
+While a transfer runs, the slave's server for its protocol belongs to one client: a segment or a
+packet of somebody else would end up in the wrong file.  Whether it runs is told by nothing but the
+octets of requests and replies, so any client and any slave can be followed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
+from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.eoe import EoeType
+from eap.codec.foe import DATA_OVERHEAD, FoeHeader, FoeOpcode
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoHeader, SdoRequest, SdoResponse
+from eap.codec.soe import SoeHeader, SoeOpcode
+
+_SDO_DATA = CoeHeader.SIZE + SdoHeader.SIZE
+"""Where the data of a normal SDO begins."""
+_SDO_SEGMENTS = frozenset((SdoRequest.DOWNLOAD_SEGMENT, SdoRequest.UPLOAD_SEGMENT))
+_EXPEDITED, _LAST = 0x02, 0x01
+_SOE_INCOMPLETE = 0x08
+_NO_ANSWER = StateFlags.RESPONSE | StateFlags.NO_RETURN
+
+
+class Room(NamedTuple):
+    """Octets of a slave's mailboxes, header included."""
+
+    to_slave: int
+    to_master: int
+
+
+class Course(Protocol):
+    """How far the transfers of one protocol are, of one client with one slave.
+
+    Attributes:
+        is_running: Whether more requests belong to what was begun.
+    """
+
+    is_running: bool
+
+    def ask(self, body: bytes) -> bool:
+        """Note a request; return whether the slave answers it at all."""
+
+    def answer(self, body: bytes) -> None:
+        """Note a reply."""
+
+    def is_step(self, body: bytes) -> bool:
+        """Say whether a request goes on with a transfer, and is known to be repeated if it is."""
+
+
+class Transfer:
+    """What one client has under way with one slave in one protocol.
+
+    Args:
+        kind: The protocol.
+        room: Of the slave's mailboxes.
+
+    Attributes:
+        replies: To the last request, as far as they came.
+    """
+
+    def __init__(self, kind: MailboxType, room: Room) -> None:
+        self.replies: list[bytes] = []
+        self._course = _course(kind, room)
+        self._request = b""
+        self._is_busy = False
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the slave's server still belongs to this client."""
+        return self._course.is_running
+
+    def is_repeated(self, body: bytes) -> bool:
+        """Say whether a request is the last step once more, whose reply got lost on its way.
+
+        A slave would refuse it: to a slave every packet has come once.  After BUSY it is none,
+        that is how a client asks whether the slave has time now.
+        """
+        is_same = body == self._request and bool(self.replies) and not self._is_busy
+        return is_same and self._course.is_step(body)
+
+    def ask(self, body: bytes) -> bool:
+        """Begin or go on with a request; return whether the slave answers it at all."""
+        self._request = body
+        self._is_busy = False
+        self.replies = []
+        return self._course.ask(body)
+
+    def answer(self, body: bytes) -> None:
+        """Note a reply to the last request."""
+        self.replies.append(body)
+        self._is_busy = is_busy(body) if isinstance(self._course, _Foe) else False
+        self._course.answer(body)
+
+
+def is_busy(body: bytes) -> bool:
+    """Say whether a message of FoE tells the client to ask again."""
+    return body[:1] == bytes((FoeOpcode.BUSY,))
+
+
+def _course(kind: MailboxType, room: Room) -> Course:
+    match kind:
+        case MailboxType.COE:
+            return _Coe()
+        case MailboxType.FOE:
+            return _Foe(room)
+        case MailboxType.SOE:
+            return _Soe()
+        case MailboxType.AOE:
+            return _Aoe()
+        case MailboxType.EOE:
+            return _Eoe()
+    return _Single()
+
+
+class _Single:
+    """A request and a reply."""
+
+    def __init__(self) -> None:
+        self.is_running = False
+
+    def ask(self, body: bytes) -> bool:
+        del body
+        return True
+
+    def answer(self, body: bytes) -> None:
+        del body
+
+    def is_step(self, body: bytes) -> bool:
+        del body
+        return False
+
+
+class _Coe(_Single):
+    """SDOs in segments; whatever else there is begins and ends with one request."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._goes_on = False
+
+    def ask(self, body: bytes) -> bool:
+        self._goes_on = False
+        service = _coe_service(body)
+        if service != CoeService.SDO_REQUEST or len(body) <= CoeHeader.SIZE:
+            self.is_running = False
+            return service not in {CoeService.TX_PDO, CoeService.RX_PDO, CoeService.EMERGENCY}
+        command = body[CoeHeader.SIZE]
+        specifier = command >> 5
+        if specifier == SdoRequest.ABORT:
+            self.is_running = False
+            return False
+        if specifier == SdoRequest.DOWNLOAD:
+            self._goes_on = not command & _EXPEDITED and _size(body) > len(body) - _SDO_DATA
+        elif specifier == SdoRequest.DOWNLOAD_SEGMENT:
+            self._goes_on = not command & _LAST
+        return True
+
+    def answer(self, body: bytes) -> None:
+        self.is_running = False
+        if _coe_service(body) != CoeService.SDO_RESPONSE or len(body) <= CoeHeader.SIZE:
+            return
+        command = body[CoeHeader.SIZE]
+        specifier = command >> 5
+        if specifier == SdoResponse.UPLOAD:
+            self.is_running = not command & _EXPEDITED and _size(body) > len(body) - _SDO_DATA
+        elif specifier == SdoResponse.UPLOAD_SEGMENT:
+            self.is_running = not command & _LAST
+        elif specifier in {SdoResponse.DOWNLOAD, SdoResponse.DOWNLOAD_SEGMENT}:
+            self.is_running = self._goes_on
+
+    def is_step(self, body: bytes) -> bool:
+        is_sdo = _coe_service(body) == CoeService.SDO_REQUEST and len(body) > CoeHeader.SIZE
+        return is_sdo and body[CoeHeader.SIZE] >> 5 in _SDO_SEGMENTS
+
+
+class _Foe(_Single):
+    """Files; a packet that does not fill the mailbox is the last one."""
+
+    def __init__(self, room: Room) -> None:
+        super().__init__()
+        overhead = DATA_OVERHEAD - FoeHeader.SIZE
+        self._full_to_slave = room.to_slave - overhead
+        self._full_to_master = room.to_master - overhead
+        self._is_last = False
+
+    def ask(self, body: bytes) -> bool:
+        opcode = body[0] if body else 0
+        if opcode == FoeOpcode.ACK and self._is_last:
+            self.is_running = False
+            return False
+        if opcode == FoeOpcode.ERROR:
+            self.is_running = False
+            return False
+        self._is_last = opcode == FoeOpcode.DATA and len(body) < self._full_to_slave
+        return True
+
+    def answer(self, body: bytes) -> None:
+        opcode = body[0] if body else 0
+        if opcode == FoeOpcode.DATA:
+            self._is_last = len(body) < self._full_to_master
+            self.is_running = True
+        elif opcode == FoeOpcode.ACK:
+            self.is_running = not self._is_last
+        else:
+            self.is_running = opcode == FoeOpcode.BUSY
+
+    def is_step(self, body: bytes) -> bool:
+        return body[:1] in {bytes((FoeOpcode.DATA,)), bytes((FoeOpcode.ACK,))}
+
+
+class _Soe(_Single):
+    """Written elements that come in fragments; only the last of these is answered."""
+
+    def ask(self, body: bytes) -> bool:
+        is_write = len(body) >= SoeHeader.SIZE and body[0] & 0x07 == SoeOpcode.WRITE_REQUEST
+        self.is_running = is_write and bool(body[0] & _SOE_INCOMPLETE)
+        return not self.is_running
+
+    def answer(self, body: bytes) -> None:
+        self.is_running = False
+
+
+class _Aoe(_Single):
+    """Packets in fragments, each of which is acknowledged unless its sender wants nothing."""
+
+    def ask(self, body: bytes) -> bool:
+        if len(body) < AmsHeader.SIZE:
+            self.is_running = False
+            return True
+        self.is_running = int.from_bytes(body[16:18], "little") == AmsCommand.FRAGMENT
+        return not int.from_bytes(body[18:20], "little") & _NO_ANSWER
+
+    def answer(self, body: bytes) -> None:
+        is_fragment = int.from_bytes(body[16:18], "little") == AmsCommand.FRAGMENT
+        self.is_running = self.is_running and is_fragment
+
+
+class _Eoe(_Single):
+    """Settings are answered, Ethernet frames are not."""
+
+    def ask(self, body: bytes) -> bool:
+        return bool(body) and body[0] & 0x0F in _EOE_REQUESTS
+
+
+_EOE_REQUESTS = frozenset(
+    (
+        EoeType.SET_IP_REQUEST,
+        EoeType.SET_FILTER_REQUEST,
+        EoeType.GET_IP_REQUEST,
+        EoeType.GET_FILTER_REQUEST,
+    )
+)
+
+
+def _coe_service(body: bytes) -> int:
+    return body[1] >> 4 if len(body) >= CoeHeader.SIZE else 0
+
+
+def _size(body: bytes) -> int:
+    return int.from_bytes(body[_SDO_DATA - 4 : _SDO_DATA], "little")

@@ -1,0 +1,113 @@
+"""Errors speak the requester's protocol, and tshark's and our own decoders read them."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
+from eap.codec.foe import Busy, FoeErrorCode, FoeOpcode, decode_message, text_of
+from eap.codec.mailbox import MailboxError, MailboxType
+from eap.codec.soe import SoeHeader, error_code_of
+from eap.codec.soeerror import SoeErrorCode
+from eap.gateway.refusal import Reason, refuse
+from eap.ids import NetId
+
+COE, FOE, SOE, VOE, EOE, AOE = (
+    MailboxType[name] for name in ("COE", "FOE", "SOE", "VOE", "EOE", "AOE")
+)
+UPLOAD = bytes.fromhex("0020 40 1810 02 00000000")
+MAILBOX = {
+    Reason.NO_SLAVE: "0100 0500",
+    Reason.NO_PROTOCOL: "0100 0200",
+    Reason.TIMEOUT: "0100 0900",
+    Reason.TOO_LONG: "0100 0800",
+}
+
+
+@pytest.mark.parametrize(
+    ("reason", "code"),
+    [
+        (Reason.NO_SLAVE, "00000206"),
+        (Reason.NO_MAILBOX, "21000008"),
+        (Reason.NO_PROTOCOL, "00000106"),
+        (Reason.TIMEOUT, "00000405"),
+        (Reason.TOO_LONG, "05000106"),
+    ],
+)
+def test_an_sdo_is_aborted(reason, code) -> None:
+    answer = refuse(COE, UPLOAD, reason)
+    assert answer == (COE, bytes.fromhex("0020 80 1810 02" + code))
+
+
+def test_sdo_information_has_an_error_of_its_own() -> None:
+    answer = refuse(COE, bytes.fromhex("0080 03 00 0000 1810"), Reason.TIMEOUT)
+    assert answer == (COE, bytes.fromhex("0080 07 00 0000 00000405"))
+
+
+def test_an_idn_is_refused() -> None:
+    answer = refuse(SOE, bytes.fromhex("a1 40 2000"), Reason.TIMEOUT)
+    header = SoeHeader.decode(answer.body)
+    assert (header.opcode, header.error, header.drive, header.idn) == (2, 1, 5, 32)
+    assert error_code_of(answer.body) == SoeErrorCode.GENERAL
+    assert refuse(SOE, bytes.fromhex("03 40 2000"), Reason.TOO_LONG).body[0] & 0x17 == 0x14
+
+
+def test_a_file_transfer_ends_with_words() -> None:
+    answer = refuse(FOE, bytes.fromhex("01 00 00000000 66"), Reason.NO_SLAVE, "no slave 1009")
+    header, body = decode_message(answer.body)
+    assert (header.opcode, header.number) == (FoeOpcode.ERROR, FoeErrorCode.NOT_FOUND)
+    assert text_of(body) == "no slave 1009"
+
+
+def test_who_is_busy_with_a_file_asks_for_patience() -> None:
+    header, body = decode_message(refuse(FOE, bytes.fromhex("01 00 00000000 66"), Reason.BUSY).body)
+    assert header.opcode is FoeOpcode.BUSY
+    assert Busy.of(header.number) == Busy(0, 100)
+    assert "another client" in text_of(body)
+
+
+def test_an_ams_packet_comes_back() -> None:
+    slave, client = NetId.parse("1.2.3.4.5.6"), NetId.parse("6.5.4.3.2.1")
+    asked = AmsHeader(slave, 1001, client, 7, AmsCommand.READ, StateFlags.ADS, invoke_id=99)
+    answer = refuse(AOE, encode_packet(asked, bytes(12)), Reason.TIMEOUT)
+    header, body = decode_packet(answer.body)
+    assert (header.target, header.target_port, header.invoke_id) == (client, 7, 99)
+    assert (header.error_code, bytes(body)) == (AdsError.TIMEOUT, b"")
+
+
+@pytest.mark.parametrize(("reason", "octets"), MAILBOX.items())
+def test_what_has_no_error_of_its_own_gets_that_of_the_mailbox(reason, octets) -> None:
+    expected = MailboxType.ERR, bytes.fromhex(octets)
+    assert refuse(VOE, b"anything", reason) == expected
+    assert refuse(EOE, b"", reason) == expected
+    assert refuse(AOE, b"short", reason) == expected
+    assert refuse(COE, b"", reason) == expected
+    assert refuse(COE, b"\0\x50", reason) == expected
+    assert refuse(SOE, b"\x05\0\0\0", reason) == expected
+    assert refuse(FOE, b"", reason) == expected
+
+
+def test_a_protocol_that_nobody_speaks_is_for_the_mailbox_to_refuse() -> None:
+    for kind in (SOE, FOE, AOE):
+        answer = refuse(kind, bytes.fromhex("01 40 2000"), Reason.NO_PROTOCOL)
+        assert answer == (MailboxType.ERR, bytes.fromhex("0100 0200"))
+
+
+def test_time_outs_missing_slaves_and_protocols_and_lengths_differ_in_every_protocol() -> None:
+    requests = {COE: UPLOAD, SOE: bytes.fromhex("01 40 2000"), FOE: b"\1\0\0\0\0\0f", VOE: bytes(6)}
+    reasons = (Reason.NO_SLAVE, Reason.NO_PROTOCOL, Reason.TIMEOUT, Reason.TOO_LONG)
+    for kind, request in requests.items():
+        answers = [refuse(kind, request, reason) for reason in reasons]
+        assert all(one != other for one, other in itertools.combinations(answers, 2))
+
+
+def test_every_request_has_an_answer() -> None:
+    for reason, kind, size in itertools.product(Reason, MailboxType, range(8)):
+        answer = refuse(kind, bytes((0x21,)) * size, reason)
+        assert answer.type in {kind, MailboxType.ERR}
+        assert answer.body
+        assert reason.text
+        assert isinstance(reason.value.mailbox, MailboxError)

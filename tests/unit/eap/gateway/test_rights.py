@@ -1,0 +1,79 @@
+"""Mailbox requests as operations that rules judge."""
+
+from __future__ import annotations
+
+import pytest
+
+from eap.aoe.access import objects_of, service_of
+from eap.aoe.spec import AccessService, ObjectRange
+from eap.codec.mailbox import MailboxType
+from eap.gateway.rights import operation_of
+
+COE, FOE, SOE, VOE, EOE = (MailboxType[name] for name in ("COE", "FOE", "SOE", "VOE", "EOE"))
+READ, WRITE, FILES, RAW = (AccessService[name] for name in ("READ", "WRITE", "FILES", "RAW"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "octets", "service"),
+    [
+        (COE, "0020 40 1810 01 00000000", READ),
+        (COE, "0020 41 1810 01 00000000", READ),
+        (COE, "0020 23 1810 01 01020304", WRITE),
+        (COE, "0020 20 4060 00 0600", WRITE),
+        (COE, "0080 01 00 0000 0100", READ),
+        (COE, "0080 03 00 0000 1810", READ),
+        (COE, "0080 05 00 0000 1810 01 7f", READ),
+        (COE, "0080", RAW),
+        (COE, "0050 0102", RAW),
+        (COE, "", RAW),
+        (SOE, "01 40 2000", READ),
+        (SOE, "a1 40 2000", READ),
+        (SOE, "03 40 2000 0102", WRITE),
+        (SOE, "0b 40 0100 0102", WRITE),
+        (SOE, "05 40 2000", RAW),
+        (SOE, "01", RAW),
+        (FOE, "01 00 00000000 66", READ),
+        (FOE, "02 00 00000000 66", FILES),
+        (VOE, "", RAW),
+        (EOE, "0600", READ),
+        (EOE, "0200", RAW),
+        (EOE, "0000", RAW),
+    ],
+)
+def test_services(kind, octets, service) -> None:
+    operation = operation_of(kind, bytes.fromhex(octets))
+    assert operation is not None
+    assert service_of(operation) is service
+
+
+@pytest.mark.parametrize(
+    ("kind", "octets"),
+    [
+        (COE, "0020 60 00000000000000"),
+        (COE, "0020 00 01020304050607"),
+        (COE, "0020 80 1810 01 00000000"),
+        (COE, "0020 40"),
+        (FOE, "03 00 01000000 66"),
+        (FOE, "04 00 01000000"),
+        (FOE, "05 00 01000000"),
+        (FOE, ""),
+    ],
+)
+def test_steps_of_transfers_are_judged_at_their_start(kind, octets) -> None:
+    assert operation_of(kind, bytes.fromhex(octets)) is None
+
+
+@pytest.mark.parametrize(
+    ("octets", "touched"),
+    [
+        ("0020 40 1810 01 00000000", ObjectRange(0x1018, 0x1018, 1, 1)),
+        ("0020 50 1810 00 00000000", ObjectRange(0x1018, 0x1018)),
+        ("0020 31 1810 01 00000000", ObjectRange(0x1018, 0x1018)),
+        ("0080 03 00 0000 1810", ObjectRange(0x1018, 0x1018)),
+        ("0080 05 00 0000 1810 03 7f", ObjectRange(0x1018, 0x1018, 3, 3)),
+    ],
+)
+def test_objects(octets, touched) -> None:
+    operation = operation_of(COE, bytes.fromhex(octets))
+    assert operation is not None
+    assert objects_of(operation) == touched
