@@ -1,18 +1,14 @@
-"""What is kept of a station that was configured while it ran, and the file it is kept in.
-
-The file is JSON: a version, a digest, and under ``content`` a :class:`Stored`.  The digest tells a
-file that was damaged, or edited by hand, from one that was written whole.
-"""
+"""What is kept of a station that was configured while it ran, and the file it is kept in."""
 
 from __future__ import annotations
 
-import hashlib
 import time
 from functools import cache
 from typing import Any
 
 import msgspec
 
+from eap.appliance.durable import digest, seal, unseal
 from eap.errors import ConfigError
 from eap.pd.device import DeviceState
 from eap.pd.spec import Record, StationSpec
@@ -48,14 +44,6 @@ class Stored(Configuration, frozen=True, kw_only=True):
     """Whether *cause* was rolled back: *previous* is what it had brought."""
 
 
-class _File(msgspec.Struct, frozen=True):
-    """The file."""
-
-    version: int
-    digest: str
-    content: msgspec.Raw
-
-
 def new_cause() -> str:
     """Return a name for a change; those of later changes sort behind it."""
     return f"{time.time_ns():020d}"
@@ -66,33 +54,21 @@ def digest_of(spec: StationSpec) -> str:
 
     Fields that hold their defaults do not count: a release that adds one does not change it.
     """
-    return hashlib.sha256(msgspec.json.encode(_lean(spec))).hexdigest()
+    return digest(msgspec.json.encode(_lean(spec)))
 
 
 def encode_stored(stored: Stored) -> bytes:
     """Return the octets of a file."""
-    content = msgspec.json.encode(stored)
-    return msgspec.json.encode(_File(VERSION, _digest(content), msgspec.Raw(content)))
+    return seal(msgspec.json.encode(stored), VERSION)
 
 
 def decode_stored(data: bytes) -> Stored:
     """Read the octets of a file; raise ConfigError that says what is wrong with them."""
+    content = unseal(data, VERSION)
     try:
-        file = msgspec.json.decode(data, type=_File)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as exc:
-        raise ConfigError(f"it is not whole: {exc}") from None
-    if file.version != VERSION:
-        raise ConfigError(f"its version is {file.version}, this release knows {VERSION}")
-    if file.digest != _digest(bytes(file.content)):
-        raise ConfigError("its content is not what was written")
-    try:
-        return msgspec.json.decode(file.content, type=Stored)
+        return msgspec.json.decode(content, type=Stored)
     except msgspec.MsgspecError as exc:
         raise ConfigError(f"it holds no configuration: {exc}") from None
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def _lean(value: Any) -> Any:

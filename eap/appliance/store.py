@@ -25,6 +25,7 @@ from eap.appliance.configuration import (
     encode_stored,
     new_cause,
 )
+from eap.appliance.durable import put_aside, replace_file
 from eap.appliance.runtime import folder_name
 from eap.device.rollout import without_alternates
 from eap.errors import ConfigError, EnvironmentalError
@@ -98,7 +99,7 @@ class Store:
                 exc,
                 aside.name,
             )
-            _put_aside(path, aside)
+            put_aside(path, aside)
             return None
 
     def save(self, station: str, stored: Stored) -> None:
@@ -110,7 +111,7 @@ class Store:
         path = self.file(station)
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _replace(path, encode_stored(stored))
+            replace_file(path, encode_stored(stored))
         except OSError as exc:
             raise EnvironmentalError(
                 f"station {station}: its configuration cannot be kept in {path}: {exc.strerror};"
@@ -216,28 +217,3 @@ def _settled(stored: Stored, file: Stored) -> Stored:
         return replace(file, previous=stored.previous, cause=stored.cause)
     previous = Configuration(base=stored.base, spec=bare, objects=stored.objects)
     return replace(file, previous=previous)
-
-
-def _replace(path: Path, data: bytes) -> None:
-    temporary = path.with_suffix(".new")  # what a kill leaves behind is overwritten next time
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(folder)  # the name, too, is to survive a loss of power
-    finally:
-        os.close(folder)
-
-
-def _put_aside(path: Path, aside: Path) -> None:
-    try:
-        path.replace(aside)
-    except OSError as exc:
-        logger.warning("%s cannot be renamed: %s", path, exc.strerror)

@@ -14,6 +14,7 @@ from eap.appliance.configuration import (
     digest_of,
     encode_stored,
 )
+from eap.appliance.durable import seal
 from eap.errors import ConfigError
 from eap.pd.device import DeviceState
 
@@ -53,11 +54,9 @@ def test_other_version_is_refused(stored):
         decode_stored(data)
 
 
-def test_content_that_is_no_configuration_is_refused(monkeypatch):
-    monkeypatch.setattr("eap.appliance.configuration._digest", lambda content: "d")
-    file = {"version": VERSION, "digest": "d", "content": {"base": 1}}
+def test_content_that_is_no_configuration_is_refused():
     with pytest.raises(ConfigError, match="no configuration"):
-        decode_stored(msgspec.json.encode(file))
+        decode_stored(seal(b'{"base":1}', VERSION))
 
 
 @pytest.mark.parametrize("data", [b"\xff\xfe", b"[]", b"null", b"{}"])

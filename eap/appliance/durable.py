@@ -1,0 +1,81 @@
+"""Files that survive whatever happens: replaced in one step, and known to be whole when read.
+
+A file is JSON: a version, a digest, and under ``content`` what it is about.  The digest tells a
+file that was damaged, or edited by hand, from one that was written whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from pathlib import Path
+
+import msgspec
+
+from eap.errors import ConfigError
+
+logger = logging.getLogger(__name__)
+
+
+class _File(msgspec.Struct, frozen=True):
+    """The file."""
+
+    version: int
+    digest: str
+    content: msgspec.Raw
+
+
+def seal(content: bytes, version: int) -> bytes:
+    """Return the octets of a file that holds *content*, which is JSON."""
+    return msgspec.json.encode(_File(version, digest(content), msgspec.Raw(content)))
+
+
+def unseal(data: bytes, version: int) -> bytes:
+    """Return the content of a file; raise ConfigError that says what is wrong with it."""
+    try:
+        file = msgspec.json.decode(data, type=_File)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as exc:
+        raise ConfigError(f"it is not whole: {exc}") from None
+    if file.version != version:
+        raise ConfigError(f"its version is {file.version}, this release knows {version}")
+    content = bytes(file.content)
+    if file.digest != digest(content):
+        raise ConfigError("its content is not what was written")
+    return content
+
+
+def digest(content: bytes) -> str:
+    """Return what tells *content* from any other."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Put *data* in the place of what *path* holds; one of the two is there whatever happens.
+
+    Raises:
+        OSError: it cannot be written; what there was is still there.
+    """
+    temporary = path.with_suffix(".new")  # what a kill leaves behind is overwritten next time
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(folder)  # the name, too, is to survive a loss of power
+    finally:
+        os.close(folder)
+
+
+def put_aside(path: Path, aside: Path) -> None:
+    """Rename a file that nobody can use; that it cannot be done is a warning."""
+    try:
+        path.replace(aside)
+    except OSError as exc:
+        logger.warning("%s cannot be renamed: %s", path, exc.strerror)

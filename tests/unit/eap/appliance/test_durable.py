@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import os
+import re
+
+import pytest
+
+from eap.appliance import durable
+from eap.appliance.durable import digest, put_aside, replace_file, seal, unseal
+from eap.errors import ConfigError
+
+
+def test_content_comes_out_as_it_went_in():
+    assert unseal(seal(b'{"a":[1]}', 3), 3) == b'{"a":[1]}'
+    assert digest(b"a") != digest(b"b")
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (seal(b'{"a":1}', 3)[:-1], "it is not whole"),
+        (seal(b'{"a":1}', 3).replace(b'"a"', b'"b"'), "its content is not what was written"),
+        (seal(b'{"a":1}', 4), "its version is 4, this release knows 3"),
+        (b"\xff", "it is not whole"),
+    ],
+)
+def test_anything_else_is_refused(data, reason):
+    with pytest.raises(ConfigError, match=re.escape(reason)):
+        unseal(data, 3)
+
+
+def test_a_file_is_replaced_and_nothing_is_left_beside_it(tmp_path):
+    path = tmp_path / "x.json"
+    replace_file(path, b"one")
+    replace_file(path, b"two")
+    assert path.read_bytes() == b"two"
+    assert [each.name for each in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_what_cannot_be_written_leaves_what_there_was(tmp_path, monkeypatch):
+    path = tmp_path / "x.json"
+    replace_file(path, b"one")
+
+    def full(_fd):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(durable.os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        replace_file(path, b"two")
+    assert path.read_bytes() == b"one"
+    assert len(os.listdir(tmp_path)) == 1  # noqa: PTH208  names only
+
+
+def test_what_is_damaged_is_put_aside_or_told(tmp_path, caplog):
+    path = tmp_path / "x.json"
+    path.touch()
+    put_aside(path, tmp_path / "x.damaged")
+    assert (tmp_path / "x.damaged").exists()
+    put_aside(path, tmp_path / "x.damaged")
+    assert "x.json cannot be renamed: No such file" in caplog.text
