@@ -179,11 +179,12 @@ class Prober:
         self._version = self._table.version
         before, self._hops = self._hops, {}
         for route in self._table:
-            if route.is_probed and route.octets and route.hop not in self._hops:
+            target = route.next_router
+            if route.is_probed and target is not None and route.hop not in self._hops:
                 hop = before.get(route.hop)
-                if hop is None:
+                if hop is None or hop.target != target:
                     self._number += 1
-                    hop = _Hop(self._number, route.to_real(route.net_id))
+                    hop = _Hop(self._number, target)
                     self._turns.append((now_ns, hop.number))
                 self._hops[route.hop] = hop
         self._by_number = {hop.number: way for way, hop in self._hops.items()}

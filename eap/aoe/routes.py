@@ -57,6 +57,8 @@ class Route(msgspec.Struct, frozen=True):
         timeout_ns: How long an answer may take; 0 for as long as usual.
         is_probed: Whether the station answers whoever asks for its ADS state; where it answers
             only whom it has a route to, it would be taken for dead.
+        router: NetID of the router at the hop; None if that is not known, and the station itself
+            is asked instead.
 
     Raises:
         ValueError: a number of octets that cannot be, or a virtual NetID of a default route.
@@ -72,12 +74,20 @@ class Route(msgspec.Struct, frozen=True):
     real: NetId | None = None
     timeout_ns: int = 0
     is_probed: bool = True
+    router: NetId | None = None
 
     def __post_init__(self) -> None:
         if self.octets not in _LEVELS:
             raise ValueError(f"{self.name}: {self.octets} octets to match, expected 6, 5, 4 or 0")
         if self.real is not None and not self.octets:
             raise ValueError(f"{self.name}: a default route has no virtual NetID")
+
+    @property
+    def next_router(self) -> NetId | None:
+        """NetID of whoever is asked whether the hop is alive; None if nobody is known."""
+        if self.router is not None or not self.octets:
+            return self.router
+        return self.to_real(self.net_id)
 
     @property
     def key(self) -> RouteKey:

@@ -165,6 +165,20 @@ def test_real_net_id_is_asked() -> None:
     assert tick(station, 0)[0][0].target == f"{FAR}:{SYSTEM_PORT}"
 
 
+def test_the_router_at_the_hop_is_asked_and_not_who_is_behind_it() -> None:
+    near = NetId.parse("6.2.2.2.1.1")
+    station = probing(route(FAR, LINK, router=near))
+    assert tick(station, 0)[0][0].target == f"{near}:{SYSTEM_PORT}"
+    station.table.add(route(FAR, LINK))
+    assert tick(station, 0)[0][0].target == f"{FAR}:{SYSTEM_PORT}"
+
+
+def test_a_default_route_is_asked_only_if_its_router_is_known() -> None:
+    assert not tick(probing(route("0.0.0.0.0.0", LINK, octets=0)), 0)[0]
+    known = probing(route("0.0.0.0.0.0", LINK, octets=0, router=NetId.parse(FAR)))
+    assert tick(known, 0)[0][0].target == f"{FAR}:{SYSTEM_PORT}"
+
+
 def test_many_hops_are_asked_less_often() -> None:
     table = RouteTable(route(f"6.1.{n // 200}.{n % 200}.1.1", Way("link", str(n)))
                        for n in range(500))  # fmt: skip
