@@ -205,7 +205,13 @@ def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
         layout = msgspec.json.decode(memory[offset : offset + length], type=ImageLayout)
     except msgspec.MsgspecError as exc:
         raise ImageError(f"process image has a damaged directory: {exc}") from None
-    if layout.directory_offset != offset or WORDS_OFFSET + 8 * layout.word_count > offset:
+    samples = layout.samples
+    ends = (
+        (WORDS_OFFSET + 8 * layout.word_count, samples.first),
+        (samples.last, samples.offset),
+        (samples.offset + samples.count * samples.size, offset),
+    )
+    if layout.directory_offset != offset or any(end > start for end, start in ends):
         raise ImageError("process image has a damaged directory: it contradicts the header")
     return layout, generation
 

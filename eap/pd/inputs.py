@@ -19,14 +19,14 @@ class Inputs:
     """The station's variables as the cycle sees them.
 
     Attributes:
-        memory: As long as the image, with variables at the same offsets.  What the engine itself
-            writes must be read from the image instead.
+        memory: With variables at the same offsets as in the image.  What the engine itself writes
+            must be read from there instead.
     """
 
     def __init__(self, image: Image) -> None:
         self._image = image
         self._words = image.words
-        self.memory = memoryview(bytearray(len(image.memory)))
+        self.memory = memoryview(bytearray(image.layout.samples.last))
         self._regions = [
             (place.sequence, slice(place.offset, place.offset + place.size))
             for writer, place in image.layout.regions.items()

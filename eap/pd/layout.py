@@ -7,6 +7,8 @@ A received PD lies in the engine's region as it travels: eight octets of PD head
 PDs that follow each other in a frame also follow each other here, so that one copy takes them all.
 Behind them lie the inputs of slaves, as they travel as well, then their outputs in the region of
 whoever writes them.
+
+Behind all regions is room for copies of them: samples of the latest cycles, for those who ask.
 """
 
 from __future__ import annotations
@@ -31,10 +33,17 @@ from eap.pd.spec import (
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 
 MAGIC = b"EAPIMAGE"
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
 HEADER = struct.Struct("<8sIIQQQ")
 """Magic, layout version, generation, offset and length of the directory, size of the file."""
 WORDS_OFFSET = 64
+
+SAMPLE_HEAD = 16
+SAMPLES_FOR_US = 250_000
+"""How long ago the oldest sample is, unless that takes too much room."""
+MIN_SAMPLES, MAX_SAMPLES = 8, 256
+SAMPLES_SIZE = 1 << 20
+"""Octets that more than MIN_SAMPLES may take."""
 
 VAR_CTRL = ".VarCtrl"
 """Suffix of the control variable of a TxPD: bit 0 suppresses it, a rising bit 1 sends it."""
@@ -60,6 +69,20 @@ class RegionPlace(Record, frozen=True):
     offset: int
     size: int
     sequence: int
+
+
+class SamplePlace(Record, frozen=True):
+    """Samples of all regions, one a cycle; offsets and sizes in octets.
+
+    The sample of a cycle lies at ``offset + cycle % count * size``: the cycle and its time, which
+    take 16 octets, then the image from *first* to *last*.
+    """
+
+    offset: int
+    count: int
+    size: int
+    first: int
+    last: int
 
 
 class PortPlace(Record, frozen=True):
@@ -142,6 +165,7 @@ class ImageLayout(Record, frozen=True):
     frames: tuple[FramePlace, ...]
     tx: tuple[TxPlace, ...]
     rx: tuple[RxPlace, ...]
+    samples: SamplePlace
     word_count: int
     directory_offset: int
 
@@ -186,6 +210,7 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
         sequence = StationWord[f"{writer.name}_SEQUENCE"]
         regions[writer] = RegionPlace(start, octets.used - start, sequence)
         start = octets.used
+    samples = _sample_place(regions[Writer.ENGINE].offset, octets, spec.cycle_us)
 
     return ImageLayout(
         station=spec.name,
@@ -197,6 +222,7 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
         frames=frames,
         tx=tx,
         rx=rx,
+        samples=samples,
         word_count=words.used,
         directory_offset=octets.used,
     )
@@ -215,6 +241,15 @@ class _Allocator:
 
     def align(self) -> None:
         self.used += -self.used % 8
+
+
+def _sample_place(first: int, octets: _Allocator, cycle_us: int) -> SamplePlace:
+    """Keep enough samples for whoever looks now and then, in not too much memory."""
+    last = octets.used
+    size = SAMPLE_HEAD + last - first
+    count = min(SAMPLES_FOR_US // cycle_us, MAX_SAMPLES, SAMPLES_SIZE // size)
+    count = max(count, MIN_SAMPLES)
+    return SamplePlace(octets.take(count * size), count, size, first, last)
 
 
 def _control_variables(spec: StationSpec) -> Iterable[VariableSpec]:

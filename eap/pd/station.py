@@ -27,6 +27,7 @@ from eap.pd.link import Channel, CyclicBus, Taker
 from eap.pd.links import Links
 from eap.pd.poll import questions_of, requests_at
 from eap.pd.publisher import FrameRow, Publisher
+from eap.pd.samples import Sampler
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
 from eap.pd.statechannel import StateChannel
 from eap.pd.subscriber import Subscriber
@@ -73,6 +74,7 @@ class Station:
         self._words = image.words
         self._wake = wake
         self._inputs = Inputs(image)
+        self._samples = Sampler(image, self._inputs.memory)
         generated = [s for s in spec.sources if isinstance(s, EngineSource)]
         self._generate = Generators(image, generated).run
         self._run_links = Links(image, self.memory_of, spec.links).run if spec.links else None
@@ -165,7 +167,7 @@ class Station:
         self._has_own_variables = True
 
     def memory_of(self, writer: Writer) -> memoryview:
-        """Return where the cycle reads the variables of *writer*, as long as the image.
+        """Return where the cycle reads the variables of *writer*, at their offsets in the image.
 
         What the engine does not write itself is a copy that does not change within a cycle.
         """
@@ -318,6 +320,7 @@ class Station:
         words[_LATENESS + bin_] += 1
         if late_ns > words[_LATENESS_MAX_NS]:  # noqa: PLR1730  max() takes five times as long
             words[_LATENESS_MAX_NS] = late_ns
+        self._samples.end_cycle(cycle, now_ns)
         words[_FUTEX] = cycle & 0xFFFFFFFF
         # Never cleared here: whoever comes between the look and the clearing would sleep on.
         if cycle - words[_WAITERS] <= WAKE_FOR_CYCLES:

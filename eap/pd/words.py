@@ -86,7 +86,9 @@ class StationWord(IntEnum):
     LATENESS = DISCARDED + len(DISCARDS)
     LINKS_HELD = LATENESS + HISTOGRAM_BINS
     """Values that no link could pass on, because their source was infinite or no number."""
-    SIZE = LINKS_HELD + 1
+    SAMPLED_UNTIL = LINKS_HELD + 1
+    """The last cycle of which services wants a sample; written by services."""
+    SIZE = LINKS_HELD + 2
 
 
 class FrameWord(IntEnum):

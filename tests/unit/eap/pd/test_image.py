@@ -209,6 +209,11 @@ def damaged(change: str) -> memoryview:
         text = bytes(memory[fields[3] : fields[3] + fields[4]])
         more = text.replace(count, b'"word_count":' + b"9" * (len(count) - 13))
         memory[fields[3] : fields[3] + fields[4]] = more
+    if change == "samples":
+        count = f'"count":{layout.samples.count}'.encode()
+        text = bytes(memory[fields[3] : fields[3] + fields[4]])
+        more = text.replace(count, b'"count":' + b"9" * (len(count) - 8))
+        memory[fields[3] : fields[3] + fields[4]] = more
     HEADER.pack_into(memory, 0, *fields)
     return memory
 
@@ -218,12 +223,13 @@ def damaged(change: str) -> memoryview:
     [
         ("short", "shorter than the header"),
         ("magic", "magic is missing"),
-        ("version", "layout version 3, this program knows 2"),
+        ("version", "layout version 4, this program knows 3"),
         ("cut", "cut off"),
         ("length", "cut off"),
         ("directory", "damaged directory"),
         ("shifted", "contradicts the header"),
         ("words", "contradicts the header"),
+        ("samples", "contradicts the header"),
     ],
 )
 def test_a_damaged_image_is_refused_by_what_is_wrong(change, message):
@@ -244,4 +250,4 @@ def test_the_header_is_where_other_languages_expect_it():
     memory = memoryview(bytearray(layout.size))
     format_image(memory, layout, 3)
     assert bytes(memory[:8]) == b"EAPIMAGE"
-    assert struct.unpack_from("<IIQ", memory, 8) == (2, 3, layout.directory_offset)
+    assert struct.unpack_from("<IIQ", memory, 8) == (3, 3, layout.directory_offset)

@@ -222,7 +222,7 @@ def test_links_do_what_one_after_the_other_would(kinds, data):
     links = data.draw(links_of(types))
     image, model = image_of(spec), image_of(spec)
     first = image.layout.regions[Writer.ENGINE].offset
-    size = image.layout.directory_offset - first
+    size = image.layout.samples.last - first
     octets = data.draw(st.binary(min_size=size, max_size=size))
     for each in (image, model):
         each.memory[first : first + size] = octets

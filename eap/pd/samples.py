@@ -1,0 +1,93 @@
+"""Samples: what all variables of a station were at the end of each of its latest cycles.
+
+The engine takes them as long as somebody says that they are wanted, and waits for nobody: who looks
+too late finds that the place of a sample holds a later one.  A sample is taken with the copies that
+the cycle itself has read, so that its values belong to one moment, whoever writes them.
+"""
+
+from __future__ import annotations
+
+from eap.pd.image import Image
+from eap.pd.layout import SAMPLE_HEAD
+from eap.pd.spec import Writer
+from eap.pd.words import StationWord
+
+_CYCLE = int(StationWord.CYCLE)
+_SAMPLED_UNTIL = int(StationWord.SAMPLED_UNTIL)
+_NO_CYCLE = 0
+"""In the head of a sample that is being taken: the first cycle of a station is 1."""
+
+
+class Sampler:
+    """The engine's side.
+
+    Args:
+        image: Where the variables and the samples are.
+        inputs: The cycle's copy of what others write, at the same offsets.
+    """
+
+    def __init__(self, image: Image, inputs: memoryview) -> None:
+        self._words = image.words
+        self._memory = image.memory
+        self._inputs = inputs
+        self._place = place = image.layout.samples
+        self._heads = _heads(image)
+        engine = image.layout.regions[Writer.ENGINE]
+        self._engine = slice(engine.offset, engine.offset + engine.size)
+        self._others = slice(engine.offset + engine.size, place.last)
+
+    def end_cycle(self, cycle: int, now_ns: int) -> None:
+        """Keep the variables as they are after *cycle*, which ran at *now_ns*, if wanted."""
+        if cycle <= self._words[_SAMPLED_UNTIL]:
+            self._take(cycle, now_ns)
+
+    def _take(self, cycle: int, now_ns: int) -> None:
+        place, memory = self._place, self._memory
+        number = cycle % place.count
+        head = number * (place.size // 8)
+        self._heads[head] = _NO_CYCLE
+        self._heads[head + 1] = now_ns
+        start = place.offset + number * place.size + SAMPLE_HEAD
+        middle = start + self._engine.stop - self._engine.start
+        memory[start:middle] = memory[self._engine]
+        memory[middle : start - SAMPLE_HEAD + place.size] = self._inputs[self._others]
+        self._heads[head] = cycle
+
+
+class Samples:
+    """The side of those who read them; one in all may say what is wanted."""
+
+    def __init__(self, image: Image) -> None:
+        self._image = image
+        self._place = image.layout.samples
+        self._heads = _heads(image)
+
+    @property
+    def newest(self) -> int:
+        """The cycle that ran last, or runs right now."""
+        return int(self._image.words[_CYCLE])
+
+    def want(self, cycles: int) -> None:
+        """Have samples taken of so many cycles from now on."""
+        self._image.words[_SAMPLED_UNTIL] = self.newest + cycles
+
+    def ran_at_ns(self, cycle: int) -> int | None:
+        """Return when *cycle* ran, on the monotonic clock; None if there is no sample of it."""
+        head = self._head(cycle)
+        at_ns = self._heads[head + 1]
+        return at_ns if self._heads[head] == cycle else None
+
+    def read(self, cycle: int) -> bytes | None:
+        """Return the variables at the end of *cycle*; None if there is no sample of it."""
+        start = self._place.offset + cycle % self._place.count * self._place.size + SAMPLE_HEAD
+        data = bytes(self._image.memory[start : start - SAMPLE_HEAD + self._place.size])
+        return data if self._heads[self._head(cycle)] == cycle else None
+
+    def _head(self, cycle: int) -> int:
+        return cycle % self._place.count * (self._place.size // 8)
+
+
+def _heads(image: Image) -> memoryview:
+    """Return the samples as words, which are stored and loaded whole."""
+    place = image.layout.samples
+    return image.memory[place.offset : place.offset + place.count * place.size].cast("q")
