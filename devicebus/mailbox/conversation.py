@@ -49,6 +49,8 @@ class Message(NamedTuple):
     data: bytes
     at_ns: int = 0
     """When it came; 0 where nobody has a clock, and a number of messages is the only limit."""
+    counter: int = 0
+    """Of its mailbox header: the slave's own, which says nothing of the request."""
 
 
 Conversation: TypeAlias = Generator[Ask, Message, T]

@@ -267,7 +267,7 @@ class Mailbox:
             if header.type == MailboxType.ERR:
                 raise self._refusal(data)
             self._lanes.judge(ask.type).took(data)
-            return Message(header.type, data)
+            return Message(header.type, data, counter=header.counter)
         if self._lanes.judge(header.type).keep(data):
             return None
         if is_unsolicited(header.type, data):

@@ -148,6 +148,8 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag=
     id: int
     failure: Failure | None = None
     data: bytes = b""
+    counter: int = 0
+    """Of the mailbox header of a slave's reply."""
     outcomes: tuple[Outcome, ...] = ()
     report: BusReport | None = None
 

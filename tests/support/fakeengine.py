@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.master.access import Access
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master
@@ -88,7 +88,8 @@ class FakeBus:
             return {"report": self.report()}
         if isinstance(request, AskMailbox):
             talk = _one(_ask_of(request))
-            return {"data": self.finish(master.converse(request.station, talk, now_ns))}
+            message = self.finish(master.converse(request.station, talk, now_ns))
+            return {"data": message.data, "counter": message.counter}
         if isinstance(request, Transfer):
             accesses = [
                 Access(Command(each[0]), *each[1:]) for each in map(_fields, request.datagrams)
@@ -155,9 +156,8 @@ def _ask_of(request: AskMailbox) -> Ask:
     )
 
 
-def _one(ask: Ask) -> Conversation[bytes]:
-    message = yield ask
-    return message.data
+def _one(ask: Ask) -> Conversation[Message]:
+    return (yield ask)
 
 
 def _transfer(accesses: Sequence[Access]) -> Procedure[Sequence[Any]]:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import msgspec
 
 from devicebus.errors import BusError
+from devicebus.mailbox.conversation import Message
 from devicebus.master.access import Reply
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
@@ -155,7 +156,7 @@ class BusDesk:
         task = bus.master.converse(
             request.station, one_ask(ask), now_ns, name=f"{ask.type.name} request", requester=self
         )
-        self._watch(bus, request, request.station, task, _data_answer, now_ns)
+        self._watch(bus, request, request.station, task, _message_answer, now_ns)
 
     def _transfer(self, bus: EngineBus, request: Transfer, now_ns: int) -> None:
         self._check_room((request.bus, 0))
@@ -233,8 +234,8 @@ class BusDesk:
             self.dropped += 1
 
 
-def _data_answer(number: int, data: bytes) -> Answer:
-    return Answer(id=number, data=data)
+def _message_answer(number: int, message: Message) -> Answer:
+    return Answer(id=number, data=message.data, counter=message.counter)
 
 
 def _outcomes_answer(number: int, replies: list[Reply]) -> Answer:

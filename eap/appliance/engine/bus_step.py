@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import msgspec
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.master.access import Access, Reply
 from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure
@@ -43,10 +43,9 @@ def to_ask(request: AskMailbox) -> Ask:
     )
 
 
-def one_ask(ask: Ask) -> Conversation[bytes]:
-    """Ask once and return the reply's octets."""
-    message = yield ask
-    return message.data
+def one_ask(ask: Ask) -> Conversation[Message]:
+    """Ask once and return the reply."""
+    return (yield ask)
 
 
 def to_accesses(request: Transfer) -> list[Access]:

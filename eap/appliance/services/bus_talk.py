@@ -52,7 +52,7 @@ class Talk:
             lambda number: self._request(ask, number),
             (ask.delay_ns + ask.timeout_ns) / _S + MARGIN_S,
         )
-        return Message(self._kind, answer.data, monotonic_ns())
+        return Message(self._kind, answer.data, monotonic_ns(), answer.counter)
 
     def abandon(self) -> None:
         """Close it in the middle: the slave is told that what it has begun will not go on."""

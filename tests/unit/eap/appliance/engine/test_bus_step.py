@@ -27,7 +27,7 @@ def test_a_message_keeps_all_that_was_asked():
     assert next(conversation) == ask
     with pytest.raises(StopIteration) as end:
         conversation.send(Message(MailboxType.FOE, b"reply"))
-    assert end.value.value == b"reply"
+    assert end.value.value == Message(MailboxType.FOE, b"reply")
 
 
 def test_a_protocol_that_is_none_is_named():

@@ -39,6 +39,7 @@ def test_step_as_it_was_asked_for():
         message = await talk.ask(VENDOR._replace(delay_ns=5, timeout_ns=10**9))
         assert message.type is MailboxType.COE
         assert message.data[6:] == b"\x5a\x0e\0\0"
+        assert message.counter in range(1, 8)
         (request,) = engine.of(AskMailbox)
         assert (request.delay_ns, request.timeout_ns) == (5, 10**9)
         assert (request.listen, request.expects_reply) == (False, True)
