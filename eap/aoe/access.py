@@ -43,6 +43,7 @@ _LOOKUPS = frozenset(
         IndexGroup.FOE_CLOSE,
         IndexGroup.FOE_READ,
         IndexGroup.FOE_PROGRESS,
+        IndexGroup.WHEREABOUTS,
     )
 )
 """Groups whose ReadWrite changes nothing but what a client keeps of its own."""

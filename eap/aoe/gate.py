@@ -56,6 +56,11 @@ class Gate:
         """Take the oldest entry of the audit."""
         return self._entries.popleft() if self._entries else None
 
+    def may(self, header: AmsHeader, way: Way) -> dict[AccessService, bool | None]:
+        """Return what a client may do with its target; None if that depends on the object."""
+        grants = self._access.grants(way, header.source, header.target, header.target_port)
+        return {service: grants.may(service) for service in AccessService}
+
     def let_through(
         self, header: AmsHeader, data: bytes, way: Way, now_ns: int, route: str = ""
     ) -> tuple[bytes, Judged | None] | Refusal:

@@ -190,6 +190,10 @@ class Passage:
         """Return in words why nothing can go to *hop* now; empty if it can."""
         return self._judge.why_down(hop)
 
+    def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
+        """Return how a request would go on that is for nobody here."""
+        return self._judge.find_route(header, way)
+
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
         return self.in_flight.next_timeout()

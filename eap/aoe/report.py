@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from eap.aoe.prober import Prober
 from eap.aoe.routes import Route
+from eap.aoe.spec import AccessService
 from eap.aoe.traffic import Traffic
 from eap.aoe.way import Way
 
@@ -39,6 +40,19 @@ class ConnectionReport(NamedTuple):
 
     way: Way
     traffic: Traffic
+
+
+class Location(NamedTuple):
+    """Where a request would go.
+
+    *route* is None if it is for this station, or if there is none; *why* says why it would go
+    nowhere.  *may* is what access rules let the asker do, None if that depends on the object.
+    """
+
+    is_here: bool
+    route: RouteReport | None
+    why: str
+    may: dict[AccessService, bool | None]
 
 
 def report_route(

@@ -19,7 +19,7 @@ from eap.aoe.prober import MISSES, Prober
 from eap.aoe.reassembly import Reassembly
 from eap.aoe.record import Record, Stats
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
-from eap.aoe.report import ConnectionReport, RouteReport, report_route
+from eap.aoe.report import ConnectionReport, Location, RouteReport, report_route
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
 from eap.codec.ads import AdsError
@@ -170,6 +170,17 @@ class Router:
         traffic = self.record.routes.get(route.key)
         return report_route(route, self._passage.why_down(route.hop), traffic, self._prober)
 
+    def locate(self, header: AmsHeader, way: Way) -> Location:
+        """Say where a request would go that came by *way*."""
+        may = self.gate.may(header, way)
+        ports = self._devices.get(header.target)
+        if ports is not None:
+            text = _no_port(header)
+            return Location(True, None, "" if header.target_port in ports else text, may)
+        found = self._passage.find_route(header, way)
+        route, why = (found.route, found.text) if isinstance(found, Refusal) else (found, "")
+        return Location(False, None if route is None else self.report(route), why, may)
+
     def connections(self) -> list[ConnectionReport]:
         """Return who asks, or asked and is still connected."""
         return [ConnectionReport(*each) for each in self.record.connections.snapshot().items()]
@@ -229,8 +240,8 @@ class Router:
         self, header: AmsHeader, data: bytes, way: Way, ports: Container[int], now_ns: int
     ) -> list[Action]:
         if header.target_port not in ports:
-            text = f"nothing has port {header.target_port} of {header.target}"
-            return self._refuser.refuse(header, way, Refusal(AdsError.TARGET_PORT, text), now_ns)
+            why = Refusal(AdsError.TARGET_PORT, _no_port(header))
+            return self._refuser.refuse(header, way, why, now_ns)
         through = self.gate.let_through(header, data, way, now_ns)
         if isinstance(through, Refusal):
             return self._refuser.refuse(header, way, through, now_ns)
@@ -242,3 +253,7 @@ class Router:
             return [Deliver(_NOBODY, header, body, way)]
         ticket = self._passage.wait_for_service(header, data, way, judged, now_ns)
         return [Deliver(ticket, header, body, way)] if isinstance(ticket, int) else ticket
+
+
+def _no_port(header: AmsHeader) -> str:
+    return f"nothing has port {header.target_port} of {header.target}"

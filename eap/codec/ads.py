@@ -176,6 +176,8 @@ class IndexGroup(IntEnum):
     """Offset: see :class:`SoePlace`."""
     VOE = 0xF430
     """Written: a message with its VoE header."""
+    WHEREABOUTS = 0x4541_5001
+    """Own format: of the system service, where it passes requests on to, see ``HopQuestion``."""
 
 
 class AdsRange(WireStruct, frozen=True):
