@@ -51,7 +51,7 @@ def _lacks_root() -> str | None:
 
 
 def _lacks_program(name: str, *, package: str) -> str | None:
-    if shutil.which(name) is None:
+    if shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin") is None:
         return f"needs {name}; to install: apt-get install {package}"
     return None
 
@@ -75,7 +75,12 @@ def state_dir(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what this machine cannot do, and put the ``net`` tests last."""
-    missing = {"root": _lacks_root(), "tshark": _lacks_program("tshark", package="tshark")}
+    missing = {
+        "root": _lacks_root(),
+        "tshark": _lacks_program("tshark", package="tshark"),
+        "mosquitto": _lacks_program("mosquitto", package="mosquitto")
+        or _lacks_program("openssl", package="openssl"),
+    }
     for item in items:
         for marker, reason in missing.items():
             if reason is not None and item.get_closest_marker(marker) is not None:

@@ -1,0 +1,214 @@
+"""A connection to an MQTT broker, made again whenever it is lost (MQTT 5, else 3.1.1).
+
+aiomqtt is an extra of this project and imported only where a plant has a broker.  MQTT 5 comes
+first because only there the broker can be told how long a message may be; to a broker of before,
+every publisher sends as much as the broker itself allows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from random import uniform
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+from eap.aoe.mqtt_network import Publish, Subscribe
+from eap.aoe.spec import MqttSpec
+from eap.errors import EnvironmentalError
+
+if TYPE_CHECKING:
+    from eap.net.mqttclient import Client
+
+KEEPALIVE_S = 10
+"""After how much silence the broker is asked whether it is there; it waits half as long again."""
+MAX_WAITING = 1024
+"""Messages that wait to be sent."""
+MAX_WAITING_OCTETS = 8 << 20
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 15.0
+"""Between two attempts to connect: twice as long each time."""
+_STABLE_S = 10.0
+"""How long a connection has to last to be a good one."""
+_GOODBYE_S = 0.3
+_UNCONFIRMED = 16
+"""Messages of QoS 1 and 2 on their way at a time."""
+
+Outgoing: TypeAlias = Publish | Subscribe
+
+logger = logging.getLogger(__name__)
+
+
+class Handlers(NamedTuple):
+    """Who is told what; all of them return at once."""
+
+    connected: Callable[[], Iterable[Outgoing]]
+    """Returns what is sent first."""
+    lost: Callable[[str], None]
+    """The connection is gone; why, for people."""
+    message: Callable[[str, bytes, bool], None]
+    """Topic, payload, and whether the broker had kept it."""
+
+
+class MqttLink:
+    """One broker.
+
+    Args:
+        spec: Where it is and who we are.
+        client_id: At the broker.
+        will: What the broker publishes when this end is gone; at an orderly end it is published.
+        handlers: Who is told.
+
+    Raises:
+        EnvironmentalError: aiomqtt is not installed.
+    """
+
+    def __init__(
+        self, spec: MqttSpec, client_id: str, *, will: Publish, handlers: Handlers
+    ) -> None:
+        require_mqtt()
+        self._spec = spec
+        self._client_id = client_id
+        self._will = will
+        self._handlers = handlers
+        self._name = f"MQTT broker {spec.host}:{spec.port}"
+        self._outbox: asyncio.Queue[Outgoing] = asyncio.Queue()
+        self._octets = 0
+        self._is_connected = False
+        self._is_old = False
+        self._said = ""
+
+    def send(self, message: Outgoing) -> str | None:
+        """Send *message* soon and in its turn; return why not, if not."""
+        if not self._is_connected:
+            return f"no connection to {self._name}: {self._said or 'not yet'}"
+        if self._outbox.qsize() >= MAX_WAITING or self._octets > MAX_WAITING_OCTETS:
+            return f"too much waits for {self._name}"
+        self._octets += _size(message)
+        self._outbox.put_nowait(message)
+        return None
+
+    async def run(self) -> None:
+        """Keep the connection until cancelled."""
+        pause_s = FIRST_PAUSE_S
+        loop = asyncio.get_running_loop()
+        while True:
+            began_s = loop.time()
+            why = await self._connect_once()
+            if loop.time() - began_s > _STABLE_S:
+                pause_s = FIRST_PAUSE_S
+            if why != self._said:  # a broker that is away for long is no flood of lines
+                logger.warning("%s: %s; trying again", self._name, why)
+                self._said = why
+            await asyncio.sleep(pause_s * uniform(0.8, 1.2))  # noqa: S311  spreads a crowd
+            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+    async def _connect_once(self) -> str:
+        """Connect and serve until the connection is lost; return why it was."""
+        from eap.net.mqttclient import MqttError, describe, is_too_new, make_client, tls_context
+
+        try:
+            client = make_client(
+                self._spec.host, self._spec.port, self._client_id,
+                login=self._login(), tls=tls_context(self._spec.tls), will=self._will,
+                keepalive_s=KEEPALIVE_S, is_old=self._is_old,
+            )  # fmt: skip
+        except (OSError, UnicodeError) as exc:  # files of password and certificates
+            return str(exc)
+        try:
+            async with client:
+                await self._serve(client)
+            why = "it was closed"
+        except MqttError as exc:
+            if not self._is_connected and is_too_new(exc):
+                self._is_old = not self._is_old
+            why = describe(exc, client, self._spec.user)
+        finally:
+            client.close()
+        if self._is_connected:
+            self._is_connected = False
+            self._handlers.lost(f"no connection to {self._name}: {why}")
+        return why
+
+    async def _serve(self, client: Client) -> None:
+        self._outbox = asyncio.Queue()
+        self._octets = 0
+        self._is_connected = True
+        logger.info("%s: connected as %s", self._name, self._client_id)
+        self._said = ""
+        if self._is_old:
+            logger.warning("%s speaks no MQTT 5: the longest message is its own affair", self._name)
+        for message in self._handlers.connected():
+            self.send(message)
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._write(client, group))
+                await self._read(client)
+        except asyncio.CancelledError:
+            with suppress(Exception):  # the broker gets to know in any case
+                async with asyncio.timeout(_GOODBYE_S):
+                    await _publish(client, self._will)
+            raise
+        except ExceptionGroup as group_error:
+            raise group_error.exceptions[0] from None
+
+    async def _read(self, client: Client) -> None:
+        has_said = False
+        async for message in client.messages:
+            self._handlers.message(message.topic.value, message.payload, message.retain)
+            if client.inbox.discarded and not has_said:
+                has_said = True
+                logger.warning("%s sends more than can be taken; some is lost", self._name)
+
+    async def _write(self, client: Client, group: asyncio.TaskGroup) -> None:
+        room = asyncio.Semaphore(_UNCONFIRMED)
+
+        async def confirm(message: Publish) -> None:
+            try:
+                await _publish(client, message)
+            finally:
+                room.release()
+
+        while True:
+            message = await self._outbox.get()
+            self._octets -= _size(message)
+            if isinstance(message, Subscribe):
+                await self._subscribe(client, message)
+            elif message.qos:
+                await room.acquire()
+                group.create_task(confirm(message))
+            else:
+                await _publish(client, message)
+
+    async def _subscribe(self, client: Client, message: Subscribe) -> None:
+        for topic in await client.subscribe_all(message.filters):
+            logger.warning("%s does not let %s read %s", self._name, self._client_id, topic)
+
+    def _login(self) -> tuple[str, str] | None:
+        spec = self._spec
+        if not spec.user:
+            return None
+        lines = Path(spec.password_file).read_text().splitlines() if spec.password_file else []
+        return spec.user, lines[0] if lines else ""
+
+
+def require_mqtt() -> None:
+    """Raise EnvironmentalError, and say what to do, if this installation has no MQTT."""
+    try:
+        import aiomqtt  # noqa: F401  only whether it is there
+    except ImportError:
+        raise EnvironmentalError(
+            "MQTT needs aiomqtt, which is not installed: pip install 'eap-appliance[mqtt]'"
+            " (in the project's folder: pip install '.[mqtt]')"
+        ) from None
+
+
+async def _publish(client: Client, message: Publish) -> None:
+    await client.publish(
+        message.topic, message.payload, qos=message.qos, retain=message.is_retained
+    )
+
+
+def _size(message: Outgoing) -> int:
+    return len(message.payload) if isinstance(message, Publish) else 0

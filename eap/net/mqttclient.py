@@ -1,0 +1,192 @@
+"""What this project needs of aiomqtt, and paho underneath, besides what they have.
+
+This is the only module that imports them, and it is imported late.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl
+from collections.abc import Iterable
+
+import aiomqtt
+from aiomqtt import Message, MqttError
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+
+from eap.aoe.mqtt_network import Publish
+from eap.aoe.spec import TlsSpec
+
+__all__ = ["Client", "MqttError", "describe", "is_too_new", "make_client", "tls_context"]
+
+MAX_MESSAGE = 1 << 20
+"""Octets of a message; the broker is asked to keep longer ones."""
+MAX_INBOX, MAX_INBOX_OCTETS = 1024, 8 << 20
+"""Messages that were received and wait for their turn."""
+CONNECT_S, ANSWER_S = 3.0, 5.0
+"""How long a connection may take to be made, and the broker to answer."""
+_UNCONFIRMED = 64
+_REFUSED = 0x80
+"""And above: results of subscriptions that are not granted."""
+_UNSUPPORTED = frozenset({1, 0x84})
+"""Reasons of brokers that want another version of MQTT (3.1.1 and 5)."""
+_LOGIN = frozenset({4, 5, 0x86, 0x87})
+"""Reasons of brokers that do not want this user."""
+
+
+class Inbox(asyncio.Queue[Message]):
+    """Messages that wait; what has no room is thrown away and counted."""
+
+    discarded = 0
+    octets = 0
+
+    def full(self) -> bool:
+        """Say whether there is no room, by number or by octets."""
+        return super().full() or self.octets >= MAX_INBOX_OCTETS
+
+    def put_nowait(self, item: Message) -> None:
+        """Take *item* if there is room."""
+        if self.full():
+            self.discarded += 1
+        else:
+            super().put_nowait(item)
+
+    def _put(self, item: Message) -> None:
+        self.octets += len(item.payload)
+        super()._put(item)
+
+    def _get(self) -> Message:
+        item = super()._get()
+        self.octets -= len(item.payload)
+        return item
+
+
+class Complaints(logging.Handler):
+    """Keeps the latest error of paho: often the only place that says why a connection broke."""
+
+    latest = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep it."""
+        self.latest = record.getMessage()
+
+
+class Client(aiomqtt.Client):
+    """A client that connects within bounded time and can be closed at any time."""
+
+    complaints: Complaints
+
+    @property
+    def inbox(self) -> Inbox:
+        """What was received and waits."""
+        assert isinstance(self._queue, Inbox)  # noqa: S101  made below
+        return self._queue
+
+    async def subscribe_all(self, filters: Iterable[str]) -> list[str]:
+        """Subscribe with QoS 2; return what is refused."""
+        wanted = list(filters)
+        codes: Iterable[int | ReasonCode] = await self.subscribe([(each, 2) for each in wanted])
+        numbers = (each.value if isinstance(each, ReasonCode) else each for each in codes)
+        return [topic for topic, number in zip(wanted, numbers, strict=True) if number >= _REFUSED]
+
+    def limit_connect(self, timeout_s: float) -> None:
+        """Set how long the thread may wait that connects."""
+        self._client.connect_timeout = timeout_s
+
+    def close(self) -> None:
+        """Close what is still open, also after a connection that was given up half-way."""
+        self._client.disconnect()
+
+
+class _Socket(ssl.SSLSocket):
+    """A socket that does not wait for long for the other end of TLS, and is closed if that fails.
+
+    Left to itself paho waits as long as the broker may be silent, and leaves the socket open.
+    """
+
+    def do_handshake(self, block: bool = False) -> None:
+        """Agree with the other end."""
+        self.settimeout(CONNECT_S)
+        try:
+            super().do_handshake(block)
+        except OSError:
+            self.close()
+            raise
+
+
+def tls_context(spec: TlsSpec | None) -> ssl.SSLContext | None:
+    """Return how to connect; None for a connection that anybody can read.
+
+    Raises:
+        OSError: a file is missing or is not what it should be.
+    """
+    if spec is None:
+        return None
+    context = ssl.create_default_context(cafile=spec.ca or None)
+    context.sslsocket_class = _Socket
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.check_hostname = spec.check_name
+    if spec.certificate:
+        context.load_cert_chain(spec.certificate, spec.key or None)
+    return context
+
+
+def make_client(
+    host: str, port: int, client_id: str, *,
+    login: tuple[str, str] | None, tls: ssl.SSLContext | None, will: Publish, keepalive_s: int,
+    is_old: bool,
+) -> Client:  # fmt: skip
+    """Return a client that is not connected yet; *is_old* makes it speak MQTT 3.1.1."""
+    properties = None
+    if not is_old:
+        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        properties.MaximumPacketSize = MAX_MESSAGE
+        properties.ReceiveMaximum = _UNCONFIRMED
+    user, password = login or (None, None)
+    # Of this client alone, and heard by nobody else.
+    logger = logging.Logger(__name__, logging.ERROR)  # noqa: LOG001
+    complaints = Complaints()
+    logger.addHandler(complaints)
+    client = Client(
+        host,
+        port,
+        username=user,
+        password=password,
+        identifier=client_id,
+        logger=logger,
+        queue_type=Inbox,
+        max_queued_incoming_messages=MAX_INBOX,
+        protocol=aiomqtt.ProtocolVersion.V311 if is_old else aiomqtt.ProtocolVersion.V5,
+        properties=properties,
+        will=aiomqtt.Will(will.topic, will.payload, will.qos, will.is_retained),
+        tls_context=tls,
+        timeout=ANSWER_S,
+        keepalive=keepalive_s,
+    )
+    client.complaints = complaints
+    client.limit_connect(CONNECT_S)
+    return client
+
+
+def is_too_new(error: MqttError) -> bool:
+    """Say whether the broker may speak another version; some of them just say nothing."""
+    code = _code(error)
+    return code in _UNSUPPORTED or (code is None and "timed out" in str(error))
+
+
+def describe(error: MqttError, client: Client, user: str) -> str:
+    """Return in words why there is no connection."""
+    if _code(error) in _LOGIN:
+        if not user:
+            return "it wants to know who connects: give 'user' and 'password_file', or 'tls'"
+        return f"it refuses user {user!r} or the password: look at 'user' and 'password_file'"
+    if client.complaints.latest:
+        return client.complaints.latest
+    return str(error.__cause__ or error) or type(error).__name__
+
+
+def _code(error: MqttError) -> int | None:
+    reason = getattr(error, "rc", None)
+    return reason.value if isinstance(reason, ReasonCode) else reason

@@ -1,0 +1,225 @@
+"""A link to a real broker: what it says first, broken connections, and who is not let in."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from collections.abc import Awaitable, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+
+from eap.aoe.mqtt_network import Publish, Subscribe
+from eap.aoe.spec import MqttSpec, TlsSpec
+from eap.errors import EnvironmentalError
+from eap.net import mqtt
+from eap.net.mqtt import Handlers, MqttLink
+from tests.support.mosquitto import broker, write_certificates, write_passwords
+
+pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
+
+ADDRESS = "127.0.3.40"
+WILL = Publish("hall/1/info", b"gone", 2, is_retained=True)
+HELLO = Publish("hall/1/info", b"here", 2, is_retained=True)
+
+
+class Peer:
+    """A link, and what it told."""
+
+    def __init__(self, name: str = "one", **settings: object) -> None:
+        self.heard: list[tuple[str, bytes, bool]] = []
+        self.lost: list[str] = []
+        self.connections = 0
+        spec = MqttSpec(network="hall", **{"host": ADDRESS, **settings})
+        self.link = MqttLink(
+            spec, name, will=WILL, handlers=Handlers(self._connected, self.lost.append, self._hear)
+        )
+
+    def _connected(self) -> list[Publish | Subscribe]:
+        self.connections += 1
+        return [Subscribe(("hall/#",)), HELLO]
+
+    def _hear(self, topic: str, payload: bytes, is_retained: bool) -> None:
+        self.heard.append((topic, payload, is_retained))
+
+
+async def until(done: Callable[[], object]) -> None:
+    async with asyncio.timeout(15):
+        while not done():  # noqa: ASYNC110  several links and logs
+            await asyncio.sleep(0.01)
+
+
+@asynccontextmanager
+async def running(*peers: Peer):
+    tasks = [asyncio.ensure_future(peer.link.run()) for peer in peers]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def play(story: Callable[[], Awaitable[None]]) -> None:
+    asyncio.run(story())
+
+
+def test_link_subscribes_tells_and_says_goodbye(tmp_path):
+    async def story():
+        one, two = Peer(), Peer("two")
+        async with running(two):
+            await until(lambda: two.heard)
+            async with running(one):
+                await until(lambda: ("hall/1/info", b"here", True) in one.heard)
+                for number in range(100):
+                    message = Publish("hall/2/ams", b"%d" % number, 0)
+                    assert one.link.send(message) is None
+                await until(lambda: len(two.heard) >= 102)
+                numbers = [each for each in two.heard if each[0] == "hall/2/ams"]
+                assert numbers == [("hall/2/ams", b"%d" % n, False) for n in range(100)]
+                one.link.send(Publish("hall/2/ams", b"sure", 2))
+                await until(lambda: two.heard[-1] == ("hall/2/ams", b"sure", False))
+            await until(lambda: two.heard[-1] == ("hall/1/info", b"gone", False))
+
+    with broker(tmp_path, ADDRESS):
+        play(story)
+
+
+def test_link_comes_back_with_its_broker(tmp_path, caplog):
+    async def story(server):
+        peer = Peer()
+        assert "no connection to MQTT broker 127.0.3.40:1883" in peer.link.send(HELLO)
+        async with running(peer):
+            await until(lambda: "refused" in caplog.text)
+            server.start()
+            await until(lambda: peer.heard)
+            server.stop()
+            await until(lambda: peer.lost)
+            assert peer.link.send(HELLO).startswith("no connection")
+            await asyncio.sleep(1)
+            server.start()
+            await until(lambda: peer.connections == 2 and peer.heard[1:])
+        assert caplog.text.count("refused") <= 2  # once each time that it is away
+
+    caplog.set_level(logging.INFO)
+    with broker(tmp_path, ADDRESS) as server:
+        server.stop()
+        play(lambda: story(server))
+
+
+def test_user_and_password_are_asked_for_and_a_wrong_one_is_named(tmp_path, caplog):
+    right, wrong = tmp_path / "right", tmp_path / "wrong"
+    right.write_text("secret\n")
+    wrong.write_text("guess\n")
+
+    async def story():
+        known = Peer("known", user="island", password_file=str(right))
+        other = Peer("other", user="island", password_file=str(wrong))
+        nobody, lost = Peer("nobody"), Peer("lost", user="island", password_file="/nowhere")
+        async with running(known, other, nobody, lost):
+            await until(lambda: known.heard)
+            await until(lambda: caplog.text.count("trying again") >= 3)
+        assert not other.connections + nobody.connections + lost.connections
+
+    passwords = write_passwords(tmp_path, island="secret")
+    with broker(tmp_path, ADDRESS, "allow_anonymous false", f"password_file {passwords}"):
+        play(story)
+    name = "MQTT broker 127.0.3.40:1883: "
+    assert (
+        f"{name}it refuses user 'island' or the password: look at 'user' and 'password_file';"
+        " trying again"
+    ) in caplog.text
+    assert f"{name}it wants to know who connects: give 'user' and 'password_file'" in caplog.text
+    assert "No such file or directory: '/nowhere'" in caplog.text
+    assert "secret" not in caplog.text
+    assert "guess" not in caplog.text
+
+
+def test_tls_names_the_broker_and_shows_who_connects(tmp_path, caplog):
+    files = write_certificates(tmp_path, ADDRESS)
+    mine = TlsSpec(str(files["ca"]), str(files["client"]), str(files["client_key"]))
+    settings = (
+        "allow_anonymous true", "require_certificate true", "use_identity_as_username true",
+        f"cafile {files['ca']}", f"certfile {files['broker']}", f"keyfile {files['broker_key']}",
+    )  # fmt: skip
+
+    async def story(server):
+        good = Peer("good", port=8883, tls=mine)
+        stranger = Peer("stranger", port=8883, tls=TlsSpec())
+        nobody = Peer("nobody", port=8883, tls=TlsSpec(str(files["ca"])))
+        async with running(good, stranger, nobody):
+            await until(lambda: good.heard)
+            await until(lambda: "certificate verify failed" in caplog.text)
+            await until(lambda: "certificate required" in caplog.text)
+        assert not nobody.connections + stranger.connections
+        assert "as good (p5, c1, k10, u'island-01')" in server.log.read_text()
+
+    with broker(tmp_path, ADDRESS, *settings, port=8883) as server:
+        play(lambda: story(server))
+
+
+def test_certificate_of_another_name_is_refused_unless_told_otherwise(tmp_path, caplog):
+    files = write_certificates(tmp_path, "127.0.3.99")
+    settings = ("allow_anonymous true", f"certfile {files['broker']}",
+                f"keyfile {files['broker_key']}")  # fmt: skip
+
+    async def story():
+        strict = Peer("strict", port=8883, tls=TlsSpec(str(files["ca"])))
+        easy = Peer("easy", port=8883, tls=TlsSpec(str(files["ca"]), check_name=False))
+        async with running(strict, easy):
+            await until(lambda: easy.heard)
+            await until(lambda: "IP address mismatch" in caplog.text)
+        assert not strict.connections
+
+    with broker(tmp_path, ADDRESS, *settings, port=8883):
+        play(story)
+
+
+def test_message_longer_than_any_packet_stays_with_the_broker(tmp_path):
+    async def story():
+        one, two = Peer(), Peer("two")
+        async with running(one, two):
+            await until(lambda: one.heard and two.heard)
+            one.link.send(Publish("hall/2/ams", bytes(1 << 21), 0))
+            one.link.send(Publish("hall/2/ams", b"after", 0))
+            await until(lambda: ("hall/2/ams", b"after", False) in two.heard)
+            assert max(len(payload) for _, payload, _ in two.heard) < 100
+            assert two.connections == 1
+
+    with broker(tmp_path, ADDRESS):
+        play(story)
+
+
+def test_topic_that_may_not_be_read_is_named(caplog):
+    class Client:
+        async def subscribe_all(self, topics):
+            return topics[1:]
+
+    async def story():
+        await Peer().link._subscribe(Client(), Subscribe(("hall/#", "hall/+/info")))
+
+    play(story)  # mosquitto grants everything, and then brings nothing
+    assert [each.getMessage() for each in caplog.records] == [
+        "MQTT broker 127.0.3.40:1883 does not let one read hall/+/info"
+    ]
+
+
+def test_too_much_at_once_is_not_taken(tmp_path, monkeypatch):
+    monkeypatch.setattr(mqtt, "MAX_WAITING", 3)
+
+    async def story():
+        peer = Peer()
+        async with running(peer):
+            await until(lambda: peer.heard)
+            said = [peer.link.send(Publish("hall/2/ams", b"x", 0)) for _ in range(5)]
+            assert said == [None] * 3 + ["too much waits for MQTT broker 127.0.3.40:1883"] * 2
+
+    with broker(tmp_path, ADDRESS):
+        play(story)
+
+
+def test_without_aiomqtt_one_is_told_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "aiomqtt", None)
+    with pytest.raises(EnvironmentalError, match=r"pip install 'eap-appliance\[mqtt\]'"):
+        Peer()
