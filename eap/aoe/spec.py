@@ -55,12 +55,12 @@ class RouteSpec(Record, frozen=True, kw_only=True):
 
     Attributes:
         name: As people call it: a station, or what the plant file says.
-        net_id: Of the station, as it really is there; the next one's for a default route.
+        net_id: Of the station, as it really is there; 0.0.0.0.0.0 for a default route.
         hop: Where packets for it go.
         octets: How many octets of a NetID have to be those of *net_id*: 6, 5 or 4; 0 makes it a
             default route.
-        router: NetID of the router at the next hop, which is asked whether it is alive; empty if it
-            is not known, then *net_id* is.
+        router: NetID of the router at the next hop, which is asked whether it is alive; empty if
+            that is not known.
         virtual: NetID by which it is known here instead of *net_id*; empty for none.
         is_unidirectional: Whether nothing may be asked from there.
         timeout_ms: How long an answer may take; 0 for as long as usual.

@@ -102,7 +102,7 @@ def _check_claims(
     """Report NetIDs that belong to somebody else, or to another route of the station."""
     station, route = sent
     try:
-        claims = reach(index, route, "", loose)
+        claims = reach(index, route, loose)
         if route.virtual and route.to != DEFAULT_TARGET:
             claims = [(route.virtual, octets) for _, octets in claims]
         keys = [(NetId.parse(net_id)[:octets], octets) for net_id, octets in claims]

@@ -74,7 +74,7 @@ def _written(index: Index, station: Station, loose: set[str]) -> Iterator[RouteS
         if route.mqtt:
             continue
         hop, router = next_hop(index, station, route)
-        for net_id, octets in reach(index, route, router, loose):
+        for net_id, octets in reach(index, route, loose):
             yield RouteSpec(
                 name=route.to,
                 net_id=net_id,
@@ -84,7 +84,7 @@ def _written(index: Index, station: Station, loose: set[str]) -> Iterator[RouteS
                 virtual=str(NetId.parse(route.virtual)) if route.virtual else "",
                 is_unidirectional=route.unidirectional,
                 timeout_ms=route.timeout_ms,
-                is_probed=route.probe and any(NetId.parse(router or net_id)),
+                is_probed=route.probe,
             )
 
 

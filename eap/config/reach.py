@@ -14,17 +14,13 @@ WHOLE = 6
 NOBODY = NetId(bytes(WHOLE))
 
 
-def reach(index: Index, route: Route, router: str, loose: set[str]) -> list[tuple[str, int]]:
+def reach(index: Index, route: Route, loose: set[str]) -> list[tuple[str, int]]:
     """Return NetID and octets to match of each part of *route*.
 
-    Args:
-        index: The plant.
-        route: As it is written.
-        router: NetID of the next hop's, empty if it is not known.
-        loose: As :func:`without_prefix` returns them.
+    *loose* are the stations that :func:`without_prefix` returns.
     """
     if route.to == DEFAULT_TARGET:
-        return [(router or str(NOBODY), 0)]
+        return [(str(NOBODY), 0)]
     target = target_of(index, route)
     if target is None:
         return [(str(NetId.parse(route.net_id)), route.octets or COMMON)]

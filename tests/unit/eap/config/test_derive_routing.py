@@ -85,13 +85,13 @@ def test_a_route_that_is_written_stands_for_the_derived_ones(plant):
     )
 
 
-def test_what_is_written_comes_first_and_a_router_that_nobody_knows_is_not_asked(plant):
+def test_what_is_written_comes_first(plant):
     found = plant(routes("{to: default, via: 127.0.9.77}")).routing["left"].routes
     assert [(route.name, route.octets, route.is_derived) for route in found] == [
         ("default", 0, False),
         ("right", 4, True),
     ]
-    assert not found[0].is_probed
+    assert (found[0].net_id, found[0].router) == ("0.0.0.0.0.0", "")
 
 
 def test_stations_that_share_but_a_network_reach_each_other_by_its_broker(plant):

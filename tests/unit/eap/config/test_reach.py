@@ -33,15 +33,14 @@ def test_net_ids_that_are_none_are_passed_over(index):
 
 
 @pytest.mark.parametrize(
-    ("route", "router", "found"),
+    ("route", "found"),
     [
-        (Route(to="default"), "1.1.1.1.1.1", [("1.1.1.1.1.1", 0)]),
-        (Route(to="default"), "", [("0.0.0.0.0.0", 0)]),
-        (Route(to="plc", net_id="5.1.2.3.1.1"), "", [("5.1.2.3.1.1", 4)]),
-        (Route(to="plc", net_id="5.1.2.3.1.1", octets=6), "", [("5.1.2.3.1.1", 6)]),
-        (Route(to="left"), "", [("127.0.9.1.1.1", 6), ("127.0.9.1.2.1", 6)]),
-        (Route(to="left", virtual="9.9.9.9.1.1"), "", [("127.0.9.1.1.1", 4)]),
+        (Route(to="default"), [("0.0.0.0.0.0", 0)]),
+        (Route(to="plc", net_id="5.1.2.3.1.1"), [("5.1.2.3.1.1", 4)]),
+        (Route(to="plc", net_id="5.1.2.3.1.1", octets=6), [("5.1.2.3.1.1", 6)]),
+        (Route(to="left"), [("127.0.9.1.1.1", 6), ("127.0.9.1.2.1", 6)]),
+        (Route(to="left", virtual="9.9.9.9.1.1"), [("127.0.9.1.1.1", 4)]),
     ],
 )
-def test_a_route_is_for_the_net_ids_of_its_target(index, route, router, found):
-    assert reach(index(), route, router, {"left"}) == found
+def test_a_route_is_for_the_net_ids_of_its_target(index, route, found):
+    assert reach(index(), route, {"left"}) == found

@@ -1,0 +1,265 @@
+"""The routes of one station: those of the plant file, those that were added, and what is learned.
+
+Rule: what the plant file says goes before everything else; what was added is kept over restarts,
+what was learned is not.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection
+from typing import Protocol
+
+from msgspec.structs import replace
+
+from eap.aoe.routes import Origin, Route, RouteTable
+from eap.aoe.spec import HopSpec, RouteSpec, RoutingSpec
+from eap.aoe.way import Way
+from eap.appliance.route_store import RouteStore
+from eap.errors import ControlError
+from eap.ids import NetId
+
+MAX_ADDED = 1000
+"""Routes that can be added to one station."""
+MAX_NAME = 80
+_MS = 1_000_000
+_WHOLE = 6
+
+logger = logging.getLogger(__name__)
+
+
+class RoutedStation(Protocol):
+    """What is needed of the router of a station."""
+
+    @property
+    def table(self) -> RouteTable:
+        """Its routes, to be read."""
+
+    @property
+    def net_ids(self) -> Collection[NetId]:
+        """All NetIDs of the station."""
+
+    def add_route(self, route: Route) -> bool:
+        """Take a route into the table; return whether it was taken."""
+
+    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+        """Forget a route; return whether there was one."""
+
+
+class StationRoutes:
+    """Which routes the router of a station has.
+
+    Args:
+        router: Of the station.
+        spec: What the plant file says.
+        store: Of the added routes.
+        open_hop: Returns door and address of a hop, which begins to connect if it has to; raises
+            ValueError if there is no such door.
+        close_unused: Called when routes have gone.
+    """
+
+    def __init__(
+        self,
+        router: RoutedStation,
+        spec: RoutingSpec,
+        store: RouteStore,
+        *,
+        open_hop: Callable[[HopSpec], Way],
+        close_unused: Callable[[], None],
+    ) -> None:
+        self._router = router
+        self._spec = spec
+        self._store = store
+        self._open_hop = open_hop
+        self._close_unused = close_unused
+        self._added: list[RouteSpec] = []
+        self._written: dict[tuple[NetId, Way], RouteSpec] = {}
+
+    @property
+    def spec(self) -> RoutingSpec:
+        """What the plant file says."""
+        return self._spec
+
+    @property
+    def added(self) -> tuple[RouteSpec, ...]:
+        """The added routes, the oldest first."""
+        return tuple(self._added)
+
+    def start(self) -> None:
+        """Take the routes of the plant file, then those that were added before."""
+        self._take_spec()
+        for spec in self._store.load():
+            try:
+                self._take(spec, Origin.ADDED)
+            except ControlError as exc:
+                logger.warning("added route %s is left out: %s", spec.name, exc)
+            self._added.append(spec)  # what cannot be today may be one after the next start
+
+    def replace_spec(self, spec: RoutingSpec) -> None:
+        """Go on with what another plant file says; added and learned routes stay."""
+        for key in self._written:
+            self._router.remove_route(*key)
+        self._written.clear()
+        self._spec = spec
+        self._take_spec()
+        for each in self._added:  # one of them may have been hidden by a route of the same hop
+            try:
+                self._take(each, Origin.ADDED)
+            except ControlError as exc:
+                logger.warning("added route %s is left out: %s", each.name, exc)
+        self._close_unused()
+
+    def is_derived(self, route: Route) -> bool:
+        """Tell whether a route follows from the ports of the plant."""
+        spec = self._written.get(route.key)
+        return spec is not None and spec.is_derived
+
+    def add(self, spec: RouteSpec, *, replaces: str = "") -> None:
+        """Add a route and keep it, in place of the added one of its name, or to its NetID.
+
+        Args:
+            spec: The route.
+            replaces: Name or NetID of one more that it takes the place of.
+
+        Raises:
+            ControlError: there cannot be such a route, or a route of the plant file is before it.
+            EnvironmentalError: it cannot be kept.
+        """
+        spec = replace(spec, name=_plain(spec.name), is_derived=False)
+        known_as = {spec.name, spec.virtual or spec.net_id, replaces} - {""}
+        old = [each for each in self._added if _names(each) & known_as]
+        self._check(spec, len(self._added) - len(old))
+        left = [each for each in self._added if each not in old]
+        route = self._route(spec, Origin.ADDED)
+        if route.key in self._written:
+            raise ControlError(_hidden_by(self._written[route.key].name))
+        self._store.save([*left, spec])
+        for each in old:
+            self._forget(each)
+        self._router.add_route(route)
+        self._added = [*left, spec]
+        self._close_unused()
+
+    def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
+        """Remove an added route by its name or NetID, and return it.
+
+        *door* and *address* choose where there are several.
+
+        Raises:
+            ControlError: there is none that can be removed.
+            EnvironmentalError: that cannot be kept.
+        """
+        found = [
+            spec
+            for spec in self._added
+            if text in _names(spec) and self._is_at(spec, door, address)
+        ]
+        if not found:
+            raise ControlError(self._why_not_removed(text))
+        left = [each for each in self._added if each is not found[0]]
+        self._store.save(left)
+        self._added = left
+        self._forget(found[0])
+        self._close_unused()
+        return found[0]
+
+    def _take_spec(self) -> None:
+        for spec in self._spec.routes:
+            try:
+                route = self._take(spec, Origin.STATIC)
+            except ControlError as exc:
+                logger.warning("route %s of the plant file is left out: %s", spec.name, exc)
+            else:
+                self._written[route.key] = spec
+
+    def _take(self, spec: RouteSpec, origin: Origin) -> Route:
+        route = self._route(spec, origin)
+        self._router.add_route(route)
+        return route
+
+    def _route(self, spec: RouteSpec, origin: Origin) -> Route:
+        try:
+            hop = self._open_hop(spec.hop)
+            return make_route(spec, hop, origin)
+        except ValueError as exc:
+            raise ControlError(f"route {spec.name!r}: {exc}") from None
+
+    def _forget(self, spec: RouteSpec) -> None:
+        """Take an added route out of the table, unless one of the plant file has its place."""
+        for route in list(self._router.table):
+            same = route.origin is Origin.ADDED and route.name == spec.name
+            if same and str(route.net_id) == (spec.virtual or spec.net_id):
+                self._router.remove_route(*route.key)
+
+    def _check(self, spec: RouteSpec, others: int) -> None:
+        if others >= MAX_ADDED:
+            raise ControlError(f"{MAX_ADDED} routes were added already; remove some")
+        if not spec.name:
+            raise ControlError("a route needs a name")
+        try:
+            net_id = NetId.parse(spec.virtual or spec.net_id)
+        except ValueError as exc:
+            raise ControlError(f"route {spec.name!r}: {exc}") from None
+        if not any(net_id) and spec.octets:
+            raise ControlError(f"NetID {net_id} stands for any; a default route matches 0 octets")
+        prefix = net_id[: spec.octets]
+        if spec.octets and any(own.startswith(prefix) for own in self._router.net_ids):
+            shown = ".".join(map(str, prefix)) + ".x" * (_WHOLE - spec.octets)
+            raise ControlError(f"NetID {shown} is one of this station itself")
+        for route in self._router.table:
+            if route.origin is Origin.STATIC and _takes_all(route, net_id, spec.octets):
+                raise ControlError(_hidden_by(route.name))
+
+    def _is_at(self, spec: RouteSpec, door: str, address: str) -> bool:
+        if not door and not address:
+            return True
+        hop = self._open_hop(spec.hop)
+        return door in {"", hop.door} and address in {"", hop.connection}
+
+    def _why_not_removed(self, text: str) -> str:
+        for route in self._router.table:
+            if text in {route.name, str(route.net_id)}:
+                if route.origin is Origin.STATIC:
+                    where = "follows from the ports" if self.is_derived(route) else "is"
+                    return f"route {route.name!r} {where} of the plant file; change it there"
+                if route.origin is Origin.LEARNED:
+                    return f"route {route.name!r} is learned: it goes by itself, or learn: false"
+        names = ", ".join(spec.name for spec in self._added) or "none"
+        return f"no route {text!r} was added; there are: {names}"
+
+
+def make_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:
+    """Return the route that *spec* describes; raise ValueError if there cannot be one."""
+    net_id = NetId.parse(spec.net_id)
+    return Route(
+        net_id=NetId.parse(spec.virtual) if spec.virtual else net_id,
+        name=spec.name,
+        hop=hop,
+        origin=origin,
+        octets=spec.octets,
+        is_unidirectional=spec.is_unidirectional,
+        real=net_id if spec.virtual else None,
+        timeout_ns=spec.timeout_ms * _MS,
+        is_probed=spec.is_probed,
+        router=NetId.parse(spec.router) if spec.router else None,
+    )
+
+
+def _takes_all(route: Route, net_id: NetId, octets: int) -> bool:
+    """Tell whether a route of the plant file leaves nothing for another one."""
+    return route.octets == octets and route.net_id[:octets] == net_id[:octets]
+
+
+def _hidden_by(name: str) -> str:
+    return (
+        f"route {name!r} of the plant file is for the same NetIDs and goes before one that is"
+        " added; change the plant file"
+    )
+
+
+def _names(spec: RouteSpec) -> set[str]:
+    return {spec.name, spec.virtual or spec.net_id}
+
+
+def _plain(name: str) -> str:
+    return "".join(filter(str.isprintable, name)).strip()[:MAX_NAME]
