@@ -35,20 +35,17 @@ def object_list(list_type: ListType = ListType.ALL) -> Conversation[list[int]]:
         SdoAbortError: the slave refuses.
         MailboxProtocolError: its answer is no answer.
     """
-    what = f"object list {list_type.name}"
-    request = ListRequest(list_type).encode()
-    body = yield from _ask(what, SdoInfoOpcode.LIST_REQUEST, request)
+    body = yield from read_list(list_type)
     if len(body) % 2:
+        what = f"object list {list_type.name}"
         raise MailboxProtocolError(f"{what}: {len(body)} octets, expected whole indexes")
     return list(struct.unpack(f"<{len(body) // 2}H", body))[1:]
 
 
 def object_description(index: int) -> Conversation[ObjectDescription]:
     """Read what the slave says of an object; raises as object_list() does."""
-    what = f"object description 0x{index:04X}"
-    request = ObjectRequest(index).encode()
-    body = yield from _ask(what, SdoInfoOpcode.OBJECT_REQUEST, request, index=index)
-    with reading(what):
+    body = yield from read_object(index)
+    with reading(f"object description 0x{index:04X}"):
         return ObjectDescription.decode(body)
 
 
@@ -56,13 +53,30 @@ def entry_description(
     index: int, subindex: int, value_info: int = ~ValueInfo(0)
 ) -> Conversation[EntryDescription]:
     """Read what the slave says of an entry; raises as object_list() does."""
+    body = yield from read_entry(index, subindex, value_info)
+    with reading(f"entry description 0x{index:04X}:{subindex:02X}"):
+        return EntryDescription.decode(body)
+
+
+def read_list(list_type: int) -> Conversation[bytes]:
+    """As object_list(), but return the octets, list type included."""
+    request = ListRequest(list_type).encode()
+    return (yield from _ask(f"object list {list_type}", SdoInfoOpcode.LIST_REQUEST, request))
+
+
+def read_object(index: int) -> Conversation[bytes]:
+    """As object_description(), but return the octets."""
+    what = f"object description 0x{index:04X}"
+    request = ObjectRequest(index).encode()
+    return (yield from _ask(what, SdoInfoOpcode.OBJECT_REQUEST, request, index=index))
+
+
+def read_entry(index: int, subindex: int, value_info: int) -> Conversation[bytes]:
+    """As entry_description(), but return the octets."""
     what = f"entry description 0x{index:04X}:{subindex:02X}"
     request = EntryRequest(index, subindex, value_info).encode()
-    body = yield from _ask(
-        what, SdoInfoOpcode.ENTRY_REQUEST, request, index=index, subindex=subindex
-    )
-    with reading(what):
-        return EntryDescription.decode(body)
+    opcode = SdoInfoOpcode.ENTRY_REQUEST
+    return (yield from _ask(what, opcode, request, index=index, subindex=subindex))
 
 
 def read_pdo(service: CoeService, number: int) -> Conversation[bytes]:

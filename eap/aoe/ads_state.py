@@ -31,6 +31,7 @@ _ASKED: dict[int, int] = {
     AdsState.RESET: INIT,
     AdsState.CONFIG: PREOP,
     AdsState.RECONFIG: PREOP,
+    AdsState.LOAD_CONFIG: BOOT,
     AdsState.STOP: SAFEOP,
     AdsState.SUSPEND: SAFEOP,
     AdsState.RUN: OP,

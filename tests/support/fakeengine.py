@@ -114,10 +114,9 @@ class FakeBus:
 
     def report(self) -> BusReport:
         """Say how it is."""
-        if not self.is_up:
-            return BusReport(is_up=False, fault="no frame comes back")
         return BusReport(
-            is_up=True,
+            is_up=self.is_up,
+            fault="" if self.is_up else "no frame comes back",
             slaves=tuple(_slave(unit) for unit in self.master.units.values()),
             frames_sent=self.master.stats().link.sent,
         )
@@ -171,12 +170,14 @@ class FakeEngine:
     Attributes:
         requests: All that came.
         holds: Requests are not answered while it is set; :meth:`release` does them.
+        held_kind: Of those that are held.
     """
 
     def __init__(self, *buses: FakeBus) -> None:
         self.buses = buses
         self.requests: list[Request] = []
         self.holds = False
+        self.held_kind: type = object
         self._held: list[Request] = []
         self._awaited = 0
         self._enough = asyncio.Event()
@@ -216,7 +217,7 @@ class FakeEngine:
         self.requests.append(request)
         if len(self.requests) == self._awaited:
             self._enough.set()
-        if self.holds:
+        if self.holds and isinstance(request, self.held_kind):
             self._held.append(request)
         else:
             self._take(request)

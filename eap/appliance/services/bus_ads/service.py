@@ -1,0 +1,209 @@
+"""Whoever answers behind the NetID of a bus port: the master at port 0xFFFF, slaves at theirs.
+
+Rule 1: the operations of a request are judged and done one after the other, and what cannot be
+done by the end of its time is answered so: an answer comes before the routers on its way lose
+patience, and clients theirs.
+Rule 2: requests do not wait for each other here; turns at a slave's mailbox are the bus client's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Container
+from time import monotonic_ns
+from typing import Protocol, TypeAlias
+
+from eap.aoe.ads_device import AdsDevice, Judge
+from eap.aoe.ads_master import MasterSpace
+from eap.aoe.ads_notifications import Client
+from eap.aoe.ads_operation import (
+    AdsRefusedError,
+    Operation,
+    OperationOutcome,
+    ReadDeviceInfo,
+    ReadState,
+    ReadWrite,
+)
+from eap.aoe.ads_request import AdsRequest, Outcomes, encode_refusal, parse_request
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.way import Way
+from eap.appliance.bus_request import BusReport
+from eap.appliance.handover import PortName
+from eap.appliance.services.bus_ads.master_side import MasterSide
+from eap.appliance.services.bus_ads.raw_command import RawCommands
+from eap.appliance.services.bus_ads.results import refusal
+from eap.appliance.services.bus_ads.slave_space import Asked
+from eap.appliance.services.bus_ads.slaves import Slaves
+from eap.appliance.services.bus_client import BusClient
+from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, device_name
+from eap.codec.ams import AmsHeader
+from eap.errors import EapError
+from eap.ids import NetId
+
+MASTER_PORT = 0xFFFF
+ANSWER_S = 4.0
+"""How long a request may take; routers give up after 4.5 s, clients after 5 s."""
+_IN_HEADER = frozenset((AdsError.HOST_UNREACHABLE, AdsError.TARGET_PORT, AdsError.COMMAND))
+"""Errors of the way to a service, which belong into the AMS header."""
+
+_MAX_REASONS = 3
+"""Of a sum command, for traces."""
+_MAX_NAMED = 8
+
+
+class Request(Protocol):
+    """What a router hands over."""
+
+    @property
+    def header(self) -> AmsHeader:
+        """As it came."""
+
+    @property
+    def body(self) -> bytes:
+        """What follows the header."""
+
+    @property
+    def came_by(self) -> Way:
+        """Where the client is."""
+
+    @property
+    def judge(self) -> Judge:
+        """Says what the client may not do."""
+
+
+Perform: TypeAlias = Callable[[Operation], Awaitable[OperationOutcome]]
+
+
+class BusService:
+    """The services of one bus port.
+
+    Args:
+        bus: Reaches the bus through the engine.
+        port: Which bus.
+        net_id: Of the port.
+
+    Attributes:
+        ports: AMS ports that it answers for; it knows itself which slaves there are.
+    """
+
+    def __init__(self, bus: BusClient, port: PortName, net_id: NetId) -> None:
+        self.ports: Container[int] = range(1, MASTER_PORT + 1)
+        self._bus = bus
+        self._port = port
+        self._master = MasterSide(bus, port)
+        self._slaves = Slaves(bus, port, net_id, self._master)
+        self._device = AdsDevice(
+            AdsDeviceInfo(1, 0, 0, device_name(_name(port))),
+            self._master.states,
+            [MasterSpace(self._master)],
+            control=self._master.control,
+        )
+
+    async def answer(self, request: Request) -> AmsAnswer:
+        """Do what a request asks for, as far as its judge has nothing against it."""
+        header = request.header
+        try:
+            parsed = parse_request(header.command, request.body)
+            report = await self._bus.describe(self._port)
+            client = Client(request.came_by, header.source, header.source_port)
+            perform = self._performer(header.target_port, report, client)
+        except AdsRefusedError as exc:
+            return _refuse(header.command, OperationOutcome(exc.result, why=exc.why))
+        except EapError as exc:
+            error = refusal(exc)
+            return _refuse(header.command, OperationOutcome(error.result, why=error.why))
+        return await self._perform_all(parsed, request, perform)
+
+    def client_gone(self, way: Way) -> None:
+        """Forget what belongs to a connection that is closed; files stay open for another one."""
+        self._device.notifications.forget(way)
+
+    def close(self) -> None:
+        """End what goes on."""
+        self._slaves.close()
+        self._master.close()
+
+    def _performer(self, ams_port: int, report: BusReport, client: Client) -> Perform:
+        """Return who does operations for a port, or raise AdsRefusedError if nobody has it."""
+        if ams_port == MASTER_PORT:
+            return lambda operation: self._perform_of_master(operation, report, client)
+        slave = next((each for each in report.slaves if each.station == ams_port), None)
+        if slave is None:
+            known = ", ".join(str(each.station) for each in report.slaves[:_MAX_NAMED]) or "none"
+            why = f"{_name(self._port)} has no slave {ams_port}; known are {known}"
+            raise AdsRefusedError(AdsError.TARGET_PORT, why)
+        asked = Asked(slave, client)
+        return lambda operation: self._perform_of_slave(operation, report, asked)
+
+    async def _perform_of_master(
+        self, operation: Operation, report: BusReport, client: Client
+    ) -> OperationOutcome:
+        if isinstance(operation, ReadWrite) and operation.group == IndexGroup.RAW_COMMAND:
+            commands = RawCommands(operation.data)
+            _check_up(self._port, report)
+            answer = commands.encode_answer(
+                await self._bus.transfer(self._port, commands.accesses())
+            )
+            if len(answer) > operation.length:
+                raise AdsRefusedError(AdsError.SIZE)
+            return OperationOutcome(data=answer)
+        self._master.report = report
+        return self._device.perform(operation, client, monotonic_ns())
+
+    async def _perform_of_slave(
+        self, operation: Operation, report: BusReport, asked: Asked
+    ) -> OperationOutcome:
+        if not isinstance(operation, ReadState | ReadDeviceInfo):
+            _check_up(self._port, report)
+        return await self._slaves.perform(asked, operation)
+
+    async def _perform_all(
+        self, parsed: AdsRequest, request: Request, perform: Perform
+    ) -> AmsAnswer:
+        outcomes = Outcomes(parsed)
+        reasons: list[str] = []
+        end_s = asyncio.get_running_loop().time() + ANSWER_S
+        outcome = OperationOutcome()
+        for operation in parsed.operations:
+            denied = request.judge(operation)
+            if denied:
+                outcome = OperationOutcome(denied)
+            else:
+                outcome = await _perform_until(end_s, perform, operation)
+            outcomes.add(outcome)
+            if outcome.why and len(reasons) < _MAX_REASONS:
+                reasons.append(outcome.why)
+        why = "; ".join(reasons)
+        if len(parsed.operations) == 1 and not parsed.sum_group and outcome.result in _IN_HEADER:
+            return AmsAnswer(error_code=outcome.result, why=why)
+        return AmsAnswer(outcomes.encode(), why=why)
+
+
+async def _perform_until(end_s: float, perform: Perform, operation: Operation) -> OperationOutcome:
+    """Do an operation, or say why it was not done; at the end of its time, that it was not."""
+    try:
+        async with asyncio.timeout_at(end_s):
+            return await perform(operation)
+    except TimeoutError:
+        return OperationOutcome(AdsError.TIMEOUT, why=f"not done within {ANSWER_S:g} s")
+    except AdsRefusedError as exc:
+        return OperationOutcome(exc.result, why=exc.why)
+    except EapError as exc:
+        error = refusal(exc)
+        return OperationOutcome(error.result, why=error.why)
+
+
+def _check_up(port: PortName, report: BusReport) -> None:
+    if not report.is_up:
+        fault = report.fault or "it begins"
+        raise AdsRefusedError(AdsError.HOST_UNREACHABLE, f"{_name(port)} is not up: {fault}")
+
+
+def _refuse(command: int, outcome: OperationOutcome) -> AmsAnswer:
+    if outcome.result in _IN_HEADER:
+        return AmsAnswer(error_code=outcome.result, why=outcome.why)
+    return AmsAnswer(encode_refusal(command, outcome.result), why=outcome.why)
+
+
+def _name(port: PortName) -> str:
+    return f"{port.station}/{port.port}"

@@ -1,0 +1,224 @@
+"""Who answers behind the NetID of a bus port: master and slaves, judged and in time."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from eap.aoe.access import service_of
+from eap.aoe.ads_operation import (
+    Operation,
+    OperationOutcome,
+    Read,
+    ReadDeviceInfo,
+    ReadState,
+    ReadWrite,
+    Write,
+    WriteControl,
+)
+from eap.aoe.spec import AccessService
+from eap.appliance.bus_request import AskMailbox
+from eap.appliance.services.bus_ads import service
+from eap.codec.ads import (
+    AdsDeviceInfo,
+    AdsError,
+    AdsRange,
+    AdsState,
+    AdsStates,
+    IndexGroup,
+    device_name,
+)
+from eap.codec.ams import AmsCommand
+from eap.codec.mailbox import MailboxType
+from tests.support.busads import DRIVE, MASTER, play, until
+from tests.support.fakeengine import PORT
+
+VENDOR = Read(IndexGroup.SDO, 0x1018_0001, 4)
+VENDOR_ID = b"\x5a\x0e\0\0"
+SENSOR = 1003
+COMMAND = bytes.fromhex("01ff 0000 0000 0400 0000 00000000 0000")
+"""As AdsLib sends it, to count slaves."""
+
+
+def no_changes(operation: Operation) -> AdsError:
+    reads = service_of(operation) is AccessService.READ
+    return AdsError.NONE if reads else AdsError.ACCESS_DENIED
+
+
+def sum_of(group: int, *items: Read | Write) -> ReadWrite:
+    heads = b"".join(
+        AdsRange(each[0], each[1], each[2] if isinstance(each, Read) else len(each[2])).encode()
+        for each in items
+    )
+    data = b"".join(each.data for each in items if isinstance(each, Write))
+    return ReadWrite(group, len(items), 1000, heads + data)
+
+
+def test_slave_by_its_address():
+    async def scene(client, engine):
+        assert await client.good(DRIVE, VENDOR) == VENDOR_ID
+        assert await client.good(DRIVE, ReadState()) == AdsStates(AdsState.CONFIG, 2).encode()
+        info = AdsDeviceInfo.decode(await client.good(DRIVE, ReadDeviceInfo()))
+        assert info == AdsDeviceInfo(0, 1, 0, device_name("drive"))
+
+    play(scene)
+
+
+def test_master_by_port_0xffff():
+    async def scene(client, engine):
+        info = AdsDeviceInfo.decode(await client.good(MASTER, ReadDeviceInfo()))
+        assert info.name == device_name("left/bus0")
+        assert await client.good(MASTER, ReadState()) == AdsStates(AdsState.CONFIG, 2).encode()
+        found = await client.read(MASTER, IndexGroup.SLAVE_ADDRESSES, 0)
+        assert found == b"".join(n.to_bytes(2, "little") for n in (1001, 1002, 1003))
+        # It has no dictionary yet, and says so.
+        assert (await client.do(MASTER, VENDOR)).result == AdsError.INDEX_GROUP
+
+    play(scene, "coe")
+
+
+def test_states_are_requested():
+    async def scene(client, engine):
+        await client.good(MASTER, WriteControl(AdsState.INIT, 0, b""))
+        await until_state(client, 1)
+        await client.good(DRIVE, WriteControl(AdsState.CONFIG, 0, b""))
+        await until_state(client, 2)
+        await client.write(MASTER, IndexGroup.SLAVE_STATES, DRIVE, b"\1\0")
+        await until_state(client, 1)
+        await client.write(MASTER, IndexGroup.MASTER_STATE, 2)
+        await until_state(client, 2)
+
+    play(scene)
+
+
+async def until_state(client, state):
+    async def is_there():
+        return (await client.good(DRIVE, ReadState()))[2] == state
+
+    await until(is_there)
+
+
+def test_raw_command():
+    async def scene(client, engine):
+        answer = await client.ask(MASTER, IndexGroup.RAW_COMMAND, 0, COMMAND, len(COMMAND))
+        assert answer[2:4] == b"\3\0"  # what AdsLib takes for the number of slaves
+        assert answer[-2:] == b"\1\0"
+        short = await client.do(MASTER, ReadWrite(IndexGroup.RAW_COMMAND, 0, 4, COMMAND))
+        assert short.result == AdsError.SIZE
+
+    play(scene, "coe")
+
+
+def test_who_is_not_there():
+    async def scene(client, engine):
+        answer = await client.answer(1009, AmsCommand.READ_STATE, b"")
+        assert answer[:2] == (b"", AdsError.TARGET_PORT)
+        assert answer.why == "left/bus0 has no slave 1009; known are 1001"
+        assert (await client.answer(DRIVE, 77, b"")).error_code == AdsError.COMMAND
+        assert (await client.answer(DRIVE, AmsCommand.READ, b"")).data[:4] == b"\5\7\0\0"
+
+    play(scene)
+
+
+def test_bus_that_is_down():
+    async def scene(client, engine):
+        engine.buses[0].is_up = False
+        answer = await client.answer(DRIVE, AmsCommand.READ, AdsRange(*VENDOR).encode())
+        assert answer[:2] == (b"", AdsError.HOST_UNREACHABLE)
+        assert answer.why == "left/bus0 is not up: no frame comes back"
+        assert (await client.do(MASTER, ReadState())).data == b"\3\0\1\0"
+        raw = await client.do(MASTER, ReadWrite(IndexGroup.RAW_COMMAND, 0, 16, COMMAND))
+        assert raw.result == AdsError.HOST_UNREACHABLE
+
+    play(scene)
+
+
+def test_engine_that_is_gone():
+    async def scene(client, engine):
+        engine.holds = True
+        answer = await client.answer(MASTER, AmsCommand.READ_STATE, b"")
+        assert answer.error_code == AdsError.HOST_UNREACHABLE
+        assert "engine" in answer.why
+
+    play(scene)
+
+
+def test_each_operation_is_judged():
+    async def scene(client, engine):
+        client.judge = no_changes
+        assert await client.good(DRIVE, VENDOR) == VENDOR_ID
+        denied = [
+            Write(IndexGroup.SDO, 0x6040_0000, b"\6\0"),
+            WriteControl(AdsState.RUN, 0, b""),
+            ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 4, b"firmware.bin"),
+            ReadWrite(IndexGroup.VOE, 0, 100, bytes(6)),
+        ]
+        for operation in denied:
+            assert (await client.do(DRIVE, operation)).result == AdsError.ACCESS_DENIED
+        raw = ReadWrite(IndexGroup.RAW_COMMAND, 0, 16, COMMAND)
+        assert (await client.do(MASTER, raw)).result == AdsError.ACCESS_DENIED
+        assert len(engine.of(AskMailbox)) == 1
+
+    play(scene)
+
+
+def test_sum_commands_item_by_item():
+    async def scene(client, engine):
+        items = VENDOR, Read(IndexGroup.SDO, 0x5555_0000, 4), Read(0x9999, 0, 2)
+        found = await client.good(DRIVE, sum_of(IndexGroup.SUM_READ, *items))
+        not_passed_on = await client.do(DRIVE, items[2])
+        results = b"".join(n.to_bytes(4, "little") for n in (0, 0x70C, not_passed_on.result))
+        assert found == results + VENDOR_ID + bytes(6)
+        client.judge = lambda operation: (
+            AdsError.ACCESS_DENIED if operation[1] == 0x6040_0000 else AdsError.NONE
+        )
+        writes = (
+            Write(IndexGroup.SDO, 0x6040_0000, b"\6\0"),
+            Write(IndexGroup.SDO, 0x607A_0000, bytes(4)),
+        )
+        found = await client.good(DRIVE, sum_of(IndexGroup.SUM_WRITE, *writes))
+        assert found == b"\x23\7\0\0" + bytes(4)
+
+    play(scene)
+
+
+def test_what_takes_too_long_is_answered_in_time(monkeypatch):
+    monkeypatch.setattr(service, "ANSWER_S", 0.05)
+
+    async def scene(client, engine):
+        client.judge = lambda operation: hold(engine)
+        outcome = await client.do(DRIVE, sum_of(IndexGroup.SUM_READ, VENDOR, VENDOR))
+        assert outcome.data[:8] == 2 * b"\x19\7\0\0"
+        assert client.why == "; ".join(2 * ["not done within 0.05 s"])
+        client.judge = lambda operation: AdsError.NONE
+        engine.release()
+        assert await client.good(DRIVE, VENDOR) == VENDOR_ID
+
+    def hold(engine):
+        engine.holds = True
+        return AdsError.NONE
+
+    play(scene)
+
+
+def test_slaves_do_not_wait_for_each_other():
+    async def scene(client, engine):
+        talk = await client.bus.open_talk(PORT, 1001, MailboxType.COE, "somebody else")
+        waiting = asyncio.ensure_future(client.do(1001, VENDOR))
+        assert await client.good(SENSOR, VENDOR) == VENDOR_ID
+        assert not waiting.done()
+        talk.close()
+        assert (await waiting).data == VENDOR_ID
+
+    play(scene, "coe")
+
+
+@pytest.mark.parametrize("length", [0, 3])
+def test_answer_has_to_fit(length):
+    async def scene(client, engine):
+        outcome = await client.do(DRIVE, VENDOR._replace(length=length))
+        assert outcome == OperationOutcome(AdsError.SIZE)
+        assert client.why == f"4 octets, the client has room for {length}"
+
+    play(scene)

@@ -1,0 +1,136 @@
+"""A file that goes on by itself as far as there is data, or room for it."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+
+import pytest
+
+from devicebus.errors import FoeError
+from devicebus.mailbox.conversation import Message
+from devicebus.mailbox.foe_server import FoeServer
+from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.appliance.services.bus_ads.transfer import AHEAD, Transfer
+from eap.codec.mailbox import MailboxType
+
+SIZES = MailboxSizes(1024, 1024)
+LONG = bytes(range(256)) * 1024
+
+
+class FakeTalk:
+    """A slave without a bus."""
+
+    def __init__(self, content: bytes = b"") -> None:
+        store = MemoryStore([MemoryFile("a.bin", content, max_size=1 << 20)])
+        self.server = FoeServer(store, SIZES)
+        self.asked = 0
+        self.end = ""
+
+    async def open(self) -> FakeTalk:
+        await asyncio.sleep(0)
+        return self
+
+    async def ask(self, ask) -> Message:
+        await asyncio.sleep(0)
+        self.asked += 1
+        answers = self.server.receive_message(ask.request, 0)
+        return Message(MailboxType.FOE, answers[0] if ask.expects_reply else b"")
+
+    def abandon(self) -> None:
+        self.end = "abandoned"
+
+    def close(self) -> None:
+        self.end = self.end or "closed"
+
+
+def play(scene, talk, *, is_write=False, name="a.bin"):
+    async def run():
+        transfer = Transfer(name, 0, SIZES, is_write=is_write)
+        task = asyncio.ensure_future(transfer.run(talk.open))
+        async with asyncio.timeout(5):
+            await scene(transfer, task)
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+    asyncio.run(run())
+
+
+def test_reads_ahead_but_not_everything():
+    talk = FakeTalk(LONG)
+
+    async def scene(transfer, task):
+        await transfer.wait_open()
+        assert (transfer.has_turn, transfer.is_open) == (True, True)
+        for _ in range(1000):
+            await asyncio.sleep(0)
+        assert AHEAD <= transfer.progress.done < AHEAD + 1024
+        assert await transfer.read(2 * AHEAD) == LONG[: 2 * AHEAD]
+        assert await transfer.read(1 << 20) == LONG[2 * AHEAD :]
+        assert await transfer.read(10) == b""
+        assert transfer.is_complete
+
+    play(scene, talk)
+    assert talk.end == "closed"
+
+
+def test_writes_while_more_is_on_its_way():
+    talk = FakeTalk()
+
+    async def scene(transfer, task):
+        await transfer.wait_open()
+        await transfer.write(LONG[:AHEAD])
+        await transfer.write(LONG[AHEAD:])
+        assert talk.asked < 100
+        await transfer.finish()
+        assert (transfer.is_complete, transfer.progress.done) == (True, len(LONG))
+
+    play(scene, talk, is_write=True)
+    assert talk.end == "closed"
+
+
+def test_empty_file():
+    async def scene(transfer, task):
+        await transfer.finish()
+        assert transfer.is_complete
+
+    play(scene, FakeTalk(b"before"), is_write=True)
+
+
+def test_refusal_is_told_to_everybody_who_asks():
+    async def scene(transfer, task):
+        for _ in range(2):
+            with pytest.raises(FoeError):
+                await transfer.wait_open()
+        with pytest.raises(FoeError):
+            await transfer.read(1)
+        assert (transfer.has_ended, transfer.is_complete) == (True, False)
+
+    play(scene, FakeTalk(), name="none.bin")
+
+
+def test_who_gives_up_waiting_takes_nothing():
+    talk = FakeTalk(b"0123456789")
+
+    async def scene(transfer, task):
+        reading = asyncio.ensure_future(transfer.read(5))
+        await asyncio.sleep(0)
+        reading.cancel()
+        assert await transfer.read(100) == b"0123456789"
+
+    play(scene, talk)
+
+
+def test_end_in_the_middle_is_told_to_the_slave():
+    talk = FakeTalk(LONG)
+
+    async def scene(transfer, task):
+        await transfer.wait_open()
+        task.cancel()
+        await asyncio.wait([task])
+        assert (transfer.has_ended, transfer.is_complete) == (True, False)
+
+    play(scene, talk)
+    assert talk.end == "abandoned"
