@@ -34,7 +34,6 @@ class LocalAsk(NamedTuple):
     header: AmsHeader
     body: bytes
     came_by: Way
-    judge: Judge
 
 
 class Client:
@@ -56,7 +55,7 @@ class Client:
     async def answer(self, port: int, command: int, body: bytes) -> AmsAnswer:
         """Return the answer as it is."""
         header = AmsHeader(BUS, port, self.net_id, 30000, command, length=len(body))
-        answer = await self.service.answer(LocalAsk(header, body, self.way, self.judge))
+        answer = await self.service.answer(LocalAsk(header, body, self.way), judge=self.judge)
         self.why = answer.why
         return answer
 
@@ -146,7 +145,7 @@ def play(scene: Callable[[Client, FakeEngine], Awaitable[Any]], name: str = "dri
         engine = FakeEngine(FakeBus(_line(name)))
         link = EngineLink(engine.services, look_s=0.05)
         bus = BusClient(link, [PORT])
-        service = BusService(bus, PORT, BUS)
+        service = BusService(bus, PORT, BUS, "1.2.3")
         try:
             async with asyncio.timeout(20):
                 return await scene(Client(service, bus), engine)

@@ -9,11 +9,12 @@ Rule 2: requests do not wait for each other here; turns at a slave's mailbox are
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Container
+from collections.abc import Container
+from functools import partial
 from time import monotonic_ns
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
-from eap.aoe.ads_device import AdsDevice, Judge
+from eap.aoe.ads_device import AdsDevice, Judge, allow
 from eap.aoe.ads_master import MasterSpace
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import (
@@ -24,18 +25,19 @@ from eap.aoe.ads_operation import (
     ReadState,
     ReadWrite,
 )
-from eap.aoe.ads_request import AdsRequest, Outcomes, encode_refusal, parse_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
+from eap.appliance.services.ads_requests import Perform, answer_request
 from eap.appliance.services.bus_ads.master_side import MasterSide
 from eap.appliance.services.bus_ads.raw_command import RawCommands
 from eap.appliance.services.bus_ads.results import refusal
 from eap.appliance.services.bus_ads.slave_space import Asked
 from eap.appliance.services.bus_ads.slaves import Slaves
 from eap.appliance.services.bus_client import BusClient
-from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, device_name
+from eap.appliance.services.eap_ads import device_info
+from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.errors import EapError
 from eap.ids import NetId
@@ -43,11 +45,10 @@ from eap.ids import NetId
 MASTER_PORT = 0xFFFF
 ANSWER_S = 4.0
 """How long a request may take; routers give up after 4.5 s, clients after 5 s."""
-_IN_HEADER = frozenset((AdsError.HOST_UNREACHABLE, AdsError.TARGET_PORT, AdsError.COMMAND))
+_IN_HEADER = frozenset((AdsError.HOST_UNREACHABLE, AdsError.TARGET_PORT))
 """Errors of the way to a service, which belong into the AMS header."""
 
-_MAX_REASONS = 3
-"""Of a sum command, for traces."""
+_RESULT_SIZE = 4
 _MAX_NAMED = 8
 
 
@@ -66,13 +67,6 @@ class Request(Protocol):
     def came_by(self) -> Way:
         """Where the client is."""
 
-    @property
-    def judge(self) -> Judge:
-        """Says what the client may not do."""
-
-
-Perform: TypeAlias = Callable[[Operation], Awaitable[OperationOutcome]]
-
 
 class BusService:
     """The services of one bus port.
@@ -81,38 +75,41 @@ class BusService:
         bus: Reaches the bus through the engine.
         port: Which bus.
         net_id: Of the port.
+        release: Of this software, such as ``0.1.0``.
 
     Attributes:
         ports: AMS ports that it answers for; it knows itself which slaves there are.
     """
 
-    def __init__(self, bus: BusClient, port: PortName, net_id: NetId) -> None:
+    def __init__(self, bus: BusClient, port: PortName, net_id: NetId, release: str) -> None:
         self.ports: Container[int] = range(1, MASTER_PORT + 1)
         self._bus = bus
         self._port = port
         self._master = MasterSide(bus, port)
         self._slaves = Slaves(bus, port, net_id, self._master)
         self._device = AdsDevice(
-            AdsDeviceInfo(1, 0, 0, device_name(_name(port))),
+            device_info(_name(port), release),
             self._master.states,
             [MasterSpace(self._master)],
             control=self._master.control,
         )
 
-    async def answer(self, request: Request) -> AmsAnswer:
-        """Do what a request asks for, as far as its judge has nothing against it."""
+    async def answer(self, request: Request, *, judge: Judge = allow) -> AmsAnswer:
+        """Do what a request asks for, as far as *judge* has nothing against it."""
         header = request.header
+        client = Client(request.came_by, header.source, header.source_port)
+        end_s = asyncio.get_running_loop().time() + ANSWER_S
         try:
-            parsed = parse_request(header.command, request.body)
             report = await self._bus.describe(self._port)
-            client = Client(request.came_by, header.source, header.source_port)
             perform = self._performer(header.target_port, report, client)
         except AdsRefusedError as exc:
-            return _refuse(header.command, OperationOutcome(exc.result, why=exc.why))
+            return AmsAnswer(error_code=exc.result, why=exc.why)
         except EapError as exc:
-            error = refusal(exc)
-            return _refuse(header.command, OperationOutcome(error.result, why=error.why))
-        return await self._perform_all(parsed, request, perform)
+            return AmsAnswer(error_code=refusal(exc).result, why=str(exc))
+        perform_in_time = partial(_perform_until, end_s, perform)
+        answer = await answer_request(header.command, request.body, perform_in_time, judge=judge)
+        result = int.from_bytes(answer.data[:_RESULT_SIZE], "little")
+        return AmsAnswer(error_code=result, why=answer.why) if result in _IN_HEADER else answer
 
     def client_gone(self, way: Way) -> None:
         """Forget what belongs to a connection that is closed; files stay open for another one."""
@@ -157,27 +154,6 @@ class BusService:
             _check_up(self._port, report)
         return await self._slaves.perform(asked, operation)
 
-    async def _perform_all(
-        self, parsed: AdsRequest, request: Request, perform: Perform
-    ) -> AmsAnswer:
-        outcomes = Outcomes(parsed)
-        reasons: list[str] = []
-        end_s = asyncio.get_running_loop().time() + ANSWER_S
-        outcome = OperationOutcome()
-        for operation in parsed.operations:
-            denied = request.judge(operation)
-            if denied:
-                outcome = OperationOutcome(denied)
-            else:
-                outcome = await _perform_until(end_s, perform, operation)
-            outcomes.add(outcome)
-            if outcome.why and len(reasons) < _MAX_REASONS:
-                reasons.append(outcome.why)
-        why = "; ".join(reasons)
-        if len(parsed.operations) == 1 and not parsed.sum_group and outcome.result in _IN_HEADER:
-            return AmsAnswer(error_code=outcome.result, why=why)
-        return AmsAnswer(outcomes.encode(), why=why)
-
 
 async def _perform_until(end_s: float, perform: Perform, operation: Operation) -> OperationOutcome:
     """Do an operation, or say why it was not done; at the end of its time, that it was not."""
@@ -197,12 +173,6 @@ def _check_up(port: PortName, report: BusReport) -> None:
     if not report.is_up:
         fault = report.fault or "it begins"
         raise AdsRefusedError(AdsError.HOST_UNREACHABLE, f"{_name(port)} is not up: {fault}")
-
-
-def _refuse(command: int, outcome: OperationOutcome) -> AmsAnswer:
-    if outcome.result in _IN_HEADER:
-        return AmsAnswer(error_code=outcome.result, why=outcome.why)
-    return AmsAnswer(encode_refusal(command, outcome.result), why=outcome.why)
 
 
 def _name(port: PortName) -> str:
