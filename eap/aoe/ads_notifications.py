@@ -188,6 +188,8 @@ class NotificationTable:
 
     def next_timeout(self) -> int | None:
         """Return when a cycle has something to do at the earliest, None if never."""
+        if not self._notifications:
+            return None  # the times of those that were deleted are still listed
         times = [pending.deadline_ns for pending in self._clients.values() if pending.stamps]
         if self._due:
             times.append(self._due[0][0])

@@ -7,6 +7,8 @@ the cycle itself has read, so that its values belong to one moment, whoever writ
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from eap.pd.image import Image
 from eap.pd.layout import SAMPLE_HEAD
 from eap.pd.spec import Writer
@@ -55,21 +57,35 @@ class Sampler:
 
 
 class Samples:
-    """The side of those who read them; one in all may say what is wanted."""
+    """The side of those who read them; one in all may say what is wanted.
+
+    Args:
+        image: Where they are.
+
+    Attributes:
+        image: The same.
+    """
 
     def __init__(self, image: Image) -> None:
-        self._image = image
+        self.image = image
         self._place = image.layout.samples
         self._heads = _heads(image)
 
     @property
     def newest(self) -> int:
         """The cycle that ran last, or runs right now."""
-        return int(self._image.words[_CYCLE])
+        return int(self.image.words[_CYCLE])
 
     def want(self, cycles: int) -> None:
         """Have samples taken of so many cycles from now on."""
-        self._image.words[_SAMPLED_UNTIL] = self.newest + cycles
+        self.image.words[_SAMPLED_UNTIL] = self.newest + cycles
+
+    def since(self, cycle: int) -> Iterable[int]:
+        """Return the cycles behind *cycle* that there may be samples of, the oldest first."""
+        newest = self.newest
+        if self._heads[self._head(newest)] != newest:
+            newest -= 1  # it runs right now
+        return range(max(cycle, newest - self._place.count) + 1, newest + 1)
 
     def ran_at_ns(self, cycle: int) -> int | None:
         """Return when *cycle* ran, on the monotonic clock; None if there is no sample of it."""
@@ -80,7 +96,7 @@ class Samples:
     def read(self, cycle: int) -> bytes | None:
         """Return the variables at the end of *cycle*; None if there is no sample of it."""
         start = self._place.offset + cycle % self._place.count * self._place.size + SAMPLE_HEAD
-        data = bytes(self._image.memory[start : start - SAMPLE_HEAD + self._place.size])
+        data = bytes(self.image.memory[start : start - SAMPLE_HEAD + self._place.size])
         return data if self._heads[self._head(cycle)] == cycle else None
 
     def _head(self, cycle: int) -> int:

@@ -7,6 +7,7 @@ else is answered at once.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from time import monotonic_ns
 
@@ -29,6 +30,7 @@ from eap.appliance.services.ads_result import ads_result
 from eap.appliance.services.image_variables import StationSymbols
 from eap.appliance.services.station_device import StationDevice
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsStates, IndexGroup, device_name
+from eap.codec.adsnotification import AddNotification
 from eap.errors import ControlError
 from eap.od.abort import SdoAbortError
 
@@ -47,11 +49,15 @@ class EapAds:
         port: Name of the port.
         symbols: The station's variables.
         info: What ReadDeviceInfo tells.
+
+    Attributes:
+        on_watch: Called when a notification was added.
     """
 
     def __init__(
         self, device: StationDevice, port: str, symbols: StationSymbols, info: AdsDeviceInfo
     ) -> None:
+        self.on_watch: Callable[[], None] | None = None
         self._device = device
         self._port = port
         objects = ObjectSpace(device.dictionaries[port], device.od_state, ads_result)
@@ -75,6 +81,8 @@ class EapAds:
         if _changes_objects(operation):
             return await self._change(perform)
         outcome = perform()
+        if isinstance(operation, AddNotification) and self.on_watch is not None:
+            self.on_watch()
         if isinstance(operation, Read | ReadWrite):
             for _ in range(_BUSY_PAUSES):
                 if outcome.result != AdsError.BUSY:

@@ -6,6 +6,9 @@ Clients write those that belong to the application.  A new layout is a new versi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from eap.aoe.ads_operation import AdsRefusedError
 from eap.aoe.ads_space import AdsSpace, Source
 from eap.aoe.ads_symbol_table import SymbolTable, Variable
@@ -14,8 +17,7 @@ from eap.appliance.station_image import StationImage
 from eap.codec import datatypes
 from eap.codec.ads import AdsError
 from eap.errors import ImageError, TornReadError, WriterConflictError
-from eap.net.image_file import ImageFile
-from eap.pd.image import Image
+from eap.pd.image import Image, take
 from eap.pd.layout import VariablePlace
 from eap.pd.spec import Writer
 
@@ -32,11 +34,24 @@ class ImageVariables:
     """
 
     def __init__(self, station: StationImage, image: Image) -> None:
+        self._sample: bytes | None = None
         self._station = station
         self._image = image
+        self._first_bit = 8 * image.layout.samples.first
+
+    @contextmanager
+    def shown(self, sample: bytes) -> Iterator[None]:
+        """Read from *sample*, of one cycle, for the length of a block."""
+        self._sample = sample
+        try:
+            yield
+        finally:
+            self._sample = None
 
     def read(self, name: str) -> bytes:
         """Return the octets of a value; refuse with BUSY while its writer is in the middle."""
+        if self._sample is not None:
+            return take(self._image.places[name], self._sample, self._first_bit)
         try:
             return self._image.load(name, attempts=_ATTEMPTS)
         except TornReadError as exc:
@@ -56,14 +71,24 @@ class ImageVariables:
 
 
 class StationSymbols(AdsSpace):
-    """The symbols of one station, as its newest image has them."""
+    """The symbols of one station, as its newest image has them.
+
+    Attributes:
+        store: The values in the image that was the newest when somebody looked last.
+        image: That image.
+    """
 
     groups = SymbolSpace.groups
 
     def __init__(self, station: StationImage) -> None:
         self._station = station
         self._file = station.file
-        self._space = SymbolSpace(*self._configuration(self._file))
+        self.store = ImageVariables(station, self.image)
+        self._space = SymbolSpace(self._table(), self.store)
+
+    @property
+    def image(self) -> Image:  # noqa: D102  the class says it
+        return self._file.image
 
     def look(self) -> SymbolSpace:
         """Go over to the newest image; return the symbols there, or refuse with NOT_READY."""
@@ -73,7 +98,8 @@ class StationSymbols(AdsSpace):
             raise AdsRefusedError(AdsError.NOT_READY, str(exc)) from None
         if file is not self._file:
             self._file = file
-            self._space.replace(*self._configuration(file))
+            self.store = ImageVariables(self._station, self.image)
+            self._space.replace(self._table(), self.store)
         return self._space
 
     def read(self, group: int, offset: int, length: int) -> bytes:
@@ -92,10 +118,9 @@ class StationSymbols(AdsSpace):
         """Return what gives a value."""
         return self.look().watch(group, offset, length)
 
-    def _configuration(self, file: ImageFile) -> tuple[SymbolTable, ImageVariables]:
-        variables = map(_variable, file.image.layout.variables)
-        store = ImageVariables(self._station, file.image)
-        return SymbolTable(variables, file.generation), store
+    def _table(self) -> SymbolTable:
+        variables = map(_variable, self.image.layout.variables)
+        return SymbolTable(variables, self._file.generation)
 
 
 def _variable(place: VariablePlace) -> Variable:
