@@ -24,6 +24,7 @@ from eap.cli.group import LazyGroup
         "pd": "eap.cli.pd:pd",
         "plan": "eap.cli.plan:plan",
         "rollback": "eap.cli.apply:rollback",
+        "routes": "eap.cli.routes:routes",
         "run": "eap.cli.run:run",
         "sim": "eap.cli.sim:sim",
         "state": "eap.cli.state:state",

@@ -14,7 +14,7 @@ from eap.cli import main
 from eap.cli.group import ExitCode, LazyGroup
 from eap.errors import ConfigError, ControlError, EnvironmentalError, ImageError
 
-SLOW = {"asyncio", "dpkt", "msgspec", "rich", "socket", "yaml"}
+SLOW = {"asyncio", "dpkt", "msgspec", "rich", "socket", "textual", "yaml"}
 
 
 class Failing(LazyGroup):
@@ -128,6 +128,8 @@ HELP = [
     ["plan"],
     ["apply"],
     ["new"],
+    ["routes"],
+    ["routes", "add"],
     ["run"],
     ["sim", "fault"],
     ["state"],

@@ -1,0 +1,279 @@
+"""The screen of the live view: a table, below it what there is to say of the chosen row, keys."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from rich.text import Text
+from textual import on, work
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import VerticalScroll
+from textual.widgets import DataTable, Footer, Input, Static
+
+from eap.appliance.control_routes import RouteRow
+from eap.cli import routes_text
+from eap.cli.routes_tui.forms import Message, Question, RouteForm, values_of
+from eap.cli.routes_tui.grid import STYLES, Grid
+from eap.cli.routes_tui.link import Link, Picture, Router
+from eap.cli.routes_tui.table import View, detail, lines
+from eap.errors import EapError
+
+PERIOD_S = 1.0
+"""Between two looks."""
+_ALL = "all stations"
+
+
+class RoutesApp(App[None]):
+    """Routes and connections of running stations.
+
+    Args:
+        link: To the appliances.
+        period_s: Between two looks.
+    """
+
+    CSS_PATH = "style.tcss"
+    ENABLE_COMMAND_PALETTE = False
+    TITLE = "eapctl routes"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("a", "add", "Add"),
+        Binding("e", "edit", "Edit"),
+        Binding("d,delete", "remove", "Remove", key_display="d"),
+        Binding("t,enter", "test", "Test", key_display="t"),
+        Binding("slash", "filter", "Filter", key_display="/"),
+        Binding("s", "station", "Station"),
+        Binding("r", "view('routes')", "Routes"),
+        Binding("c", "view('connections')", "Conns"),
+        Binding("w", "view('warnings')", "Warn"),
+        Binding("q,ctrl+c", "quit", "Quit", key_display="q"),
+    ]
+
+    def __init__(self, link: Link, *, period_s: float = PERIOD_S) -> None:
+        super().__init__()
+        self._link = link
+        self._period_s = period_s
+        self._picture = Picture([], "asking…")
+        self._view = View.ROUTES
+        self._station = _ALL
+        self._match = ""
+        self._is_looking = False
+
+    def compose(self) -> ComposeResult:
+        """Yield the parts of the screen, top to bottom."""
+        yield Static(id="head", markup=False)
+        yield Static(id="views")
+        yield Input(placeholder="show only what has this in it", id="filter", compact=True)
+        yield Grid("table")
+        with VerticalScroll(id="detail"):
+            yield Static(id="said")
+        yield Footer(compact=True)
+
+    def on_mount(self) -> None:
+        """Begin to look."""
+        self.query_one("#filter").display = False
+        self.query_one(Grid).focus()
+        self.set_interval(self._period_s, self.look)
+        self.look()
+
+    def on_resize(self) -> None:
+        """Use the room that there is."""
+        self.call_after_refresh(self._show)
+
+    def look(self) -> None:
+        """Ask the appliances, unless they are still being asked."""
+        if not self._is_looking:
+            self._is_looking = True
+            self._look(self._match if self._view is View.ROUTES else "")
+
+    @work(thread=True)
+    def _look(self, match: str) -> None:
+        picture = self._link.look(match)
+        self.call_from_thread(self._take, picture)
+
+    def _take(self, picture: Picture) -> None:
+        self._is_looking = False
+        if picture.problem:
+            picture = Picture(self._picture.routers, picture.problem)
+        self._picture = picture
+        self._show()
+
+    def _routers(self) -> list[Router]:
+        routers = self._picture.routers
+        names = {each.routes.station for each in routers}
+        if self._station in names:
+            return [each for each in routers if each.routes.station == self._station]
+        return routers
+
+    def _show(self) -> None:
+        """Put on the screen what is known."""
+        routers = self._routers()
+        found = lines(self._view, routers, self._match)
+        self._show_head(routers)
+        has_station = len(routers) > 1
+        self.query_one(Grid).show_lines(self._view, found, self.size.width, has_station=has_station)
+        self._show_detail()
+
+    def _show_head(self, routers: list[Router]) -> None:
+        stations = [each.routes for each in routers]
+        plants = ", ".join(dict.fromkeys(each.plant for each in self._picture.routers))
+        where = self._station if self._station != _ALL else f"{len(stations)} stations"
+        text = Text(f" {plants}, {where}: {routes_text.summary(stations)}" if stations else " ")
+        if self._picture.problem:
+            text = Text(f" {self._picture.problem}", style="bold red")
+        text.truncate(self.size.width, overflow="ellipsis")
+        self.query_one("#head", Static).update(text)
+        self.query_one("#table").set_class(bool(self._picture.problem), "stale")
+        counts = {
+            View.ROUTES: sum(each.total for each in stations),
+            View.CONNECTIONS: sum(len(each.connections) for each in stations),
+            View.WARNINGS: sum(len(each.warnings) for each in stations),
+        }
+        parts = [
+            f"[@click=app.view('{view}')]{'[reverse]' if view is self._view else ''}"
+            f" {view.capitalize()} {counts[view]} {'[/]' if view is self._view else ''}[/]"
+            for view in View
+        ]
+        parts.append(f"[@click=app.station()] Station: {self._station} [/]")
+        if self._match:
+            parts.append(f"[@click=app.filter()] Filter: {self._match.replace('[', '')} [/]")
+        self.query_one("#views", Static).update("".join(parts))
+
+    @on(DataTable.RowHighlighted)
+    def _show_detail(self) -> None:
+        text = Text("\n").join(
+            Text(part, style=STYLES[style]) for part, style in detail(self.query_one(Grid).chosen)
+        )
+        self.query_one("#said", Static).update(text)
+
+    def action_view(self, view: str) -> None:
+        """Show routes, connections or warnings."""
+        self._view = View(view)
+        self._show()
+
+    def action_station(self) -> None:
+        """Show the next station alone, and after the last one all."""
+        names = [_ALL, *dict.fromkeys(each.routes.station for each in self._picture.routers)]
+        at = names.index(self._station) if self._station in names else 0
+        self._station = names[(at + 1) % len(names)]
+        self._show()
+
+    def action_filter(self) -> None:
+        """Ask what rows have to have in them."""
+        field = self.query_one("#filter", Input)
+        field.display = True
+        field.focus()
+
+    @on(Input.Changed, "#filter")
+    def _take_filter(self, event: Input.Changed) -> None:
+        self._match = event.value.strip()
+        self._show()
+        self.look()
+
+    @on(Input.Submitted, "#filter")
+    def _leave_filter(self) -> None:
+        self.query_one("#filter").display = False
+        self.query_one(Grid).focus()
+
+    def key_escape(self) -> None:
+        """End the filter."""
+        field = self.query_one("#filter", Input)
+        field.value = ""
+        self._leave_filter()
+
+    def action_add(self) -> None:
+        """Ask for a new route of the chosen station."""
+        if (router := self._router()) is not None:
+            self._ask_for(router, f"New route of {router.routes.station}", {"octets": "4"})
+
+    def action_edit(self) -> None:
+        """Ask for a change of the chosen route."""
+        line = self.query_one(Grid).chosen
+        if line is None or not isinstance(line.row, RouteRow):
+            self._tell("Edit", "Choose a route first.")
+        elif line.row.origin != "added":
+            self._tell("Edit", _KEPT_ELSEWHERE[line.row.origin].format(name=line.row.name))
+        else:
+            title = f"Route {line.row.name} of {line.router.routes.station}"
+            self._ask_for(line.router, title, values_of(line.row))
+
+    def action_remove(self) -> None:
+        """Remove the chosen route, when that is what is wanted."""
+        line = self.query_one(Grid).chosen
+        if line is None or not isinstance(line.row, RouteRow):
+            self._tell("Remove", "Choose a route first.")
+            return
+        row, router = line.row, line.router
+
+        def answered(is_wanted: bool | None) -> None:
+            if is_wanted:
+                self._remove(router, row)
+
+        station = router.routes.station
+        text = (
+            f"Remove route {row.name} ({row.pattern}, by {row.door} to {row.address}) of {station}?"
+        )
+        self.push_screen(Question(text), answered)
+
+    def action_test(self) -> None:
+        """Measure the way to the chosen route's station."""
+        line = self.query_one(Grid).chosen
+        if line is None or not isinstance(line.row, RouteRow):
+            self._tell("Test", "Choose a route first.")
+        elif not line.row.octets:
+            self._tell("Test", "A default route leads to no station of its own.")
+        else:
+            self._test(line.router, line.row)
+
+    def on_data_table_row_selected(self) -> None:
+        """Test what is chosen by Enter or by a second click."""
+        self.action_test()
+
+    @work(thread=True)
+    def _remove(self, router: Router, row: RouteRow) -> None:
+        try:
+            self._link.remove(router, row.net_id, row.door, row.address)
+        except EapError as exc:
+            self.call_from_thread(self._tell, "Remove", str(exc))
+        self.call_from_thread(self.look)
+
+    @work(thread=True)
+    def _test(self, router: Router, row: RouteRow) -> None:
+        try:
+            result = self._link.test(router, row.net_id)
+        except EapError as exc:
+            text = str(exc)
+        else:
+            text = "\n".join(filter(None, [f"{result.target}: {result.text}", result.hint]))
+        title = f"{router.routes.station} to {row.name}"
+        self.call_from_thread(self._tell, title, text)
+
+    def _ask_for(self, router: Router, title: str, values: dict[str, Any]) -> None:
+        def ended(warnings: list[str] | None) -> None:
+            self.look()
+            if warnings:
+                self._tell("Added, but", "\n".join(warnings))
+
+        form = RouteForm(title, values, lambda params: self._link.add(router, params))
+        self.push_screen(form, ended)
+
+    def _router(self) -> Router | None:
+        line = self.query_one(Grid).chosen
+        if line is not None:
+            return line.router
+        routers = self._routers()
+        return routers[0] if routers else None
+
+    def _tell(self, title: str, text: str) -> None:
+        self.push_screen(Message(title, text))
+
+
+_KEPT_ELSEWHERE = {
+    "static": "Route {name} is in the plant file: change it there.",
+    "derived": "Route {name} follows from the ports in the plant file: write another one there.",
+    "learned": "Route {name} is told of by the station itself.",
+}
+
+
+def run_view(plant: str | None) -> None:
+    """Show the live view until it is left."""
+    RoutesApp(Link(plant)).run()

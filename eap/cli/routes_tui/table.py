@@ -1,0 +1,194 @@
+"""What the tables of the live view show: rows, columns, and how wide a screen has room for.
+
+Pure: records in, texts out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
+from eap.appliance.control_routes import ConnectionRow, RouteRow
+from eap.cli import routes_text, words
+from eap.cli.routes_tui.link import Router
+
+_GAP = 1
+
+
+class View(StrEnum):
+    """What the table is about."""
+
+    ROUTES = "routes"
+    CONNECTIONS = "connections"
+    WARNINGS = "warnings"
+
+
+class Column(NamedTuple):
+    """A column.
+
+    Attributes:
+        heading: Above it.
+        least: Characters without which it is useless.
+        most: Characters that it never needs more of; 0 takes what is left.
+        is_number: Whether it stands on the right.
+        is_extra: Whether it is left out on a narrow screen.
+    """
+
+    heading: str
+    least: int
+    most: int
+    is_number: bool = False
+    is_extra: bool = False
+
+
+class Line(NamedTuple):
+    """A row of a table."""
+
+    key: str
+    router: Router
+    row: RouteRow | ConnectionRow | None
+    """None for a warning."""
+    cells: tuple[str, ...]
+    state: str
+    """``up``, ``down``, ``unknown``, or empty: how it is coloured."""
+
+
+_STATION = Column("Station", 7, 14)
+COLUMNS = {
+    View.ROUTES: (
+        _STATION,
+        Column("Route", 8, 20),
+        Column("NetID", 11, 23),
+        Column("Door", 7, 16),
+        Column("State", 5, 7),
+        Column("Trip", 7, 8, is_number=True),
+        Column("Asked", 5, 5, is_number=True),
+        Column("Octets", 6, 6, is_number=True),
+        Column("Errors", 6, 6, is_number=True),
+        Column("Address", 12, 21, is_extra=True),
+        Column("Origin", 7, 7, is_extra=True),
+        Column("Last error", 20, 0, is_extra=True),
+    ),
+    View.CONNECTIONS: (
+        _STATION,
+        Column("Connection", 16, 26),
+        Column("Door", 7, 16),
+        Column("NetIDs", 12, 23),
+        Column("For", 6, 8, is_number=True),
+        Column("Asked", 5, 5, is_number=True),
+        Column("Octets", 6, 6, is_number=True),
+        Column("Errors", 6, 6, is_number=True),
+        Column("Last error", 20, 0, is_extra=True),
+    ),
+    View.WARNINGS: (_STATION, Column("Warning", 30, 0)),
+}
+
+
+def lines(view: View, routers: Iterable[Router], match: str) -> list[Line]:
+    """Return the rows of *view*; of routes those that *match* have been asked for already."""
+    found = []
+    for router in routers:
+        if view is View.ROUTES:
+            found += [_route_line(router, row) for row in router.routes.routes]
+        elif view is View.CONNECTIONS:
+            found += [_connection_line(router, row) for row in router.routes.connections]
+        else:
+            found += [
+                Line(f"{router.plant}/{router.routes.station}/{text}", router, None,
+                     (router.routes.station, text), "down")
+                for text in router.routes.warnings
+            ]  # fmt: skip
+    if view is View.ROUTES:
+        return found
+    return [line for line in found if match.lower() in " ".join(line.cells).lower()]
+
+
+def fit(
+    view: View, found: Sequence[Line], width: int, *, has_station: bool
+) -> list[tuple[int, Column, int]]:
+    """Return number, column and width of what *width* characters have room for.
+
+    Columns are as wide as they need to be; where that is too wide, texts give way, the longest
+    first.
+    """
+    chosen = []
+    left = width
+    for number, column in enumerate(COLUMNS[view]):
+        if column is _STATION and not has_station:
+            continue
+        if column.is_extra and left < column.least + _GAP:
+            break
+        needed = max((len(line.cells[number]) for line in found), default=0)
+        needed = max(needed, len(column.heading), column.least if column.is_number else 0)
+        size = min(needed, column.most) if column.most else max(left - _GAP, column.least)
+        if column.is_extra:
+            size = min(size, left - _GAP)
+        chosen.append((number, column, size))
+        left -= size + _GAP
+    sizes = [size for _, _, size in chosen]
+    while sum(sizes) + _GAP * len(sizes) > width:
+        spare = [size - each[1].least for size, each in zip(sizes, chosen, strict=True)]
+        widest = max(range(len(spare)), key=lambda each: (spare[each], sizes[each]))
+        if spare[widest] <= 0:
+            break
+        sizes[widest] -= 1
+    return [(*each[:2], size) for each, size in zip(chosen, sizes, strict=True)]
+
+
+def cut(text: str, size: int, *, is_number: bool) -> str:
+    """Return *text* in *size* characters."""
+    if len(text) > size:
+        text = f"{text[: size - 1]}…"
+    return text.rjust(size) if is_number else text
+
+
+def _route_line(router: Router, row: RouteRow) -> Line:
+    station = router.routes.station
+    key = f"{router.plant}/{station}/{row.net_id}/{row.door}/{row.address}"
+    cells = (
+        station, row.name, row.pattern, row.door, "?" if row.state == "unknown" else row.state,
+        routes_text.round_trip(row.rtt_us), routes_text.short(row.requests),
+        routes_text.octets(row), routes_text.short(row.errors), row.address, row.origin,
+        row.last_error,
+    )  # fmt: skip
+    return Line(key, router, row, cells, row.state)
+
+
+def _connection_line(router: Router, row: ConnectionRow) -> Line:
+    station = router.routes.station
+    key = f"{router.plant}/{station}/{row.door}/{row.address}"
+    cells = (
+        station, row.address, row.door, " ".join(row.net_ids),
+        words.duration(row.since_s * 1_000_000), routes_text.short(row.requests),
+        routes_text.octets(row), routes_text.short(row.errors), row.last_error,
+    )  # fmt: skip
+    return Line(key, router, row, cells, "")
+
+
+def detail(line: Line | None) -> list[tuple[str, str]]:
+    """Return what there is to say of a row: texts with how they are coloured."""
+    if line is None:
+        return []
+    row = line.row
+    if row is None:
+        return [(line.cells[1], "down")]
+    if isinstance(row, RouteRow):
+        texts = [
+            (f"{row.name}  {row.pattern}  by {row.door} to {row.address}", "bold"),
+            (f"{routes_text.route_kind(row)}; {routes_text.route_state(row)}", row.state),
+        ]
+    else:
+        asked = f"asked by {', '.join(row.net_ids)}" if row.net_ids else "nothing asked yet"
+        texts = [(f"{row.address} by {row.door}", "bold"), (asked, "")]
+    texts.append((routes_text.figures(row), ""))
+    if row.last_error:
+        texts.append((f"last error: {row.last_error}", "down"))
+    own = row.net_id if isinstance(row, RouteRow) else row.address
+    texts += [(text, "down") for text in line.router.routes.warnings if own in text]
+    requests = [each for each in line.router.routes.requests if routes_text.belongs(each, row)]
+    texts += [
+        (routes_text.request_line(each), "" if each.outcome == "answered" else "down")
+        for each in reversed(requests)
+    ]
+    return texts

@@ -1,0 +1,105 @@
+"""Routes and connections of stations as tables.  Pure: records in, rich renderables out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from rich import box
+from rich.console import RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from eap.appliance.control_routes import ImportRow, StationRoutes, TestResult
+from eap.cli import routes_text, words
+
+_STYLES = {"up": "green", "down": "bold red", "unknown": "dim"}
+
+
+def routes_tables(stations: Sequence[StationRoutes]) -> Iterator[RenderableType]:
+    """Yield what to print for the routers of *stations*, top to bottom."""
+    yield _routes(stations)
+    if any(each.connections for each in stations):
+        yield _connections(stations)
+    remarks = [f"{each.station}: {text}" for each in stations for text in _remarks(each)]
+    if remarks:
+        yield Text("Worth a look", style="bold")
+        yield from (Padding(Text(remark), (0, 0, 0, 1)) for remark in remarks)
+
+
+def result_table(results: Iterable[tuple[str, TestResult]]) -> RenderableType:
+    """Return what came of questions to targets, by station."""
+    table = _table("Station", "Target", "Round trip", "Says")
+    table.columns[2].justify = "right"
+    for station, result in results:
+        said = Text(result.text, style="" if result.ok else _STYLES["down"])
+        if result.hint:
+            said.append(f"\n{result.hint}", style="none")
+        target = f"{result.name} {result.target}".strip()
+        table.add_row(station, target, routes_text.round_trip(result.rtt_us), said)
+    return table
+
+
+def import_table(rows: Iterable[ImportRow], *, is_done: bool) -> RenderableType:
+    """Return the routes of a file, and what became of each."""
+    table = _table("Route", "NetID", "Via", "Added" if is_done else "Would be added")
+    for row in rows:
+        outcome = Text(row.reason or "yes", style=_STYLES["down" if row.reason else "up"])
+        table.add_row(row.name, row.net_id, row.via, outcome)
+    return table
+
+
+def _routes(stations: Sequence[StationRoutes]) -> RenderableType:
+    table = _table("Station", "Route", "NetID", "Door", "Address", "State", "Trip", "Requests")
+    table.add_column("Errors")
+    for column in table.columns[6:]:
+        column.justify = "right"
+    for station in stations:
+        own = station.station
+        for row in station.routes:
+            state = Text(row.state, style=_STYLES[row.state])
+            trip = routes_text.round_trip(row.rtt_us)
+            errors = Text(str(row.errors), style="red" if row.errors else "")
+            table.add_row(
+                own, row.name, row.pattern, row.door, row.address, state, trip, str(row.requests),
+                errors,
+            )  # fmt: skip
+            own = ""
+        if not station.routes:
+            table.add_row(own, Text("none", style="dim"))
+    return table
+
+
+def _connections(stations: Sequence[StationRoutes]) -> RenderableType:
+    table = _table("Station", "Connection", "Door", "NetIDs", "For", "Requests", "Octets", "Errors")
+    for column in table.columns[4:]:
+        column.justify = "right"
+    for station in stations:
+        own = station.station
+        for row in station.connections:
+            table.add_row(
+                own, row.address, row.door, "\n".join(row.net_ids),
+                words.duration(row.since_s * 1_000_000), str(row.requests),
+                routes_text.octets(row), str(row.errors),
+            )  # fmt: skip
+            own = ""
+    return table
+
+
+def _remarks(station: StationRoutes) -> Iterator[str]:
+    yield from station.warnings
+    for row in station.routes:
+        if row.why:
+            yield f"{row.name} ({row.door} {row.address}) is down: {row.why}"
+        if row.last_error:
+            yield f"{row.name}, last error: {row.last_error}"
+    for connection in station.connections:
+        if connection.last_error:
+            yield f"{connection.address} by {connection.door}, last error: {connection.last_error}"
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for heading in headings:
+        table.add_column(heading, overflow="fold", vertical="top")
+    return table

@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import asyncio
+
+from textual.app import App, ComposeResult
+
+from eap.cli.routes_tui.grid import Grid
+from eap.cli.routes_tui.link import Router
+from eap.cli.routes_tui.table import View, lines
+from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
+
+
+class Holder(App[None]):
+    def compose(self) -> ComposeResult:
+        yield Grid("grid")
+
+
+def test_lines_change_in_place_and_the_cursor_follows_its_line() -> None:
+    fake = FakeRoutes()
+
+    def found():
+        return lines(View.ROUTES, [Router("line", fake.stations["island-01"])], "")
+
+    async def script() -> None:
+        app = Holder()
+        async with app.run_test(size=(80, 24)):
+            grid = app.query_one(Grid)
+            assert grid.chosen is None
+            grid.show_lines(View.ROUTES, [], 80, has_station=True)
+            assert grid.chosen is None
+            grid.show_lines(View.ROUTES, found(), 80, has_station=True)
+            grid.move_cursor(row=1)
+            assert grid.chosen.row is PRESS
+            fake.set_routes("island-01", PRESS, ISLAND)
+            grid.show_lines(View.ROUTES, found(), 80, has_station=True)
+            assert (grid.cursor_row, grid.chosen.row) == (0, PRESS)
+            fake.set_routes("island-01", ISLAND)
+            grid.show_lines(View.ROUTES, found(), 80, has_station=True)
+            assert grid.chosen.row is ISLAND
+
+    asyncio.run(script())

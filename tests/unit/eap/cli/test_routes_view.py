@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+from rich.console import Console
+
+from eap.appliance.control_routes import ImportRow, TestResult
+from eap.cli.routes_view import import_table, result_table, routes_tables
+from tests.support.fakeroutes import FakeRoutes
+
+
+def shown(*parts: object) -> str:
+    console = Console(width=100, highlight=False)
+    with console.capture() as capture:
+        for part in parts:
+            console.print(part)
+    return capture.get()
+
+
+def test_tables_of_routes_and_connections() -> None:
+    text = shown(*routes_tables(list(FakeRoutes().stations.values())))
+    rows = [line.split() for line in text.splitlines()]
+    assert ["island-02", "none"] in rows
+    assert ["press", "5.1.2.3.1.1", "ams-tcp", "192.168.1.5:48898", "down", "3", "3"] in rows
+    assert ["island-01", "127.0.0.1:40112#3", "ams-tcp", "127.0.0.1.1.1", "75.0", "s", "15",
+            "47.3k", "3"] in rows  # fmt: skip
+    remarks = text.partition("Worth a look\n")[2].splitlines()
+    assert [each.strip().partition(":")[2][:22] for each in remarks] == [
+        " route press (5.1.2.3.", " press (ams-tcp 192.16", " press, last error: pr",
+        " 127.0.0.1:40112#3 by ",
+    ]  # fmt: skip
+
+
+def test_stations_that_are_well_have_no_remarks() -> None:
+    quiet = FakeRoutes().stations["island-02"]
+    assert "Worth a look" not in shown(*routes_tables([quiet]))
+    assert "Connection" not in shown(*routes_tables([quiet]))
+
+
+def test_results() -> None:
+    ok = TestResult(target="1.1.1.1.1.1:10000", name="a", ok=True, rtt_us=840, text="answers: RUN")
+    bad = TestResult(target="2.1.1.1.1.1:10000", name="", ok=False, text="down", hint="look there")
+    text = " ".join(shown(result_table([("mixer", ok), ("mixer", bad)])).split())
+    assert "mixer a 1.1.1.1.1.1:10000 840 µs answers: RUN" in text
+    assert "mixer 2.1.1.1.1.1:10000 down look there" in text
+
+
+def test_imports() -> None:
+    rows = [
+        ImportRow(name="a", net_id="1.1.1.1.1.1", via="ams-tcp:a"),
+        ImportRow(name="b", net_id="", via="", reason="no NetID"),
+    ]
+    text = shown(import_table(rows, is_done=True))
+    assert "Added" in text
+    assert ["a", "1.1.1.1.1.1", "ams-tcp:a", "yes"] in [each.split() for each in text.splitlines()]
+    assert "b" in text
+    assert "no NetID" in text
+    assert "Would be added" in shown(import_table(rows, is_done=False))

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+from contextlib import suppress
+from xml.etree import ElementTree as ET
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.codec.staticroutes import MAX_ROUTES, StaticRoute, decode, encode
+from eap.errors import CodecError, MalformedError
+
+# As the .NET router's description and as users of TwinCAT show them.
+FILE = """\
+<?xml version="1.0" encoding="utf-8"?>
+<TcConfig xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"
+          xsi:noNamespaceSchemaLocation="C:\\TwinCAT3\\Config\\TcConfig.xsd">
+  <Local>
+    <Name>MyLocalSystem</Name>
+    <NetId>192.168.1.20.1.1</NetId> <!-- Local NetId -->
+    <TcpPort>48898</TcpPort>
+  </Local>
+  <RemoteConnections>
+    <Route>
+      <Name>press</Name>
+      <Address> press.hall </Address> <!-- host name -->
+      <NetId>192.168.1.21.1.1</NetId>
+      <Type>TCP_IP</Type>
+      <Timeout>5</Timeout>
+      <Flags>64</Flags>
+    </Route>
+    <Mqtt><Address Port="1883">broker</Address><Topic>line</Topic></Mqtt>
+    <Route>
+      <Name>old</Name>
+      <NetId>5.1.2.3.1.1</NetId>
+      <Type>PROFIBUS</Type>
+    </Route>
+    <Route/>
+  </RemoteConnections>
+</TcConfig>
+"""
+PRESS = StaticRoute("press", "192.168.1.21.1.1", "press.hall")
+NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), max_size=20)
+
+
+def test_routes_are_read_in_their_order_as_they_stand() -> None:
+    old = StaticRoute("old", "5.1.2.3.1.1", "", "PROFIBUS")
+    assert decode(FILE.encode()) == [PRESS, old, StaticRoute("", "", "")]
+
+
+def test_byte_order_mark_and_other_encodings_are_read() -> None:
+    assert decode(FILE.replace("utf-8", "utf-16").encode("utf-16"))[0] == PRESS
+    assert decode(b"\xef\xbb\xbf" + FILE.encode())[0] == PRESS
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "not XML that can be read"),
+        ("<TcConfig>", "not XML that can be read"),
+        ('<?xml version="1.0" encoding="none"?><TcConfig/>', "not XML that can be read"),
+        ("<Routes/>", "it begins with 'Routes', expected TcConfig"),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><TcConfig>&a;</TcConfig>', "it declares entities"),
+        (
+            "<TcConfig><RemoteConnections>"
+            + "<Route/>" * (MAX_ROUTES + 1)
+            + "</RemoteConnections></TcConfig>",
+            "10001 routes, expected at most 10000",
+        ),
+    ],
+)
+def test_other_files_are_refused(text: str, reason: str) -> None:
+    with pytest.raises(MalformedError, match=reason):
+        decode(text.encode())
+
+
+@given(st.lists(st.builds(StaticRoute, NAMES, NAMES, NAMES, st.just("TCP_IP")), max_size=4))
+def test_what_is_written_is_read(routes: list[StaticRoute]) -> None:
+    assert decode(encode("here <&>", "1.1.1.1.1.1", routes, tcp_port=48898)) == routes
+
+
+def test_file_tells_of_its_own_router() -> None:
+    root = ET.fromstring(encode("a&b", "1.2.3.4.1.1", [PRESS], tcp_port=48898))
+    assert [root.findtext(f"Local/{tag}") for tag in ("Name", "NetId", "TcpPort")] == [
+        "a&b", "1.2.3.4.1.1", "48898"
+    ]  # fmt: skip
+    (route,) = root.iterfind("RemoteConnections/Route")
+    assert [(each.tag, each.text) for each in route] == [
+        ("Name", "press"), ("Address", "press.hall"), ("NetId", "192.168.1.21.1.1"),
+        ("Type", "TCP_IP"),
+    ]  # fmt: skip
+
+
+@given(st.binary(max_size=200))
+def test_any_octets_are_read_or_refused(octets: bytes) -> None:
+    with suppress(CodecError):
+        decode(octets)
