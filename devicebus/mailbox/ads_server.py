@@ -8,9 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from devicebus.mailbox.ads_services import AdsServices
+from eap.aoe.ads_device import AdsDevice
+from eap.aoe.ads_notifications import Client
+from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.answer import AmsAnswer
-from eap.codec.ads import AdsError, AdsRange, IndexGroup, encode_result
+from eap.aoe.way import Way
+from eap.codec.ads import (
+    AdsDeviceInfo,
+    AdsError,
+    AdsRange,
+    AdsState,
+    AdsStates,
+    IndexGroup,
+    device_name,
+    encode_result,
+)
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
@@ -18,15 +30,19 @@ from eap.od.model import OdState
 
 _NET_ID_OFFSET = 3
 _NET_ID_SIZE = 6
+_SERVICES = frozenset((AmsCommand.READ_DEVICE_INFO, AmsCommand.READ_STATE, AmsCommand.READ,
+                       AmsCommand.WRITE, AmsCommand.READ_WRITE))  # fmt: skip
+_MASTER = Client(Way("", ""), NetId(bytes(_NET_ID_SIZE)), 0)
+"""Without notifications nothing belongs to a client."""
 
 
 class AdsServer:
-    """The services of one slave; an instance is the handler of an AoeServer.
+    """The services of one slave, its dictionary without notifications; the handler of an AoeServer.
 
     Args:
         dictionary: What is read and written.
         state: Says in which state the slave is now.
-        name: Of the device; 16 octets of it are told.
+        name: Of the device; 15 octets of it are told.
 
     Attributes:
         address: NetID and port of the slave; None until a request has told them.
@@ -36,7 +52,11 @@ class AdsServer:
         self, dictionary: ObjectDictionary, state: Callable[[], OdState], name: str
     ) -> None:
         self.address: tuple[NetId, int] | None = None
-        self._services = AdsServices(dictionary, state, name)
+        self._device = AdsDevice(
+            AdsDeviceInfo(1, 0, 0, device_name(name)),
+            lambda: AdsStates(AdsState.RUN, 0),
+            [ObjectSpace(dictionary, state)],
+        )
 
     def forget(self) -> None:
         """Take any address next: the mailbox starts again."""
@@ -52,7 +72,9 @@ class AdsServer:
             return AmsAnswer(error_code=AdsError.TARGET_MACHINE)
         if header.target_port != self.address[1]:
             return AmsAnswer(error_code=AdsError.TARGET_PORT)
-        return self._services.answer(header.command, data)
+        if header.command not in _SERVICES:
+            return AmsAnswer(error_code=AdsError.SERVICE)
+        return self._device.answer(header.command, data, _MASTER, 0)
 
     def _take_address(self, header: AmsHeader, data: bytes) -> bool:
         if len(data) < AdsRange.SIZE + _NET_ID_SIZE:
