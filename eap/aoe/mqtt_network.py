@@ -112,17 +112,19 @@ class MqttNetwork:
         net_id: Of this station's router.
         name: Of the station.
         door: Name of the door by which the network is reached.
-        table: Routes of the station, for what is learned; None to learn nothing.
+        table: Routes of the station.
+        learns: Whether routes are added to them.
     """
 
     def __init__(
-        self, spec: MqttSpec, net_id: NetId, name: str, *, door: str, table: RouteTable | None
-    ) -> None:
+        self, spec: MqttSpec, net_id: NetId, name: str, *,
+        door: str, table: RouteTable, learns: bool = True,
+    ) -> None:  # fmt: skip
         self._spec = spec
         self._net_id = net_id
         self._info = Info(name, is_online=True, is_unidirectional=spec.is_unidirectional)
         self._topics = Topics(spec.network, net_id)
-        self._peers = Peers(net_id, door, table)
+        self._peers = Peers(net_id, door, table, learns=learns)
         self._ports = ClientPorts(net_id)
         self._senders: OrderedDict[str, _Sender] = OrderedDict()
         self._connected_at_ns: int | None = None
@@ -141,7 +143,7 @@ class MqttNetwork:
         """Return what to do first on a new connection, in this order."""
         self._connected_at_ns = now_ns
         self._refresh_at_ns = now_ns + CONFIRM_NS
-        return [Subscribe(self._topics.filters), self._tell(now_ns)]
+        return [*self._await(), Subscribe(self._topics.filters), self._tell(now_ns)]
 
     def disconnected(self) -> None:
         """Wait for the next connection."""
@@ -275,6 +277,7 @@ class MqttNetwork:
             actions.append(HopDown(str(net_id), "it is gone without a word"))
             actions.append(Closed(str(net_id)))
         actions += [HopUp(str(net_id)) for net_id in (*were_there, *were_not)]
+        actions += self._await()
         while self._senders:
             address, sender = next(iter(self._senders.items()))
             if now_ns - sender.heard_at_ns < _SILENCE_NS:
@@ -282,6 +285,9 @@ class MqttNetwork:
             del self._senders[address]
             actions.append(Closed(address))
         return actions
+
+    def _await(self) -> list[Action]:
+        return [HopDown(each, "it has not told of itself yet") for each in self._peers.awaited()]
 
     def _tell(self, now_ns: int) -> Publish:
         self._told_at_ns = now_ns

@@ -48,13 +48,15 @@ class Peers:
     Args:
         net_id: Of this station's router.
         door: By which they are reached.
-        table: Where learned routes go; None to learn none.
+        table: Routes of this station.
+        learns: Whether routes are added to them.
     """
 
-    def __init__(self, net_id: NetId, door: str, table: RouteTable | None) -> None:
+    def __init__(self, net_id: NetId, door: str, table: RouteTable, *, learns: bool = True) -> None:
         self._net_id = net_id
         self._door = door
         self._table = table
+        self._learns = learns
         self._peers: dict[NetId, _Peer] = {}
         self._online: dict[bytes, list[NetId]] = {}
         """By the octets that the NetIDs of a station have in common, the first one first."""
@@ -81,13 +83,24 @@ class Peers:
         self._list(net_id, is_online=info.is_online)
         return Change.UP if info.is_online else Change.DOWN
 
+    def awaited(self) -> list[str]:
+        """Return the hops that some route needs, nothing asks for life, and have not told yet."""
+        there = {str(each) for each, peer in self._peers.items() if peer.is_online}
+        needed = {
+            each.hop.connection
+            for each in self._table
+            if each.hop.door == self._door and not each.is_probed
+            if each.origin is not Origin.LEARNED
+        }
+        return sorted(needed - there)
+
     def forget(self, since_ns: int, now_ns: int) -> tuple[list[NetId], list[NetId]]:
         """Forget who told nothing since then; return who of them was there, and who was not."""
         silent = [each for each, peer in self._peers.items() if peer.told_at_ns < since_ns]
         were_there, were_not = [], []
         for net_id in silent:
             peer = self._peers.pop(net_id)
-            if peer.route is not None and self._table is not None:
+            if peer.route is not None:
                 # Not removed: in its place there may be one that is not learned by now.
                 self._table.add(msgspec.structs.replace(peer.route, expires_at_ns=now_ns))
             if peer.is_online:
@@ -106,7 +119,7 @@ class Peers:
 
     def _learn(self, net_id: NetId, name: str, known: Route | None, now_ns: int) -> Route | None:
         """Return the route, new or with more time; None if there cannot be one."""
-        if self._table is None:
+        if not self._learns:
             return None
         expires_at_ns, name = now_ns + EXPIRY_NS, name or str(net_id)
         if known is not None and known.name == name:

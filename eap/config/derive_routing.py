@@ -108,5 +108,7 @@ def _derived(index: Index, station: Station, loose: set[str]) -> Iterator[RouteS
                 hop=hop,
                 octets=octets,
                 router=router,
+                # The broker tells who is there; all asking all each second is a load of its own.
+                is_probed=hop.kind is not DoorKind.MQTT,
                 is_derived=True,
             )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from random import uniform
@@ -43,8 +43,8 @@ logger = logging.getLogger(__name__)
 class Handlers(NamedTuple):
     """Who is told what; all of them return at once."""
 
-    connected: Callable[[], Iterable[Outgoing]]
-    """Returns what is sent first."""
+    connected: Callable[[], None]
+    """Messages can be sent."""
     lost: Callable[[str], None]
     """The connection is gone; why, for people."""
     message: Callable[[str, bytes, bool], None]
@@ -139,8 +139,7 @@ class MqttLink:
         self._said = ""
         if self._is_old:
             logger.warning("%s speaks no MQTT 5: the longest message is its own affair", self._name)
-        for message in self._handlers.connected():
-            self.send(message)
+        self._handlers.connected()
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._write(client, group))

@@ -21,8 +21,9 @@ from eap.aoe.mqtt_network import (
 )
 from eap.aoe.mqtt_peers import REFRESH_NS
 from eap.aoe.mqtt_ports import FIRST_PORT
-from eap.aoe.routes import RouteTable
+from eap.aoe.routes import Route, RouteTable
 from eap.aoe.spec import MqttSpec
+from eap.aoe.way import Way
 from eap.ids import NetId
 from tests.support.ams import NOTIFICATION, Ams, parse
 
@@ -101,6 +102,23 @@ def test_routers_that_do_not_come_back_with_the_broker_are_gone() -> None:
     ]  # fmt: skip
     place.table.expire(place.now_ns)
     assert [str(each.net_id) for each in place.table] == ["8.1.1.1.1.1"]
+
+
+def test_hop_of_the_plant_file_is_down_until_it_tells_of_itself() -> None:
+    place = Place()
+    far = NetId.parse(FAR)
+    place.table.add(Route(far, "far", Way("mqtt:hall", FAR), is_probed=False))
+    place.network.disconnected()
+    awaited = HopDown(FAR, "it has not told of itself yet")
+    assert place.network.connected(place.now_ns) == [awaited, *place.first]
+    assert place.wait(30)[0] == awaited
+    assert place.hear_of(FAR, HERE) == [HopUp(FAR)]
+    place.wait(REFRESH_NS / SECOND)
+    place.wait(REFRESH_NS / SECOND)
+    gone = place.wait(REFRESH_NS / SECOND)
+    assert gone[:4] == [
+        HopDown(FAR, "it is gone without a word"), Closed(FAR), HopUp(FAR), awaited,
+    ]  # fmt: skip
 
 
 def test_all_are_asked_for_now_and_then() -> None:

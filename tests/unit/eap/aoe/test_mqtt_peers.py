@@ -15,7 +15,7 @@ HERE, GONE = Info("far", is_online=True), Info("far", is_online=False)
 
 
 def peers_with(table: RouteTable | None = None) -> Peers:
-    return Peers(OWN, DOOR, table)
+    return Peers(OWN, DOOR, RouteTable() if table is None else table)
 
 
 def test_router_comes_and_goes() -> None:
@@ -59,7 +59,25 @@ def test_nothing_is_learned_that_is_not_to_be_learned() -> None:
     assert peers.tell(FAR, HERE, 0) is Change.UP
     peers.tell(NEAR, HERE._replace(is_unidirectional=True), 0)
     assert [each.origin for each in table] == [Origin.STATIC]
-    assert peers_with(None).tell(FAR, HERE, 0) is Change.UP
+    table = RouteTable()
+    assert Peers(OWN, DOOR, table, learns=False).tell(FAR, HERE, 0) is Change.UP
+    assert not len(table)
+
+
+def test_hops_that_nothing_probes_are_awaited() -> None:
+    table = RouteTable([
+        Route(FAR, "far", Way(DOOR, str(FAR)), is_probed=False),
+        Route(NEAR, "near", Way(DOOR, str(NEAR)), is_probed=False),
+        Route(OWN, "probed", Way(DOOR, str(OWN))),
+        Route(OWN, "elsewhere", Way("mqtt:line", str(OWN)), is_probed=False),
+    ])  # fmt: skip
+    peers = peers_with(table)
+    assert peers.awaited() == [str(FAR), str(NEAR)]
+    peers.tell(FAR, HERE, 0)
+    peers.tell(NetId.parse("7.1.1.1.1.1"), HERE, 0)
+    assert peers.awaited() == [str(NEAR)]
+    peers.tell(FAR, GONE, 0)
+    assert peers.awaited() == [str(FAR), str(NEAR)]
 
 
 def test_other_routers_of_this_computer_get_their_own_net_id_only() -> None:

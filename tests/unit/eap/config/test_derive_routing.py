@@ -103,6 +103,7 @@ def test_stations_that_share_but_a_network_reach_each_other_by_its_broker(plant)
         (right, f"{right}\n{broker}"),
     ).routing["left"]
     assert [route.hop for route in told.routes] == [HopSpec(DoorKind.MQTT, "n", "127.0.9.2.1.1")]
+    assert not told.routes[0].is_probed
     assert [each.host for each in told.mqtt] == ["b"]
 
 

@@ -36,9 +36,10 @@ class Peer:
             spec, name, will=WILL, handlers=Handlers(self._connected, self.lost.append, self._hear)
         )
 
-    def _connected(self) -> list[Publish | Subscribe]:
+    def _connected(self) -> None:
         self.connections += 1
-        return [Subscribe(("hall/#",)), HELLO]
+        assert self.link.send(Subscribe(("hall/#",))) is None
+        assert self.link.send(HELLO) is None
 
     def _hear(self, topic: str, payload: bytes, is_retained: bool) -> None:
         self.heard.append((topic, payload, is_retained))
