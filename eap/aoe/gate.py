@@ -61,6 +61,10 @@ class Gate:
         grants = self._access.grants(way, header.source, header.target, header.target_port)
         return {service: grants.may(service) for service in AccessService}
 
+    def is_this_host(self, way: Way) -> bool:
+        """Say whether only a program of this host can have come by *way*."""
+        return self._access.is_this_host(way)
+
     def let_through(
         self, header: AmsHeader, data: bytes, way: Way, now_ns: int, route: str = ""
     ) -> tuple[bytes, Judged | None] | Refusal:

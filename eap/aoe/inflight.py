@@ -72,6 +72,10 @@ class InFlight:
         """Return the request with this id."""
         return self._by_id.get(invoke_id)
 
+    def ways(self) -> list[Way]:
+        """Return by which ways there came requests that wait."""
+        return list(self._by_way)
+
     def count(self, way: Way) -> int:
         """Return how many came by *way*."""
         return len(self._by_way.get(way, ()))

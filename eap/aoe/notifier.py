@@ -12,6 +12,7 @@ from eap.aoe.routes import Route
 from eap.aoe.subscriptions import MAX_PER_WAY, Subscription, Subscriptions, divide
 from eap.aoe.way import Way
 from eap.codec.ads import AdsReadWrite, IndexGroup
+from eap.codec.adsnotification import decode_notification
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.ids import NetId
 
@@ -67,6 +68,18 @@ class Notifier:
             if oldest is not None:
                 surplus.append(oldest)
         return surplus
+
+    def knows(self, header: AmsHeader, body: bytes) -> bool:
+        """Say whether somebody here asked for a sample of a notification.
+
+        Raises:
+            CodecError: it is shorter or longer than it says.
+        """
+        onward = _ADDRESSES.pack(
+            header.source, header.source_port, header.target, header.target_port
+        )
+        handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
+        return any(self.subscriptions.find(onward, handle) is not None for handle in handles)
 
     def hand_on(self, header: AmsHeader, body: bytes, is_hop: Callable[[Way], bool]) -> list[Reply]:
         """Return what the clients get of a notification; nothing if nobody here asked for it.

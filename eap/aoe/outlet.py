@@ -11,23 +11,31 @@ from eap.codec.ams import AmsHeader
 
 
 class Outlet:
-    """The doors of a router, seen from inside.
-
-    Raises:
-        ValueError: a door has not even room for a fragment, or the name of another.
-    """
+    """The doors of a router, seen from inside; raises as :meth:`add`."""
 
     def __init__(self, doors: Iterable[Door]) -> None:
         self._doors: dict[str, Door] = {}
         self._number = 0
         for door in doors:
-            if door.name in self._doors:
-                raise ValueError(f"two doors {door.name!r}")
-            if door.room and door.room <= AmsHeader.SIZE:
-                raise ValueError(
-                    f"door {door.name!r}: {door.room} octets, expected more than {AmsHeader.SIZE}"
-                )
-            self._doors[door.name] = door
+            self.add(door)
+
+    def add(self, door: Door) -> None:
+        """Take one more door.
+
+        Raises:
+            ValueError: it has not even room for a fragment, or the name of another.
+        """
+        if door.name in self._doors:
+            raise ValueError(f"two doors {door.name!r}")
+        if door.room and door.room <= AmsHeader.SIZE:
+            raise ValueError(
+                f"door {door.name!r}: {door.room} octets, expected more than {AmsHeader.SIZE}"
+            )
+        self._doors[door.name] = door
+
+    def remove(self, name: str) -> None:
+        """Forget a door; nothing goes back by it any more."""
+        del self._doors[name]
 
     @property
     def doors(self) -> Mapping[str, Door]:

@@ -157,6 +157,11 @@ class Passage:
         pending = self.in_flight.pop(ticket)
         return [] if pending is None else self._fail(pending, text, now_ns)
 
+    def ways_of(self, door: str) -> set[Way]:
+        """Return by which ways of a door somebody waits here for something."""
+        ways = {*self.in_flight.ways(), *self.notifier.subscriptions.ways()}
+        return {way for way in ways if way.door == door}
+
     def connection_closed(self, way: Way, now_ns: int) -> list[Action]:
         """Forget who waits at *way*, and end their notifications."""
         for pending in self.in_flight.abandon(way):
@@ -193,6 +198,10 @@ class Passage:
     def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
         """Return how a request would go on that is for nobody here."""
         return self._judge.find_route(header, way)
+
+    def is_down(self, hop: Way) -> bool:
+        """Say whether nothing can go to a hop now."""
+        return self._judge.is_down(hop)
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""

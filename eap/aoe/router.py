@@ -81,6 +81,37 @@ class Router:
         """Answer for *net_id* no more."""
         self._devices.pop(net_id, None)
 
+    def add_door(self, door: Door) -> None:
+        """Let packets come and go by *door*; raises ValueError as :meth:`Outlet.add`."""
+        self._outlet.add(door)
+
+    def remove_door(self, name: str, now_ns: int) -> list[Action]:
+        """Forget a door, and whoever waits at it; answer what waits for those behind it."""
+        actions: list[Action] = []
+        for way in self._passage.ways_of(name):
+            actions += self.connection_closed(*way, now_ns)
+        actions += self._passage.hop_lost(name, None, f"{name} is there no more", now_ns)
+        self._outlet.remove(name)
+        return actions
+
+    def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
+        """Say whether a packet is for this station or for somebody who waits here.
+
+        For whoever has several routers behind one socket.  A request is, if its target is of this
+        station; an answer, if it was asked for; a notification, if a client of this router has it.
+        """
+        if header.target in self._devices:
+            return True
+        if header.state_flags & _RESPONSE:
+            pending = self._passage.in_flight.get(header.invoke_id)
+            return (
+                pending is not None
+                and pending.route is not None
+                and (pending.route.hop.door == door)
+            )
+        is_notification = header.command == AmsCommand.NOTIFICATION
+        return is_notification and self._passage.notifier.knows(header, body)
+
     def receive_packet(
         self, data: bytes, door: str, connection: str, now_ns: int, *, for_all: bool = False
     ) -> list[Action]:
@@ -140,6 +171,18 @@ class Router:
         if self._prober is not None:
             self._prober.resume(door, address)
         self._passage.hop_up(door, address)
+
+    def is_down(self, hop: Way) -> bool:
+        """Say whether a hop is known not to answer now."""
+        return self._passage.is_down(hop)
+
+    def waiting(self, way: Way) -> int:
+        """Return how many requests that came by *way* wait for their answers."""
+        return self._passage.in_flight.count(way)
+
+    def notify(self, way: Way, packet: bytes) -> list[Action]:
+        """Send what a service has for a client; nothing if its door is there no more."""
+        return [self._outlet.reply(way, packet)] if way.door in self._outlet.doors else []
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
@@ -218,7 +261,7 @@ class Router:
         if ports is None and for_all:
             return []
         self.record.connections.of(way, now_ns).ask(len(data), header.source)
-        if header.source in self._devices and not self._outlet.doors[way.door].is_this_host:
+        if header.source in self._devices and not self.gate.is_this_host(way):
             text = f"it comes back to where it began: {header.source} is of this station"
             why = Refusal(AdsError.TARGET_MACHINE, text, outcome=Outcome.LOOP)
             return self._refuser.refuse(header, way, why, now_ns)

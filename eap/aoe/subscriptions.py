@@ -68,6 +68,10 @@ class Subscriptions:
             del self._of_way[way]
         return subscription
 
+    def ways(self) -> list[Way]:
+        """Return who has any."""
+        return list(self._of_way)
+
     def close(self, way: Way) -> list[Subscription]:
         """Forget and return those of *way*."""
         mine = self._of_way.pop(way, OrderedDict())

@@ -32,7 +32,6 @@ class Door(msgspec.Struct, frozen=True):
         is_shared: Whether all answers come by one connection, whoever gives them (a broker).
         is_hub: Whether those behind it reach each other through a router only, so that packets
             may go back to where they came in, though not to the same address.
-        is_this_host: Whether only programs of this host come by it; they may use its NetIDs.
     """
 
     name: str
@@ -40,4 +39,3 @@ class Door(msgspec.Struct, frozen=True):
     is_stream: bool = False
     is_shared: bool = False
     is_hub: bool = False
-    is_this_host: bool = False

@@ -48,8 +48,6 @@ class Refusal(StrEnum):
     """An AMS/TCP connection left a packet unfinished, or took no answers, and was closed."""
     AMS_UNASKED = auto()
     """An answer came by AMS/TCP, and nobody had asked."""
-    AMS_ACCESS = auto()
-    """More than a read was wanted by AMS/TCP from another host."""
     AMS_DISCOVERY = auto()
     """A datagram came to UDP 48899 that asks for nothing that there is."""
 

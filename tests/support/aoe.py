@@ -6,15 +6,9 @@ mailbox header of 6, an AMS header of 32.
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import struct
-from collections.abc import Awaitable
 from typing import NamedTuple, Self
-
-from eap.aoe.answer import AmsAnswer
-from eap.appliance.services.aoe_desk import AoeDesk
-from eap.ids import NetId
 
 DEVICE = 0xFFFF
 READ, WRITE, READ_STATE = 2, 3, 4
@@ -125,21 +119,3 @@ class UdpClient:
 
     def write(self, index: int, subindex: int, data: bytes, *, complete: bool = False) -> Answer:
         return self.ask(WRITE, write_body(index << 16 | complete << 8 | subindex, data))
-
-
-async def echo(command: int, data: bytes) -> AmsAnswer:
-    """Answer as a device that sends back what it got."""
-    return AmsAnswer(bytes(4) + bytes([command]) + data[::-1])
-
-
-def echoing_desk(target: str) -> AoeDesk:
-    """Return the desk of a station with one device that echoes."""
-    return AoeDesk({NetId.parse(target): echo}, {NetId.parse(target)})
-
-
-async def while_serving(desk: AoeDesk, script: Awaitable[object]) -> None:
-    """Run *script* while *desk* serves."""
-    async with asyncio.TaskGroup() as group:
-        serving = group.create_task(desk.serve())
-        await script
-        serving.cancel()

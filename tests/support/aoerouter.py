@@ -24,7 +24,7 @@ LINK = Way("link", "10.0.0.6")
 SECOND_LINK = Way("link", "10.0.0.7")
 DOORS = (
     Door("tcp", is_stream=True, is_hub=True),
-    Door("here", is_stream=True, is_hub=True, is_this_host=True),
+    Door("local", is_stream=True, is_hub=True),
     Door("link", is_hub=True, is_stream=True),
     Door("segment"),
     Door("broker", is_shared=True),

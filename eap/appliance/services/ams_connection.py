@@ -1,6 +1,6 @@
-"""One AMS/TCP connection: requests in, and each answer back on it (Beckhoff ADS, AMS/TCP).
+"""AMS/TCP connections: requests in, and each answer back on its own (Beckhoff ADS, AMS/TCP).
 
-Rule 1: one request of a connection is answered before its next one is looked at, so what a client
+Rule 1: few requests of a connection are under way, and of large ones only one, so what a client
 sends ahead waits in its own connection and nowhere else.
 Rule 2: answers know their connection, not their client: clients of one host share its NetID, and
 often ports and numbers of requests too.
@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from eap.aoe.answer import AmsAnswer, response_to
 from eap.aoe.stream import PacketCutter, Piece, TooLong
 from eap.appliance.discards import Refusal
-from eap.appliance.services.aoe_desk import AoeDesk, find_desk
+from eap.appliance.services.routing.entrance import Entrance
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 from eap.codec.amstcp import encode_with_prefix
@@ -25,40 +25,69 @@ LONGEST_PACKET = 256 << 10
 """Octets of an AMS packet; nothing here has a value a quarter as long."""
 PATIENCE_S = 10.0
 """How long a packet may take from its first octet to its last, and an answer to be taken."""
+MAX_UNANSWERED = 32
+"""Requests of one connection that wait for their answers."""
+LARGE_REQUEST = 8 << 10
+"""Octets of a request that is answered before the next one is looked at."""
+_MAX_UNSENT = 1 << 20
+"""Octets that wait for a client that does not take them."""
 _CHUNK = 64 << 10
 
 logger = logging.getLogger(__name__)
+
+
+class AmsClients:
+    """All AMS/TCP connections of this process by name; the carrier of each station's door."""
+
+    def __init__(self) -> None:
+        self._connections: dict[str, AmsConnection] = {}
+
+    def add(self, name: str, connection: AmsConnection) -> None:
+        """Take one more."""
+        self._connections[name] = connection
+
+    def remove(self, name: str) -> None:
+        """Forget one that has ended."""
+        del self._connections[name]
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send packets on a connection; return why not if that cannot be done."""
+        client = self._connections.get(connection)
+        if client is None:
+            return "the connection is closed"
+        for packet in packets:
+            client.send(packet)
+        return None
 
 
 class AmsConnection:
     """One client that has connected.
 
     Args:
+        name: Of the connection.
         reader: What it sends.
         writer: To it.
-        desks: Of the stations behind the listener.
+        entrance: To the stations behind the listener.
         refuse: Counts what is not answered as it was wanted.
-        is_this_host: Whether it runs on this machine: others only read.
     """
 
     def __init__(
         self,
+        name: str,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
-        desks: Sequence[AoeDesk],
+        entrance: Entrance,
         refuse: Callable[[Refusal], None],
         *,
-        is_this_host: bool,
         patience_s: float = PATIENCE_S,
     ) -> None:
+        self._name = name
         self._reader = reader
         self._writer = writer
-        self._desks = desks
+        self._entrance = entrance
         self._refuse = refuse
-        self._is_this_host = is_this_host
         self._patience_s = patience_s
         self._cutter = PacketCutter(LONGEST_PACKET)
-        self._has_warned = False
 
     async def serve(self) -> None:
         """Answer until the client leaves, or breaks the rules.
@@ -68,9 +97,12 @@ class AmsConnection:
         """
         try:
             while (piece := await self._next_piece()) is not None:
-                packet = await self._answer(piece)
-                if packet is not None:
-                    await self._send(packet)
+                self._take(piece)
+                is_large = len(piece) > LARGE_REQUEST
+                await self._entrance.wait_below(self._name, 1 if is_large else MAX_UNANSWERED)
+                if self._writer.transport.get_write_buffer_size():  # mostly it is gone at once
+                    async with asyncio.timeout(self._patience_s):
+                        await self._writer.drain()
         except MalformedError as exc:
             logger.debug("AMS/TCP connection closed: %s", exc)
             self._refuse(Refusal.AMS_TYPE)
@@ -98,50 +130,30 @@ class AmsConnection:
             piece = self._cutter.next_piece()
         return piece
 
-    async def _send(self, packet: bytes) -> None:
-        self._writer.write(encode_with_prefix(packet))
-        if self._writer.transport.get_write_buffer_size():  # mostly the kernel takes it at once
-            async with asyncio.timeout(self._patience_s):
-                await self._writer.drain()
-
-    async def _answer(self, piece: Piece) -> bytes | None:
-        """Return the packet that goes back, None for what has no answer."""
+    def _take(self, piece: Piece) -> None:
+        """Hand a request on, or say what is wrong with it."""
         if isinstance(piece, TooLong):
             header, length = piece
         else:
             header, length = AmsHeader.decode(piece), len(piece)
         if header.state_flags & StateFlags.RESPONSE:
             self._refuse(Refusal.AMS_UNASKED)
-            return None
-        if isinstance(piece, TooLong) or header.length != length - AmsHeader.SIZE:
+        elif isinstance(piece, TooLong) or header.length != length - AmsHeader.SIZE:
             self._refuse(Refusal.AMS_LENGTH)
-            answer = AmsAnswer(error_code=AdsError.AMS_LENGTH)
-        elif not self._is_this_host and header.command not in _READS:
-            answer = self._deny(header)
+            self._answer(header, AdsError.AMS_LENGTH)
+        elif header.command == AmsCommand.FRAGMENT:
+            self._answer(header, AdsError.COMMAND)  # these belong to mailboxes
         else:
-            answer = await self._ask(header, piece[AmsHeader.SIZE :])
-        no_return = header.state_flags & StateFlags.NO_RETURN
-        return None if no_return else response_to(header, answer)
+            self._entrance.receive(piece, self._name)
 
-    async def _ask(self, header: AmsHeader, body: bytes) -> AmsAnswer:
-        if header.command == AmsCommand.FRAGMENT:
-            return AmsAnswer(error_code=AdsError.COMMAND)  # these belong to mailboxes
-        found = find_desk(self._desks, header)
-        if isinstance(found, AdsError):
-            return AmsAnswer(error_code=found)
-        desk, services = found
-        return await desk.ask(header, body, services)
+    def send(self, packet: bytes) -> None:
+        """Send a packet, unless the client takes nothing any more."""
+        if self._writer.transport.get_write_buffer_size() > _MAX_UNSENT:
+            self._refuse(Refusal.AMS_SLOW)
+            self._writer.transport.abort()
+        elif not self._writer.is_closing():
+            self._writer.write(encode_with_prefix(packet))
 
-    def _deny(self, header: AmsHeader) -> AmsAnswer:
-        self._refuse(Refusal.AMS_ACCESS)
-        if not self._has_warned:
-            self._has_warned = True  # a flood of writes is no flood of lines
-            command = AmsCommand.name_of(header.command)
-            peer = "{}:{}".format(*self._writer.get_extra_info("peername")[:2])
-            where = f"{header.target}:{header.target_port}"
-            logger.warning("AMS/TCP %s: %s to %s refused: only reads", peer, command, where)
-        return AmsAnswer(error_code=AdsError.ACCESS_DENIED)
-
-
-_READS = frozenset((AmsCommand.READ_DEVICE_INFO, AmsCommand.READ, AmsCommand.READ_STATE))
-"""What other hosts may do.  ReadWrite is a write."""
+    def _answer(self, header: AmsHeader, error: AdsError) -> None:
+        if not header.state_flags & StateFlags.NO_RETURN:
+            self.send(response_to(header, AmsAnswer(error_code=error)))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from ipaddress import IPv4Address
+from typing import Any
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.ams_connection import PATIENCE_S, AmsConnection
-from eap.appliance.services.aoe_desk import AoeDesk
+from eap.appliance.services.accepting import accept_connections, connection_name
+from eap.appliance.services.ams_connection import PATIENCE_S, AmsClients, AmsConnection
+from eap.appliance.services.routing.entrance import Entrance
 
 MAX_CONNECTIONS = 128
 """Of one listener."""
@@ -29,7 +30,8 @@ class AmsDoor:
 
     Args:
         listener: Opened by the supervisor; it stays open.
-        desks: Of the stations that are reached by it.
+        entrance: To the stations that are reached by it.
+        clients: Where those who have connected are found when an answer is there.
         refuse: Counts what is not answered as it was wanted.
         patience_s: As in :class:`AmsConnection`.
     """
@@ -37,69 +39,63 @@ class AmsDoor:
     def __init__(
         self,
         listener: socket.socket,
-        desks: Sequence[AoeDesk],
+        entrance: Entrance,
+        clients: AmsClients,
         refuse: Callable[[Refusal], None],
         *,
         patience_s: float = PATIENCE_S,
     ) -> None:
         self._listener = listener
-        self._desks = desks
+        self._entrance = entrance
+        self._clients = clients
         self._refuse = refuse
         self._patience_s = patience_s
         self._count = 0
 
     async def serve(self) -> None:
         """Accept until cancelled."""
-        self._listener.setblocking(False)
-        loop = asyncio.get_running_loop()
-        async with asyncio.TaskGroup() as group:
-            while True:
-                try:
-                    connection, address = await loop.sock_accept(self._listener)
-                except OSError as exc:
-                    logger.warning("AMS/TCP listener: %s", exc.strerror)
-                    await asyncio.sleep(1)
-                    continue
-                if self._count < MAX_CONNECTIONS:
-                    self._count += 1  # not in the task: a crowd is accepted before it runs
-                    group.create_task(self._serve(connection, address[0]))
-                else:
-                    logger.debug("AMS/TCP connection from %s closed: too many", address[0])
-                    self._refuse(Refusal.AMS_FULL)
-                    connection.close()
+        await accept_connections(self._listener, "AMS/TCP", self._take)
 
-    async def _serve(self, connection: socket.socket, host: str) -> None:
+    def _take(self, connection: socket.socket, peer: str) -> Coroutine[Any, Any, None] | None:
+        if self._count >= MAX_CONNECTIONS:
+            logger.debug("AMS/TCP connection from %s closed: too many", peer)
+            self._refuse(Refusal.AMS_FULL)
+            connection.close()
+            return None
+        self._count += 1
+        return self._serve(connection)
+
+    async def _serve(self, connection: socket.socket) -> None:
         try:
             with connection:
-                await self._talk(connection, host)
+                await self._talk(connection)
         finally:
             self._count -= 1
 
-    async def _talk(self, connection: socket.socket, host: str) -> None:
-        is_here = is_this_host(host, connection.getsockname()[0])
+    async def _talk(self, connection: socket.socket) -> None:
+        name = connection_name(connection)
         _set_options(connection)
         reader, writer = await asyncio.open_connection(sock=connection)
         client = AmsConnection(
+            name,
             reader,
             writer,
-            self._desks,
+            self._entrance,
             self._refuse,
-            is_this_host=is_here,
             patience_s=self._patience_s,
         )
+        self._clients.add(name, client)
         with suppress(OSError):  # it broke off, which is its right
             try:
                 await client.serve()
                 async with asyncio.timeout(self._patience_s):
+                    await self._entrance.wait_below(name, 1)
                     writer.close()
                     await writer.wait_closed()
             finally:
                 writer.transport.abort()
-
-
-def is_this_host(peer: str, own: str) -> bool:
-    """Tell whether *peer*, that connected to *own*, is this machine: who is has its address."""
-    return IPv4Address(peer).is_loopback or peer == own
+                self._clients.remove(name)
+                self._entrance.connection_closed(name)
 
 
 def _set_options(connection: socket.socket) -> None:

@@ -6,24 +6,20 @@ import asyncio
 import platform
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from time import monotonic_ns
 
-from eap.aoe.ads_notifications import Client
-from eap.aoe.ads_operation import DeleteNotification, Operation
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.way import Way
-from eap.appliance.services.aoe_desk import AoeDesk
+from eap.aoe.spec import RoutingSpec
 from eap.appliance.services.eap_ads import EapAds, device_info
 from eap.appliance.services.image_values import ImageValues
 from eap.appliance.services.image_variables import StationSymbols
+from eap.appliance.services.routing.dictionary_service import DictionaryService
+from eap.appliance.services.routing.planned import make_router
+from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sources import SourcePlayer
 from eap.appliance.services.station_device import StationDevice
 from eap.appliance.services.station_keeper import StationEngine, StationKeeper
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
-from eap.codec.ads import AdsError
-from eap.codec.adsnotification import AddNotification
 from eap.device.eap_content import Identity
 from eap.errors import ImageError
 from eap.ids import NetId
@@ -44,10 +40,11 @@ class Devices:
         images: The process image of each station.
         engine: Who runs the stations.
         release: Of this software.
+        routing: What the routers of the stations are told; nothing for one that is not there.
 
     Attributes:
         by_station: The devices.
-        desks: Who answers AMS packets to them, by station.
+        routers: Of AMS packets, by station.
     """
 
     def __init__(
@@ -58,10 +55,11 @@ class Devices:
         images: Mapping[str, StationImage],
         engine: StationEngine,
         release: str,
+        routing: Mapping[str, RoutingSpec] = {},
     ) -> None:
         store = Store(plant)
         self.by_station: dict[str, StationDevice] = {}
-        self.desks: dict[str, AoeDesk] = {}
+        self.routers: dict[str, StationRouter] = {}
         self._players: list[SourcePlayer] = []
         self._images = images
         self._has_restarted = asyncio.Event()
@@ -80,7 +78,13 @@ class Devices:
             )
             device = StationDevice(keeper, ImageValues(image), identity)
             self.by_station[name] = device
-            self.desks[name] = _desk(station, device, image, release)
+            told = routing.get(name, RoutingSpec())
+            self.routers[name] = router = make_router(station, told)
+            symbols = StationSymbols(image)
+            for port in device.dictionaries:
+                info = device_info(f"{name}/{port}", release)
+                service = DictionaryService(EapAds(device, port, symbols, info))
+                router.add_service(_net_id(station, port), service)
 
     async def serve(self) -> None:
         """Serve all of them until cancelled.
@@ -91,8 +95,8 @@ class Devices:
         async with asyncio.TaskGroup() as group:
             for device in self.by_station.values():
                 group.create_task(device.serve())
-            for desk in self.desks.values():
-                group.create_task(desk.serve())
+            for router in self.routers.values():
+                group.create_task(router.serve())
             for player in self._players:
                 group.create_task(player.serve())
             group.create_task(self._follow_restarts())
@@ -118,26 +122,5 @@ def _runs(image: StationImage) -> bool:
     return bool(ran_at_ns) and monotonic_ns() - ran_at_ns < _LATELY_NS
 
 
-def _desk(
-    station: StationSpec, device: StationDevice, image: StationImage, release: str
-) -> AoeDesk:
-    net_ids = {port.name: NetId.parse(port.net_id) for port in station.ports}
-    symbols = StationSymbols(image)
-    answering = {}
-    for port in device.dictionaries:
-        info = device_info(f"{station.name}/{port}", release)
-        ads = EapAds(device, port, symbols, info)
-        answering[net_ids[port]] = partial(_answer, ads)
-    return AoeDesk(answering, {NetId.parse(station.net_id), *net_ids.values()})
-
-
-_ANYBODY = Client(Way("", ""), NetId(bytes(6)), 0)
-
-
-async def _answer(ads: EapAds, command: int, body: bytes) -> AmsAnswer:
-    return await ads.answer(command, body, _ANYBODY, judge=_without_notifications)
-
-
-def _without_notifications(operation: Operation) -> AdsError:
-    is_told = isinstance(operation, AddNotification | DeleteNotification)
-    return AdsError.SERVICE if is_told else AdsError.NONE
+def _net_id(station: StationSpec, port: str) -> NetId:
+    return next(NetId.parse(each.net_id) for each in station.ports if each.name == port)

@@ -74,7 +74,7 @@ class Services:
         self._resources.callback(link.close)
         devices = self._devices(images, link)
         doors = open_doors(
-            self._handover, devices.desks, self._counters, self._link, self._resources
+            self._handover, devices.routers, self._counters, self._link, self._resources
         )
         buses = self._buses(link)
         methods = self._methods(images, buses, devices)
@@ -108,7 +108,13 @@ class Services:
         handover = self._handover
         engine = EngineClient(link, Path(handover.folder))
         devices = Devices(
-            handover.plant, handover.stations, handover.states, images, engine, RELEASE
+            handover.plant,
+            handover.stations,
+            handover.states,
+            images,
+            engine,
+            RELEASE,
+            handover.routing,
         )
         link.on_restart.append(devices.engine_has_restarted)
         gc.freeze()  # what a collection would go through again and again, while clients wait

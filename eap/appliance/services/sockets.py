@@ -7,13 +7,18 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from time import monotonic_ns
 
+from eap.aoe.way import Door
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.appliance.services.ams_connection import AmsClients
 from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.ams_door import AmsDoor
-from eap.appliance.services.aoe_desk import AoeDesk
 from eap.appliance.services.intake import FrameIntake, watch_channel
-from eap.appliance.services.mailbox_intake import MailboxIntake, judge
+from eap.appliance.services.routing.entrance import Entrance
+from eap.appliance.services.routing.mailbox_frames import FRAME_OVERHEAD
+from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake, judge
+from eap.appliance.services.routing.mailbox_stream import LARGEST_FRAME, MailboxStreams
+from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.ids import InterfaceUri, NetId
@@ -21,10 +26,13 @@ from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 
+AMS_DOOR = "ams-tcp"
+"""By which clients come in that connect to AMS/TCP."""
+
 
 def open_doors(
     handover: Handover,
-    desks: Mapping[str, AoeDesk],
+    routers: Mapping[str, StationRouter],
     counters: DiscardCounters,
     link: socket.socket,
     resources: ExitStack,
@@ -33,7 +41,7 @@ def open_doors(
 
     Args:
         handover: What the supervisor opened.
-        desks: Of the stations, by name.
+        routers: Of the stations, by name; they get their doors.
         counters: Of what is not taken.
         link: To the engine, for connections that belong there.
         resources: Closes what is opened here.
@@ -41,24 +49,25 @@ def open_doors(
     Returns:
         The listeners for TCP, to be served.
     """
-    return _Sockets(handover, desks, counters, resources).open(link)
+    return _Sockets(handover, routers, counters, resources).open(link)
 
 
 class _Sockets:
     def __init__(
         self,
         handover: Handover,
-        desks: Mapping[str, AoeDesk],
+        routers: Mapping[str, StationRouter],
         counters: DiscardCounters,
         resources: ExitStack,
     ) -> None:
         self._handover = handover
-        self._desks = desks
+        self._routers = routers
         self._counters = counters
         self._resources = resources
         self._batch = ReceiveBatch()
         self._now_ns = monotonic_ns()
-        self._unicast: dict[PortName, UdpChannel] = {}
+        self._ams_clients = AmsClients()
+        self._ams_stations: set[str] = set()
 
     def open(self, link: socket.socket) -> list[TcpDoor | AmsDoor]:
         by_kind: dict[SocketKind, list[SharedSocket]] = {kind: [] for kind in SocketKind}
@@ -66,7 +75,7 @@ class _Sockets:
             by_kind[shared.kind].append(shared)
         for shared in by_kind[SocketKind.UDP]:
             self._watch_unicast(shared)
-        for shared in by_kind[SocketKind.GROUP]:  # these answer by the others
+        for shared in by_kind[SocketKind.GROUP]:  # what comes there is answered by the others
             self._watch_group(shared)
         for shared in by_kind[SocketKind.PACKET]:
             self._watch_interface(shared)
@@ -82,54 +91,64 @@ class _Sockets:
         self._resources.callback(channel.close)
         return channel
 
-    def _desks_of(self, stations: Sequence[str]) -> list[AoeDesk]:
-        return [self._desks[station] for station in stations]
+    def _entrance(self, kind: str, owners: Sequence[PortName]) -> Entrance:
+        """Return the way in to the stations of *owners*, by the doors of their ports."""
+        doors: dict[str, str] = {}
+        for owner in owners:
+            doors.setdefault(owner.station, f"{kind}:{owner.port}")
+        return Entrance([(self._routers[station], door) for station, door in doors.items()])
 
     def _watch_unicast(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
-        self._unicast.update(dict.fromkeys(shared.owners, channel))
-        stations = _stations_of(shared)
-        mailbox = MailboxIntake(
-            self._desks_of(stations), channel, MAX_UDP_FRAME, lambda data: False
-        )
-        intake = FrameIntake(stations, self._counters, self._now_ns, mailbox.take)
-        channel.takers.append(intake.take)
+        carrier = ChannelCarrier(channel)
+        for owner in shared.owners:
+            door = Door(f"udp:{owner.port}", MAX_UDP_FRAME - FRAME_OVERHEAD, is_hub=True)
+            self._routers[owner.station].add_door(door, carrier)
+        self._take_datagrams(shared.owners, channel, lambda data: False)
         watch_channel(channel)
 
     def _watch_group(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
         for owner in shared.owners:
-            mailbox = MailboxIntake(
-                self._desks_of([owner.station]),
-                self._unicast[owner],
-                MAX_UDP_FRAME,
-                lambda data: True,
-            )
-            intake = FrameIntake([owner.station], self._counters, self._now_ns, mailbox.take)
-            channel.takers.append(intake.take)
+            self._take_datagrams([owner], channel, lambda data: True)
         watch_channel(channel)
 
+    def _take_datagrams(
+        self,
+        owners: Sequence[PortName],
+        channel: UdpChannel,
+        is_for_many: Callable[[memoryview], bool],
+    ) -> None:
+        mailbox = MailboxIntake(self._entrance("udp", owners), is_for_many)
+        stations = list(dict.fromkeys(owner.station for owner in owners))
+        intake = FrameIntake(stations, self._counters, self._now_ns, mailbox.take)
+        channel.takers.append(intake.take)
+
     def _watch_interface(self, shared: SharedSocket) -> None:
-        """One door for each VLAN: its ports have one MAC address, and all get what comes there."""
+        """One way in for each VLAN: its ports have one MAC address, and all get what comes there.
+
+        Of two ports of a station in one VLAN the first one has the door.
+        """
         interface = EthernetInterface(socket.socket(fileno=shared.services_fd), packet_batch())
         self._resources.callback(interface.close)
-        served: set[int] = set()
+        intakes: dict[int, FrameIntake] = {}
+        owners: dict[int, dict[str, PortName]] = {}
         for owner in shared.owners:
             spec = self._handover.port(owner)
             intake = FrameIntake([owner.station], self._counters, self._now_ns, judge)
             port = interface.port(
                 intake.take, vlan_id=spec.vlan_id, priority=spec.vlan_priority, join=spec.join
             )
-            if spec.vlan_id not in served:
-                served.add(spec.vlan_id)
-                stations = [
-                    name.station
-                    for name in shared.owners
-                    if self._handover.port(name).vlan_id == spec.vlan_id
-                ]
-                desks = self._desks_of(list(dict.fromkeys(stations)))
-                mailbox = MailboxIntake(desks, port, MAX_ETHERNET_FRAME, interface.is_for_many)
-                intake.mailbox = mailbox.take
+            intakes.setdefault(spec.vlan_id, intake)
+            in_vlan = owners.setdefault(spec.vlan_id, {})
+            if owner.station not in in_vlan:
+                in_vlan[owner.station] = owner
+                door = Door(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
+                self._routers[owner.station].add_door(door, ChannelCarrier(port))
+        for vlan_id, intake in intakes.items():
+            entrance = self._entrance("ethernet", [*owners[vlan_id].values()])
+            mailbox = MailboxIntake(entrance, interface.is_for_many)
+            intake.mailbox = mailbox.take
         watch_channel(port)
 
     def _watch_discovery(self, shared: SharedSocket) -> None:
@@ -142,17 +161,30 @@ class _Sockets:
         AmsDiscovery(self._socket(shared), routers, self._refuser(names)).watch()
 
     def _ams_door(self, shared: SharedSocket) -> AmsDoor:
+        """Return the listener of an address; a station with several has one door for all."""
         stations = _stations_of(shared)
-        return AmsDoor(self._socket(shared), self._desks_of(stations), self._refuser(stations))
+        for station in stations:
+            if station not in self._ams_stations:
+                self._ams_stations.add(station)
+                door = Door(AMS_DOOR, is_stream=True, is_hub=True)
+                self._routers[station].add_door(door, self._ams_clients)
+        entrance = Entrance([(self._routers[station], AMS_DOOR) for station in stations])
+        refuse = self._refuser(stations)
+        return AmsDoor(self._socket(shared), entrance, self._ams_clients, refuse)
 
     def _door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
-        stations = _stations_of(shared)
+        refuse = self._refuser(_stations_of(shared))
+        streams = MailboxStreams(self._entrance("tcp", shared.owners), refuse)
+        for owner in shared.owners:
+            room = LARGEST_FRAME - FRAME_OVERHEAD
+            door = Door(f"tcp:{owner.port}", room, is_stream=True, is_hub=True)
+            self._routers[owner.station].add_door(door, streams)
         return TcpDoor(
             self._socket(shared),
             tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
             link,
-            self._refuser(stations),
-            self._desks_of(stations),
+            refuse,
+            streams,
         )
 
     def _socket(self, shared: SharedSocket) -> socket.socket:

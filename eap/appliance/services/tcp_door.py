@@ -10,13 +10,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 from eap.appliance.discards import Refusal
 from eap.appliance.handover import PortName
 from eap.appliance.passing import PassedConnection, pass_connection
-from eap.appliance.services.aoe_desk import AoeDesk
-from eap.appliance.services.mailbox_stream import serve_stream
+from eap.appliance.services.accepting import accept_connections
+from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.codec.ethercat import EtherCatHeader, FrameType
 
 FIRST_FRAME_S = 5.0
@@ -38,7 +39,7 @@ class TcpDoor:
         takers: Ports that take type 4 from TCP; may be empty.
         link: To the engine.
         refuse: Counts a connection that was closed.
-        desks: Of the stations that answer type 5 here.
+        streams: Take the connections of type 5.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class TcpDoor:
         takers: tuple[PortName, ...],
         link: socket.socket,
         refuse: Callable[[Refusal], None],
-        desks: Sequence[AoeDesk],
+        streams: MailboxStreams,
         *,
         first_frame_s: float = FIRST_FRAME_S,
     ) -> None:
@@ -55,29 +56,21 @@ class TcpDoor:
         self._takers = takers
         self._link = link
         self._refuse = refuse
-        self._desks = desks
+        self._mailboxes = streams
         self._first_frame_s = first_frame_s
         self._waiting = 0
         self._streams = 0
 
     async def serve(self) -> None:
         """Accept until cancelled."""
-        self._listener.setblocking(False)
-        loop = asyncio.get_running_loop()
-        async with asyncio.TaskGroup() as group:
-            while True:
-                try:
-                    connection, address = await loop.sock_accept(self._listener)
-                except OSError as exc:
-                    logger.warning("TCP listener: %s", exc.strerror)
-                    await asyncio.sleep(1)
-                    continue
-                peer = f"{address[0]}:{address[1]}"
-                if self._waiting < MAX_WAITING:
-                    self._waiting += 1  # not in the task: a crowd is accepted before it runs
-                    group.create_task(self._sort(connection, peer))
-                else:
-                    self._close(connection, peer, Refusal.TCP_FULL)
+        await accept_connections(self._listener, "TCP", self._take)
+
+    def _take(self, connection: socket.socket, peer: str) -> Coroutine[Any, Any, None] | None:
+        if self._waiting >= MAX_WAITING:
+            self._close(connection, peer, Refusal.TCP_FULL)
+            return None
+        self._waiting += 1
+        return self._sort(connection, peer)
 
     async def _sort(self, connection: socket.socket, peer: str) -> None:
         try:
@@ -105,7 +98,7 @@ class TcpDoor:
             return
         self._streams += 1
         try:
-            await serve_stream(connection, self._desks, self._refuse)
+            await self._mailboxes.serve(connection)
         finally:
             self._streams -= 1
 

@@ -10,10 +10,10 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.fragment import Assembler, iter_fragments
 from eap.aoe.judge import Limits
 from eap.aoe.routes import Origin
-from eap.aoe.way import Way
+from eap.aoe.way import Door, Way
 from eap.codec.ams import StateFlags, decode_packet
 from eap.ids import NetId
-from tests.support.ams import NOTIFICATION, Ams, parse
+from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams, parse
 from tests.support.aoerouter import (
     CLIENT,
     DEVICE,
@@ -26,6 +26,7 @@ from tests.support.aoerouter import (
     only_reply,
     route,
 )
+from tests.unit.eap.aoe.test_subscriptions import stream
 
 SECOND = 1_000_000_000
 TCP, UDP = Way("tcp", "10.0.0.9:4711 #1"), Way("segment", "02:00:00:00:00:09")
@@ -80,8 +81,8 @@ def test_own_source_is_refused_unless_it_is_of_this_host() -> None:
     (event,) = station.events()
     assert event[0] is Outcome.LOOP
     assert "comes back to where it began" in event[1]
-    assert station.delivered(asked, Way("here", "1")).header.source_port == 30000
-    assert station.forwarded(asked._replace(target=FAR_DEVICE), Way("here", "1"))
+    assert station.delivered(asked, Way("local", "1")).header.source_port == 30000
+    assert station.forwarded(asked._replace(target=FAR_DEVICE), Way("local", "1"))
 
 
 def test_what_came_by_multicast_is_for_who_is_meant() -> None:
@@ -100,6 +101,52 @@ def test_request_without_answer_gets_none() -> None:
     assert station.delivered(Ams(DEVICE, CLIENT, NOTIFICATION, body=bytes(8)), TCP).ticket == 0
     assert station.router.receive_answer(0, AmsAnswer(), 1) == []
     assert station.router.stats().in_flight == 0
+
+
+def test_doors_come_and_go() -> None:
+    station = Station([route(FAR, Way("new", "1"))])
+    assert station.replied(Ams(FAR_DEVICE, CLIENT), TCP)[1].error == 0x1B
+    station.router.add_door(Door("new"))
+    with pytest.raises(ValueError, match="two doors"):
+        station.router.add_door(Door("new"))
+    station.forwarded(Ams(FAR_DEVICE, CLIENT), TCP)
+    served = station.delivered(Ams(DEVICE, CLIENT), Way("new", "2"))
+    assert station.router.waiting(Way("new", "2")) == 1
+    way, answer = only_reply(station.router.remove_door("new", 0))
+    assert (way, answer.error) == (TCP, 0x1B)
+    assert station.router.waiting(Way("new", "2")) == 0
+    assert station.router.receive_answer(served.ticket, AmsAnswer(), 0) == []
+    assert station.router.notify(Way("new", "2"), b"packet") == []
+    assert station.router.notify(TCP, b"packet") == [Reply(TCP, (b"packet",))]
+
+
+def test_what_is_expected_is_for_here_or_for_who_waits_here() -> None:
+    station = Station([route(FAR, LINK)])
+
+    def expects(packet: Ams, door: str = "link") -> bool:
+        header, body = decode_packet(packet.octets())
+        return station.router.expects(header, bytes(body), door)
+
+    onward = station.forwarded(Ams(FAR_DEVICE, CLIENT, ADD_NOTIFICATION, body=bytes(40)), TCP)
+    answer = onward.answer(bytes(4) + b"\7\0\0\0")
+    assert expects(answer)
+    assert not expects(answer, "tcp")
+    assert not expects(answer._replace(invoke_id=1))
+    station.give(answer, LINK)
+    assert not expects(answer)
+    assert expects(Ams(DEVICE, CLIENT))
+    assert not expects(Ams(FAR_DEVICE, CLIENT))
+    notice = Ams(CLIENT, FAR_DEVICE, NOTIFICATION)
+    assert expects(notice._replace(body=stream((5, {6: b"", 7: b""}))))
+    assert not expects(notice._replace(body=stream((5, {6: b""}))))
+
+
+def test_hop_that_is_down_is_known() -> None:
+    station = Station()
+    station.router.hop_down("link", None, "no cable", 0)
+    assert station.router.is_down(LINK)
+    station.router.hop_up("link", None)
+    assert not station.router.is_down(LINK)
 
 
 def test_removed_device_is_unknown() -> None:

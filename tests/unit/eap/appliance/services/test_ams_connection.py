@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import logging
 import socket
 import struct
 
 import pytest
 
 from eap.aoe.answer import AmsAnswer
+from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
 from eap.appliance.services import ams_connection
-from eap.appliance.services.ams_connection import AmsConnection
-from eap.appliance.services.aoe_desk import AoeDesk
-from eap.ids import NetId
+from eap.appliance.services.ams_connection import AmsClients, AmsConnection
 from tests.support import aoe
+from tests.support.routing import entrance, station, while_serving
 
 pytestmark = pytest.mark.net
 
@@ -32,9 +31,11 @@ def prefixed(packet: bytes, *, reserved: int = 0, length: int | None = None) -> 
     return struct.pack("<HI", reserved, len(packet) if length is None else length) + packet
 
 
-def talk(script, desk=None, *, is_this_host: bool = True, patience_s: float = 5) -> list[Refusal]:
+def talk(script, there=None, *, patience_s: float = 5) -> list[Refusal]:
     """Run ``script(reader, writer)`` on a connection that is being served."""
-    desk = desk or aoe.echoing_desk(TARGET)
+    there = there or station(TARGET)
+    clients = AmsClients()
+    there.add_door(Door("door", is_stream=True), clients)
     refused: list[Refusal] = []
 
     async def run():
@@ -43,9 +44,13 @@ def talk(script, desk=None, *, is_this_host: bool = True, patience_s: float = 5)
             theirs, _ = listener.accept()
         served = await asyncio.open_connection(sock=theirs)
         client = AmsConnection(
-            *served, [desk], refused.append, is_this_host=is_this_host, patience_s=patience_s
+            "client",
+            *served,
+            entrance(there),
+            refused.append,
+            patience_s=patience_s,
         )
-        answering = asyncio.ensure_future(desk.serve())
+        clients.add("client", client)
         stream = asyncio.ensure_future(client.serve())
         stream.add_done_callback(lambda _: served[1].close())
         reader, writer = await asyncio.open_connection(sock=ours)
@@ -56,11 +61,12 @@ def talk(script, desk=None, *, is_this_host: bool = True, patience_s: float = 5)
             await asyncio.wait([stream], timeout=5)
             assert stream.done()
             served[1].transport.abort()
-            answering.cancel()
         error = stream.exception()
         assert error is None or isinstance(error, OSError)
 
-    asyncio.run(run())
+    asyncio.run(while_serving(run(), there))
+    clients.remove("client")
+    assert clients.send("client", (b"",)) == "the connection is closed"
     return refused
 
 
@@ -86,11 +92,11 @@ def test_requests_are_answered_in_their_order_however_they_are_cut():
     assert talk(script) == []
 
 
-def test_one_request_at_a_time_is_under_way():
+def test_one_request_of_a_client_to_a_device_is_under_way():
     waiting = []
 
-    async def slow(command: int, data: bytes) -> AmsAnswer:
-        waiting.append(data)
+    async def slow(request) -> AmsAnswer:
+        waiting.append(request.body)
         await asyncio.sleep(0.02)
         assert len(waiting) == 1
         return AmsAnswer(bytes(4) + waiting.pop())
@@ -99,7 +105,7 @@ def test_one_request_at_a_time_is_under_way():
         writer.write(b"".join(ask(bytes([n]), n) for n in range(5)))
         assert [(await hear(reader))[1] for _ in range(5)] == list(range(5))
 
-    assert talk(script, AoeDesk({NetId.parse(TARGET): slow}, {NetId.parse(TARGET)})) == []
+    assert talk(script, station(TARGET, slow)) == []
 
 
 @pytest.mark.parametrize(
@@ -107,7 +113,6 @@ def test_one_request_at_a_time_is_under_way():
     [
         (ask(target="9.9.9.9.1.1"), 7),
         (ask(port=1), 6),
-        (ask(command=77), 8),
         (ask(command=0x0902), 8),
     ],
 )
@@ -208,7 +213,7 @@ def test_client_that_has_vanished_is_not_slow():
         reader = asyncio.StreamReader()
         reader.set_exception(TimeoutError(errno.ETIMEDOUT, "Connection timed out"))
         _, writer = await asyncio.open_connection(sock=ours)
-        client = AmsConnection(reader, writer, [], refused.append, is_this_host=True)
+        client = AmsConnection("client", reader, writer, entrance(), refused.append)
         with pytest.raises(OSError, match="timed out"):
             await client.serve()
         writer.transport.abort()
@@ -217,16 +222,3 @@ def test_client_that_has_vanished_is_not_slow():
     with theirs:
         asyncio.run(run())
     assert refused == []
-
-
-def test_other_hosts_only_read(caplog):
-    async def script(reader, writer):
-        for command in (aoe.READ_STATE, aoe.WRITE, 9, 5, 6, aoe.READ, 1):
-            writer.write(ask(command=command))
-        errors = [(await hear(reader))[0] for _ in range(7)]
-        assert errors == [0, 0x723, 0x723, 0x723, 0x723, 0, 0]
-
-    with caplog.at_level(logging.WARNING):
-        assert talk(script, is_this_host=False) == [Refusal.AMS_ACCESS] * 4
-    (line,) = caplog.messages
-    assert "WRITE to 1.1.1.1.2.1:65535 refused: only reads" in line

@@ -8,13 +8,13 @@ import struct
 
 import pytest
 
-from eap.aoe.answer import AmsAnswer
+from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
 from eap.appliance.services import ams_door
-from eap.appliance.services.ams_door import AmsDoor, is_this_host
-from eap.appliance.services.aoe_desk import AoeDesk
-from eap.ids import NetId
+from eap.appliance.services.ams_connection import AmsClients
+from eap.appliance.services.ams_door import AmsDoor
 from tests.support import aoe
+from tests.support.routing import echo, entrance, station
 
 pytestmark = pytest.mark.net
 
@@ -32,14 +32,19 @@ async def hear(reader) -> bytes:
     return (await reader.readexactly(length))[37:][::-1]
 
 
-def play(script, *, patience_s: float = 5, desks=()) -> list[Refusal]:
+def play(script, *, patience_s: float = 5, reply=echo) -> list[Refusal]:
     """Run ``script(connect, listener)`` while a door serves two stations."""
     refused: list[Refusal] = []
 
     async def run():
         with socket.create_server(("127.0.0.1", 0)) as listener:
-            there = desks or [aoe.echoing_desk(target) for target in TARGETS]
-            door = AmsDoor(listener, there, refused.append, patience_s=patience_s)
+            there = [station(target, reply) for target in TARGETS]
+            clients = AmsClients()
+            for each in there:
+                each.add_door(Door("door", is_stream=True), clients)
+            door = AmsDoor(
+                listener, entrance(*there), clients, refused.append, patience_s=patience_s
+            )
             serving = [asyncio.ensure_future(each.serve()) for each in (door, *there)]
 
             async def connect():
@@ -75,9 +80,9 @@ def test_each_answer_goes_back_on_the_connection_of_its_question():
 def test_who_sends_ahead_lets_others_in_between():
     served = []
 
-    async def note(command: int, data: bytes) -> AmsAnswer:
-        served.append(data)
-        return await aoe.echo(command, data)
+    def note(request):
+        served.append(request.body)
+        return echo(request)
 
     async def script(connect, listener):
         greedy, writer = await connect()
@@ -90,8 +95,7 @@ def test_who_sends_ahead_lets_others_in_between():
         writer.close()
         other.close()
 
-    target = NetId.parse(TARGETS[0])
-    assert play(script, desks=[AoeDesk({target: note}, {target})]) == []
+    assert play(script, reply=note) == []
     assert len(served) == 501
     assert served.index(b"other") < 250
 
@@ -180,9 +184,3 @@ def test_dead_peers_are_looked_for(monkeypatch):
 
     play(script)
     assert seen == [(1, 60)]
-
-
-def test_this_host_is_known_by_its_address():
-    assert is_this_host("127.9.2.1", "127.0.0.1")
-    assert is_this_host("10.0.0.1", "10.0.0.1")
-    assert not is_this_host("10.0.0.2", "10.0.0.1")

@@ -8,10 +8,10 @@ from time import monotonic_ns
 import pytest
 from msgspec.structs import replace
 
-from eap.appliance.services.aoe_desk import AoeDoor
 from eap.appliance.services.devices import Devices
-from eap.codec.ams import AmsHeader, decode_packet
+from eap.codec.ams import AmsCommand
 from eap.errors import EngineGoneError
+from eap.ids import NetId
 from eap.net.image_file import create_image
 from eap.pd.device import DeviceState
 from eap.pd.layout import plan_layout
@@ -58,20 +58,24 @@ def test_live_values_are_those_of_the_image(devices, files):
     assert devices.by_station["left"].upload("eap0", 0xF110, 1) == (77).to_bytes(8, "little")
 
 
-def test_port_answers_by_its_net_id(devices, stations):
-    packets: list[bytes] = []
-    door = AoeDoor(list(devices.desks.values()), 1000)
+def test_port_answers_by_its_net_id_and_the_router_by_its_own(devices, stations):
+    left = devices.routers["left"]
+    asked = [
+        (stations[0].ports[0].net_id, 0xFFFF, AmsCommand.READ, aoe.read_body(0x1000 << 16)),
+        (stations[0].net_id, 10_000, AmsCommand.READ_STATE, b""),
+        (stations[0].net_id, 0xFFFF, AmsCommand.READ_STATE, b""),
+        ("9.9.9.9.9.9", 0xFFFF, AmsCommand.READ_STATE, b""),
+    ]
+    answers = []
 
     async def script():
-        for target in (stations[0].ports[0].net_id, stations[1].net_id, "9.9.9.9.9.9"):
-            packet = aoe.packet(target, aoe.READ, aoe.read_body(0x1000 << 16))
-            door.receive_packet(packet, packets.append, 0)
-        await devices.desks["left"].wait_idle()
+        for net_id, *more in asked:
+            answers.append(await left.ask(NetId.parse(net_id), *more, timeout_s=1))
 
     play(devices, script)
-    by_error = {decode_packet(each)[0].error_code: each[AmsHeader.SIZE :] for each in packets}
-    assert set(by_error) == {0, 6, 7}
-    assert by_error[0][8:] == bytes.fromhex("8913e803")
+    assert [each.error_code for each in answers] == [0, 0, 6, 7]
+    assert answers[0].data[8:] == bytes.fromhex("8913e803")
+    assert answers[1].data == bytes.fromhex("00000000 0500 0000")
 
 
 def test_sources_follow_the_configuration(devices, files, stations):

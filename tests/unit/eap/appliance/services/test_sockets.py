@@ -16,6 +16,7 @@ from eap.appliance.services.sockets import open_doors
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EAP_PORT
 from tests.support import aoe
+from tests.support.routing import station
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
@@ -36,13 +37,15 @@ def script_on(tmp_path):
                 counters = resources.enter_context(DiscardCounters(tmp_path / "counts", names))
                 handover = Handover(1, "", "", "", stations, sockets.descriptions)
                 handover = _with_own_descriptors(handover)
-                desks = {each.name: aoe.echoing_desk(each.ports[0].net_id) for each in stations}
+                routers = {
+                    each.name: station(each.ports[0].net_id, name=each.name) for each in stations
+                }
                 ours, theirs = socket.socketpair()
                 resources.enter_context(ours)
                 resources.enter_context(theirs)
-                doors = open_doors(handover, desks, counters, ours, resources)
+                doors = open_doors(handover, routers, counters, ours, resources)
                 serving = [
-                    asyncio.ensure_future(each.serve()) for each in (*desks.values(), *doors)
+                    asyncio.ensure_future(each.serve()) for each in (*routers.values(), *doors)
                 ]
                 try:
                     await script(counters)

@@ -8,13 +8,16 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
+from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
 from eap.appliance.handover import PortName
 from eap.appliance.passing import take_connection
 from eap.appliance.services import tcp_door
+from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import EtherCatHeader
 from tests.support import aoe
+from tests.support.routing import entrance, station
 
 pytestmark = pytest.mark.net
 
@@ -57,11 +60,13 @@ def play(
     async def run():
         services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with services, engine, socket.create_server(("127.0.0.1", 0)) as listener:
-            desk = aoe.echoing_desk(TARGET)
+            there = station(TARGET)
+            streams = MailboxStreams(entrance(there), refused.append)
+            there.add_door(Door("door", is_stream=True), streams)
             door = TcpDoor(
-                listener, takers, services, refused.append, [desk], first_frame_s=first_frame_s
+                listener, takers, services, refused.append, streams, first_frame_s=first_frame_s
             )
-            serving = [asyncio.ensure_future(each.serve()) for each in (door, desk)]
+            serving = [asyncio.ensure_future(each.serve()) for each in (door, there)]
             await script(Scene(listener, engine, refused))
             for task in serving:
                 task.cancel()

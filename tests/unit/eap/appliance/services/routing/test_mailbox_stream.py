@@ -8,12 +8,12 @@ import socket
 import pytest
 
 from eap.aoe.answer import AmsAnswer
+from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
-from eap.appliance.services import mailbox_stream
-from eap.appliance.services.aoe_desk import AoeDesk
-from eap.appliance.services.mailbox_stream import serve_stream
-from eap.ids import NetId
+from eap.appliance.services.routing import mailbox_stream
+from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from tests.support import aoe
+from tests.support.routing import entrance, station, while_serving
 
 pytestmark = pytest.mark.net
 
@@ -24,24 +24,25 @@ def ask(body: bytes = b"abc", number: int = 1) -> bytes:
     return aoe.frame(aoe.packet(TARGET, 4, body, invoke_id=number))
 
 
-def talk(script, desk: AoeDesk | None = None) -> list[Refusal]:
+def talk(script, there=None) -> list[Refusal]:
     """Run ``script(reader, writer)`` on a connection that is being served."""
-    desk = desk or aoe.echoing_desk(TARGET)
+    there = there or station(TARGET)
     refused: list[Refusal] = []
+    streams = MailboxStreams(entrance(there), refused.append)
+    there.add_door(Door("door", 2000, is_stream=True), streams)
 
     async def run():
         ours, theirs = socket.socketpair()
-        serving = asyncio.ensure_future(desk.serve())
-        stream = asyncio.ensure_future(serve_stream(theirs, [desk], refused.append))
+        stream = asyncio.ensure_future(streams.serve(theirs))
         reader, writer = await asyncio.open_connection(sock=ours)
         try:
             await script(reader, writer)
         finally:
             writer.close()
             await asyncio.wait_for(stream, 5)
-            serving.cancel()
 
-    asyncio.run(run())
+    asyncio.run(while_serving(run(), there))
+    assert streams.send("x#0", (b"",)) == "the connection is closed"
     return refused
 
 
@@ -64,9 +65,9 @@ def test_frames_are_cut_by_their_length():
 
 
 def test_who_has_only_closed_its_sending_side_is_still_answered():
-    async def slow(command: int, data: bytes) -> AmsAnswer:
+    async def slow(request) -> AmsAnswer:
         await asyncio.sleep(0.05)
-        return AmsAnswer(bytes(4) + data)
+        return AmsAnswer(bytes(4) + request.body)
 
     async def script(reader, writer):
         writer.write(ask(b"late"))
@@ -74,8 +75,7 @@ def test_who_has_only_closed_its_sending_side_is_still_answered():
         assert (await hear(reader)).data == b"late"
         assert await reader.read() == b""
 
-    desk = AoeDesk({NetId.parse(TARGET): slow}, {NetId.parse(TARGET)})
-    assert talk(script, desk) == []
+    assert talk(script, station(TARGET, slow)) == []
 
 
 @pytest.mark.parametrize("octets", [b"\x04\x40" + bytes(4), b"\x05\x50" + bytes(5)])

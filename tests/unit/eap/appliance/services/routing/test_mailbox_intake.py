@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import pytest
 
+from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
-from eap.appliance.services.mailbox_intake import MailboxIntake, judge
+from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake, judge
 from tests.support import aoe
+from tests.support.routing import entrance, station
 
 TARGET = "1.1.1.1.2.1"
 
@@ -21,31 +21,24 @@ class Wire:
         self.sent: list[tuple[str, bytes]] = []
         self._headroom = headroom
         self._sender = sender
+        self.is_broken = False
 
     def link_header(self, destination):
         return destination.encode() + self._headroom if self._headroom else b""
 
     def send(self, frames, now_ns):
         self.sent += [(frame.destination, bytes(frame.buffer)) for frame in frames]
-        return ()
+        return frames if self.is_broken else ()
 
     def sender_of(self, data):
         return self._sender
 
 
-def tell(wire: Wire, frame: bytes, *, for_many: bool = False) -> Refusal | None:
-    desk = aoe.echoing_desk(TARGET)
-    intake = MailboxIntake([desk], wire, 1472, lambda data: for_many)
-
-    async def run():
-        serving = asyncio.ensure_future(desk.serve())
-        padded = memoryview(frame + bytes(20))
-        reason = intake.take(padded, len(frame), 0, wire)
-        await desk.wait_idle()
-        serving.cancel()
-        return reason
-
-    return asyncio.run(run())
+def tell(wire: Wire, frame: bytes, *, for_many: bool = False, room: int = 0) -> Refusal | None:
+    there = station(TARGET)
+    there.add_door(Door("door", room), ChannelCarrier(wire))
+    intake = MailboxIntake(entrance(there), lambda data: for_many)
+    return intake.take(memoryview(frame + bytes(20)), len(frame), 0, wire)
 
 
 def ask(target: str = TARGET, **more) -> bytes:
@@ -73,6 +66,19 @@ def test_who_has_no_address_gets_no_answer():
     wire = Wire(sender="")
     assert tell(wire, ask()) is Refusal.MAILBOX
     assert wire.sent == []
+
+
+def test_answers_fit_the_transport():
+    wire = Wire()
+    tell(wire, aoe.frame(aoe.packet(TARGET, 4, b"x" * 200)), room=100)
+    assert len(wire.sent) > 1
+    assert all(len(aoe.opened(frame)) <= 100 for _, frame in wire.sent)
+
+
+def test_frame_that_the_network_does_not_take():
+    wire = Wire()
+    wire.is_broken = True
+    assert ChannelCarrier(wire).send("peer", (b"x" * 32,)) == "the network took no frame"
 
 
 @pytest.mark.parametrize(("for_many", "answers"), [(False, 1), (True, 0)])

@@ -1,0 +1,50 @@
+"""AMS packets in frames of type 5: what is for the router of a station, and how packets are packed.
+
+That is AoE to address 0; every other mailbox belongs to a bus, and nothing in this release passes
+it on.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from devicebus.mailbox.counter import next_counter
+from eap.appliance.discards import Refusal
+from eap.codec.ams import AmsHeader
+from eap.codec.ethercat import EtherCatHeader
+from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame, encode_frame
+from eap.codec.wire import Buffer
+from eap.errors import CodecError
+
+FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
+_MAX_PEERS = 1024
+
+
+def aoe_packet(data: Buffer) -> bytes | Refusal:
+    """Return the AMS packet in a frame of type 5, or why there is none for a station."""
+    try:
+        header, body = decode_frame(data)
+        if header.type is not MailboxType.AOE or header.address:
+            return Refusal.MAILBOX
+    except CodecError:
+        return Refusal.TRUNCATED
+    return bytes(body) if len(body) >= AmsHeader.SIZE else Refusal.MAILBOX
+
+
+class MailboxCounters:
+    """Counts the frames to each peer from 1 to 7, so that none is taken for a repeated one.
+
+    What comes is not looked at for that: requests are told apart by who asks and by their numbers,
+    and clients of their own making often leave the counter at 1.
+    """
+
+    def __init__(self) -> None:
+        self._latest: OrderedDict[str, int] = OrderedDict()
+
+    def frame(self, peer: str, packet: bytes) -> bytes:
+        """Return the frame that brings *packet* to *peer*."""
+        counter = next_counter(self._latest.pop(peer, 0))
+        self._latest[peer] = counter
+        if len(self._latest) > _MAX_PEERS:
+            self._latest.popitem(last=False)
+        return encode_frame(MailboxHeader(0, 0, type=MailboxType.AOE, counter=counter), packet)

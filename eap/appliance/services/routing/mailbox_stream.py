@@ -1,0 +1,96 @@
+"""Frames of type 5 over TCP: connections, cut into frames by their Length."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+
+from eap.appliance.discards import Refusal
+from eap.appliance.services.accepting import connection_name
+from eap.appliance.services.routing.entrance import Entrance
+from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.mailbox import MailboxHeader
+
+LARGEST_FRAME = EtherCatHeader.SIZE + 0x7FF
+"""What the 11 bits of Length allow."""
+SLOW_READER_S = 10.0
+"""A client that takes nothing for this long while answers wait for it is disconnected."""
+MAX_UNANSWERED = 64
+"""Requests of one connection that wait; what it sends ahead stays in the connection."""
+_MAX_UNSENT = 1 << 20
+"""Octets that wait for a client that does not take them."""
+
+
+class MailboxStreams:
+    """All connections of one listener; the carrier of its door.
+
+    Args:
+        entrance: To the stations behind the listener.
+        refuse: Counts a frame that is not taken.
+    """
+
+    def __init__(self, entrance: Entrance, refuse: Callable[[Refusal], None]) -> None:
+        self._entrance = entrance
+        self._refuse = refuse
+        self._counters = MailboxCounters()
+        self._writers: dict[str, asyncio.StreamWriter] = {}
+
+    async def serve(self, connection: socket.socket) -> None:
+        """Take what comes by *connection* until its end, and close it.
+
+        Its first frame may have been looked at, not taken.
+        """
+        reader, writer = await asyncio.open_connection(sock=connection)
+        name = connection_name(connection)
+        self._writers[name] = writer
+        try:
+            await self._take(reader, writer, name)
+            async with asyncio.timeout(SLOW_READER_S):
+                # Who has only closed its sending side still listens.
+                await self._entrance.wait_below(name, 1)
+                writer.close()
+                await writer.wait_closed()
+        except (OSError, TimeoutError):
+            pass
+        finally:
+            writer.transport.abort()
+            del self._writers[name]
+            self._entrance.connection_closed(name)
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send packets on a connection; return why not if that cannot be done."""
+        writer = self._writers.get(connection)
+        if writer is None or writer.is_closing():
+            return "the connection is closed"
+        if writer.transport.get_write_buffer_size() > _MAX_UNSENT:
+            writer.transport.abort()
+            return "the other side takes nothing"
+        for packet in packets:
+            writer.write(self._counters.frame(connection, packet))
+        return None
+
+    async def _take(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str
+    ) -> None:
+        """Take frames until the end, or until what comes is none."""
+        while True:
+            try:
+                head = await reader.readexactly(EtherCatHeader.SIZE)
+                header = EtherCatHeader.decode(head)
+                if header.type != FrameType.MAILBOX or header.length < MailboxHeader.SIZE:
+                    self._refuse(Refusal.TCP_TYPE)
+                    return
+                frame = head + await reader.readexactly(header.length)
+            except asyncio.IncompleteReadError:
+                return
+            packet = aoe_packet(frame)
+            if isinstance(packet, Refusal):
+                self._refuse(packet)
+            else:
+                self._entrance.receive(packet, name)
+                await self._entrance.wait_below(name, MAX_UNANSWERED)
+            async with asyncio.timeout(SLOW_READER_S):
+                await writer.drain()
+            await asyncio.sleep(0)  # others first: more of this one may be there already

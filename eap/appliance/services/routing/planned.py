@@ -1,0 +1,63 @@
+"""The router of a station, made from what the plant file says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from ipaddress import IPv4Address
+
+from eap.aoe.access import AccessList
+from eap.aoe.routes import Origin, Route
+from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.aoe.way import Way
+from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.services.routing.system_service import SystemService
+from eap.ids import InterfaceUri, NetId
+from eap.pd.spec import StationSpec
+
+_IP_SCHEMES = ("udp", "tcp")
+
+
+def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
+    """Return the router of a station, with its routes and the service that every router has."""
+    net_id = NetId.parse(station.net_id)
+    net_ids = [NetId.parse(port.net_id) for port in station.ports]
+    router = StationRouter(station.name, net_id, net_ids, access=access_of(station, routing))
+    router.add_service(net_id, SystemService(station.name))
+    for route in routing.routes:
+        router.add_route(to_route(route))
+    return router
+
+
+def to_route(spec: RouteSpec) -> Route:
+    """Return a route of the plant file, whose door may not be there yet."""
+    net_id = NetId.parse(spec.net_id)
+    return Route(
+        NetId.parse(spec.virtual) if spec.virtual else net_id,
+        spec.name,
+        to_way(spec.hop),
+        Origin.STATIC,
+        spec.octets,
+        spec.is_unidirectional,
+        real=net_id if spec.virtual else None,
+        timeout_ns=spec.timeout_ms * 1_000_000,
+        is_probed=spec.is_probed,
+        router=NetId.parse(spec.router) if spec.router else None,
+    )
+
+
+def to_way(hop: HopSpec) -> Way:
+    """Return door and address of a hop; each AMS/TCP connection to others is a door of its own."""
+    where = hop.address if hop.kind is DoorKind.AMS_TCP else hop.port
+    return Way(f"{hop.kind}:{where}", hop.address)
+
+
+def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
+    """Return the access rules of a station."""
+    return AccessList(routing.access, own=tuple(_own_addresses(station)))
+
+
+def _own_addresses(station: StationSpec) -> Iterator[IPv4Address]:
+    for port in station.ports:
+        uri = InterfaceUri.parse(port.interface)
+        if uri.scheme in _IP_SCHEMES:
+            yield IPv4Address(uri.host)

@@ -1,0 +1,297 @@
+"""The router of one station, with its doors, its services and the running loop around it.
+
+How the parts meet:
+
+- A **door** brings packets: whoever receives one calls :meth:`StationRouter.receive` with the
+  door's name and the connection that it came by, or the sender's address.  Answers and packets for
+  the next hop leave by the :class:`~.service.Carrier` that was given with the door.  Where several
+  stations are behind one socket, an :class:`~.entrance.Entrance` finds out whose a packet is.
+- A **service** answers for one NetID and its AMS ports, see :class:`~.service.Service`.
+- **Routes** are in :attr:`StationRouter.table`; they are added and removed by the methods here, so
+  that hops are asked for life from then on.
+- A **client** of this process asks by :meth:`StationRouter.ask`, and needs no door.
+
+Everything is called from the running loop; nothing that a peer sends raises.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable, Collection
+from time import monotonic_ns
+
+from eap.aoe.access import AccessList
+from eap.aoe.action import Action, Deliver, Forward, Reply, Trace
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.judge import Limits
+from eap.aoe.judged import AuditEntry
+from eap.aoe.prober import Prober
+from eap.aoe.record import Record, Stats
+from eap.aoe.router import Router
+from eap.aoe.routes import Route, RouteTable
+from eap.aoe.way import Door, Way
+from eap.appliance.services.routing.lanes import Lanes
+from eap.appliance.services.routing.local_client import LOCAL_DOOR, LocalClient
+from eap.appliance.services.routing.service import Carrier, LocalRequest, Service
+from eap.appliance.services.routing.trace_log import TraceLog
+from eap.codec.ams import AmsHeader
+from eap.ids import NetId
+
+_SHORTEST_WAIT_S = 0.001
+
+
+class StationRouter:
+    """What becomes of the AMS packets of one station.
+
+    Args:
+        name: Of the station.
+        net_id: Of the router itself.
+        net_ids: Of the station's ports; a request to a port that none of its services has is
+            answered with error 6, one to another NetID of the station with error 7.
+        access: The access rules; without any others than this host only read.
+        limits: How much it takes on.
+
+    Attributes:
+        name: Of the station.
+        net_id: Of the router itself.
+        table: The routes, to be read; changed by :meth:`add_route` and :meth:`remove_route`.
+        on_trace: Called with each trace of what was not simply answered.
+        on_audit: Called with each entry of the audit: what was changed, and what was refused.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        net_id: NetId,
+        net_ids: Collection[NetId] = (),
+        *,
+        access: AccessList | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.name = name
+        self.net_id = net_id
+        self.table = RouteTable()
+        self.on_trace: list[Callable[[Trace], None]] = [TraceLog(name).write]
+        self.on_audit: list[Callable[[AuditEntry], None]] = []
+        self._router = Router(
+            net_id,
+            self.table,
+            [],
+            first_invoke_id=int.from_bytes(os.urandom(4), "little"),
+            limits=limits,
+            prober=Prober(net_id, self.table),
+            access=access,
+        )
+        self._carriers: dict[str, Carrier] = {}
+        self._services: dict[NetId, list[Service]] = {}
+        for each in (net_id, *net_ids):
+            self._services[each] = []
+            self._router.add_device(each, _Ports(self._services[each]))
+        self._lanes = Lanes(self._finish)
+        self._client = LocalClient(self)
+        self.add_door(LOCAL_DOOR, self._client)
+        self._settling: dict[Way, tuple[int, asyncio.Event]] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._is_serving = False
+
+    @property
+    def net_ids(self) -> Collection[NetId]:
+        """All NetIDs of the station; none of them is routed."""
+        return self._services.keys()
+
+    @property
+    def record(self) -> Record:
+        """What was done: traffic by connection and hop, and the latest traces."""
+        return self._router.record
+
+    def stats(self) -> Stats:
+        """Return what is going on, and what was."""
+        return self._router.stats()
+
+    async def serve(self) -> None:
+        """Look after time-outs and hops until cancelled."""
+        self._is_serving = True
+        self._schedule()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self._is_serving = False
+            if self._timer is not None:
+                self._timer.cancel()
+            await self._lanes.close()
+
+    def add_door(self, door: Door, carrier: Carrier) -> None:
+        """Let packets come and go by *door*; raises ValueError if there is one of its name."""
+        self._router.add_door(door)
+        self._carriers[door.name] = carrier
+
+    def remove_door(self, name: str) -> None:
+        """Forget a door; what waits for those behind it is answered with 0x1B."""
+        self._act(self._router.remove_door(name, monotonic_ns()))
+        del self._carriers[name]
+
+    def add_service(self, net_id: NetId, service: Service) -> None:
+        """Let *service* answer for *net_id*, one of the station; the first that has a port does.
+
+        Raises:
+            KeyError: the station has no such NetID.
+        """
+        self._services[net_id].append(service)
+
+    def remove_service(self, net_id: NetId, service: Service) -> None:
+        """Ask *service* no more."""
+        self._services[net_id].remove(service)
+
+    def add_route(self, route: Route) -> bool:
+        """Take *route* into the table; return whether it was taken."""
+        is_taken = self.table.add(route)
+        self._schedule()
+        return is_taken
+
+    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+        """Forget a route; return whether there was one."""
+        was_there = self.table.remove(net_id, hop)
+        self._schedule()
+        return was_there
+
+    def is_down(self, hop: Way) -> bool:
+        """Say whether a hop is known not to answer now."""
+        return self._router.is_down(hop)
+
+    def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
+        """Say whether a packet is for this station or for somebody who waits here."""
+        return self._router.expects(header, body, door)
+
+    def receive(self, data: bytes, door: str, connection: str, *, for_all: bool = False) -> None:
+        """Act on an AMS packet, or on the fragment of one.
+
+        Args:
+            data: Header and what follows it.
+            door: Name of the door that it came by.
+            connection: That it came by, or its sender's address; where that is of IP, the name
+                begins with ``ADDRESS:``, for the access rules.
+            for_all: Whether others got it too: who is not meant says nothing.
+        """
+        self._act(
+            self._router.receive_packet(data, door, connection, monotonic_ns(), for_all=for_all)
+        )
+
+    def connection_closed(self, door: str, connection: str) -> None:
+        """Forget whom nobody can answer any more, and tell the services."""
+        way = Way(door, connection)
+        self._lanes.forget(way)
+        for services in self._services.values():
+            for service in services:
+                service.client_gone(way)
+        self._act(self._router.connection_closed(door, connection, monotonic_ns()))
+
+    def hop_down(self, door: str, address: str | None, text: str) -> None:
+        """Answer what waits for a hop, and what will be for it, with 0x1B.
+
+        Args:
+            door: By which it is reached.
+            address: None for all that are reached by the door.
+            text: Why, for people.
+        """
+        self._act(self._router.hop_down(door, address, text, monotonic_ns()))
+
+    def hop_up(self, door: str, address: str | None) -> None:
+        """Pass requests on again; the arguments are those of :meth:`hop_down`."""
+        self._router.hop_up(door, address)
+        self._schedule()
+
+    def send_notification(self, way: Way, packet: bytes) -> None:
+        """Send what a service has for a client of it, in fragments where they are needed."""
+        self._act(self._router.notify(way, packet))
+
+    async def ask(
+        self, target: NetId, target_port: int, command: int, body: bytes = b"", *, timeout_s: float
+    ) -> AmsAnswer:
+        """Ask whoever has *target*, near or far, as a program of this station.
+
+        Returns:
+            The data of the answer; every failure is an error code of the AMS header: of the router
+            that found it, 0x719 too when *timeout_s* is over.
+        """
+        return await self._client.ask(target, target_port, command, body, timeout_s=timeout_s)
+
+    async def wait_below(self, door: str, connection: str, count: int) -> None:
+        """Wait until fewer than *count* requests of a connection wait for their answers.
+
+        Only its reader calls this: by waiting here it takes no more than it can answer.
+        """
+        way = Way(door, connection)
+        if self._router.waiting(way) < count:
+            return
+        event = asyncio.Event()
+        self._settling[way] = count, event
+        try:
+            await event.wait()
+        finally:
+            del self._settling[way]
+
+    def _act(self, actions: list[Action]) -> None:
+        for action in actions:
+            match action:
+                case Reply(way, packets):
+                    self._carriers[way.door].send(way.connection, packets)
+                case Forward(hop, packets, ticket):
+                    self._forward(hop, packets, ticket)
+                case _:
+                    self._deliver(action)
+        self._tell()
+        for way, (count, event) in self._settling.items():
+            if self._router.waiting(way) < count:
+                event.set()
+        self._schedule()
+
+    def _tell(self) -> None:
+        while (trace := self._router.next_event()) is not None:
+            for tell in self.on_trace:
+                tell(trace)
+        while (entry := self._router.gate.next_entry()) is not None:
+            for write in self.on_audit:
+                write(entry)
+
+    def _forward(self, hop: Way, packets: tuple[bytes, ...], ticket: int) -> None:
+        text = self._carriers[hop.door].send(hop.connection, packets)
+        if text is not None:
+            self._act(self._router.send_failed(ticket, text, monotonic_ns()))
+
+    def _deliver(self, deliver: Deliver) -> None:
+        ticket, header, body, way = deliver
+        for service in self._services[header.target]:
+            if header.target_port in service.ports:
+                self._lanes.put(ticket, service, LocalRequest(header, body, way))
+                return
+
+    def _finish(self, ticket: int, answer: AmsAnswer) -> None:
+        self._act(self._router.receive_answer(ticket, answer, monotonic_ns()))
+
+    def _schedule(self) -> None:
+        """Have the router called when it has something to do."""
+        at_ns = self._router.next_timeout()
+        if at_ns is None or not self._is_serving:
+            return
+        if self._timer is not None:
+            if self._timer.when() <= at_ns / 1e9:
+                return
+            self._timer.cancel()
+        loop = asyncio.get_running_loop()
+        at_s = max(at_ns / 1e9, loop.time() + _SHORTEST_WAIT_S)
+        self._timer = loop.call_at(at_s, self._handle_timeout)
+
+    def _handle_timeout(self) -> None:
+        self._timer = None
+        self._act(self._router.handle_timeout(monotonic_ns()))
+
+
+class _Ports:
+    """The AMS ports that some services have now."""
+
+    def __init__(self, services: Collection[Service]) -> None:
+        self._services = services
+
+    def __contains__(self, port: object) -> bool:
+        return any(port in service.ports for service in self._services)

@@ -1,0 +1,70 @@
+"""Routes and access of a plant file, for a router."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from eap.aoe.routes import Origin, Route
+from eap.aoe.spec import AccessRule, DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.aoe.way import Way
+from eap.appliance.services.routing.planned import access_of, make_router, to_route, to_way
+from eap.codec.ams import AmsCommand
+from eap.ids import NetId
+from tests.unit.eap.appliance.conftest import eap_port, left
+
+UDP = HopSpec(DoorKind.UDP, "eap0", "127.0.1.2:34980")
+THERE = NetId.parse("5.1.2.3.1.1")
+
+
+def test_route_is_one_of_the_plant_file():
+    spec = RouteSpec(name="plc", net_id=str(THERE), hop=UDP, timeout_ms=700, router="7.7.7.7.1.1")
+    assert to_route(spec) == Route(
+        THERE,
+        "plc",
+        Way("udp:eap0", "127.0.1.2:34980"),
+        Origin.STATIC,
+        timeout_ns=700_000_000,
+        router=NetId.parse("7.7.7.7.1.1"),
+    )
+
+
+def test_virtual_net_id_is_the_one_that_is_known_here():
+    route = to_route(RouteSpec(name="plc", net_id=str(THERE), hop=UDP, virtual="6.6.6.6.1.1"))
+    assert (str(route.net_id), route.real) == ("6.6.6.6.1.1", THERE)
+
+
+@pytest.mark.parametrize(
+    ("hop", "way"),
+    [
+        (UDP, Way("udp:eap0", "127.0.1.2:34980")),
+        (HopSpec(DoorKind.ETHERNET, "eap1", "1.2.3.4.5.6"), Way("ethernet:eap1", "1.2.3.4.5.6")),
+        (HopSpec(DoorKind.AMS_TCP, "", "10.0.0.5:48898"),
+         Way("ams-tcp:10.0.0.5:48898", "10.0.0.5:48898")),
+        (HopSpec(DoorKind.MQTT, "line", "1.2.3.4.5.6"), Way("mqtt:line", "1.2.3.4.5.6")),
+    ],
+)  # fmt: skip
+def test_hops(hop, way):
+    assert to_way(hop) == way
+
+
+def test_addresses_of_the_station_are_this_host():
+    station = left(eap_port(1, interface="udp://10.0.0.1"))
+    access = access_of(station, RoutingSpec(access=(AccessRule("no", allow=False),)))
+    assert access.is_this_host(Way("ams-tcp", "10.0.0.1:4711#1"))
+    assert not access.is_this_host(Way("ams-tcp", "10.0.0.2:4711#1"))
+    way = Way("ams-tcp", "10.0.0.2:4711#1")
+    assert not access.grants(way, THERE, THERE, 1).may_read
+
+
+def test_router_has_the_routes_and_answers_probes():
+    spec = RouteSpec(name="plc", net_id=str(THERE), hop=UDP)
+    router = make_router(left(), RoutingSpec(routes=(spec,)))
+    assert [route.name for route in router.table] == ["plc"]
+    assert {str(each) for each in router.net_ids} == {"1.1.1.1.1.1", "1.2.3.4.5.1"}
+
+    async def script():
+        return await router.ask(router.net_id, 10_000, AmsCommand.READ_STATE, timeout_s=1)
+
+    assert asyncio.run(script()).error_code == 0

@@ -1,0 +1,30 @@
+"""The two sides of a router: whoever stands there fits."""
+
+from __future__ import annotations
+
+from inspect import signature
+
+import pytest
+
+from eap.appliance.services.ams_connection import AmsClients
+from eap.appliance.services.routing.dictionary_service import DictionaryService
+from eap.appliance.services.routing.local_client import LocalClient
+from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
+from eap.appliance.services.routing.mailbox_stream import MailboxStreams
+from eap.appliance.services.routing.service import Carrier, Service
+from eap.appliance.services.routing.system_service import SystemService
+from tests.support.routing import KeepingCarrier, StubService
+
+
+@pytest.mark.parametrize("service", [DictionaryService, SystemService, StubService])
+def test_services(service):
+    for method in ("answer", "client_gone"):
+        asked = [*signature(getattr(Service, method)).parameters]
+        assert [*signature(getattr(service, method)).parameters] == asked
+
+
+@pytest.mark.parametrize(
+    "carrier", [AmsClients, ChannelCarrier, KeepingCarrier, LocalClient, MailboxStreams]
+)
+def test_carriers(carrier):
+    assert [*signature(carrier.send).parameters] == [*signature(Carrier.send).parameters]
