@@ -1,16 +1,22 @@
-"""Stations that run without processes: with a wire, and configured anew between two cycles."""
+"""Hypothesis strategies for stations as plant files describe them, and their dictionaries."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
-import msgspec
+from hypothesis import strategies as st
 
-from eap.codec.pd import iter_pds
-from eap.pd.image import Image
-from eap.pd.link import OutFrame
+from eap.codec import datatypes, pdo
+from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_fill import fill
+from eap.ids import InterfaceUri
 from eap.pd.spec import (
+    REQUESTER,
+    CounterSource,
+    LinkSpec,
     OnChangeSpec,
+    PortKind,
+    PortSpec,
     RxPdSpec,
     StationSpec,
     Substitute,
@@ -18,120 +24,225 @@ from eap.pd.spec import (
     TxFrameSpec,
     TxPdSpec,
     VariableSpec,
+    Wake,
     Writer,
 )
-from eap.pd.station import Station
-from eap.pd.succession import ImageSuccession
-from eap.pd.words import StationWord
-from tests.support.cyclic import (
-    PEER,
-    Wire,
-    eap_port,
-    image_of,
-    station,
-    written,
+
+CYCLE_US = 10_000
+TYPES = (
+    "BOOL", "BIT3", "SINT", "UINT", "UDINT", "LINT", "REAL", "LREAL", "INT24", "UINT[3]",
+    "REAL[2]", "STRING(5)", "BLOCK(7)", "BLOCK(100)",
+)  # fmt: skip
+PORTS = (
+    PortSpec("eap0", PortKind.EAP, "udp://127.0.9.1", "127.0.9.1.2.1"),
+    PortSpec("eap1", PortKind.EAP, "ethernet://eth0", "127.0.9.1.3.1"),
 )
+BLANK = StationSpec("station", "127.0.9.1.1.1", CYCLE_US, PORTS)
+DESTINATIONS = {
+    "udp": ("10.0.0.2", "10.0.0.2:4000", "239.1.2.3", "255.255.255.255", "tcp://10.0.0.3:5"),
+    "ethernet": (
+        "01:01:05:04:00:00",
+        "02:00:00:00:00:07",
+        "ff:ff:ff:ff:ff:ff",
+        "5.5.5.5.2.1",
+    ),
+}
+UNICAST = {"10.0.0.2", "10.0.0.2:4000", "02:00:00:00:00:07", "5.5.5.5.2.1"}
 
 
-class Watched(Wire):
-    """A wire that notes whether the engine's variables were marked as changing."""
-
-    image: Image
-
-    def drain(self, now_ns: int) -> int:
-        count = super().drain(now_ns)
-        self.log.append("changing" if self.image.words[StationWord.ENGINE_SEQUENCE] % 2 else "calm")
-        return count
-
-    def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
-        self.log.append("changing" if self.image.words[StationWord.ENGINE_SEQUENCE] % 2 else "calm")
-        return super().send(frames, now_ns)
+def empty(station: StationSpec = BLANK) -> dict[str, EapDictionary]:
+    """Return an empty dictionary for each EAP port."""
+    names = [port.name for port in station.ports if port.kind is PortKind.EAP]
+    return {name: EapDictionary(station, name) for name in names}
 
 
-def assemble(spec: StationSpec, image: Image | None = None) -> tuple[Station, Watched]:
-    wire = Watched()
-    wire.image = image or image_of(spec)
-    made = Station(spec, wire.image, lambda: wire.log.append("wake"))
-    wire.takers.append(made.takers["eap0"])
-    made.connect("eap0", wire)
-    return made, wire
+def filled(
+    station: StationSpec, like: dict[str, EapDictionary] | None = None
+) -> dict[str, EapDictionary]:
+    """Return the dictionaries of *station*."""
+    dictionaries = empty(station)
+    for name, each in dictionaries.items():
+        fill(each, like[name] if like is not None else None)
+    return dictionaries
 
 
-def addressed() -> StationSpec:
-    """Sends to a port whose address it learns, and to one address."""
-    port = msgspec.structs.replace(eap_port(), interface="ethernet://eth0")
-    pds = (TxPdSpec("p", 1, ("x",)), TxPdSpec("q", 2, ("x",)))
-    return station(
-        ports=(port,),
-        variables=written("x:UINT"),
-        frames=(
-            TxFrameSpec("by-id", "eap0", PEER, pds[:1]),
-            TxFrameSpec("by-mac", "eap0", "02:00:00:00:00:05", pds[1:]),
-        ),
-    )
+def _default(draw: st.DrawFn, text: str) -> Any:
+    kind = datatypes.parse(text)
+    if draw(st.booleans()):
+        return None
+    if text.startswith("STRING"):
+        return draw(st.text("abcxyz äö", max_size=3))
+    if text.startswith("BLOCK"):
+        return draw(st.binary(min_size=kind.size, max_size=kind.size)).hex()
+    octets = bytes(draw(st.lists(st.integers(0, 0x3F), min_size=kind.size, max_size=kind.size)))
+    return kind.to_plain(kind.decode(octets, 0))
 
 
-def moody() -> StationSpec:
-    """Sends by change, by event, and what asks; receives answers and something with a time-out."""
-    return station(
-        variables=(
-            *written("x:UINT", "y:UINT"),
-            *(VariableSpec(name, "UINT", Writer.ENGINE) for name in ("a", "r")),
-        ),
-        frames=(
+@st.composite
+def _variables(draw: st.DrawFn, prefix: str, count: int, writer: Writer) -> list[VariableSpec]:
+    made = []
+    for number in range(count):
+        text = draw(st.sampled_from(TYPES))
+        made.append(
+            VariableSpec(
+                f"{prefix}{number}",
+                text,
+                writer,
+                _default(draw, text),
+                draw(st.sampled_from(["", "degC"])),
+                draw(st.sampled_from(["", "what it is"])),
+            )
+        )
+    return made
+
+
+@st.composite
+def _triggers(draw: st.DrawFn) -> TriggerSpec:
+    event = draw(st.booleans())
+    match draw(st.integers(0, 3)):
+        case 0:
+            return TriggerSpec(event=event)
+        case 1:
+            return TriggerSpec(cycle_us=draw(st.integers(1, 5)) * CYCLE_US, event=event)
+        case 2:
+            divider = draw(st.integers(1, 9))
+            modulo = draw(st.integers(0, divider - 1))
+            return TriggerSpec(divider=divider, modulo=modulo, event=event)
+    inhibit = draw(st.sampled_from([0, 500, 5000]))
+    return TriggerSpec(on_change=OnChangeSpec(draw(st.sampled_from([0, 7])), inhibit), event=event)
+
+
+def _fits(variables: list[VariableSpec], names: tuple[str, ...], limit: int) -> bool:
+    types = {each.name: datatypes.parse(each.type) for each in variables}
+    return pdo.layout([types[name] for name in names]).size <= limit
+
+
+@st.composite
+def stations(draw: st.DrawFn) -> StationSpec:
+    """Any station with two EAP ports whose every detail is drawn."""
+    own = draw(_variables("own", draw(st.integers(0, 5)), Writer.APPLICATION))
+    counter = [VariableSpec("counter", "UDINT", Writer.ENGINE)]
+    follower = [VariableSpec("follower", "UDINT", Writer.ENGINE)]
+    received = draw(_variables("got", draw(st.integers(0, 6)), Writer.ENGINE))
+    ports = tuple(_port(draw, port) for port in PORTS)
+    # Each PD takes some of what is received; a variable belongs to one PD.
+    subscriptions, left = [], [each.name for each in received]
+    for number in range(draw(st.integers(0, len(left)))):
+        count = draw(st.integers(1, 3))
+        names, left = tuple(left[:count]), left[count:]
+        if names:
+            subscriptions.append(_subscription(draw, number, names))
+    unreceived = set(left)
+    received = [each for each in received if each.name not in unreceived]
+    variables = [*own, *counter, *follower, *received]
+    frames, used = [], 0
+    for number in range(draw(st.integers(0, 3))):
+        port = draw(st.sampled_from(ports))
+        requests = [each.name for each in subscriptions if each.port == port.name]
+        answers = bool(requests) and draw(st.booleans())
+        gate = not answers and draw(st.integers(0, 4)) == 0
+        pds = []
+        for _ in range(draw(st.integers(1, 3))):
+            names = tuple(draw(st.lists(st.sampled_from(variables), min_size=1, max_size=6)))
+            pds.append(
+                TxPdSpec(
+                    name=f"pd{used}",
+                    pd_id=used + 1,
+                    variables=tuple(each.name for each in names),
+                    version=draw(st.integers(0, 3)),
+                    trigger=TriggerSpec() if answers or gate else draw(_triggers()),
+                    poll_request=draw(st.sampled_from(requests)) if answers else "",
+                    changeable=draw(st.booleans()),
+                )
+            )
+            used += 1
+        scheme = InterfaceUri.parse(port.interface).scheme
+        target = REQUESTER if answers else draw(st.sampled_from(DESTINATIONS[scheme]))
+        is_net_id = target.count(".") == 5
+        is_monitored = target in UNICAST and draw(st.booleans())
+        has_ip = is_monitored and scheme == "ethernet" and draw(st.booleans())
+        frames.append(
             TxFrameSpec(
-                "f",
-                "eap0",
-                "10.0.0.1",
-                (
-                    TxPdSpec("change", 1, ("x",), trigger=TriggerSpec(on_change=OnChangeSpec())),
-                    TxPdSpec("event", 2, ("y",), trigger=TriggerSpec(event=True)),
-                ),
-            ),
-            TxFrameSpec("q", "eap0", "10.0.0.1", (TxPdSpec("ask", 3, ("y",)),)),
-        ),
-        subscriptions=(
-            RxPdSpec("answer", "eap0", 4, ("a",), PEER, poll_request="ask"),
-            RxPdSpec("in", "eap0", 7, ("r",), PEER, timeout_ms=3, substitute=Substitute.ZERO),
-        ),
+                name=f"frame{number}",
+                port=port.name,
+                destination=target,
+                pds=tuple(pds),
+                divider=4 if gate else 0,
+                modulo=draw(st.integers(0, 3)) if gate else 0,
+                changeable=draw(st.booleans()),
+                mac=draw(st.sampled_from(("", "02:00:00:00:00:08"))) if is_net_id else "",
+                monitor_interval_ms=draw(st.sampled_from([100, 5000])) if is_monitored else 0,
+                monitor_ip="10.0.0.9" if has_ip else "",
+            )
+        )
+    return StationSpec(
+        name="station",
+        net_id="127.0.9.1.1.1",
+        cycle_us=CYCLE_US,
+        ports=ports,
+        phase_us=draw(st.integers(0, CYCLE_US - 1)),
+        variables=tuple(variables),
+        sources=(CounterSource("counter"),),
+        frames=tuple(frames),
+        subscriptions=tuple(_asking(draw, subscriptions, frames)),
+        links=(LinkSpec("counter", "follower"),),
     )
 
 
-def sent_ids(wire: Watched) -> list[int]:
-    """Return what was sent since the last look."""
-    ids = sorted(pd.pd_id for frame in wire.sent for pd, _ in iter_pds(frame))
-    wire.sent.clear()
-    return ids
+def _port(draw: st.DrawFn, port: PortSpec) -> PortSpec:
+    is_udp = port.interface.startswith("udp")
+    vlan = 0 if is_udp else draw(st.sampled_from([0, 7, 4094]))
+    groups = ("239.1.2.3", "224.0.0.9") if is_udp else ("01:00:5e:00:00:01",)
+    return PortSpec(
+        port.name,
+        port.kind,
+        port.interface,
+        port.net_id,
+        vlan_id=vlan,
+        vlan_priority=draw(st.integers(0, 7)) if vlan else 0,
+        join=tuple(draw(st.lists(st.sampled_from(groups), max_size=2, unique=True))),
+        broadcast=is_udp and draw(st.booleans()),
+        tcp=is_udp and draw(st.booleans()),
+        wake=draw(st.sampled_from(Wake)),
+        eap_sm=draw(st.booleans()),
+        profile=draw(st.sampled_from((0, 5002))),
+    )
 
 
-def set_value(image: Image, name: str, value: int) -> None:
-    with image.writing(Writer.APPLICATION):
-        image.write(name, value)
+def _subscription(draw: st.DrawFn, number: int, names: tuple[str, ...]) -> RxPdSpec:
+    return RxPdSpec(
+        name=f"rx{number}",
+        port=draw(st.sampled_from(PORTS)).name,
+        pd_id=number + 1,
+        variables=names,
+        publisher=draw(st.sampled_from(["", "1.2.3.4.5.6"])),
+        version=draw(st.integers(0, 3)),
+        ignore_version=draw(st.booleans()),
+        timeout_ms=draw(st.sampled_from([0, 50])),
+        substitute=draw(st.sampled_from(Substitute)),
+        sender_cycle_us=draw(st.sampled_from([0, 500])),
+        step=draw(st.integers(0, 2)),
+        changeable=draw(st.booleans()),
+    )
 
 
-def succeed(before: Station, spec: StationSpec) -> Station:
-    """Configure a station anew between two cycles, as the engine does."""
-    images = ImageSuccession(before.image, image_of(spec))
-    images.carry_words()
-    after = Station(spec, images._new, lambda: None)
-    after.prepare_to_follow(before)
-    images.settle()
-    images.carry_words()
-    after.follow(before, 0)
-    return after
-
-
-def succeed_with_values(before: Station, spec: StationSpec, now_ns: int = 0) -> Station:
-    """Configure a station anew, its variables included."""
-    image = image_of(spec)
-    images = ImageSuccession(before.image, image)
-    images.carry_words()
-    images.carry_values(before.inputs.memory)
-    after = Station(spec, image, lambda: None)
-    after.prepare_to_follow(before)
-    images.settle()
-    images.carry_words()
-    before.inputs.refresh()
-    images.carry_values(before.inputs.memory)
-    after.follow(before, now_ns)
-    return after
+def _asking(
+    draw: st.DrawFn, subscriptions: list[RxPdSpec], frames: list[TxFrameSpec]
+) -> list[RxPdSpec]:
+    """Make answers of some subscriptions that are no requests."""
+    requests = {pd.poll_request for frame in frames for pd in frame.pds}
+    made = []
+    for each in subscriptions:
+        questions = [
+            pd.name
+            for frame in frames
+            for pd in frame.pds
+            if frame.port == each.port and not pd.poll_request
+        ]
+        if questions and each.name not in requests and draw(st.booleans()):
+            question = draw(st.sampled_from(questions))
+            fields = {name: getattr(each, name) for name in each.__struct_fields__}
+            made.append(RxPdSpec(**fields | {"poll_request": question, "step": 0}))
+        else:
+            made.append(each)
+    return made

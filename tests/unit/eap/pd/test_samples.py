@@ -9,7 +9,7 @@ from eap.pd.samples import Sampler, Samples
 from eap.pd.spec import CounterSource, VariableSpec, Writer
 from eap.pd.words import StationWord
 from tests.support.cyclic import image_of, station, written
-from tests.support.stations import assemble
+from tests.support.runstations import assemble
 
 MS = 1_000_000
 

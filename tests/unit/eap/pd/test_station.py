@@ -51,7 +51,7 @@ from tests.support.cyclic import (
     station,
     written,
 )
-from tests.support.stations import (
+from tests.support.runstations import (
     addressed,
     assemble,
     moody,

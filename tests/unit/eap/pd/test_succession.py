@@ -38,7 +38,7 @@ from tests.support.cyclic import (
     received,
     station,
 )
-from tests.support.stations import (
+from tests.support.runstations import (
     addressed,
     assemble,
     moody,
