@@ -218,7 +218,7 @@ class RequestRow(Document, frozen=True, kw_only=True):
     text: str = ""
 
 
-class StationRoutes(Document, frozen=True, kw_only=True):
+class RouterRow(Document, frozen=True, kw_only=True):
     """The router of one station; *total* routes match, of which *routes* are some."""
 
     station: str

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from eap.appliance.control_routes import ConnectionRow, Figures, RequestRow, RouteRow, StationRoutes
+from eap.appliance.control_routes import ConnectionRow, Figures, RequestRow, RouteRow, RouterRow
 from eap.cli import words
 
 _UNITS = ("", "k", "M", "G", "T", "P", "E")
@@ -85,7 +85,7 @@ def belongs(request: RequestRow, row: RouteRow | ConnectionRow) -> bool:
     return is_target and (request.door, request.address) == (row.door, row.address)
 
 
-def summary(stations: list[StationRoutes]) -> str:
+def summary(stations: list[RouterRow]) -> str:
     """Return how many routes and connections there are, and what is wrong with them."""
     routes = [route for each in stations for route in each.routes]
     total = sum(each.total for each in stations)

@@ -10,13 +10,13 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from eap.appliance.control_routes import ImportRow, StationRoutes, TestResult
+from eap.appliance.control_routes import ImportRow, RouterRow, TestResult
 from eap.cli import routes_text, words
 
 _STYLES = {"up": "green", "down": "bold red", "unknown": "dim"}
 
 
-def routes_tables(stations: Sequence[StationRoutes]) -> Iterator[RenderableType]:
+def routes_tables(stations: Sequence[RouterRow]) -> Iterator[RenderableType]:
     """Yield what to print for the routers of *stations*, top to bottom."""
     yield _routes(stations)
     if any(each.connections for each in stations):
@@ -49,7 +49,7 @@ def import_table(rows: Iterable[ImportRow], *, is_done: bool) -> RenderableType:
     return table
 
 
-def _routes(stations: Sequence[StationRoutes]) -> RenderableType:
+def _routes(stations: Sequence[RouterRow]) -> RenderableType:
     table = _table("Station", "Route", "NetID", "Door", "Address", "State", "Trip", "Requests")
     table.add_column("Errors")
     for column in table.columns[6:]:
@@ -70,7 +70,7 @@ def _routes(stations: Sequence[StationRoutes]) -> RenderableType:
     return table
 
 
-def _connections(stations: Sequence[StationRoutes]) -> RenderableType:
+def _connections(stations: Sequence[RouterRow]) -> RenderableType:
     table = _table("Station", "Connection", "Door", "NetIDs", "For", "Requests", "Octets", "Errors")
     for column in table.columns[4:]:
         column.justify = "right"
@@ -86,7 +86,7 @@ def _connections(stations: Sequence[StationRoutes]) -> RenderableType:
     return table
 
 
-def _remarks(station: StationRoutes) -> Iterator[str]:
+def _remarks(station: RouterRow) -> Iterator[str]:
     yield from station.warnings
     for row in station.routes:
         if row.why:

@@ -13,13 +13,13 @@ from eap.appliance.control_routes import (
     ImportRow,
     RequestRow,
     RouteRow,
+    RouterRow,
     RoutesAddParameters,
     RoutesExportParameters,
     RoutesImportParameters,
     RoutesListParameters,
     RoutesRemoveParameters,
     RoutesTestParameters,
-    StationRoutes,
     TestResult,
 )
 from eap.errors import ControlError
@@ -58,11 +58,11 @@ class FakeRoutes:
 
     def __init__(self) -> None:
         self.stations = {
-            "island-01": StationRoutes(
+            "island-01": RouterRow(
                 station="island-01", net_id="127.0.1.1.1.1", routes=[ISLAND, PRESS], total=2,
                 connections=[TOOL], requests=[READ, REFUSED], warnings=[SHADOW],
             ),
-            "island-02": StationRoutes(
+            "island-02": RouterRow(
                 station="island-02", net_id="127.0.1.2.1.1", routes=[], total=0
             ),
         }  # fmt: skip
@@ -83,7 +83,7 @@ class FakeRoutes:
             self.stations[station], routes=list(routes), total=len(routes)
         )
 
-    def _list(self, params: dict[str, Any]) -> list[StationRoutes]:
+    def _list(self, params: dict[str, Any]) -> list[RouterRow]:
         wanted = parameters(params, RoutesListParameters)
         found = []
         for each in self.stations.values():

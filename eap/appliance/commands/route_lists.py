@@ -9,7 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from eap.appliance.commands.client import Client, connect
-from eap.appliance.control_routes import StationRoutes, read_document
+from eap.appliance.control_routes import RouterRow, read_document
 
 _DECLARED = re.compile(rb"""<\?xml[^>]*\sencoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 _MARKS = (
@@ -23,7 +23,7 @@ class PlantRoutes(NamedTuple):
     """The routers of one running appliance."""
 
     plant: str
-    stations: list[StationRoutes]
+    stations: list[RouterRow]
 
 
 def list_routes(
@@ -59,18 +59,18 @@ def list_routes(
 
 def _ask(
     client: Client, station: str, match: str, requests: int, most: int | None
-) -> list[StationRoutes]:
+) -> list[RouterRow]:
     """Return the routes of one appliance, page by page."""
     params = {"station": station, "match": match}
     answer = client.request("routes_list", **params, requests=requests)
     whole = []
-    for each in read_document(answer, list[StationRoutes]):
+    for each in read_document(answer, list[RouterRow]):
         rows = list(each.routes)
         while len(rows) < (each.total if most is None else min(most, each.total)):
             page = client.request(
                 "routes_list", station=each.station, match=match, first=len(rows), requests=0
             )
-            (more,) = read_document(page, list[StationRoutes])
+            (more,) = read_document(page, list[RouterRow])
             if not more.routes:  # some went away meanwhile
                 break
             rows += more.routes

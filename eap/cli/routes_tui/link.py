@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from eap.appliance.commands.client import connect_station
 from eap.appliance.commands.route_lists import list_routes
-from eap.appliance.control_routes import StationRoutes, TestResult, read_document
+from eap.appliance.control_routes import RouterRow, TestResult, read_document
 from eap.errors import EapError
 
 MOST = 500
@@ -20,7 +20,7 @@ class Router(NamedTuple):
     """The router of one station, and the plant of its appliance."""
 
     plant: str
-    routes: StationRoutes
+    routes: RouterRow
 
 
 class Picture(NamedTuple):
