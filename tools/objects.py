@@ -1,4 +1,4 @@
-"""Write docs/objects.md: every object and sub-index of the EAP device, from the profile's tables.
+"""Write docs/objects.md: every object and sub-index of EAP ports and routers, from their tables.
 
     python -m tools.objects
 
@@ -7,12 +7,12 @@ A test compares the page with what this would write.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from eap.codec import datatypes
 from eap.od.model import Access, Entry, ObjectCode
-from eap.od.profiles import eap1000 as profile
+from eap.od.profiles import eap1000, router9000
 from eap.od.profiles.forms import to_text
 from eap.od.profiles.table import CONFIG, OWN_TYPE, EntryRow, ObjectRange
 
@@ -21,11 +21,16 @@ _COLUMNS = (
 )  # fmt: skip
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "objects.md"
 
-_HEAD = """# Objects of an EAP port
+_HEAD = """# Objects
 
-Each EAP port of a station is a device with an object dictionary: modular device profile 5001,
-sub-profile 1000 (ETG.5001, ETG.1005). This page is written by `python -m tools.objects` from the
-tables in `eap/od/profiles/eap1000.py`, from which the dictionary itself is made.
+Each EAP port of a station, and its router, is a device with an object dictionary. This page is
+written by `python -m tools.objects` from the tables from which the dictionaries themselves are
+made. [EAP port](#eap-port) · [Router](#router)
+
+# EAP port
+
+Modular device profile 5001, sub-profile 1000 (ETG.5001, ETG.1005); the tables are in
+`eap/od/profiles/eap1000.py`. Commands call it `STATION/PORT`, and `STATION` the first one.
 
 - **Access** is told for PreOp, SafeOp and Op: `r` read, `w` written, `-` neither. `rw r r` is
   configuration: it can be written in PreOp only and is kept; elsewhere a download is refused with
@@ -43,18 +48,33 @@ tables in `eap/od/profiles/eap1000.py`, from which the dictionary itself is made
   public descriptions of the profile; the other sub-index tables are this project's own.
 """
 
+_ROUTER = """
+# Router
+
+Modular device profile 5001, sub-profile 9000 (ETG.5001, ETG.1005); the tables are in
+`eap/od/profiles/router9000.py`. Commands call it `STATION/router`; ADS clients find it at the NetID
+of the station, AMS port 65535. Everything can be read in all states and nothing can be written. The
+meaning of 0x8000 and 0xF000 comes from public descriptions; the sub-indexes and the routes are this
+project's own (own format).
+"""
+
 
 def render() -> str:
     """Return the page."""
-    parts = [_HEAD, "\n## Overview\n\n", *_overview()]
-    for row in profile.ALL:
-        parts += ["\n", *_object(row)]
-    return "".join(parts)
+    return "".join([_HEAD, *_profile(eap1000.ALL), _ROUTER, *_profile(router9000.ALL)])
 
 
-def _overview() -> Iterator[str]:
+def _profile(rows: Sequence[ObjectRange]) -> Iterator[str]:
+    yield "\n## Overview\n\n"
+    yield from _overview(rows)
+    for row in rows:
+        yield "\n"
+        yield from _object(row)
+
+
+def _overview(rows: Sequence[ObjectRange]) -> Iterator[str]:
     yield "| Index | Object | Kind | Description |\n|---|---|---|---|\n"
-    for row in profile.ALL:
+    for row in rows:
         kind = f"{row.code.name}{', dynamic' if row.dynamic else ''}"
         yield f"| {_range(row)} | {_title(row)} | {kind} | {_cell(row.description)} |\n"
 
@@ -65,7 +85,8 @@ def _object(row: ObjectRange) -> Iterator[str]:
     yield f". {row.description}\n\n"
     yield f"| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}\n"
     if row.code is not ObjectCode.VAR:
-        access = CONFIG if row.dynamic or row.list_row else Access.READ_ANY
+        is_kept = row.list_row is not None and row.list_row.access & CONFIG == CONFIG
+        access = CONFIG if row.dynamic or is_kept else Access.READ_ANY
         count = EntryRow(0, "Highest sub-index", "USINT", access, _count_text(row),
                          row.fixed_count)  # fmt: skip
         yield _entry(count)

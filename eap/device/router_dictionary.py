@@ -1,0 +1,180 @@
+"""The object dictionary of a station's router: its ports, its routes, and what became of packets.
+
+All of it is read only.  The objects of routes are made whenever somebody looks, for routes come and
+go by themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from ipaddress import IPv4Address
+from typing import Any, NamedTuple, Protocol
+
+from eap.codec import datatypes
+from eap.codec.datatypes import DataType
+from eap.device.eap_content import Identity
+from eap.ids import InterfaceUri, NetId
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RO, Entry, ObjectCode, OdObject
+from eap.od.profiles import eap1000
+from eap.od.profiles import router9000 as profile
+from eap.od.profiles.router9000 import Live
+from eap.od.profiles.table import UNITS, EntryRow, ObjectRange
+from eap.pd.spec import PortKind, PortSpec, StationSpec
+
+_IP_SCHEMES = ("udp", "tcp")
+_MAX_ROUTES = profile.ROUTE.last - profile.ROUTE.first + 1
+
+
+class RouterValues(Protocol):
+    """The running router; values are numbers, octets or texts, as the profile's types say."""
+
+    def number(self, key: Live) -> int:
+        """Return what *key* stands for, of the router as a whole."""
+
+    def state_of(self, port: str) -> int:
+        """Return the state of a port."""
+
+    def mac_of(self, port: str) -> bytes:
+        """Return the MAC address of a port's interface; all zero if it has none."""
+
+    def routes(self) -> Sequence[object]:
+        """Return all routes in their order."""
+
+    def of_route(self, key: Live, route: object) -> Any:
+        """Return what *key* stands for, of one of the routes."""
+
+
+class RouterDictionary(ObjectDictionary):
+    """What a station's router is, for clients to read.
+
+    Args:
+        station: Whose router it is.
+        values: Where live entries get theirs.
+        identity: What 0x1008 to 0x1018 show.
+    """
+
+    def __init__(self, station: StationSpec, values: RouterValues, identity: Identity) -> None:
+        super().__init__()
+        self._values = values
+        self._names = {
+            profile.DEVICE.first + number: port.name for number, port in enumerate(station.ports)
+        }
+        for row in profile.STATIC:
+            self.add(_make(row, row.first, self._read, last=len(station.ports)))
+        for number, port in enumerate(station.ports):
+            index = profile.DEVICE.first + number
+            self.add(_make(profile.DEVICE, index, partial(self._read_device, port.name)))
+        self._set_fixed(station, identity)
+
+    def name_of(self, index: int) -> str:
+        """Return the name of what the object at *index* is about, empty for the router itself."""
+        if _is_route(index):
+            return str(self[index].entries[3].value)
+        return self._names.get(index, "")
+
+    def __contains__(self, index: int) -> bool:
+        return super().__contains__(index) or index in self._route_indexes()
+
+    def __getitem__(self, index: int) -> OdObject:
+        """Return the object at *index*; refuse with NO_OBJECT."""
+        if _is_route(index) and index in self._route_indexes():
+            return self._make_route(index, self._values.routes()[index - profile.ROUTE.first])
+        return super().__getitem__(index)
+
+    def __iter__(self) -> Iterator[OdObject]:
+        """Yield the objects in the order of their indexes."""
+        indexes = sorted({*self._objects, *self._route_indexes()})
+        return (self[index] for index in indexes)
+
+    def __len__(self) -> int:
+        return super().__len__() + len(self._route_indexes())
+
+    def _route_indexes(self) -> range:
+        first = profile.ROUTE.first
+        return range(first, first + min(len(self._values.routes()), _MAX_ROUTES))
+
+    def _make_route(self, index: int, route: object) -> OdObject:
+        return _make(profile.ROUTE, index, lambda key: self._values.of_route(key, route))
+
+    def _read(self, key: Live) -> int:
+        return self._values.number(key)
+
+    def _read_device(self, port: str, key: Live) -> int | bytes:
+        if key is Live.DEVICE_STATE:
+            return self._values.state_of(port)
+        return self._values.mac_of(port)
+
+    def _set_fixed(self, station: StationSpec, identity: Identity) -> None:
+        fixed: dict[tuple[int, int], Any] = {
+            (0x1008, 0): identity.device_name,
+            (0x1009, 0): identity.hardware_version,
+            (0x100A, 0): identity.software_version,
+            (0x1018, 1): identity.vendor,
+            (0x1018, 2): identity.product,
+            (0x1018, 3): identity.revision,
+            (0x1018, 4): identity.serial,
+            (0xF920, 1): NetId.parse(station.net_id),
+        }
+        for number, port in enumerate(station.ports):
+            kind = _PROFILES[port.kind]
+            fixed[profile.MODULES.first, number + 1] = kind
+            index = profile.DEVICE.first + number
+            fixed |= {
+                (index, 1): NetId.parse(port.net_id),
+                (index, 2): kind,
+                (index, 3): port.interface,
+                (index, 5): _ip_of(port),
+                (index, 7): port.name,
+            }
+        for (index, subindex), value in fixed.items():
+            self[index].entries[subindex].value = value
+
+
+_PROFILES = {PortKind.EAP: eap1000.MODULE_PROFILE, PortKind.BUS: profile.MASTER_PROFILE}
+
+
+class _Reader(NamedTuple):
+    """What gives the octets of a live entry."""
+
+    kind: DataType
+    key: Live
+    read: Callable[[Live], Any]
+
+    def __call__(self) -> bytes:
+        value, kind = self.read(self.key), self.kind
+        if kind.is_text:
+            return str(value).encode()[: kind.size]
+        if kind.scalar_range is not None:
+            value = min(value, int(kind.scalar_range[1]))
+        return kind.encode(value)
+
+
+def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, last: int = 0) -> OdObject:
+    """Return an object; *last* is that of a list's sub-indexes."""
+    entries = {}
+    for each in row.entries:
+        for subindex in range(each.subindex, (last if each.last else each.subindex) + 1):
+            entries[subindex] = _make_entry(each, subindex, read)
+    if row.code is not ObjectCode.VAR:
+        entries[0] = Entry("SubIndex 000", "USINT", RO, max(entries, default=0))
+    is_array = row.code is ObjectCode.ARRAY
+    code = datatypes.parse(row.entries[-1].kind).code if is_array else None
+    return OdObject(index, row.title(index), row.code, entries, data_type=code)
+
+
+def _make_entry(row: EntryRow, subindex: int, read: Callable[[Live], Any]) -> Entry:
+    kind = datatypes.parse(row.kind)
+    reader = _Reader(kind, Live(row.live), read) if row.live else None
+    name = row.numbered(subindex)
+    return Entry(name, kind, row.access, row.default, read=reader, unit=UNITS[row.unit])
+
+
+def _is_route(index: int) -> bool:
+    return profile.ROUTE.first <= index <= profile.ROUTE.last
+
+
+def _ip_of(port: PortSpec) -> bytes:
+    uri = InterfaceUri.parse(port.interface)
+    return IPv4Address(uri.host).packed if uri.scheme in _IP_SCHEMES else bytes(4)
