@@ -6,9 +6,8 @@ import asyncio
 import tempfile
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from eap.aoe.ads_device import Judge, allow
 from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite, Write
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer
@@ -16,6 +15,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
@@ -26,14 +26,6 @@ BUS = NetId.parse("5.1.1.1.3.1")
 TOOL = NetId.parse("7.7.7.7.1.1")
 MASTER = 0xFFFF
 DRIVE = 1001
-
-
-class LocalAsk(NamedTuple):
-    """What a router hands over."""
-
-    header: AmsHeader
-    body: bytes
-    came_by: Way
 
 
 class Client:
@@ -47,7 +39,6 @@ class Client:
     def __init__(self, service: BusService, bus: BusClient, net_id: NetId = TOOL) -> None:
         self.service = service
         self.net_id = net_id
-        self.judge: Judge = allow
         self.way = Way("ams-tcp", "1")
         self.why = ""
         self.bus = bus
@@ -55,7 +46,7 @@ class Client:
     async def answer(self, port: int, command: int, body: bytes) -> AmsAnswer:
         """Return the answer as it is."""
         header = AmsHeader(BUS, port, self.net_id, 30000, command, length=len(body))
-        answer = await self.service.answer(LocalAsk(header, body, self.way), judge=self.judge)
+        answer = await self.service.answer(LocalRequest(header, body, self.way))
         self.why = answer.why
         return answer
 

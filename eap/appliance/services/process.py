@@ -26,6 +26,7 @@ from eap.appliance.handover import (
     tell_ready,
 )
 from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.bus_methods import Buses
 from eap.appliance.services.control_server import ControlServer
@@ -41,6 +42,7 @@ from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.status import ProcessMeter, appliance_status
 from eap.appliance.station_image import StationImage
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
+from eap.ids import NetId
 from eap.net import realtime
 
 IMAGE_PATIENCE_S = 15.0
@@ -76,7 +78,7 @@ class Services:
         doors = open_doors(
             self._handover, devices.routers, self._counters, self._link, self._resources
         )
-        buses = self._buses(link)
+        buses = self._buses(link, devices)
         methods = self._methods(images, buses, devices)
         server = ControlServer(methods, buses)
         async with asyncio.TaskGroup() as group:
@@ -144,7 +146,7 @@ class Services:
             more=DeviceMethods(devices.by_station, self._handover.plant_file).table(),
         )
 
-    def _buses(self, link: EngineLink) -> Buses:
+    def _buses(self, link: EngineLink, devices: Devices) -> Buses:
         handover = self._handover
         segments = {}
         for bus in handover.buses:
@@ -152,6 +154,10 @@ class Services:
                 segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
                 self._resources.callback(segments[bus.owner].close)
         client = BusClient(link, [bus.owner for bus in handover.buses])
+        for bus in handover.buses:
+            net_id = NetId.parse(handover.port(bus.owner).net_id)
+            service = BusService(client, bus.owner, net_id, RELEASE)
+            devices.routers[bus.owner.station].add_service(net_id, service)
         return Buses(handover.stations, client if handover.buses else None, segments)
 
 

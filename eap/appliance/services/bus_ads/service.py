@@ -1,8 +1,8 @@
 """Whoever answers behind the NetID of a bus port: the master at port 0xFFFF, slaves at theirs.
 
-Rule 1: the operations of a request are judged and done one after the other, and what cannot be
-done by the end of its time is answered so: an answer comes before the routers on its way lose
-patience, and clients theirs.
+Rule 1: the operations of a request are done one after the other, and what cannot be done by the end
+of its time is answered so: an answer comes before the routers on its way lose patience, and clients
+theirs.
 Rule 2: requests do not wait for each other here; turns at a slave's mailbox are the bus client's.
 """
 
@@ -12,9 +12,8 @@ import asyncio
 from collections.abc import Container
 from functools import partial
 from time import monotonic_ns
-from typing import Protocol
 
-from eap.aoe.ads_device import AdsDevice, Judge, allow
+from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_master import MasterSpace
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import (
@@ -37,8 +36,8 @@ from eap.appliance.services.bus_ads.slave_space import Asked
 from eap.appliance.services.bus_ads.slaves import Slaves
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.eap_ads import device_info
+from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.ams import AmsHeader
 from eap.errors import EapError
 from eap.ids import NetId
 
@@ -50,22 +49,6 @@ _IN_HEADER = frozenset((AdsError.HOST_UNREACHABLE, AdsError.TARGET_PORT))
 
 _RESULT_SIZE = 4
 _MAX_NAMED = 8
-
-
-class Request(Protocol):
-    """What a router hands over."""
-
-    @property
-    def header(self) -> AmsHeader:
-        """As it came."""
-
-    @property
-    def body(self) -> bytes:
-        """What follows the header."""
-
-    @property
-    def came_by(self) -> Way:
-        """Where the client is."""
 
 
 class BusService:
@@ -94,8 +77,8 @@ class BusService:
             control=self._master.control,
         )
 
-    async def answer(self, request: Request, *, judge: Judge = allow) -> AmsAnswer:
-        """Do what a request asks for, as far as *judge* has nothing against it."""
+    async def answer(self, request: LocalRequest) -> AmsAnswer:
+        """Do what a request asks for."""
         header = request.header
         client = Client(request.came_by, header.source, header.source_port)
         end_s = asyncio.get_running_loop().time() + ANSWER_S
@@ -107,7 +90,7 @@ class BusService:
         except EapError as exc:
             return AmsAnswer(error_code=refusal(exc).result, why=str(exc))
         perform_in_time = partial(_perform_until, end_s, perform)
-        answer = await answer_request(header.command, request.body, perform_in_time, judge=judge)
+        answer = await answer_request(header.command, request.body, perform_in_time)
         result = int.from_bytes(answer.data[:_RESULT_SIZE], "little")
         return AmsAnswer(error_code=result, why=answer.why) if result in _IN_HEADER else answer
 

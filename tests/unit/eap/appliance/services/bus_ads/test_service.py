@@ -6,9 +6,7 @@ import asyncio
 
 import pytest
 
-from eap.aoe.access import service_of
 from eap.aoe.ads_operation import (
-    Operation,
     OperationOutcome,
     Read,
     ReadDeviceInfo,
@@ -17,7 +15,6 @@ from eap.aoe.ads_operation import (
     Write,
     WriteControl,
 )
-from eap.aoe.spec import AccessService
 from eap.appliance.bus_request import AskMailbox
 from eap.appliance.services.bus_ads import service
 from eap.codec.ads import (
@@ -39,11 +36,6 @@ VENDOR_ID = b"\x5a\x0e\0\0"
 SENSOR = 1003
 COMMAND = bytes.fromhex("01ff 0000 0000 0400 0000 00000000 0000")
 """As AdsLib sends it, to count slaves."""
-
-
-def no_changes(operation: Operation) -> AdsError:
-    reads = service_of(operation) is AccessService.READ
-    return AdsError.NONE if reads else AdsError.ACCESS_DENIED
 
 
 def sum_of(group: int, *items: Read | Write) -> ReadWrite:
@@ -144,25 +136,6 @@ def test_engine_that_is_gone():
     play(scene)
 
 
-def test_each_operation_is_judged():
-    async def scene(client, engine):
-        client.judge = no_changes
-        assert await client.good(DRIVE, VENDOR) == VENDOR_ID
-        denied = [
-            Write(IndexGroup.SDO, 0x6040_0000, b"\6\0"),
-            WriteControl(AdsState.RUN, 0, b""),
-            ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 4, b"firmware.bin"),
-            ReadWrite(IndexGroup.VOE, 0, 100, bytes(6)),
-        ]
-        for operation in denied:
-            assert (await client.do(DRIVE, operation)).result == AdsError.ACCESS_DENIED
-        raw = ReadWrite(IndexGroup.RAW_COMMAND, 0, 16, COMMAND)
-        assert (await client.do(MASTER, raw)).result == AdsError.ACCESS_DENIED
-        assert len(engine.of(AskMailbox)) == 1
-
-    play(scene)
-
-
 def test_sum_commands_item_by_item():
     async def scene(client, engine):
         items = VENDOR, Read(IndexGroup.SDO, 0x5555_0000, 4), Read(0x9999, 0, 2)
@@ -170,15 +143,13 @@ def test_sum_commands_item_by_item():
         not_passed_on = await client.do(DRIVE, items[2])
         results = b"".join(n.to_bytes(4, "little") for n in (0, 0x70C, not_passed_on.result))
         assert found == results + VENDOR_ID + bytes(6)
-        client.judge = lambda operation: (
-            AdsError.ACCESS_DENIED if operation[1] == 0x6040_0000 else AdsError.NONE
-        )
         writes = (
-            Write(IndexGroup.SDO, 0x6040_0000, b"\6\0"),
-            Write(IndexGroup.SDO, 0x607A_0000, bytes(4)),
+            Write(IndexGroup.SDO, 0x1018_0001, bytes(4)),
+            Write(IndexGroup.SDO, 0x607A_0000, b"\5\0\0\0"),
         )
         found = await client.good(DRIVE, sum_of(IndexGroup.SUM_WRITE, *writes))
-        assert found == b"\x23\7\0\0" + bytes(4)
+        assert found == b"\4\7\0\0" + bytes(4)
+        assert await client.read(DRIVE, IndexGroup.SDO, 0x607A_0000) == b"\5\0\0\0"
 
     play(scene)
 
@@ -187,17 +158,12 @@ def test_what_takes_too_long_is_answered_in_time(monkeypatch):
     monkeypatch.setattr(service, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
-        client.judge = lambda operation: hold(engine)
+        engine.holds, engine.held_kind = True, AskMailbox
         outcome = await client.do(DRIVE, sum_of(IndexGroup.SUM_READ, VENDOR, VENDOR))
         assert outcome.data[:8] == 2 * b"\x19\7\0\0"
         assert client.why == "; ".join(2 * ["not done within 0.05 s"])
-        client.judge = lambda operation: AdsError.NONE
         engine.release()
         assert await client.good(DRIVE, VENDOR) == VENDOR_ID
-
-    def hold(engine):
-        engine.holds = True
-        return AdsError.NONE
 
     play(scene)
 
