@@ -45,6 +45,21 @@ class PacketCutter:
         self._skip -= skipped
         self._buffer += memoryview(data)[skipped:]
 
+    def receive_one(self, data: bytes) -> bytes | None:
+        """Return the packet if *data* is exactly one, as it mostly is; else take what came."""
+        start = AmsTcpHeader.SIZE
+        end = len(data)
+        # The limit is below 4 GB and no packet is empty, so these octets are the whole prefix.
+        if (
+            not self._buffer
+            and not self._skip
+            and start + AmsHeader.SIZE <= end <= start + self._limit
+            and data[:start] == (end - start << 16).to_bytes(start, "little")
+        ):
+            return data[start:]
+        self.receive(data)
+        return None
+
     def next_piece(self) -> Piece | None:
         """Return the next whole packet, None if there is none yet.
 

@@ -21,7 +21,7 @@ pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 pytestmark = pytest.mark.net
 
 REQUESTS = 10_000 if os.environ.get("EAP_LONG") else 2000
-ADDRESS = "127.9.49.1"
+ADDRESS, GATE = "127.9.49.1", "127.9.49.2"
 ROUTER, FIRST, SECOND = (f"{ADDRESS}.{end}" for end in ("1.1", "2.1", "2.2"))
 DEVICE, SDO = 0xFFFF, 0xF302
 PLANT = f"""\
@@ -40,6 +40,13 @@ stations:
     publish:
       - {{name: state, frame: out, id: 77, variables: [level]}}
 """
+THROUGH = f"""\
+  - name: gate
+    net_id: {GATE}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{GATE}", net_id: {GATE}.2.1}}
+"""
+BY_AMS_TCP = "    routes: [{to: tower, ams_tcp: tower/eap0}]\n"
 CLIENT = """
 import ctypes, random, sys
 import pyads
@@ -69,9 +76,11 @@ def appliance(farm: Plants) -> Appliance:
     return farm.run(farm.write(PLANT))
 
 
-def start_client(count: int, seed: int, stack: ExitStack) -> subprocess.Popen[str]:
+def start_client(
+    count: int, seed: int, stack: ExitStack, address: str = ADDRESS
+) -> subprocess.Popen[str]:
     """Start a client that checks each of *count* answers; return when it asks."""
-    words = [ADDRESS, FIRST, SECOND, str(count), str(seed)]
+    words = [address, FIRST, SECOND, str(count), str(seed)]
     client = subprocess.Popen(
         [sys.executable, "-c", CLIENT, *words],
         stdout=subprocess.PIPE,
@@ -110,9 +119,25 @@ def test_reads_and_writes(appliance: Appliance) -> None:
 
 
 def test_clients_of_one_address_keep_apart_while_others_die(appliance: Appliance) -> None:
+    assert_all_are_answered(ADDRESS)
+    assert appliance.station("tower")["discarded"] == {}
+
+
+@pytest.mark.parametrize("route", ["", BY_AMS_TCP], ids=["type-5", "ams-tcp"])
+def test_clients_of_one_address_keep_apart_through_another_station(
+    farm: Plants, route: str
+) -> None:
+    appliance = farm.run(farm.write(PLANT + THROUGH + route))
+    assert_all_are_answered(GATE)
+    for station in ("tower", "gate"):
+        assert appliance.station(station)["discarded"] == {}
+
+
+def assert_all_are_answered(address: str) -> None:
+    """Have some clients ask the station at *address* at the same time, and kill others of them."""
     with ExitStack() as stack:
-        dying = [start_client(10_000_000, seed, stack) for seed in (1, 2, 3)]
-        clients = [start_client(REQUESTS, seed, stack) for seed in (4, 5)]
+        dying = [start_client(10_000_000, seed, stack, address) for seed in (1, 2, 3)]
+        clients = [start_client(REQUESTS, seed, stack, address) for seed in (4, 5)]
         for client in dying:
             assert client.poll() is None
             client.kill()
@@ -120,4 +145,3 @@ def test_clients_of_one_address_keep_apart_while_others_die(appliance: Appliance
         for client in clients:
             out, errors = client.communicate(timeout=120)
             assert (client.returncode, out) == (0, f"0 wrong of {REQUESTS}\n"), errors
-    assert appliance.station("tower")["discarded"] == {}

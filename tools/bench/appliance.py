@@ -51,8 +51,13 @@ class Observation(msgspec.Struct, frozen=True):
 
 
 @contextmanager
-def running(plant: Path, link: Cable | None) -> Iterator[dict[str, str]]:
+def running(plant: Path, link: Cable | None, *arguments: str) -> Iterator[dict[str, str]]:
     """Run *plant* until the block ends; yield the environment in which ``eapctl`` finds it.
+
+    Args:
+        plant: Its file.
+        link: Where it runs; None for here.
+        arguments: Of ``eapctl run``, behind the plant.
 
     Raises:
         RuntimeError: it does not get ready.
@@ -60,7 +65,7 @@ def running(plant: Path, link: Cable | None) -> Iterator[dict[str, str]]:
     with TemporaryDirectory(dir=memory_folder()) as folder:
         environment = os.environ | {VARIABLE: folder}
         process = subprocess.Popen(
-            _command(link, "run", str(plant)),
+            _command(link, "run", str(plant), *arguments),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from itertools import count
 from typing import Any
 
@@ -47,5 +48,8 @@ async def accept_connections(
 
 def connection_name(connection: socket.socket) -> str:
     """Return a name that no other connection of this process ever has: peer, and a number."""
-    peer = connection.getpeername() if connection.family == socket.AF_INET else ("", 0)
-    return f"{peer[0]}:{peer[1]}#{next(_numbers)}"
+    host, port = "", 0
+    if connection.family == socket.AF_INET:
+        with suppress(OSError):  # the peer has gone again already
+            host, port = connection.getpeername()
+    return f"{host}:{port}#{next(_numbers)}"

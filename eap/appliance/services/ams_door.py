@@ -5,22 +5,38 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Coroutine
-from contextlib import suppress
-from typing import Any
+from collections.abc import Callable
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.accepting import accept_connections, connection_name
-from eap.appliance.services.ams_connection import PATIENCE_S, AmsClients, AmsConnection
+from eap.appliance.services.accepting import connection_name
+from eap.appliance.services.ams_connection import PATIENCE_S, AmsConnection, set_options
+from eap.appliance.services.ams_shares import Shares
 from eap.appliance.services.routing.entrance import Entrance
 
-MAX_CONNECTIONS = 128
-"""Of one listener."""
-_PROBE_AFTER_S = 30
-_PROBES = 3
-_PROBE_S = 10
-
 logger = logging.getLogger(__name__)
+
+
+class AmsClients:
+    """Who has connected to any listener of this process, by name; the carrier of their door."""
+
+    def __init__(self) -> None:
+        self._connections: dict[str, AmsConnection] = {}
+
+    def __len__(self) -> int:
+        return len(self._connections)
+
+    def add(self, connection: AmsConnection) -> None:
+        """Take one more."""
+        self._connections[connection.name] = connection
+
+    def remove(self, connection: AmsConnection) -> None:
+        """Forget one that has ended."""
+        del self._connections[connection.name]
+
+    def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
+        """Send packets by a connection; return why not if there is none of that name."""
+        found = self._connections.get(connection)
+        return "the connection was closed" if found is None else found.send(packets)
 
 
 class AmsDoor:
@@ -33,7 +49,7 @@ class AmsDoor:
         entrance: To the stations that are reached by it.
         clients: Where those who have connected are found when an answer is there.
         refuse: Counts what is not answered as it was wanted.
-        patience_s: As in :class:`AmsConnection`.
+        patience_s: How long a packet, or answers that wait to be taken, may last.
     """
 
     def __init__(
@@ -45,66 +61,69 @@ class AmsDoor:
         *,
         patience_s: float = PATIENCE_S,
     ) -> None:
+        self.refuse = refuse
         self._listener = listener
         self._entrance = entrance
         self._clients = clients
-        self._refuse = refuse
         self._patience_s = patience_s
-        self._count = 0
+        self._shares = Shares()
+        self._connections: set[AmsConnection] = set()
 
     async def serve(self) -> None:
-        """Accept until cancelled."""
-        await accept_connections(self._listener, "AMS/TCP", self._take)
-
-    def _take(self, connection: socket.socket, peer: str) -> Coroutine[Any, Any, None] | None:
-        if self._count >= MAX_CONNECTIONS:
-            logger.debug("AMS/TCP connection from %s closed: too many", peer)
-            self._refuse(Refusal.AMS_FULL)
-            connection.close()
-            return None
-        self._count += 1
-        return self._serve(connection)
-
-    async def _serve(self, connection: socket.socket) -> None:
+        """Accept until cancelled; then close all connections."""
+        self._listener.setblocking(False)
         try:
-            with connection:
-                await self._talk(connection)
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._watch_slow())
+                while True:
+                    await self._accept()
         finally:
-            self._count -= 1
+            for connection in list(self._connections):
+                connection.close("the appliance ends")
 
-    async def _talk(self, connection: socket.socket) -> None:
-        name = connection_name(connection)
-        _set_options(connection)
-        reader, writer = await asyncio.open_connection(sock=connection)
-        client = AmsConnection(
-            name,
-            reader,
-            writer,
-            self._entrance,
-            self._refuse,
-            patience_s=self._patience_s,
-        )
-        self._clients.add(name, client)
-        with suppress(OSError):  # it broke off, which is its right
-            try:
-                await client.serve()
-                async with asyncio.timeout(self._patience_s):
-                    await self._entrance.wait_below(name, 1)
-                    writer.close()
-                    await writer.wait_closed()
-            finally:
-                writer.transport.abort()
-                self._clients.remove(name)
-                self._entrance.connection_closed(name)
+    def connection_opened(self, connection: AmsConnection) -> None:
+        """Keep it (PacketTaker)."""
+        self._connections.add(connection)
+        self._clients.add(connection)
 
+    def connection_closed(self, connection: AmsConnection, why: str) -> None:
+        """Let others have its place (PacketTaker)."""
+        logger.debug("AMS/TCP connection %s: %s", connection.name, why)
+        self._connections.remove(connection)
+        self._clients.remove(connection)
+        self._shares.give_back(connection.host)
+        self._entrance.connection_closed(connection.name)
 
-def _set_options(connection: socket.socket) -> None:
-    connection.setblocking(False)
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (
-        (socket.TCP_KEEPIDLE, _PROBE_AFTER_S),
-        (socket.TCP_KEEPINTVL, _PROBE_S),
-        (socket.TCP_KEEPCNT, _PROBES),
-        (socket.TCP_NODELAY, 1),
-    ):
-        connection.setsockopt(socket.IPPROTO_TCP, option, value)
+    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+        """Hand a request to the stations (PacketTaker)."""
+        self._entrance.receive(packet, connection.name)
+
+    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        """Count a response: nothing is asked by connections that others opened (PacketTaker)."""
+        del packet, connection
+        self.refuse(Refusal.AMS_UNASKED)
+
+    async def _accept(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            sock, (host, *_) = await loop.sock_accept(self._listener)
+        except OSError as exc:
+            logger.warning("AMS/TCP listener: %s", exc.strerror)
+            await asyncio.sleep(1)
+            return
+        why_not = self._shares.take(host, sock.getsockname()[0])
+        if why_not is not None:
+            logger.debug("AMS/TCP connection from %s closed: %s", host, why_not)
+            self.refuse(Refusal.AMS_FULL)
+            sock.close()
+            return
+        name = connection_name(sock)
+        set_options(sock)
+        await loop.connect_accepted_socket(lambda: AmsConnection(name, host, self), sock)
+
+    async def _watch_slow(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(self._patience_s / 4)
+            for connection in list(self._connections):
+                connection.find_slow(loop.time(), self._patience_s)

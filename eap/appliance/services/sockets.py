@@ -10,9 +10,9 @@ from time import monotonic_ns
 from eap.aoe.way import Door
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
-from eap.appliance.services.ams_connection import AmsClients
 from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
-from eap.appliance.services.ams_door import AmsDoor
+from eap.appliance.services.ams_door import AmsClients, AmsDoor
+from eap.appliance.services.ams_uplinks import AmsUplinks
 from eap.appliance.services.intake import FrameIntake, watch_channel
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_frames import FRAME_OVERHEAD
@@ -25,6 +25,7 @@ from eap.ids import InterfaceUri, NetId
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
+from eap.pd.spec import StationSpec
 
 AMS_DOOR = "ams-tcp"
 """By which clients come in that connect to AMS/TCP."""
@@ -36,7 +37,7 @@ def open_doors(
     counters: DiscardCounters,
     link: socket.socket,
     resources: ExitStack,
-) -> list[TcpDoor | AmsDoor]:
+) -> list[TcpDoor | AmsDoor | AmsUplinks]:
     """Take frames from all sockets of *handover*, as long as the running loop lives.
 
     Args:
@@ -47,7 +48,7 @@ def open_doors(
         resources: Closes what is opened here.
 
     Returns:
-        The listeners for TCP, to be served.
+        The listeners for TCP and the connections to others, to be served.
     """
     return _Sockets(handover, routers, counters, resources).open(link)
 
@@ -69,7 +70,7 @@ class _Sockets:
         self._ams_clients = AmsClients()
         self._ams_stations: set[str] = set()
 
-    def open(self, link: socket.socket) -> list[TcpDoor | AmsDoor]:
+    def open(self, link: socket.socket) -> list[TcpDoor | AmsDoor | AmsUplinks]:
         by_kind: dict[SocketKind, list[SharedSocket]] = {kind: [] for kind in SocketKind}
         for shared in self._handover.sockets:
             by_kind[shared.kind].append(shared)
@@ -81,9 +82,10 @@ class _Sockets:
             self._watch_interface(shared)
         for shared in by_kind[SocketKind.AMS_UDP]:
             self._watch_discovery(shared)
-        doors: list[TcpDoor | AmsDoor] = []
+        doors: list[TcpDoor | AmsDoor | AmsUplinks] = []
         doors += [self._door(shared, link) for shared in by_kind[SocketKind.TCP]]
         doors += [self._ams_door(shared) for shared in by_kind[SocketKind.AMS_TCP]]
+        doors += [self._uplinks(station) for station in self._handover.stations]
         return doors
 
     def _channel(self, shared: SharedSocket) -> UdpChannel:
@@ -171,6 +173,14 @@ class _Sockets:
         entrance = Entrance([(self._routers[station], AMS_DOOR) for station in stations])
         refuse = self._refuser(stations)
         return AmsDoor(self._socket(shared), entrance, self._ams_clients, refuse)
+
+    def _uplinks(self, station: StationSpec) -> AmsUplinks:
+        sources = [
+            uri.host
+            for port in station.ports
+            if (uri := InterfaceUri.parse(port.interface)).scheme in {"udp", "tcp"}
+        ]
+        return AmsUplinks(self._routers[station.name], sources, self._refuser([station.name]))
 
     def _door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
         refuse = self._refuser(_stations_of(shared))

@@ -58,6 +58,7 @@ class StationRouter:
         table: The routes, to be read; changed by :meth:`add_route` and :meth:`remove_route`.
         on_trace: Called with each trace of what was not simply answered.
         on_audit: Called with each entry of the audit: what was changed, and what was refused.
+        on_routes: Called with the hop of each route that was added or removed.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class StationRouter:
         self.table = RouteTable()
         self.on_trace: list[Callable[[Trace], None]] = [TraceLog(name).write]
         self.on_audit: list[Callable[[AuditEntry], None]] = []
+        self.on_routes: list[Callable[[Way], None]] = []
         self._router = Router(
             net_id,
             self.table,
@@ -146,12 +148,16 @@ class StationRouter:
     def add_route(self, route: Route) -> bool:
         """Take *route* into the table; return whether it was taken."""
         is_taken = self.table.add(route)
+        for follow in self.on_routes:
+            follow(route.hop)
         self._schedule()
         return is_taken
 
     def remove_route(self, net_id: NetId, hop: Way) -> bool:
         """Forget a route; return whether there was one."""
         was_there = self.table.remove(net_id, hop)
+        for follow in self.on_routes:
+            follow(hop)
         self._schedule()
         return was_there
 

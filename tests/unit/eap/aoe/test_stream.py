@@ -52,6 +52,33 @@ def test_nothing_of_a_packet_over_the_limit_is_kept() -> None:
     assert len(cutter._buffer) == 0
 
 
+def test_one_whole_packet_is_taken_at_once() -> None:
+    cutter = PacketCutter(LIMIT)
+    one, other = encode_with_prefix(packet(5)), encode_with_prefix(packet(LIMIT - 32))
+    assert cutter.receive_one(one) == packet(5)
+    assert cutter.receive_one(other) == packet(LIMIT - 32)
+    assert not cutter.has_begun
+    for octets in (one[:-1], one + b"x", one + one, encode_with_prefix(packet(LIMIT - 31))):
+        cutter = PacketCutter(LIMIT)
+        assert cutter.receive_one(octets) is None
+        assert cutter.has_begun
+    cutter = PacketCutter(LIMIT)
+    assert cutter.receive_one(one[:7]) is None
+    assert cutter.receive_one(one) is None
+    cutter = PacketCutter(LIMIT)
+    assert cutter.receive_one(encode_with_prefix(packet(900))[:-3]) is None
+    assert isinstance(cutter.next_piece(), TooLong)
+    assert cutter.receive_one(one) is None
+
+
+@pytest.mark.parametrize("length", [0, 31])
+def test_prefix_of_less_than_a_header_is_not_taken_at_once(length: int) -> None:
+    cutter = PacketCutter(LIMIT)
+    assert cutter.receive_one(AmsTcpHeader(0, length).encode() + bytes(length)) is None
+    with pytest.raises(MalformedError, match=f"length {length}, expected 32 or more"):
+        cutter.next_piece()
+
+
 def test_packet_of_the_limit_is_taken() -> None:
     cutter = PacketCutter(LIMIT)
     cutter.receive(encode_with_prefix(packet(LIMIT - 32))[:-1])

@@ -67,6 +67,8 @@ def test_no_two_connections_have_the_same_name():
         names = [connection_name(one) for _ in range(2)]
     assert len(set(names)) == 2
     assert all(name.startswith(here) for name in names)
+    with socket.socket() as gone:
+        assert connection_name(gone).startswith(":0#")
     pair = socket.socketpair()
     assert connection_name(pair[0]).startswith(":0#")
     for each in pair:

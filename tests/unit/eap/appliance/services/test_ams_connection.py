@@ -3,71 +3,116 @@
 from __future__ import annotations
 
 import asyncio
-import errno
+import itertools
 import socket
 import struct
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeAlias
 
 import pytest
 
-from eap.aoe.answer import AmsAnswer
-from eap.aoe.way import Door
+from eap.aoe.answer import AmsAnswer, response_to
 from eap.appliance.discards import Refusal
-from eap.appliance.services import ams_connection
-from eap.appliance.services.ams_connection import AmsClients, AmsConnection
+from eap.appliance.services import ams_connection, ams_window
+from eap.appliance.services.ams_connection import AmsConnection, set_options
+from eap.codec.ams import AmsHeader
 from tests.support import aoe
-from tests.support.routing import entrance, station, while_serving
+from tests.support.eventually import eventually
 
 pytestmark = pytest.mark.net
 
 TARGET = "1.1.1.1.2.1"
 NO_RETURN = 4 | 2
+Script: TypeAlias = Callable[
+    [asyncio.StreamReader, asyncio.StreamWriter, "Taker"], Awaitable[object]
+]
 
 
-def ask(body: bytes = b"abc", number: int = 1, command: int = aoe.READ_STATE, **more) -> bytes:
-    return prefixed(aoe.packet(more.pop("target", TARGET), command, body, invoke_id=number, **more))
+def ask(body: bytes = b"abc", number: int = 1, command: int = aoe.READ_STATE, **more: Any) -> bytes:
+    return prefixed(aoe.packet(TARGET, command, body, invoke_id=number, **more))
 
 
 def prefixed(packet: bytes, *, reserved: int = 0, length: int | None = None) -> bytes:
     return struct.pack("<HI", reserved, len(packet) if length is None else length) + packet
 
 
-def talk(script, there=None, *, patience_s: float = 5) -> list[Refusal]:
-    """Run ``script(reader, writer)`` on a connection that is being served."""
-    there = there or station(TARGET)
-    clients = AmsClients()
-    there.add_door(Door("door", is_stream=True), clients)
-    refused: list[Refusal] = []
+class Taker:
+    """Echoes at once, or when ``answer`` is called."""
 
-    async def run():
+    def __init__(self, *, is_slow: bool = False, grows: int = 1) -> None:
+        self.is_slow = is_slow
+        self.grows = grows
+        self.connection: AmsConnection
+        self.waiting: list[bytes] = []
+        self.seen: list[bytes] = []
+        self.answers: list[bytes] = []
+        self.refused: list[Refusal] = []
+        self.why = ""
+        self.closed = asyncio.Event()
+
+    def connection_opened(self, connection: AmsConnection) -> None:
+        self.connection = connection
+
+    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+        assert connection is self.connection
+        self.seen.append(packet)
+        header = AmsHeader.decode(packet)
+        if not header.state_flags & 2:
+            body = packet[AmsHeader.SIZE :] * self.grows
+            self.waiting.append(response_to(header, AmsAnswer(body)))
+            if not self.is_slow:
+                self.answer()
+
+    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        self.answers.append(packet)
+
+    def connection_closed(self, connection: AmsConnection, why: str) -> None:
+        assert not self.closed.is_set()
+        self.why = why
+        self.closed.set()
+
+    def refuse(self, reason: Refusal) -> None:
+        self.refused.append(reason)
+
+    def answer(self, number: int = 0) -> None:
+        self.connection.send([self.waiting.pop(number)])
+
+
+def talk(script: Script, *, patience_s: float = 5, **more: Any) -> Taker:
+    """Run ``script(reader, writer, taker)`` on a connection, and wait for its end."""
+    made: list[Taker] = []
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        taker = Taker(**more)
+        made.append(taker)
         with socket.create_server(("127.0.0.1", 0)) as listener:
             ours = socket.create_connection(listener.getsockname())
-            theirs, _ = listener.accept()
-        served = await asyncio.open_connection(sock=theirs)
-        client = AmsConnection(
-            "client",
-            *served,
-            entrance(there),
-            refused.append,
-            patience_s=patience_s,
-        )
-        clients.add("client", client)
-        stream = asyncio.ensure_future(client.serve())
-        stream.add_done_callback(lambda _: served[1].close())
+            theirs, (host, port) = listener.accept()
+        set_options(theirs)
+        connection = AmsConnection(f"{host}:{port}#1", host, taker)
+        await loop.connect_accepted_socket(lambda: connection, theirs)
         reader, writer = await asyncio.open_connection(sock=ours)
+        watch = asyncio.ensure_future(look_for_slow(connection, taker, patience_s))
         try:
-            await asyncio.wait_for(script(reader, writer), 10)
+            async with asyncio.timeout(10):
+                await script(reader, writer, taker)
+                writer.close()
+                await taker.closed.wait()
         finally:
-            writer.close()
-            await asyncio.wait([stream], timeout=5)
-            assert stream.done()
-            served[1].transport.abort()
-        error = stream.exception()
-        assert error is None or isinstance(error, OSError)
+            writer.transport.abort()
+            watch.cancel()
+            connection.close("the test ends")
+            await taker.closed.wait()
 
-    asyncio.run(while_serving(run(), there))
-    clients.remove("client")
-    assert clients.send("client", (b"",)) == "the connection is closed"
-    return refused
+    asyncio.run(run())
+    return made[0]
+
+
+async def look_for_slow(connection: AmsConnection, taker: Taker, patience_s: float) -> None:
+    while not taker.closed.is_set():
+        await asyncio.sleep(patience_s / 4)
+        connection.find_slow(asyncio.get_running_loop().time(), patience_s)
 
 
 async def hear(reader: asyncio.StreamReader) -> tuple[int, int, bytes]:
@@ -80,145 +125,227 @@ async def hear(reader: asyncio.StreamReader) -> tuple[int, int, bytes]:
     return error, number, packet[32:]
 
 
-def test_requests_are_answered_in_their_order_however_they_are_cut():
-    async def script(reader, writer):
+def test_requests_are_answered_however_they_are_cut() -> None:
+    async def script(reader, writer, taker):
         octets = ask(b"1", 1) + ask(b"2" * 3000, 2) + ask(b"3", 3)
         for begin, end in ((0, 1), (1, 7), (7, 60), (60, 900), (900, len(octets))):
             writer.write(octets[begin:end])
             await writer.drain()
             await asyncio.sleep(0.01)
-        assert [(await hear(reader))[:2] for _ in range(3)] == [(0, 1), (0, 2), (0, 3)]
+        answers = [await hear(reader) for _ in range(3)]
+        assert answers == [(0, 1, b"1"), (0, 2, b"2" * 3000), (0, 3, b"3")]
 
-    assert talk(script) == []
-
-
-def test_one_request_of_a_client_to_a_device_is_under_way():
-    waiting = []
-
-    async def slow(request) -> AmsAnswer:
-        waiting.append(request.body)
-        await asyncio.sleep(0.02)
-        assert len(waiting) == 1
-        return AmsAnswer(bytes(4) + waiting.pop())
-
-    async def script(reader, writer):
-        writer.write(b"".join(ask(bytes([n]), n) for n in range(5)))
-        assert [(await hear(reader))[1] for _ in range(5)] == list(range(5))
-
-    assert talk(script, station(TARGET, slow)) == []
+    assert talk(script).refused == []
 
 
-@pytest.mark.parametrize(
-    ("request_", "error"),
-    [
-        (ask(target="9.9.9.9.1.1"), 7),
-        (ask(port=1), 6),
-        (ask(command=0x0902), 8),
-    ],
-)
-def test_whoever_is_not_here_is_named(request_, error):
-    async def script(reader, writer):
-        writer.write(request_ + ask(b"x", 2))
-        assert await hear(reader) == (error, 1, b"")
-        assert (await hear(reader))[:2] == (0, 2)
+def test_several_requests_are_under_way_and_answered_in_any_order() -> None:
+    async def script(reader, writer, taker):
+        writer.write(b"".join(ask(bytes([n]), n) for n in range(30)))
+        await eventually(lambda: len(taker.waiting) == 30)
+        for number in range(29, -1, -1):
+            taker.answer(number)
+            assert await hear(reader) == (0, number, bytes([number]))
 
-    assert talk(script) == []
+    talk(script, is_slow=True)
 
 
-def test_wrong_lengths_are_answered_and_the_connection_goes_on():
-    whole = aoe.packet(TARGET, 4, b"abc")
-    huge = prefixed(aoe.packet(TARGET, 4, bytes(ams_connection.LONGEST_PACKET)))
+def test_who_sends_ahead_of_too_many_answers_is_not_read_from() -> None:
+    async def script(reader, writer, taker):
+        count = ams_window.MAX_REQUESTS
+        for n in range(3 * count):
+            writer.write(ask(b"x", n))
+        await eventually(lambda: len(taker.waiting) == count)
+        await asyncio.sleep(0.05)
+        assert len(taker.waiting) == count
+        for n in range(3 * count):
+            await eventually(lambda: taker.waiting)
+            taker.answer()
+            assert (await hear(reader))[1] == n
+            assert len(taker.waiting) <= count
 
-    async def script(reader, writer):
+    talk(script, is_slow=True)
+
+
+def test_few_packets_are_taken_in_one_turn() -> None:
+    async def script(reader, writer, taker):
+        seen = []
+
+        def look():
+            seen.append(len(taker.seen))
+            if seen[-1] < 100:
+                asyncio.get_running_loop().call_soon(look)
+
+        writer.write(ask(b"x") * 100)
+        look()
+        for _ in range(100):
+            await hear(reader)
+        steps = {now - before for before, now in itertools.pairwise(seen)}
+        assert max(steps) <= ams_connection._PER_TURN
+
+    talk(script)
+
+
+@pytest.mark.parametrize("flags", [4, NO_RETURN])
+def test_wrong_lengths_are_answered_and_the_connection_goes_on(flags: int) -> None:
+    whole = aoe.packet(TARGET, 4, b"abc", flags=flags)
+    huge = prefixed(aoe.packet(TARGET, 4, bytes(ams_connection.LONGEST_PACKET), flags=flags))
+
+    async def script(reader, writer, taker):
         writer.write(prefixed(whole + b"surplus") + prefixed(whole[:-1]) + huge + ask(b"x", 9))
-        assert [(await hear(reader))[0] for _ in range(3)] == [0xE, 0xE, 0xE]
+        if flags == 4:
+            assert [(await hear(reader))[0] for _ in range(3)] == [0xE, 0xE, 0xE]
         assert (await hear(reader))[:2] == (0, 9)
 
-    assert talk(script) == [Refusal.AMS_LENGTH] * 3
+    assert talk(script).refused == [Refusal.AMS_LENGTH] * 3
 
 
 @pytest.mark.parametrize("octets", [b"GET / HTTP/1.1\r\n", prefixed(b""), prefixed(b"", length=31)])
-def test_what_is_no_ams_packet_ends_the_connection(octets):
-    async def script(reader, writer):
-        writer.write(ask() + octets)
+def test_what_is_no_ams_packet_ends_the_connection_when_all_has_been_answered(octets) -> None:
+    async def script(reader, writer, taker):
+        writer.write(ask() + ask() + octets)
+        await eventually(lambda: taker.refused)
+        assert not taker.closed.is_set()
+        taker.answer()
+        taker.answer()
+        assert (await hear(reader))[0] == 0
         assert (await hear(reader))[0] == 0
         assert await reader.read() == b""
 
-    assert talk(script) == [Refusal.AMS_TYPE]
+    taker = talk(script, is_slow=True)
+    assert taker.refused == [Refusal.AMS_TYPE]
+    assert taker.why.startswith("no AMS packets: AmsTcpHeader")
 
 
-def test_answers_that_nobody_asked_for_are_counted():
-    async def script(reader, writer):
+def test_answers_are_told_from_requests() -> None:
+    async def script(reader, writer, taker):
         writer.write(ask(flags=5) + ask(b"x", 2))
         assert (await hear(reader))[1] == 2
 
-    assert talk(script) == [Refusal.AMS_UNASKED]
+    taker = talk(script)
+    assert (len(taker.answers), len(taker.seen)) == (1, 1)
 
 
-def test_who_wants_no_answer_gets_none():
-    async def script(reader, writer):
+def test_who_wants_no_answer_gets_none() -> None:
+    async def script(reader, writer, taker):
         writer.write(ask(flags=NO_RETURN) + ask(b"x", 2))
         assert (await hear(reader))[1] == 2
 
-    assert talk(script) == []
+    assert len(talk(script).seen) == 2
 
 
-def test_packet_that_is_not_finished_ends_the_connection():
-    async def script(reader, writer):
+def test_packet_that_is_not_finished_ends_the_connection() -> None:
+    async def script(reader, writer, taker):
         for octet in ask()[:30]:
-            writer.write(bytes([octet]))
-            await asyncio.sleep(0.01)
+            if not taker.closed.is_set():
+                writer.write(bytes([octet]))
+                await asyncio.sleep(0.01)
 
-    assert talk(script, patience_s=0.1) == [Refusal.AMS_SLOW]
+    taker = talk(script, patience_s=0.1)
+    assert taker.refused == [Refusal.AMS_SLOW]
+    assert taker.why.startswith("too slow")
 
 
-def test_silence_between_packets_may_last():
-    async def script(reader, writer):
+def test_silence_between_packets_may_last() -> None:
+    async def script(reader, writer, taker):
         for number in (1, 2):
             writer.write(ask(b"x", number))
             assert (await hear(reader))[1] == number
             await asyncio.sleep(0.2)
 
-    assert talk(script, patience_s=0.05) == []
+    talk(script, patience_s=0.05)
 
 
-def test_client_that_takes_nothing_is_disconnected():
-    async def script(reader, writer):
+def test_packets_that_wait_for_their_turn_are_not_slow() -> None:
+    """The last one is not whole yet, which is our doing: we do not read."""
+
+    async def script(reader, writer, taker):
+        count = ams_window.MAX_REQUESTS
+        writer.write(ask(b"x") * 3 * count)
+        await eventually(lambda: len(taker.waiting) == count)
+        await asyncio.sleep(0.3)
+        for _ in range(3 * count):
+            await eventually(lambda: taker.waiting)
+            taker.answer()
+            await hear(reader)
+
+    assert talk(script, patience_s=0.1, is_slow=True).refused == []
+
+
+def test_client_that_takes_nothing_is_disconnected() -> None:
+    async def script(reader, writer, taker):
         reader._limit = 1  # so that it stops reading
         for _ in range(2000):
             writer.write(ask(bytes(16 << 10)))
             try:
                 await asyncio.wait_for(writer.drain(), 0.5)
-            except TimeoutError:
+            except (TimeoutError, OSError):
                 return
         raise AssertionError("everything was taken")
 
-    assert talk(script, patience_s=0.1) == [Refusal.AMS_SLOW]
+    assert talk(script, patience_s=0.1).refused == [Refusal.AMS_SLOW]
 
 
-def test_client_that_breaks_off_costs_nothing():
-    async def script(reader, writer):
+def test_notifications_do_not_pile_up() -> None:
+    packet = aoe.packet(TARGET, 8, bytes(60_000))
+
+    async def script(reader, writer, taker):
+        reader._limit = 1
+        sent = 0
+        while not taker.closed.is_set():
+            taker.connection.send([packet])
+            sent += len(packet)
+            await asyncio.sleep(0)
+        # The buffers of both kernels hold some as well.
+        assert sent < ams_connection.MAX_UNSENT + (16 << 20)
+
+    assert talk(script).refused == [Refusal.AMS_SLOW]
+
+
+def test_client_that_breaks_off_costs_nothing() -> None:
+    async def script(reader, writer, taker):
         writer.write(ask() + ask()[:20])
-        await writer.drain()
+        await eventually(lambda: taker.waiting)
+        sock = writer.get_extra_info("socket")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         writer.transport.abort()
+        await taker.closed.wait()
+        assert taker.connection.send(taker.waiting) == "the connection was closed"
 
-    assert talk(script) == []
+    assert talk(script, is_slow=True).refused == []
 
 
-def test_client_that_has_vanished_is_not_slow():
-    """The kernel says so after some probes, with an error that is a TimeoutError too."""
-    refused = []
+def test_who_has_only_closed_its_sending_side_is_still_answered() -> None:
+    async def script(reader, writer, taker):
+        writer.write(ask(b"last") + ask(b"one"))
+        writer.write_eof()
+        await eventually(lambda: len(taker.waiting) == 2)
+        taker.answer()
+        taker.answer()
+        assert (await hear(reader))[2] == b"last"
+        assert (await hear(reader))[2] == b"one"
+        assert await reader.read() == b""
 
-    async def run():
-        reader = asyncio.StreamReader()
-        reader.set_exception(TimeoutError(errno.ETIMEDOUT, "Connection timed out"))
-        _, writer = await asyncio.open_connection(sock=ours)
-        client = AmsConnection("client", reader, writer, entrance(), refused.append)
-        with pytest.raises(OSError, match="timed out"):
-            await client.serve()
-        writer.transport.abort()
+    assert talk(script, is_slow=True).why == "closed by the peer"
 
-    ours, theirs = socket.socketpair()
-    with theirs:
-        asyncio.run(run())
-    assert refused == []
+
+def test_who_leaves_without_taking_its_answers_is_let_go() -> None:
+    async def script(reader, writer, taker):
+        reader._limit = 1
+        writer.write(ask(bytes(100_000)) * 8)
+        writer.write_eof()
+        await eventually(lambda: taker.seen)
+        await taker.closed.wait()
+
+    assert talk(script, patience_s=0.1, grows=20).refused in ([], [Refusal.AMS_SLOW])
+
+
+def test_dead_peers_are_looked_for() -> None:
+    with socket.socket() as sock:
+        set_options(sock)
+        assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+        idle, each, count = (
+            sock.getsockopt(socket.IPPROTO_TCP, option)
+            for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+        )
+        assert idle + count * each == 60
+        assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 60_000

@@ -6,7 +6,7 @@ from inspect import signature
 
 import pytest
 
-from eap.appliance.services.ams_connection import AmsClients
+from eap.appliance.services.ams_door import AmsClients
 from eap.appliance.services.routing.dictionary_service import DictionaryService
 from eap.appliance.services.routing.local_client import LocalClient
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier

@@ -243,3 +243,12 @@ def test_station_knows_its_net_ids(scene):
     assert set(scene.station.net_ids) == {ROUTER, DEVICE}
     with pytest.raises(KeyError):
         scene.station.add_service(NetId.parse("2.2.2.2.2.2"), scene.service)
+
+
+def test_whoever_follows_the_routes_is_told_of_each() -> None:
+    scene = Scene()
+    told: list[Way] = []
+    scene.station.on_routes.append(told.append)
+    scene.add_route()
+    scene.station.remove_route(NetId.parse("7.7.7.7.1.1"), HOP)
+    assert told == [HOP, HOP]

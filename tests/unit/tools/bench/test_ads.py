@@ -1,0 +1,39 @@
+"""What is said of ADS reads, hops and crowds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from eap.config.load import load
+from tools.bench.ads import HOPS, crowd_figure, hop_figure, plant, reads_figure
+from tools.bench.figures import Verdict
+
+
+def test_reads_are_compared_by_round() -> None:
+    figure = reads_figure([(8000.0, 10_000.0), (4000.0, 4000.0), (8000.0, 10_000.0)])
+    assert (figure.value, figure.verdict) == (0.8, Verdict.OK)
+    assert figure.measured == "0.80 (8.0 to 10.0 thousand/s)"
+
+
+def test_hop_is_what_it_adds() -> None:
+    figure = hop_figure("mail", [(200_000.0, 100_000.0, 40_000.0)] * 3)
+    assert (figure.value, figure.verdict) == (2.5, Verdict.MISSED)
+    assert figure.measured == "2.50 (100 to 200 µs, an echo 40 µs)"
+
+
+def test_slowest_client_is_compared_with_the_median() -> None:
+    figure = crowd_figure([50, 100, 101], 2.0)
+    assert (figure.value, figure.verdict) == (0.5, Verdict.OK)
+    assert crowd_figure([0, 100, 101], 2.0).verdict is Verdict.MISSED
+    assert crowd_figure([0, 0, 0], 2.0).verdict is Verdict.MISSED
+
+
+def test_plants_can_be_loaded(tmp_path: Path) -> None:
+    path, found = tmp_path / "plant.yaml", []
+    for route in HOPS.values():
+        path.write_text(plant(route))
+        result = load(path, lambda *_: (None, ()))
+        assert result.plant is not None, result.findings
+        hops = [each.hop for each in result.plant.routing["near"].routes]
+        found.append(*hops)
+    assert [str(each.kind) for each in found] == ["udp", "ams-tcp"]
