@@ -37,6 +37,7 @@ from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
+from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
 from eap.appliance.services.segment_link import SegmentLink
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.status import ProcessMeter, appliance_status
@@ -78,12 +79,13 @@ class Services:
         doors = open_doors(
             self._handover, devices.routers, self._counters, self._link, self._resources
         )
+        brokers = open_mqtt_doors(self._handover.routing, devices.routers)
         buses = self._buses(link, devices)
         methods = self._methods(images, buses, devices)
         server = ControlServer(methods, buses)
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(server.serve(self._listener))]
-            tasks += [group.create_task(door.serve()) for door in doors]
+            tasks += [group.create_task(door.serve()) for door in (*doors, *brokers)]
             tasks.append(group.create_task(devices.serve()))
             watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
             tasks.append(group.create_task(watch.run()))
