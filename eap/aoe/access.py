@@ -95,6 +95,8 @@ class Verdict(NamedTuple):
     is_allowed: bool
     why: str
     """The rule, in words."""
+    is_by_rule: bool = False
+    """Whether the plant file says so, and not only the default."""
 
 
 class Grants:
@@ -115,7 +117,7 @@ class Grants:
         for rule in self._by_service[service]:
             if not rule.objects or (touched is not None and _is_about(rule, touched)):
                 verb = "allows" if rule.allow else "refuses"
-                return Verdict(service, rule.allow, f"rule {rule.name} {verb} it")
+                return Verdict(service, rule.allow, f"rule {rule.name} {verb} it", is_by_rule=True)
         if self._is_this_host:
             return Verdict(service, True, "no rule refuses it to this host")
         if service is AccessService.READ:

@@ -256,7 +256,7 @@ def encode_done(request: bytes, task: Task, data: bytes) -> bytes:
 
 
 def encode_failure(
-    kind: MailboxType, request: bytes, failure: Failure, *, code: int | None = None
+    kind: MailboxType, request: bytes, failure: Failure, *, code: int | None = None, text: str = ""
 ) -> bytes:
     """Return the message that says why something was not done.
 
@@ -265,6 +265,7 @@ def encode_failure(
         request: What was asked.
         failure: Why.
         code: What the slave itself says, for protocols whose codes both sides share.
+        text: For people, where the protocol has room for it.
     """
     codes = _CODES[kind]
     number = codes.get(failure, codes[Failure.GENERAL]) if code is None else code
@@ -277,7 +278,8 @@ def encode_failure(
             opcode = SoeOpcode.WRITE_RESPONSE if is_write else SoeOpcode.READ_RESPONSE
             return _soe_head(request, opcode | _SOE_ERROR) + number.to_bytes(2, "little")
         case MailboxType.FOE:
-            return bytes((FoeOpcode.ERROR, 0, 0, 0, 0)) + number.to_bytes(4, "little")
+            words = text.encode() + b"\0" if text else b""
+            return bytes((FoeOpcode.ERROR, 0, 0, 0, 0)) + number.to_bytes(4, "little") + words
     return request[: VoeHeader.SIZE].ljust(VoeHeader.SIZE, b"\0") + number.to_bytes(4, "little")
 
 

@@ -95,6 +95,11 @@ class Transfer:
         self._is_busy = is_busy(body) if isinstance(self._course, _Foe) else False
         self._course.answer(body)
 
+    def end(self) -> None:
+        """Note that nothing is under way any more, whatever was."""
+        self.replies = []
+        self._course.is_running = False
+
 
 def is_busy(body: bytes) -> bool:
     """Say whether a message of FoE tells the client to ask again."""

@@ -1,0 +1,113 @@
+"""Requests of the high-nibble dialect: who may have them done, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from devicebus.errors import BusError
+from eap.aoe.ads_operation import Operation, ReadWrite
+from eap.aoe.way import Way
+from eap.appliance.services.gateway.dialect_task import FAILURES, DialectError, perform
+from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.slave_book import SlaveBook
+from eap.appliance.services.gateway.slave_link import SlaveLink
+from eap.appliance.services.gateway.slave_session import find_refusal, reason_of
+from eap.codec.ads import IndexGroup
+from eap.codec.mailbox import MailboxType
+from eap.errors import EngineGoneError, MalformedError
+from eap.gateway.address import MASTER_ADDRESS, VIRTUAL_BIT
+from eap.gateway.dialect import (
+    Failure,
+    ReadFile,
+    ReadIdn,
+    ReadSdo,
+    Task,
+    WriteIdn,
+    WriteSdo,
+    decode,
+    encode_done,
+    encode_failure,
+)
+from eap.gateway.refusal import Reason
+from eap.gateway.rights import idn, sdo
+
+
+class DialectDesk:
+    """Answers requests of the dialect.
+
+    Args:
+        bus: The slaves.
+        book: What is known of them.
+        may: Says whether a client may have something done at a station address.
+        open_master: Begins a session with the master's dictionary.
+        room: Octets of the longest answer.
+        answer_s: How long an answer may take.
+    """
+
+    def __init__(
+        self,
+        bus: SlaveLink,
+        book: SlaveBook,
+        may: Callable[[Way, int, Operation], bool],
+        open_master: Callable[[], MasterSession],
+        room: int,
+        answer_s: float,
+    ) -> None:
+        self._bus = bus
+        self._book = book
+        self._may = may
+        self._open_master = open_master
+        self._room = room
+        self._answer_s = answer_s
+
+    async def answer(
+        self, kind: MailboxType, address: int, body: bytes, way: Way
+    ) -> tuple[bytes, Reason | None]:
+        """Return what answers a request, and why it is an error if it is one."""
+        code: int | None = None
+        try:
+            return await self._perform(kind, address & ~VIRTUAL_BIT, body, way), None
+        except MalformedError as exc:
+            failure, reason, text = Failure.COMMAND, Reason.SERVICE, str(exc)
+        except DialectError as exc:
+            failure, reason, text, code = exc.failure, Reason.SERVICE, str(exc), exc.code
+        except (BusError, EngineGoneError) as exc:
+            reason, text = reason_of(exc), str(exc)
+            failure = FAILURES.get(reason, Failure.GENERAL)
+        return encode_failure(kind, body, failure, code=code, text=text), reason
+
+    async def _perform(self, kind: MailboxType, station: int, body: bytes, way: Way) -> bytes:
+        task = decode(kind, body)
+        if not self._may(way, station, operation_of(task)):
+            raise _refusal(Reason.DENIED)
+        if station == MASTER_ADDRESS:
+            return encode_done(body, task, self._open_master().perform(task))
+        slave = await self._book.find(station)
+        reason = slave if isinstance(slave, Reason) else find_refusal(kind, b"", slave)
+        if isinstance(slave, Reason) or reason is not None:
+            raise _refusal(reason or Reason.NO_SLAVE)
+        converse = partial(self._bus.converse, station, requester=way)
+        return encode_done(
+            body, task, await perform(task, slave, converse, self._room, self._answer_s)
+        )
+
+
+def _refusal(reason: Reason) -> DialectError:
+    return DialectError(FAILURES.get(reason, Failure.GENERAL), reason.text)
+
+
+def operation_of(task: Task) -> Operation:
+    """Return what a task does, in the terms of access rules."""
+    match task:
+        case ReadSdo(index, subindex, complete):
+            return sdo(index, subindex, complete=complete)
+        case WriteSdo(index, subindex, data):
+            return sdo(index, subindex, complete=False, data=data)
+        case ReadIdn(number, drive, _):
+            return idn(number, drive)
+        case WriteIdn(number, drive, _, data):
+            return idn(number, drive, data)
+        case ReadFile(name):
+            return ReadWrite(IndexGroup.FOE_OPEN_READ, 0, 0, name.encode())
+    return ReadWrite(IndexGroup.VOE, 0, 0, b"")

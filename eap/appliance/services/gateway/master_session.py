@@ -1,0 +1,68 @@
+"""One client's session with the dictionary of the master (ETG.1510): address 0 of a gateway."""
+
+from __future__ import annotations
+
+from devicebus.errors import MailboxRefusedError
+from devicebus.mailbox.coe_server import CoeServer
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.appliance.services.gateway.dialect_task import DialectError
+from eap.appliance.services.gateway.slave_session import Reply
+from eap.codec.mailbox import MailboxHeader, MailboxType
+from eap.gateway.dialect import Failure, ReadSdo, Task, WriteSdo
+from eap.gateway.refusal import Reason, mailbox_error, refuse
+from eap.od.abort import SdoAbortError
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import OdState
+
+
+class MasterSession:
+    """What one client does with the master; segmented transfers of two clients do not meet.
+
+    Args:
+        dictionary: Of the master.
+        room: Octets of the longest answer behind its mailbox header.
+    """
+
+    is_running = False
+
+    def __init__(self, dictionary: ObjectDictionary, room: int) -> None:
+        self._dictionary = dictionary
+        size = room + MailboxHeader.SIZE
+        self._server = CoeServer(dictionary, _op, MailboxSizes(size, size))
+
+    def ask(self, kind: MailboxType, body: bytes) -> list[Reply]:
+        """Return the answers to a request."""
+        if kind is not MailboxType.COE:
+            reason = Reason.NO_PROTOCOL
+            return [Reply(*refuse(kind, body, reason), reason=reason)]
+        try:
+            answers = self._server.receive_message(body, 0)
+        except MailboxRefusedError as exc:
+            return [Reply(*mailbox_error(exc.detail))]
+        return [Reply(MailboxType.COE, answer) for answer in answers]
+
+    def perform(self, task: Task) -> bytes:
+        """Do a task of the dialect; return what was read.
+
+        Raises:
+            DialectError: it is none for the master, or refused.
+        """
+        try:
+            match task:
+                case ReadSdo(index, subindex, complete):
+                    read = self._dictionary.upload_complete if complete else self._dictionary.upload
+                    return read(index, subindex, OdState.OP)
+                case WriteSdo(index, subindex, data):
+                    self._dictionary.download(index, subindex, data, OdState.OP)
+                    return b""
+        except SdoAbortError as exc:
+            raise DialectError(Failure.GENERAL, str(exc), exc.code) from None
+        raise DialectError(Failure.NOT_SUPPORTED, "the master has only a CoE dictionary")
+
+    def close(self) -> None:
+        """Forget what is under way."""
+        self._server.reset()
+
+
+def _op() -> OdState:
+    return OdState.OP

@@ -1,0 +1,428 @@
+"""A gateway with a real bus client behind it, and slaves in memory."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from eap.aoe.access import AccessList
+from eap.aoe.spec import AccessRule, AccessService, ObjectRange
+from eap.aoe.way import Way
+from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
+from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.slave_link import PortLink
+from eap.codec.ethercat import EtherCatHeader
+from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame, encode_frame
+from eap.gateway.ledger import ClientLimits
+from eap.ids import NetId
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RW, array, variable
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.loopbus import LoopBus
+from tests.support.vectors import load
+
+COE, FOE, SOE, VOE, AOE, EOE = (
+    MailboxType[name] for name in ("COE", "FOE", "SOE", "VOE", "AOE", "EOE")
+)
+NET_ID = NetId.parse("127.0.1.1.3.1")
+HERE, ALSO_HERE = Way("udp:eap0", "127.0.0.1:1"), Way("udp:eap0", "127.0.0.1:2")
+ELSEWHERE = Way("udp:eap0", "10.0.0.9:1")
+FILE = b"firmware.bin".hex()
+VENDOR = "0020 40 1810 01 00000000"
+MASTER = ObjectDictionary(
+    [
+        variable(0x1000, "Device type", "UDINT", value=0x5100),
+        variable(0x1008, "Name", "STRING(300)", value="m" * 300),
+        array(0xF020, "Addresses", "UINT", [1001, 1002]),
+        variable(0x2000, "Anything", "UDINT", RW),
+    ]
+)
+
+
+class Desk:
+    """A gateway and its clients.
+
+    Attributes:
+        engine: That the slaves belong to.
+    """
+
+    def __init__(self, bus: str, rules: tuple[AccessRule, ...], settings: Settings) -> None:
+        self.engine = FakeEngine(FakeBus(LoopBus(bus)))
+        self._link = EngineLink(self.engine.services)
+        self.gateway = MailboxGateway(
+            PortLink(BusClient(self._link, [PORT]), PORT),
+            lambda: MasterSession(MASTER, settings.room),
+            AccessList(rules),
+            settings,
+        )
+
+    async def ask(
+        self, kind: MailboxType, address: int, octets: str | bytes, way: Way = HERE
+    ) -> list[tuple[MailboxHeader, bytes]]:
+        """Return the answers to a request."""
+        body = bytes.fromhex(octets) if isinstance(octets, str) else octets
+        frame = encode_frame(MailboxHeader(0, address, type=kind, counter=3), body)
+        return [decoded(each) for each in await self.ask_frame(frame, way)]
+
+    async def ask_frame(self, frame: bytes, way: Way = HERE) -> list[bytes]:
+        header, body = decode_frame(frame)
+        answers: list[bytes] = []
+        task = self.gateway.receive(header, bytes(body), way, answers.append)
+        if task is not None:
+            await task
+        return answers
+
+    async def one(
+        self, kind: MailboxType, address: int, octets: str | bytes, way: Way = HERE
+    ) -> str:
+        """Return the only answer, in hex, of the protocol that was asked."""
+        ((header, body),) = await self.ask(kind, address, octets, way)
+        assert header.type is kind
+        assert header.address == address
+        return body.hex(" ")
+
+    async def close(self) -> None:
+        await self.gateway.close()
+        self._link.close()
+        self.engine.close()
+
+
+def decoded(frame: bytes) -> tuple[MailboxHeader, bytes]:
+    header, body = decode_frame(frame)
+    assert len(frame) == EtherCatHeader.SIZE + MailboxHeader.SIZE + header.length
+    return header, bytes(body)
+
+
+def play(
+    scene: Callable[[Desk], Awaitable[None]],
+    *rules: AccessRule,
+    bus: str = "drive",
+    settings: Settings | None = None,
+) -> None:
+    async def run() -> None:
+        desk = Desk(bus, rules, settings or Settings(NET_ID))
+        try:
+            await scene(desk)
+        finally:
+            await desk.close()
+
+    asyncio.run(run())
+
+
+def test_each_protocol_of_a_slave() -> None:
+    async def scene(desk: Desk) -> None:
+        assert await desk.one(COE, 1001, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
+        assert await desk.one(SOE, 1001, "01 40 2000") == "02 40 20 00 02 00 00 00"
+        echo = "64110000 0100 0102"
+        assert bytes.fromhex(await desk.one(VOE, 1001, echo)) == bytes.fromhex(echo)
+        assert (await desk.one(FOE, 1001, "01 00 00000000" + b"firmware.bin".hex())).startswith(
+            "03 00 01 00 00 00 66 69"
+        )
+        assert await desk.ask(FOE, 1001, "04 00 01000000") == []
+        assert (await desk.one(EOE, 1001, "06000000"))[:2] == "07"
+
+    play(scene)
+
+
+def test_a_slaves_own_counter_comes_back() -> None:
+    async def scene(desk: Desk) -> None:
+        counters = []
+        for _ in range(9):
+            ((header, _),) = await desk.ask(COE, 1001, VENDOR)
+            counters.append(header.counter)
+        assert counters == [(counters[0] - 1 + step) % 7 + 1 for step in range(9)]
+
+    play(scene)
+
+
+def test_any_upload_command_and_surplus_octets_are_taken() -> None:
+    async def scene(desk: Desk) -> None:
+        answer = "00 30 43 18 10 01 5a 0e 00 00"
+        assert await desk.one(COE, 1001, "0020 41 1810 01 00000000") == answer
+        assert await desk.one(COE, 1001, VENDOR + "00" * 8) == answer
+        assert await desk.one(COE, 0x8000 | 1001, VENDOR) == answer
+
+    play(scene)
+
+
+@pytest.mark.parametrize(
+    ("kind", "address", "octets", "answer"),
+    [
+        (COE, 1009, VENDOR, (COE, "0020 80 1810 01 00000206")),
+        (SOE, 1009, "01 40 2000", (SOE, "12 40 2000 0a80")),
+        (VOE, 1009, "64110000 0100", (MailboxType.ERR, "0100 0500")),
+        (SOE, 1001, "01 40 2000", (MailboxType.ERR, "0100 0200")),
+        (COE, 1001, "0020 40 1810 01" + "00" * 1500, (COE, "0020 80 1810 01 05000106")),
+        (COE, 1001, "0020 40 9999 00 00000000", (COE, "0020 80 9999 00 00000206")),
+    ],
+)
+def test_what_cannot_be_done_is_answered_in_the_protocol_of_the_request(
+    kind, address, octets, answer
+) -> None:
+    async def scene(desk: Desk) -> None:
+        ((header, body),) = await desk.ask(kind, address, octets)
+        assert (header.type, body) == (answer[0], bytes.fromhex(answer[1]))
+
+    play(scene, bus="coe")
+
+
+def test_a_slave_without_mailbox() -> None:
+    async def scene(desk: Desk) -> None:
+        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
+
+    play(scene, bus="io")
+
+
+def test_a_slave_that_is_silent_is_answered_for_in_time() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.ask(COE, 1001, VENDOR)
+        desk.engine.buses[0].line.fault(kind="mailbox", slave="drive")
+        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 04 05"
+        (row,) = desk.gateway.tally.report()
+        assert row["errors"] == {"timeout": 1}
+        assert (row["requests"], row["replies"], row["address"]) == (2, 1, 1001)
+
+    play(scene, settings=Settings(NET_ID, answer_s=0.05))
+
+
+def test_silence_where_it_is_wanted() -> None:
+    async def scene(desk: Desk) -> None:
+        assert await desk.ask(COE, 1009, VENDOR) == []
+        assert await desk.one(COE, 1001, "0020 40 9999 00 00000000")
+
+    play(scene, settings=Settings(NET_ID, is_silent=True))
+
+
+def test_an_engine_that_is_gone_is_answered_for_too() -> None:
+    async def scene(desk: Desk) -> None:
+        desk.engine.buses[0].is_up = False
+        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
+
+    play(scene)
+
+
+def test_the_masters_dictionary() -> None:
+    async def scene(desk: Desk) -> None:
+        assert await desk.one(COE, 0, "0020 40 0010 00 00000000") == "00 30 43 00 10 00 00 51 00 00"
+        assert (await desk.one(COE, 0, "0020 40 9999 00 00000000"))[:8] == "00 20 80"
+        name = await desk.one(COE, 0, "0020 40 0810 00 00000000")
+        assert bytes.fromhex(name).endswith(b"m" * 300)
+        assert (await desk.one(COE, 0, "0080 01 00 0000 0100"))[:8] == "00 80 02"
+        ((header, body),) = await desk.ask(SOE, 0, "01 40 2000")
+        assert (header.type, body) == (MailboxType.ERR, bytes.fromhex("0100 0200"))
+
+    play(scene)
+
+
+def test_two_clients_transfers_do_not_mix() -> None:
+    first, second = b"a" * 3000, b"b" * 2500
+
+    async def write(desk: Desk, name: bytes, data: bytes, way: Way) -> None:
+        body = bytes.fromhex("02 00 00000000") + name
+        while (await desk.one(FOE, 1001, body, way))[:2] == "06":
+            pass
+        room = 1024 - 12
+        for number, at in enumerate(range(0, len(data) + 1, room), 1):
+            packet = bytes((3, 0)) + number.to_bytes(4, "little") + data[at : at + room]
+            answer = await desk.one(FOE, 1001, packet, way)
+            assert answer == (bytes((4, 0)) + number.to_bytes(4, "little")).hex(" ")
+
+    async def read(desk: Desk, name: bytes) -> bytes:
+        content = b""
+        body = bytes.fromhex("01 00 00000000") + name
+        while True:
+            ((_, packet),) = await desk.ask(FOE, 1001, body)
+            content += packet[6:]
+            body = bytes((4, 0)) + packet[2:6]
+            if len(packet) < 1024 - 6:
+                await desk.ask(FOE, 1001, body)
+                return content
+
+    async def scene(desk: Desk) -> None:
+        await asyncio.gather(
+            write(desk, b"firmware.bin", first, HERE),
+            write(desk, b"parameters.bin", second, ALSO_HERE),
+        )
+        assert await read(desk, b"firmware.bin") == first
+        assert await read(desk, b"parameters.bin") == second
+
+    play(scene, settings=Settings(NET_ID, answer_s=0.2))
+
+
+def test_who_has_to_wait_too_long_is_told_that_the_slave_is_busy() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
+        answer = await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
+        assert answer.startswith("06 00 00 00 64 00")
+        await desk.ask(FOE, 1001, "05 00 00800000")
+        assert not (await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)).startswith("06")
+
+    play(scene, settings=Settings(NET_ID, answer_s=0.05))
+
+
+def test_a_step_that_comes_twice_gets_the_same_answer_and_goes_no_further() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
+        packet = bytes.fromhex("03 00 01000000") + bytes(1024 - 12)
+        answers = [await desk.one(FOE, 1001, packet) for _ in range(2)]
+        assert answers == ["04 00 01 00 00 00"] * 2
+        assert (await desk.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
+        assert (await desk.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
+
+    play(scene)
+
+
+def test_a_step_of_no_transfer_does_not_reach_the_slave() -> None:
+    async def scene(desk: Desk) -> None:
+        assert (await desk.one(FOE, 1001, "03 00 01000000 01"))[:2] == "05"
+        answer = await desk.one(COE, 1001, "0020 60 00000000000000")
+        assert answer.startswith("00 20 80")
+
+    play(scene)
+
+
+def test_a_client_that_leaves_leaves_no_transfer_behind() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
+        desk.gateway.connection_closed(HERE)
+        assert not (await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)).startswith("06")
+
+    play(scene, settings=Settings(NET_ID, answer_s=0.05))
+
+
+def test_all_slaves_answer_for_themselves() -> None:
+    async def scene(desk: Desk) -> None:
+        answers = {
+            header.address: body.hex() for header, body in await desk.ask(COE, 0xFFFF, VENDOR)
+        }
+        assert set(answers) == {1001, 1002, 1003}
+        assert all(each.startswith("003043181001") for each in answers.values())
+
+    play(scene, bus="coe")
+
+
+WRITE = "0020 2b 4060 00 06000000"
+
+
+def test_writing_to_all_takes_a_rule() -> None:
+    async def scene(desk: Desk) -> None:
+        for header, body in await desk.ask(COE, 0xFFFF, WRITE):
+            assert header.address == 1001
+            assert body.hex().startswith("002080406000000001")
+
+    async def allowed(desk: Desk) -> None:
+        ((_, body),) = await desk.ask(COE, 0xFFFF, WRITE)
+        assert body.hex().startswith("0030604060")
+
+    play(scene)
+    play(allowed, AccessRule("group", services=(AccessService.WRITE,)))
+
+
+def test_other_hosts_only_read() -> None:
+    async def scene(desk: Desk) -> None:
+        assert (await desk.one(COE, 1001, VENDOR, ELSEWHERE)).startswith("00 30 43")
+        write = "0020 2b 4060 00 06000000"
+        assert (await desk.one(COE, 1001, write, ELSEWHERE)).startswith(
+            "00 20 80 40 60 00 00 00 01 06"
+        )
+        assert (await desk.one(FOE, 1001, "02 00 00000000" + FILE, ELSEWHERE)).startswith(
+            "05 00 0a 80"
+        )
+        assert (await desk.one(SOE, 1001, "03 40 2000 01020304", ELSEWHERE)).startswith("14")
+        assert (await desk.one(COE, 1001, WRITE)).startswith("00 30 60")
+
+    play(scene)
+
+
+def test_a_rule_opens_one_object() -> None:
+    rule = AccessRule(
+        "control word",
+        networks=("10.0.0.0/24",),
+        services=(AccessService.WRITE,),
+        objects=(ObjectRange(0x6040, 0x6040),),
+    )
+
+    async def scene(desk: Desk) -> None:
+        assert (await desk.one(COE, 1001, "0020 2b 4060 00 06000000", ELSEWHERE)).startswith(
+            "00 30 60"
+        )
+        other = "0020 23 0080 01 06000000"
+        assert (await desk.one(COE, 1001, other, ELSEWHERE)).startswith("00 20 80")
+
+    play(scene, rule)
+
+
+def test_the_same_request_is_answered_once_until_then() -> None:
+    async def scene(desk: Desk) -> None:
+        frame = encode_frame(MailboxHeader(0, 1001, type=COE, counter=1), bytes.fromhex(VENDOR))
+        header, body = decode_frame(frame)
+        answers: list[bytes] = []
+        for _ in range(3):
+            desk.gateway.receive(header, bytes(body), HERE, answers.append)
+        await desk.gateway.wait_idle()
+        assert len(answers) == 1
+        assert len(await desk.ask_frame(frame)) == 1
+
+    play(scene)
+
+
+def test_who_asks_too_much_at_once_is_told() -> None:
+    async def scene(desk: Desk) -> None:
+        header = MailboxHeader(10, 1001, type=COE)
+        answers: list[bytes] = []
+        for index in range(4):
+            body = b"\0\x20\x40" + bytes((index, 0x60)) + bytes(5)
+            desk.gateway.receive(header, body, HERE, answers.append)
+        assert [decoded(each)[1][-4:].hex() for each in answers] == ["05000405"] * 2
+        await desk.gateway.wait_idle()
+        assert len(answers) == 4
+
+    play(scene, settings=Settings(NET_ID, limits=ClientLimits(in_flight=2)))
+
+
+def test_a_mailbox_error_is_no_request() -> None:
+    async def scene(desk: Desk) -> None:
+        frame = encode_frame(MailboxHeader(0, 1001, counter=1), bytes.fromhex("0100 0200"))
+        ((header, body),) = [decoded(each) for each in await desk.ask_frame(frame)]
+        assert (header.type, body) == (MailboxType.ERR, bytes.fromhex("0100 0400"))
+
+    play(scene)
+
+
+DIALECT = {
+    "coe_read_master_0x1018_01": "0020 80 1810 01 00000206",
+    "coe_read_slave_0x03e9_0x6040_00": "0030 4b 4060 00 00000000",
+    "coe_write_slave_0x03e9_0x6040_00_06_00": "0030 60 4060 00 00000000",
+    "soe_read_idn_32_drive0_element_5_value": "02 05 2000",
+    "soe_read_idn_32_drive1_element_0_name": "12 08 2000 0910",
+    "soe_write_idn_32_1000": "04 05 2000",
+    "foe_read_firmware_bin": "03 00000000" + b"firmware 1.0 of a simulated drive".hex(),
+    "voe_vendor_0x1164_type_1_data_01_02": "64110000 0100 0102",
+}
+
+
+@pytest.mark.parametrize("name", DIALECT)
+def test_requests_of_the_dialect(name) -> None:
+    vector = next(each for each in load("high_nibble_dialect") if each.name.endswith(f"/{name}"))
+
+    async def scene(desk: Desk) -> None:
+        (frame,) = await desk.ask_frame(vector.frame)
+        assert frame[7] == vector.frame[7]
+        assert frame[4:6] == vector.frame[4:6]
+        assert frame[8:].startswith(bytes.fromhex(DIALECT[name]))
+
+    play(scene)
+
+
+def test_the_dialect_of_who_may_only_read() -> None:
+    write = next(each for each in load("high_nibble_dialect") if "coe_write" in each.name)
+
+    async def scene(desk: Desk) -> None:
+        (frame,) = await desk.ask_frame(write.frame, ELSEWHERE)
+        assert frame[8:] == bytes.fromhex("0020 80 4060 00 02000106")
+
+    play(scene)

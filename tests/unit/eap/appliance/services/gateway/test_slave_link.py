@@ -1,0 +1,31 @@
+"""The bus of one port."""
+
+from __future__ import annotations
+
+import asyncio
+
+from devicebus.mailbox import coe_client
+from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.gateway.slave_link import PortLink
+from eap.codec.mailbox import MailboxType
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.loopbus import LoopBus
+
+
+def test_it_names_the_port_for_all_that_is_asked() -> None:
+    async def run() -> None:
+        engine = FakeEngine(FakeBus(LoopBus("drive")))
+        link = EngineLink(engine.services)
+        port = PortLink(BusClient(link, [PORT]), PORT)
+        try:
+            assert [each.station for each in (await port.describe()).slaves] == [1001]
+            talk = await port.open_talk(1001, MailboxType.COE, "me")
+            talk.close()
+            vendor = await port.converse(1001, coe_client.upload(0x1018, 1), "me")
+            assert vendor == bytes.fromhex("5a0e0000")
+        finally:
+            link.close()
+            engine.close()
+
+    asyncio.run(run())
