@@ -16,18 +16,27 @@ class Row:
     """One slave, or the master, in one protocol.
 
     Attributes:
-        requests: That were answered, or had no answer.
+        requests: All of them.
+        answered: By the slave.
         replies: Messages of the slave.
         errors: That the gateway answered itself, by reason.
         last_error: The latest of these.
-        total_ns: Time from request to answer, of all that a slave answered.
+        total_ns: Time from request to answer, of all that the slave answered.
         slowest_ns: The longest of them.
     """
 
-    __slots__ = ("errors", "last_error", "replies", "requests", "slowest_ns", "total_ns")
+    __slots__ = (
+        "answered",
+        "errors",
+        "last_error",
+        "replies",
+        "requests",
+        "slowest_ns",
+        "total_ns",
+    )
 
     def __init__(self) -> None:
-        self.requests = self.replies = self.total_ns = self.slowest_ns = 0
+        self.requests = self.answered = self.replies = self.total_ns = self.slowest_ns = 0
         self.errors: dict[Reason, int] = {}
         self.last_error: Reason | None = None
 
@@ -41,6 +50,7 @@ class Row:
                 self.errors[reason] = self.errors.get(reason, 0) + 1
                 self.last_error = reason
         if any(reason is None for reason in reasons):
+            self.answered += 1
             self.total_ns += took_ns
             self.slowest_ns = max(self.slowest_ns, took_ns)
 
@@ -72,7 +82,7 @@ class Tally:
                 "replies": row.replies,
                 "errors": {reason.name.lower(): count for reason, count in row.errors.items()},
                 "last_error": row.last_error.text if row.last_error else "",
-                "mean_us": row.total_ns / 1000 / row.replies if row.replies else None,
+                "mean_us": row.total_ns / 1000 / row.answered if row.answered else None,
                 "slowest_us": row.slowest_ns / 1000,
             }
             for (station, kind), row in sorted(self._rows.items())

@@ -16,11 +16,7 @@ COE = MailboxType.COE
 
 
 def session(room: int = 100) -> MasterSession:
-    objects = [
-        variable(0x1008, "N", "STRING(200)", value="n" * 200),
-        variable(0x2000, "A", "UDINT", RW),
-    ]
-    return MasterSession(ObjectDictionary(objects), room)
+    return MasterSession(ObjectDictionary([variable(0x2000, "A", "UDINT", RW)]), room)
 
 
 def test_segments_of_two_clients_do_not_meet() -> None:

@@ -24,6 +24,7 @@ SLAVE = SlaveReport(
     station=1001, name="s", vendor=1, product=2, revision=3, serial=4, alias=0, state=8, target=8,
     to_slave=64, to_master=64, protocols=0x0C,
 )  # fmt: skip
+UPLOAD = bytes.fromhex("0020 40 1810 01 00000000")
 BEGIN = bytes.fromhex("02 00 00000000 66")
 ACK = bytes.fromhex("04 00 00000000")
 
@@ -31,7 +32,7 @@ ACK = bytes.fromhex("04 00 00000000")
 class Talk:
     """A slave that answers with what it is told."""
 
-    def __init__(self, *answers: bytes | Exception) -> None:
+    def __init__(self, *answers: bytes | BaseException) -> None:
         self.answers = list(answers)
         self.asked: list[Ask] = []
         self.ended = ""
@@ -41,7 +42,7 @@ class Talk:
         if not ask.expects_reply:
             return Message(ask.type, b"")
         answer = self.answers.pop(0)
-        if isinstance(answer, Exception):
+        if isinstance(answer, BaseException):
             raise answer
         return Message(ask.type, answer, 0, 5)
 
@@ -62,9 +63,7 @@ def session(kind: MailboxType, talk: Talk, idle_s: float = 5.0) -> SlaveSession:
 def test_a_request_and_its_reply() -> None:
     async def run() -> None:
         talk = Talk(bytes.fromhex("0030 43 1810 01 02000000"))
-        (reply,) = await session(COE, talk).ask(
-            bytes.fromhex("0020 40 1810 01 00000000"), is_step=False
-        )
+        (reply,) = await session(COE, talk).ask(UPLOAD, is_step=False)
         assert (reply.type, reply.counter, reply.reason) == (COE, 5, None)
         assert talk.ended == "closed"
         assert 0 < talk.asked[0].timeout_ns <= 500_000_000
@@ -79,10 +78,9 @@ def test_fragments_of_an_answer_are_waited_for() -> None:
         asked = bytes.fromhex("0080 01 00 0000 0100")
         replies = await session(COE, talk).ask(asked, is_step=False)
         assert [reply.body for reply in replies] == parts
-        assert [(ask.listen, ask.request) for ask in talk.asked] == [
-            (False, asked),
-            (True, asked[:6]),
-        ]
+        first, second = talk.asked
+        assert (first.listen, first.request) == (False, asked)
+        assert (second.listen, second.request) == (True, asked[:6])
 
     asyncio.run(run())
 
@@ -106,9 +104,7 @@ def test_a_transfer_keeps_its_turn_until_nobody_goes_on_with_it() -> None:
 def test_a_slaves_own_refusal_goes_through() -> None:
     async def run() -> None:
         talk = Talk(MailboxRefusedError("no", detail=4))
-        (reply,) = await session(COE, talk).ask(
-            bytes.fromhex("0020 40 1810 01 00000000"), is_step=False
-        )
+        (reply,) = await session(COE, talk).ask(UPLOAD, is_step=False)
         assert (reply.type, reply.body) == (MailboxType.ERR, bytes.fromhex("0100 0400"))
         assert talk.ended == "closed"
 
