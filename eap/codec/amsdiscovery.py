@@ -1,7 +1,7 @@
 """Datagrams of UDP port 48899, by which tools find AMS routers and add routes to them.
 
-Beckhoff documents none of it.  The layout is that of the requests of pyads 3.6 and of AdsLib, both
-open source; tags that nobody knows are kept as they come.
+Beckhoff documents none of it.  The layout is that of the requests of pyads 3.6, AdsLib and ads-rs
+(which has version and options), all open source; tags that nobody knows are kept as they come.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ RESPONSE = 0x8000_0000
 """Bit of the service in answers."""
 
 
+TEMPORARY = 1
+"""Bit of the options: the route is gone after a new start."""
+
+
 class DiscoveryService(IntEnum):
     """What is asked for."""
 
@@ -32,8 +36,12 @@ class Tag(IntEnum):
     RESULT = 1
     """32 bits, as in ADS."""
     PASSWORD = 2
+    VERSION = 3
+    """Of the router: two octets and 16 bits."""
     HOST = 5
     NET_ID = 7
+    OPTIONS = 9
+    """32 bits."""
     ROUTE_NAME = 12
     USER = 13
 
@@ -123,3 +131,22 @@ def encode_text(text: str) -> bytes:
     if "\0" in text:
         raise CodecError(f"a NUL in {text!r}", layout="Tag")
     return text.encode() + b"\0"
+
+
+def encode_version(text: str) -> bytes:
+    """Return the tag that says ``MAJOR.MINOR.BUILD``; what is missing or no number is 0."""
+    numbers = [*map(_number, text.split(".")), 0, 0, 0]
+    return bytes((min(numbers[0], 0xFF), min(numbers[1], 0xFF))) + min(numbers[2], 0xFFFF).to_bytes(
+        2, "little"
+    )
+
+
+def decode_version(data: bytes) -> str:
+    """Read what :func:`encode_version` returns; empty if it is not four octets."""
+    if len(data) != 4:
+        return ""
+    return f"{data[0]}.{data[1]}.{int.from_bytes(data[2:], 'little')}"
+
+
+def _number(text: str) -> int:
+    return int(text) if text.isascii() and text.isdigit() else 0

@@ -1,6 +1,8 @@
-"""UDP 48899: tools that have an address ask which AMS routers are there.
+"""UDP 48899: tools that have an address ask which AMS routers are there, and for routes to them.
 
-Rule: an answer is hardly longer than its question, so nobody is flooded by way of us.
+Rule: an answer is hardly longer than its question, so nobody is flooded by way of us.  Hence who
+asks for routers is told name and version; what routers of others tell beside that (the operating
+system, a fingerprint) is ten times as long, and no tool we know needs it.
 """
 
 from __future__ import annotations
@@ -9,10 +11,12 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
+from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from eap.appliance.discards import Refusal
-from eap.codec.ads import AdsError
+from eap.appliance.services.route_desk import RouteDesk
 from eap.codec.amsdiscovery import (
     RESPONSE,
     Discovery,
@@ -20,15 +24,16 @@ from eap.codec.amsdiscovery import (
     DiscoveryService,
     Tag,
     decode_discovery,
-    decode_text,
     encode_discovery,
     encode_text,
+    encode_version,
 )
 from eap.errors import CodecError
 from eap.ids import NetId
 
 SYSTEM_PORT = 10000
 """AMS port of the system service, in whose name routers answer."""
+_VERSION = encode_version(version("eap-appliance"))
 _LONGEST = 2048
 _DATAGRAMS_PER_TURN = 64
 
@@ -44,11 +49,13 @@ class RouterName(NamedTuple):
 
 
 class AmsDiscovery:
-    """One socket and the routers that are found by it.
+    """The routers that are found at one address.
 
     Args:
-        sock: Opened by the supervisor; it stays open.
-        routers: At its address.
+        sock: Opened by the supervisor for datagrams to that address; answers go out by it.  It
+            stays open.
+        routers: At that address.
+        desk: Decides on routes.
         refuse: Counts a datagram that is not answered.
     """
 
@@ -56,48 +63,55 @@ class AmsDiscovery:
         self,
         sock: socket.socket,
         routers: Sequence[RouterName],
+        desk: RouteDesk,
         refuse: Callable[[Refusal], None],
     ) -> None:
-        sock.setblocking(False)
         self._sock = sock
+        self._own = sock.getsockname()[0]
         self._routers = routers
+        self._desk = desk
         self._refuse = refuse
-        self._has_said = False
 
-    def watch(self) -> None:
-        """Answer whenever something arrives, as long as the running loop lives."""
-        asyncio.get_running_loop().add_reader(self._sock.fileno(), self._drain)
+    def watch(self, sock: socket.socket | None = None) -> None:
+        """Answer whenever something arrives, as long as the running loop lives.
 
-    def answers_to(self, data: bytes) -> list[bytes]:
-        """Return the datagrams that go back to the sender of *data*: one a router, or none."""
+        With *sock* what arrives there: broadcasts to the network of the address.
+        """
+        watched = self._sock if sock is None else sock
+        watched.setblocking(False)
+        asyncio.get_running_loop().add_reader(watched.fileno(), self._drain, watched)
+
+    def answers_to(self, data: bytes, sender: str) -> list[bytes]:
+        """Return the datagrams that go back to the *sender* of *data*: one a router, or none."""
         try:
             question = decode_discovery(data)
         except CodecError:
             return []
-        return list(self._answers(question))
+        return list(self._answers(question, sender))
 
-    def _answers(self, question: Discovery) -> Iterator[bytes]:
+    def _answers(self, question: Discovery, sender: str) -> Iterator[bytes]:
         service, number = question.header.service, question.header.invoke_id
         if service == DiscoveryService.SERVER_INFO:
             for router in self._routers:
-                yield _answer(router, service, number, (Tag.HOST, encode_text(router.name)))
+                # The name first: there are tools that look at no number of a tag.
+                name = Tag.HOST, encode_text(router.name)
+                yield _answer(router, service, number, [name, (Tag.VERSION, _VERSION)])
         elif service == DiscoveryService.ADD_ROUTE:
-            if not self._has_said:
-                self._has_said = True  # a flood of questions is no flood of lines
-                name = decode_text(question.find(Tag.ROUTE_NAME) or b"")[:80]
-                logger.warning("route %r is not added: who asks is answered without", name)
-            result = AdsError.SERVICE.to_bytes(4, "little")
-            yield _answer(self._routers[0], service, number, (Tag.RESULT, result))
+            is_this_host = sender == self._own or IPv4Address(sender).is_loopback
+            result = self._desk.take(question, sender, is_this_host=is_this_host)
+            if result is not None:
+                tag = Tag.RESULT, result.to_bytes(4, "little")
+                yield _answer(self._routers[0], service, number, [tag])
 
-    def _drain(self) -> None:
+    def _drain(self, sock: socket.socket) -> None:
         for _ in range(_DATAGRAMS_PER_TURN):
             try:
-                data, sender = self._sock.recvfrom(_LONGEST)
+                data, sender = sock.recvfrom(_LONGEST)
             except BlockingIOError:
                 return
             except OSError:
                 continue  # what ICMP says of an answer that went before
-            answers = self.answers_to(data)
+            answers = self.answers_to(data, sender[0])
             if not answers:
                 self._refuse(Refusal.AMS_DISCOVERY)
             for answer in answers:
@@ -107,6 +121,8 @@ class AmsDiscovery:
                     logger.debug("AMS router of %s: %s", sender[0], exc.strerror)
 
 
-def _answer(router: RouterName, service: int, number: int, tag: tuple[int, bytes]) -> bytes:
+def _answer(
+    router: RouterName, service: int, number: int, tags: Sequence[tuple[int, bytes]]
+) -> bytes:
     header = DiscoveryHeader(0, number, service | RESPONSE, router.net_id, SYSTEM_PORT)
-    return encode_discovery(header, [tag])
+    return encode_discovery(header, tags)

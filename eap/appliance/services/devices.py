@@ -9,15 +9,17 @@ from contextlib import suppress
 from time import monotonic_ns
 
 from eap.aoe.spec import RoutingSpec
+from eap.appliance.route_store import RouteStore
 from eap.appliance.services.eap_ads import EapAds, device_info
 from eap.appliance.services.image_values import ImageValues
 from eap.appliance.services.image_variables import StationSymbols
 from eap.appliance.services.routing.dictionary_service import DictionaryService
-from eap.appliance.services.routing.planned import make_router
+from eap.appliance.services.routing.planned import make_router, to_way
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sources import SourcePlayer
 from eap.appliance.services.station_device import StationDevice
 from eap.appliance.services.station_keeper import StationEngine, StationKeeper
+from eap.appliance.services.station_routes import StationRoutes
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
 from eap.device.eap_content import Identity
@@ -45,6 +47,7 @@ class Devices:
     Attributes:
         by_station: The devices.
         routers: Of AMS packets, by station.
+        routes: Of these routers.
     """
 
     def __init__(
@@ -60,6 +63,7 @@ class Devices:
         store = Store(plant)
         self.by_station: dict[str, StationDevice] = {}
         self.routers: dict[str, StationRouter] = {}
+        self.routes: dict[str, StationRoutes] = {}
         self._players: list[SourcePlayer] = []
         self._images = images
         self._has_restarted = asyncio.Event()
@@ -80,6 +84,10 @@ class Devices:
             self.by_station[name] = device
             told = routing.get(name, RoutingSpec())
             self.routers[name] = router = make_router(station, told)
+            self.routes[name] = routes = StationRoutes(
+                router, told, RouteStore(plant, name), open_hop=to_way, close_unused=lambda: None
+            )
+            routes.start()
             symbols = StationSymbols(image)
             for port in device.dictionaries:
                 info = device_info(f"{name}/{port}", release)

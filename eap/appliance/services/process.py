@@ -77,7 +77,12 @@ class Services:
         self._resources.callback(link.close)
         devices = self._devices(images, link)
         doors = open_doors(
-            self._handover, devices.routers, self._counters, self._link, self._resources
+            self._handover,
+            devices.routers,
+            devices.routes,
+            self._counters,
+            self._link,
+            self._resources,
         )
         brokers = open_mqtt_doors(self._handover.routing, devices.routers)
         buses = self._buses(link, devices)

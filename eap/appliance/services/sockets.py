@@ -14,11 +14,13 @@ from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.ams_door import AmsClients, AmsDoor
 from eap.appliance.services.ams_uplinks import AmsUplinks
 from eap.appliance.services.intake import FrameIntake, watch_channel
+from eap.appliance.services.route_desk import RouteDesk
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_frames import FRAME_OVERHEAD
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake, judge
 from eap.appliance.services.routing.mailbox_stream import LARGEST_FRAME, MailboxStreams
 from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.services.station_routes import StationRoutes
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.ids import InterfaceUri, NetId
@@ -34,6 +36,7 @@ AMS_DOOR = "ams-tcp"
 def open_doors(
     handover: Handover,
     routers: Mapping[str, StationRouter],
+    routes: Mapping[str, StationRoutes],
     counters: DiscardCounters,
     link: socket.socket,
     resources: ExitStack,
@@ -43,6 +46,7 @@ def open_doors(
     Args:
         handover: What the supervisor opened.
         routers: Of the stations, by name; they get their doors.
+        routes: Of these routers; tools may add some.
         counters: Of what is not taken.
         link: To the engine, for connections that belong there.
         resources: Closes what is opened here.
@@ -50,7 +54,7 @@ def open_doors(
     Returns:
         The listeners for TCP and the connections to others, to be served.
     """
-    return _Sockets(handover, routers, counters, resources).open(link)
+    return _Sockets(handover, routers, routes, counters, resources).open(link)
 
 
 class _Sockets:
@@ -58,11 +62,13 @@ class _Sockets:
         self,
         handover: Handover,
         routers: Mapping[str, StationRouter],
+        routes: Mapping[str, StationRoutes],
         counters: DiscardCounters,
         resources: ExitStack,
     ) -> None:
         self._handover = handover
         self._routers = routers
+        self._routes = routes
         self._counters = counters
         self._resources = resources
         self._batch = ReceiveBatch()
@@ -160,7 +166,9 @@ class _Sockets:
             for station in self._handover.stations
             if station.name in names
         ]
-        AmsDiscovery(self._socket(shared), routers, self._refuser(names)).watch()
+        desk = RouteDesk([self._routes[name] for name in names])
+        refuse = self._refuser(names)
+        AmsDiscovery(self._socket(shared), routers, desk, refuse).watch()
 
     def _ams_door(self, shared: SharedSocket) -> AmsDoor:
         """Return the listener of an address; a station with several has one door for all."""

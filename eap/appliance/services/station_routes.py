@@ -7,7 +7,7 @@ what was learned is not.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Protocol
 
 from msgspec.structs import replace
@@ -16,13 +16,13 @@ from eap.aoe.routes import Origin, Route, RouteTable
 from eap.aoe.spec import HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.route_store import RouteStore
+from eap.appliance.services.routing.planned import to_route
 from eap.errors import ControlError
 from eap.ids import NetId
 
 MAX_ADDED = 1000
 """Routes that can be added to one station."""
 MAX_NAME = 80
-_MS = 1_000_000
 _WHOLE = 6
 
 logger = logging.getLogger(__name__)
@@ -56,6 +56,9 @@ class StationRoutes:
         open_hop: Returns door and address of a hop, which begins to connect if it has to; raises
             ValueError if there is no such door.
         close_unused: Called when routes have gone.
+
+    Attributes:
+        router: Of the station.
     """
 
     def __init__(
@@ -67,12 +70,13 @@ class StationRoutes:
         open_hop: Callable[[HopSpec], Way],
         close_unused: Callable[[], None],
     ) -> None:
-        self._router = router
+        self.router = router
         self._spec = spec
         self._store = store
         self._open_hop = open_hop
         self._close_unused = close_unused
-        self._added: list[RouteSpec] = []
+        self._added: dict[RouteSpec, bool] = {}
+        """With whether it is kept over restarts."""
         self._written: dict[tuple[NetId, Way], RouteSpec] = {}
 
     @property
@@ -93,12 +97,12 @@ class StationRoutes:
                 self._take(spec, Origin.ADDED)
             except ControlError as exc:
                 logger.warning("added route %s is left out: %s", spec.name, exc)
-            self._added.append(spec)  # what cannot be today may be one after the next start
+            self._added[spec] = True  # what cannot be today may be one after the next start
 
     def replace_spec(self, spec: RoutingSpec) -> None:
         """Go on with what another plant file says; added and learned routes stay."""
         for key in self._written:
-            self._router.remove_route(*key)
+            self.router.remove_route(*key)
         self._written.clear()
         self._spec = spec
         self._take_spec()
@@ -114,12 +118,13 @@ class StationRoutes:
         spec = self._written.get(route.key)
         return spec is not None and spec.is_derived
 
-    def add(self, spec: RouteSpec, *, replaces: str = "") -> None:
-        """Add a route and keep it, in place of the added one of its name, or to its NetID.
+    def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> None:
+        """Add a route, in place of the added one of its name, or to its NetID.
 
         Args:
             spec: The route.
             replaces: Name or NetID of one more that it takes the place of.
+            is_kept: Whether it is there again after a new start.
 
         Raises:
             ControlError: there cannot be such a route, or a route of the plant file is before it.
@@ -129,16 +134,12 @@ class StationRoutes:
         known_as = {spec.name, spec.virtual or spec.net_id, replaces} - {""}
         old = [each for each in self._added if _names(each) & known_as]
         self._check(spec, len(self._added) - len(old))
-        left = [each for each in self._added if each not in old]
         route = self._route(spec, Origin.ADDED)
         if route.key in self._written:
             raise ControlError(_hidden_by(self._written[route.key].name))
-        self._store.save([*left, spec])
-        for each in old:
-            self._forget(each)
-        self._router.add_route(route)
-        self._added = [*left, spec]
-        self._close_unused()
+        left = {each: kept for each, kept in self._added.items() if each not in old}
+        self._change({**left, spec: is_kept}, gone=old)
+        self.router.add_route(route)
 
     def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
         """Remove an added route by its name or NetID, and return it.
@@ -156,12 +157,16 @@ class StationRoutes:
         ]
         if not found:
             raise ControlError(self._why_not_removed(text))
-        left = [each for each in self._added if each is not found[0]]
-        self._store.save(left)
-        self._added = left
-        self._forget(found[0])
-        self._close_unused()
+        left = {each: kept for each, kept in self._added.items() if each != found[0]}
+        self._change(left, gone=found[:1])
         return found[0]
+
+    def _change(self, added: dict[RouteSpec, bool], gone: Sequence[RouteSpec]) -> None:
+        self._store.save([each for each, is_kept in added.items() if is_kept])
+        self._added = added
+        for each in gone:
+            self._forget(each)
+        self._close_unused()
 
     def _take_spec(self) -> None:
         for spec in self._spec.routes:
@@ -174,22 +179,21 @@ class StationRoutes:
 
     def _take(self, spec: RouteSpec, origin: Origin) -> Route:
         route = self._route(spec, origin)
-        self._router.add_route(route)
+        self.router.add_route(route)
         return route
 
     def _route(self, spec: RouteSpec, origin: Origin) -> Route:
         try:
-            hop = self._open_hop(spec.hop)
-            return make_route(spec, hop, origin)
+            return to_route(spec, self._open_hop(spec.hop), origin)
         except ValueError as exc:
             raise ControlError(f"route {spec.name!r}: {exc}") from None
 
     def _forget(self, spec: RouteSpec) -> None:
         """Take an added route out of the table, unless one of the plant file has its place."""
-        for route in list(self._router.table):
+        for route in list(self.router.table):
             same = route.origin is Origin.ADDED and route.name == spec.name
             if same and str(route.net_id) == (spec.virtual or spec.net_id):
-                self._router.remove_route(*route.key)
+                self.router.remove_route(*route.key)
 
     def _check(self, spec: RouteSpec, others: int) -> None:
         if others >= MAX_ADDED:
@@ -203,11 +207,11 @@ class StationRoutes:
         if not any(net_id) and spec.octets:
             raise ControlError(f"NetID {net_id} stands for any; a default route matches 0 octets")
         prefix = net_id[: spec.octets]
-        if spec.octets and any(own.startswith(prefix) for own in self._router.net_ids):
+        if spec.octets and any(own.startswith(prefix) for own in self.router.net_ids):
             shown = ".".join(map(str, prefix)) + ".x" * (_WHOLE - spec.octets)
             raise ControlError(f"NetID {shown} is one of this station itself")
-        for route in self._router.table:
-            if route.origin is Origin.STATIC and _takes_all(route, net_id, spec.octets):
+        for route in self.router.table:
+            if route.origin is Origin.STATIC and _takes(route, net_id, spec.octets):
                 raise ControlError(_hidden_by(route.name))
 
     def _is_at(self, spec: RouteSpec, door: str, address: str) -> bool:
@@ -217,7 +221,7 @@ class StationRoutes:
         return door in {"", hop.door} and address in {"", hop.connection}
 
     def _why_not_removed(self, text: str) -> str:
-        for route in self._router.table:
+        for route in self.router.table:
             if text in {route.name, str(route.net_id)}:
                 if route.origin is Origin.STATIC:
                     where = "follows from the ports" if self.is_derived(route) else "is"
@@ -228,26 +232,11 @@ class StationRoutes:
         return f"no route {text!r} was added; there are: {names}"
 
 
-def make_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:
-    """Return the route that *spec* describes; raise ValueError if there cannot be one."""
-    net_id = NetId.parse(spec.net_id)
-    return Route(
-        net_id=NetId.parse(spec.virtual) if spec.virtual else net_id,
-        name=spec.name,
-        hop=hop,
-        origin=origin,
-        octets=spec.octets,
-        is_unidirectional=spec.is_unidirectional,
-        real=net_id if spec.virtual else None,
-        timeout_ns=spec.timeout_ms * _MS,
-        is_probed=spec.is_probed,
-        router=NetId.parse(spec.router) if spec.router else None,
-    )
-
-
-def _takes_all(route: Route, net_id: NetId, octets: int) -> bool:
-    """Tell whether a route of the plant file leaves nothing for another one."""
-    return route.octets == octets and route.net_id[:octets] == net_id[:octets]
+def _takes(route: Route, net_id: NetId, octets: int) -> bool:
+    """Tell whether a route of the plant file is for all that another one would be for."""
+    if not octets:
+        return not route.octets
+    return 0 < route.octets <= octets and net_id.startswith(route.net_id[: route.octets])
 
 
 def _hidden_by(name: str) -> str:

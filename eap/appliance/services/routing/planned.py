@@ -18,24 +18,22 @@ _IP_SCHEMES = ("udp", "tcp")
 
 
 def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
-    """Return the router of a station, with its routes and the service that every router has."""
+    """Return the router of a station, with the service that every router has, and no routes."""
     net_id = NetId.parse(station.net_id)
     net_ids = [NetId.parse(port.net_id) for port in station.ports]
     router = StationRouter(station.name, net_id, net_ids, access=access_of(station, routing))
     router.add_service(net_id, SystemService(station.name))
-    for route in routing.routes:
-        router.add_route(to_route(route))
     return router
 
 
-def to_route(spec: RouteSpec) -> Route:
-    """Return a route of the plant file, whose door may not be there yet."""
+def to_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:
+    """Return the route that *spec* describes, by *hop*; raise ValueError if there can be none."""
     net_id = NetId.parse(spec.net_id)
     return Route(
         NetId.parse(spec.virtual) if spec.virtual else net_id,
         spec.name,
-        to_way(spec.hop),
-        Origin.STATIC,
+        hop,
+        origin,
         spec.octets,
         spec.is_unidirectional,
         real=net_id if spec.virtual else None,

@@ -12,8 +12,10 @@ from eap.codec.amsdiscovery import (
     Tag,
     decode_discovery,
     decode_text,
+    decode_version,
     encode_discovery,
     encode_text,
+    encode_version,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
 from eap.ids import NetId
@@ -96,3 +98,23 @@ def test_texts() -> None:
 def test_too_long_a_tag_is_refused() -> None:
     with pytest.raises(CodecError):
         encode_discovery(HEADER, [(1, bytes(0x10000))])
+
+
+@pytest.mark.parametrize(
+    ("text", "octets", "read"),
+    [
+        ("3.1.4024", b"\3\1\xb8\x0f", "3.1.4024"),
+        ("0.2", b"\0\2\0\0", "0.2.0"),
+        ("1.2.3.dev4", b"\1\2\3\0", "1.2.3"),
+        ("1.x.700000", b"\1\0\xff\xff", "1.0.65535"),
+        ("2026.1", b"\xff\1\0\0", "255.1.0"),
+        ("", b"\0\0\0\0", "0.0.0"),
+    ],
+)
+def test_versions(text, octets, read) -> None:
+    assert encode_version(text) == octets
+    assert decode_version(octets) == read
+
+
+def test_a_version_of_another_length_is_none() -> None:
+    assert decode_version(b"\1\2\3") == ""

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import socket
+from importlib.metadata import version
 
 import pytest
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
-from eap.codec.amsdiscovery import DiscoveryHeader, Tag, decode_discovery, encode_discovery
+from eap.codec.ads import AdsError
+from eap.codec.amsdiscovery import (
+    DiscoveryHeader,
+    Tag,
+    decode_discovery,
+    encode_discovery,
+    encode_version,
+)
 from eap.ids import NetId
 from tests.support.vectors import load
 
@@ -29,11 +36,29 @@ def sock():
         yield bound
 
 
+class Desk:
+    """Stands for who decides on routes."""
+
+    def __init__(self, result=AdsError.NONE):
+        self.result = result
+        self.asked = []
+
+    def take(self, question, sender, *, is_this_host):
+        self.asked.append((question.find(Tag.ROUTE_NAME), sender, is_this_host))
+        return self.result
+
+
+def discovery(sock, *routers, desk=None, refused=None):
+    refuse = [].append if refused is None else refused.append
+    return AmsDiscovery(sock, routers or [LEFT], desk or Desk(), refuse)
+
+
 def test_every_router_of_the_address_names_itself(sock):
-    answers = AmsDiscovery(sock, [LEFT, RIGHT], [].append).answers_to(SERVER_INFO)
+    answers = discovery(sock, LEFT, RIGHT).answers_to(SERVER_INFO, "10.0.0.5")
+    release = encode_version(version("eap-appliance")).hex()
     assert answers[0].hex() == (
-        "03661471" + "00000000" + "01000080" + "010101010101" + "1027" + "01000000"
-        "0500" + "0500" + "6c65667400"
+        "03661471" + "00000000" + "01000080" + "010101010101" + "1027" + "02000000"
+        "0500" + "0500" + "6c65667400" + "0300" + "0400" + release
     )  # fmt: skip
     assert [decode_discovery(each).header.net_id for each in answers] == [
         LEFT.net_id,
@@ -43,20 +68,24 @@ def test_every_router_of_the_address_names_itself(sock):
 
 def test_the_number_of_the_question_comes_back(sock):
     header = DiscoveryHeader(0, 0xDEADBEEF, 1, NOTHING, 0)
-    (answer,) = AmsDiscovery(sock, [LEFT], [].append).answers_to(encode_discovery(header))
+    (answer,) = discovery(sock).answers_to(encode_discovery(header), "10.0.0.5")
     assert decode_discovery(answer).header.invoke_id == 0xDEADBEEF
 
 
-def test_routes_are_refused_and_that_is_said_once(sock, caplog):
-    discovery = AmsDiscovery(sock, [LEFT, RIGHT], [].append)
-    with caplog.at_level(logging.WARNING):
-        (answer,) = discovery.answers_to(ADD_ROUTE)
-        discovery.answers_to(ADD_ROUTE)
+@pytest.mark.parametrize(
+    ("sender", "is_this_host"), [("127.0.0.1", True), ("127.9.9.9", True), ("10.0.0.5", False)]
+)
+def test_a_route_is_decided_on_and_answered_once(sock, sender, is_this_host):
+    desk = Desk(AdsError.ACCESS)
+    (answer,) = discovery(sock, LEFT, RIGHT, desk=desk).answers_to(ADD_ROUTE, sender)
     read = decode_discovery(answer)
     assert read.header.service == 0x8000_0006
-    assert read.find(Tag.RESULT) == b"\1\7\0\0"
-    (line,) = caplog.messages
-    assert line == "route 'myroute' is not added: who asks is answered without"
+    assert read.find(Tag.RESULT) == b"\4\7\0\0"
+    assert desk.asked == [(b"myroute\0", sender, is_this_host)]
+
+
+def test_too_many_routes_are_not_answered(sock):
+    assert discovery(sock, desk=Desk(None)).answers_to(ADD_ROUTE, "10.0.0.5") == []
 
 
 @pytest.mark.parametrize(
@@ -70,14 +99,14 @@ def test_routes_are_refused_and_that_is_said_once(sock, caplog):
     ],
 )
 def test_nothing_is_said_to_what_is_no_question(sock, data):
-    assert AmsDiscovery(sock, [LEFT], [].append).answers_to(data) == []
+    assert discovery(sock).answers_to(data, "10.0.0.5") == []
 
 
 def test_datagrams_are_answered_to_their_senders(sock):
     refused = []
 
     async def run():
-        AmsDiscovery(sock, [LEFT], refused.append).watch()
+        discovery(sock, refused=refused).watch()
         loop = asyncio.get_running_loop()
         with (
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
@@ -99,3 +128,22 @@ def test_datagrams_are_answered_to_their_senders(sock):
 
     asyncio.run(run())
     assert refused == [Refusal.AMS_DISCOVERY] * 2
+
+
+def test_what_comes_to_a_network_is_answered_from_the_address(sock):
+    async def run():
+        loop = asyncio.get_running_loop()
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as many,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
+        ):
+            many.bind(("127.0.0.2", 0))
+            discovery(sock).watch(many)
+            client.setblocking(False)
+            client.sendto(SERVER_INFO, many.getsockname())
+            data, sender = await asyncio.wait_for(loop.sock_recvfrom(client, 100), 5)
+            loop.remove_reader(many.fileno())
+        assert decode_discovery(data).header.net_id == LEFT.net_id
+        assert sender == sock.getsockname()
+
+    asyncio.run(run())

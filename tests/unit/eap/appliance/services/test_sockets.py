@@ -10,9 +10,13 @@ from contextlib import ExitStack
 import pytest
 from msgspec.structs import replace
 
+from eap.aoe.spec import RoutingSpec
 from eap.appliance.discards import DiscardCounters
 from eap.appliance.handover import Handover
+from eap.appliance.route_store import RouteStore
+from eap.appliance.services.routing.planned import to_way
 from eap.appliance.services.sockets import open_doors
+from eap.appliance.services.station_routes import StationRoutes
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EAP_PORT
 from tests.support import aoe
@@ -43,7 +47,17 @@ def script_on(tmp_path):
                 ours, theirs = socket.socketpair()
                 resources.enter_context(ours)
                 resources.enter_context(theirs)
-                doors = open_doors(handover, routers, counters, ours, resources)
+                routes = {
+                    name: StationRoutes(
+                        router,
+                        RoutingSpec(),
+                        RouteStore("plant", name),
+                        open_hop=to_way,
+                        close_unused=lambda: None,
+                    )
+                    for name, router in routers.items()
+                }
+                doors = open_doors(handover, routers, routes, counters, ours, resources)
                 serving = [
                     asyncio.ensure_future(each.serve()) for each in (*routers.values(), *doors)
                 ]

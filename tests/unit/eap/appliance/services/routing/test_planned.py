@@ -15,23 +15,25 @@ from eap.ids import NetId
 from tests.unit.eap.appliance.conftest import eap_port, left
 
 UDP = HopSpec(DoorKind.UDP, "eap0", "127.0.1.2:34980")
+WAY = Way("udp:eap0", "127.0.1.2:34980")
 THERE = NetId.parse("5.1.2.3.1.1")
 
 
-def test_route_is_one_of_the_plant_file():
+def test_route_has_all_of_its_specification():
     spec = RouteSpec(name="plc", net_id=str(THERE), hop=UDP, timeout_ms=700, router="7.7.7.7.1.1")
-    assert to_route(spec) == Route(
+    assert to_route(spec, WAY, Origin.ADDED) == Route(
         THERE,
         "plc",
-        Way("udp:eap0", "127.0.1.2:34980"),
-        Origin.STATIC,
+        WAY,
+        Origin.ADDED,
         timeout_ns=700_000_000,
         router=NetId.parse("7.7.7.7.1.1"),
     )
 
 
 def test_virtual_net_id_is_the_one_that_is_known_here():
-    route = to_route(RouteSpec(name="plc", net_id=str(THERE), hop=UDP, virtual="6.6.6.6.1.1"))
+    spec = RouteSpec(name="plc", net_id=str(THERE), hop=UDP, virtual="6.6.6.6.1.1")
+    route = to_route(spec, WAY, Origin.STATIC)
     assert (str(route.net_id), route.real) == ("6.6.6.6.1.1", THERE)
 
 
@@ -58,10 +60,8 @@ def test_addresses_of_the_station_are_this_host():
     assert not access.grants(way, THERE, THERE, 1).may_read
 
 
-def test_router_has_the_routes_and_answers_probes():
-    spec = RouteSpec(name="plc", net_id=str(THERE), hop=UDP)
-    router = make_router(left(), RoutingSpec(routes=(spec,)))
-    assert [route.name for route in router.table] == ["plc"]
+def test_router_knows_its_net_ids_and_answers_probes():
+    router = make_router(left(), RoutingSpec())
     assert {str(each) for each in router.net_ids} == {"1.1.1.1.1.1", "1.2.3.4.5.1"}
 
     async def script():
