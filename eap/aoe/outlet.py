@@ -16,6 +16,7 @@ class Outlet:
     def __init__(self, doors: Iterable[Door]) -> None:
         self._doors: dict[str, Door] = {}
         self._number = 0
+        self._places: dict[Way, str] = {}
         for door in doors:
             self.add(door)
 
@@ -41,6 +42,18 @@ class Outlet:
     def doors(self) -> Mapping[str, Door]:
         """All doors by name."""
         return self._doors
+
+    def note_place(self, hop: Way, connection: str) -> None:
+        """Know that what comes from *hop*, which has a name, comes by *connection*."""
+        self._places[hop] = connection
+
+    def is_from(self, hop: Way, way: Way) -> bool:
+        """Say whether what comes by *way* may come from *hop*."""
+        if hop == way:
+            return True
+        if hop.door != way.door:
+            return False
+        return self._doors[way.door].is_shared or self._places.get(hop) == way.connection
 
     def reply(self, way: Way, packet: bytes) -> Reply:
         """Return how *packet* goes back by *way*."""

@@ -77,7 +77,9 @@ class Passage:
         """
         if header.command == AmsCommand.NOTIFICATION:
             body = data[AmsHeader.SIZE :]
-            replies = self.notifier.hand_on(header, body, lambda hop: self._is_from(hop, way))
+            replies = self.notifier.hand_on(
+                header, body, lambda hop: self._outlet.is_from(hop, way)
+            )
             if replies:
                 return list(replies)
         found = self._let_on(header, data, way, now_ns)
@@ -272,13 +274,10 @@ class Passage:
     def _is_answer(self, header: AmsHeader, data: bytes, way: Way, pending: Pending) -> bool:
         return (
             pending.route is not None
-            and self._is_from(pending.route.hop, way)
+            and self._outlet.is_from(pending.route.hop, way)
             and header.command == pending.header.command
             and data[:_HALF] == pending.onward[_HALF:]
         )
-
-    def _is_from(self, hop: Way, way: Way) -> bool:
-        return hop == way or (hop.door == way.door and self._outlet.doors[way.door].is_shared)
 
     def _send_back(
         self, pending: Pending, way: Way, packet: bytes, error_code: int, now_ns: int,

@@ -7,7 +7,7 @@ answers again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
@@ -109,17 +109,19 @@ class Prober:
         """Say whether a response is for the prober."""
         return header.target_port == PROBE_PORT and header.target == self._net_id
 
-    def take_answer(self, header: AmsHeader, way: Way, now_ns: int, *, is_shared: bool) -> None:
+    def take_answer(
+        self, header: AmsHeader, way: Way, now_ns: int, is_from: Callable[[Way, Way], bool]
+    ) -> None:
         """Note an answer: its hop is alive.
 
         Args:
             header: Of the answer.
             way: That it came by.
             now_ns: The time on the monotonic clock.
-            is_shared: Whether all answers of the door come by one connection.
+            is_from: Says of a hop and a way whether it may come from there.
         """
         hop = self._by_number.get(header.invoke_id)
-        if hop is None or hop.door != way.door or not (is_shared or hop == way):
+        if hop is None or not is_from(hop, way):
             return
         self.hear(hop, now_ns)
         known = self._hops[hop]

@@ -94,6 +94,10 @@ class Router:
         self._outlet.remove(name)
         return actions
 
+    def hop_is_at(self, door: str, address: str, connection: str) -> None:
+        """Take what comes by *connection* for what comes from the hop that is named *address*."""
+        self._outlet.note_place(Way(door, address), connection)
+
     def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
         """Say whether a packet is for this station or for somebody who waits here.
 
@@ -175,6 +179,10 @@ class Router:
     def is_down(self, hop: Way) -> bool:
         """Say whether a hop is known not to answer now."""
         return self._passage.is_down(hop)
+
+    def is_awaited(self, hop: Way) -> bool:
+        """Say whether an answer from a hop is waited for."""
+        return bool(self._passage.in_flight.on(*hop))
 
     def waiting(self, way: Way) -> int:
         """Return how many requests that came by *way* wait for their answers."""
@@ -275,8 +283,7 @@ class Router:
         prober = self._prober
         if prober is None or not prober.is_answer(header):
             return self._passage.take_answer(header, data, way, now_ns)
-        is_shared = self._outlet.doors[way.door].is_shared
-        prober.take_answer(header, way, now_ns, is_shared=is_shared)
+        prober.take_answer(header, way, now_ns, self._outlet.is_from)
         return []
 
     def _deliver(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from ipaddress import IPv4Address
 from time import monotonic_ns
 
 from eap.aoe.way import Door
@@ -16,15 +17,19 @@ from eap.appliance.services.ams_uplinks import AmsUplinks
 from eap.appliance.services.intake import FrameIntake, watch_channel
 from eap.appliance.services.route_desk import RouteDesk
 from eap.appliance.services.routing.entrance import Entrance
+from eap.appliance.services.routing.link_watch import LinkWatch
 from eap.appliance.services.routing.mailbox_frames import FRAME_OVERHEAD
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake, judge
 from eap.appliance.services.routing.mailbox_stream import LARGEST_FRAME, MailboxStreams
+from eap.appliance.services.routing.segment import Segment, SegmentCarrier
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.station_routes import StationRoutes
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
+from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, NetId
-from eap.net.ethernet import EthernetInterface, packet_batch
+from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
+from eap.net.interface import interface_of
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.pd.spec import StationSpec
@@ -40,7 +45,7 @@ def open_doors(
     counters: DiscardCounters,
     link: socket.socket,
     resources: ExitStack,
-) -> list[TcpDoor | AmsDoor | AmsUplinks]:
+) -> list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch]:
     """Take frames from all sockets of *handover*, as long as the running loop lives.
 
     Args:
@@ -52,7 +57,7 @@ def open_doors(
         resources: Closes what is opened here.
 
     Returns:
-        The listeners for TCP and the connections to others, to be served.
+        The listeners for TCP, the connections to others and the watch over links, to be served.
     """
     return _Sockets(handover, routers, routes, counters, resources).open(link)
 
@@ -75,8 +80,9 @@ class _Sockets:
         self._now_ns = monotonic_ns()
         self._ams_clients = AmsClients()
         self._ams_stations: set[str] = set()
+        self._links: dict[str, list[tuple[StationRouter, str]]] = {}
 
-    def open(self, link: socket.socket) -> list[TcpDoor | AmsDoor | AmsUplinks]:
+    def open(self, link: socket.socket) -> list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch]:
         by_kind: dict[SocketKind, list[SharedSocket]] = {kind: [] for kind in SocketKind}
         for shared in self._handover.sockets:
             by_kind[shared.kind].append(shared)
@@ -88,10 +94,11 @@ class _Sockets:
             self._watch_interface(shared)
         for shared in by_kind[SocketKind.AMS_UDP]:
             self._watch_discovery(shared)
-        doors: list[TcpDoor | AmsDoor | AmsUplinks] = []
+        doors: list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch] = []
         doors += [self._door(shared, link) for shared in by_kind[SocketKind.TCP]]
         doors += [self._ams_door(shared) for shared in by_kind[SocketKind.AMS_TCP]]
         doors += [self._uplinks(station) for station in self._handover.stations]
+        doors.append(LinkWatch(self._links))
         return doors
 
     def _channel(self, shared: SharedSocket) -> UdpChannel:
@@ -112,6 +119,7 @@ class _Sockets:
         for owner in shared.owners:
             door = Door(f"udp:{owner.port}", MAX_UDP_FRAME - FRAME_OVERHEAD, is_hub=True)
             self._routers[owner.station].add_door(door, carrier)
+            self._watch_link(shared.address, owner, door)
         self._take_datagrams(shared.owners, channel, lambda data: False)
         watch_channel(channel)
 
@@ -140,7 +148,7 @@ class _Sockets:
         interface = EthernetInterface(socket.socket(fileno=shared.services_fd), packet_batch())
         self._resources.callback(interface.close)
         intakes: dict[int, FrameIntake] = {}
-        owners: dict[int, dict[str, PortName]] = {}
+        ports: dict[int, dict[PortName, EthernetPort]] = {}
         for owner in shared.owners:
             spec = self._handover.port(owner)
             intake = FrameIntake([owner.station], self._counters, self._now_ns, judge)
@@ -148,15 +156,17 @@ class _Sockets:
                 intake.take, vlan_id=spec.vlan_id, priority=spec.vlan_priority, join=spec.join
             )
             intakes.setdefault(spec.vlan_id, intake)
-            in_vlan = owners.setdefault(spec.vlan_id, {})
-            if owner.station not in in_vlan:
-                in_vlan[owner.station] = owner
-                door = Door(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
-                self._routers[owner.station].add_door(door, ChannelCarrier(port))
+            in_vlan = ports.setdefault(spec.vlan_id, {})
+            if owner.station not in {each.station for each in in_vlan}:
+                in_vlan[owner] = port
         for vlan_id, intake in intakes.items():
-            entrance = self._entrance("ethernet", [*owners[vlan_id].values()])
-            mailbox = MailboxIntake(entrance, interface.is_for_many)
-            intake.mailbox = mailbox.take
+            segment = Segment(self._entrance("ethernet", [*ports[vlan_id]]), interface.address)
+            intake.mailbox = MailboxIntake(segment, interface.is_for_many).take
+            for owner, port in ports[vlan_id].items():
+                router = self._routers[owner.station]
+                door = Door(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
+                router.add_door(door, SegmentCarrier(segment, port, router.net_id))
+                self._links.setdefault(shared.address, []).append((router, door.name))
         watch_channel(port)
 
     def _watch_discovery(self, shared: SharedSocket) -> None:
@@ -192,11 +202,12 @@ class _Sockets:
 
     def _door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
         refuse = self._refuser(_stations_of(shared))
-        streams = MailboxStreams(self._entrance("tcp", shared.owners), refuse)
+        streams = MailboxStreams(self._entrance("tcp", shared.owners), refuse, shared.address)
         for owner in shared.owners:
             room = LARGEST_FRAME - FRAME_OVERHEAD
             door = Door(f"tcp:{owner.port}", room, is_stream=True, is_hub=True)
             self._routers[owner.station].add_door(door, streams)
+            self._watch_link(shared.address, owner, door)
         return TcpDoor(
             self._socket(shared),
             tuple(owner for owner in shared.owners if self._takes_tcp(owner)),
@@ -204,6 +215,14 @@ class _Sockets:
             refuse,
             streams,
         )
+
+    def _watch_link(self, address: str, owner: PortName, door: Door) -> None:
+        """Have an eye on the link of the interface with *address*, unless it is this host alone."""
+        if IPv4Address(address).is_loopback or IPv4Address(address).is_unspecified:
+            return
+        with suppress(EnvironmentalError):  # the address has been taken from this machine
+            doors = self._links.setdefault(interface_of(address), [])
+            doors.append((self._routers[owner.station], door.name))
 
     def _socket(self, shared: SharedSocket) -> socket.socket:
         return self._resources.enter_context(socket.socket(fileno=shared.services_fd))

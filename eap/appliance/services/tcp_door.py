@@ -63,7 +63,10 @@ class TcpDoor:
 
     async def serve(self) -> None:
         """Accept until cancelled."""
-        await accept_connections(self._listener, "TCP", self._take)
+        try:
+            await accept_connections(self._listener, "TCP", self._take)
+        finally:
+            await self._mailboxes.close()
 
     def _take(self, connection: socket.socket, peer: str) -> Coroutine[Any, Any, None] | None:
         if self._waiting >= MAX_WAITING:

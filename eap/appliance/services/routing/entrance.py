@@ -10,6 +10,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError
+from eap.ids import NetId
 
 
 class Entrance:
@@ -48,6 +49,33 @@ class Entrance:
         for station, door in self._behind:
             self._fragments.forget(Way(door, connection))
             station.connection_closed(door, connection)
+
+    def has(self, net_id: NetId) -> bool:
+        """Say whether a NetID is of one of the stations."""
+        return any(net_id in station.net_ids for station, _ in self._behind)
+
+    def hop_is_at(self, address: str, connection: str) -> None:
+        """Tell the stations that what comes by *connection* comes from the hop *address*."""
+        for station, door in self._behind:
+            station.hop_is_at(door, address, connection)
+
+    def hop_down(self, address: str, text: str) -> None:
+        """Tell the stations that nothing can go to *address* by this door; *text* says why."""
+        for station, door in self._behind:
+            station.hop_down(door, address, text)
+
+    def hop_up(self, address: str) -> None:
+        """Take back what :meth:`hop_down` said."""
+        for station, door in self._behind:
+            station.hop_up(door, address)
+
+    def is_wanted(self, address: str) -> bool:
+        """Say whether a route of a station leads to *address* by this door."""
+        return any(station.is_wanted(Way(door, address)) for station, door in self._behind)
+
+    def is_awaited(self, address: str) -> bool:
+        """Say whether a station waits for an answer from there."""
+        return any(station.is_awaited(Way(door, address)) for station, door in self._behind)
 
     async def wait_below(self, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait at each station."""

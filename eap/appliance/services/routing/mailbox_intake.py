@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from time import monotonic_ns
+from typing import Protocol
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
 from eap.pd.link import Channel, Origin, OutFrame
+
+
+class WayIn(Protocol):
+    """Where packets of a channel go."""
+
+    def receive(self, data: bytes, connection: str, *, for_all: bool = False) -> None:
+        """Act on a packet that came from the address *connection*."""
 
 
 class MailboxIntake:
@@ -21,7 +28,7 @@ class MailboxIntake:
 
     def __init__(
         self,
-        entrance: Entrance,
+        entrance: WayIn,
         is_for_many: Callable[[memoryview], bool],
     ) -> None:
         self._entrance = entrance

@@ -10,6 +10,7 @@ from eap.appliance.discards import Refusal
 from eap.appliance.services.accepting import connection_name
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
+from eap.appliance.services.routing.uplink import Uplinks
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxHeader
 
@@ -24,16 +25,20 @@ _MAX_UNSENT = 1 << 20
 
 
 class MailboxStreams:
-    """All connections of one listener; the carrier of its door.
+    """All connections of one port, those that came and those to others; the carrier of its door.
 
     Args:
-        entrance: To the stations behind the listener.
+        entrance: To the stations behind the port.
         refuse: Counts a frame that is not taken.
+        source: Own address to connect from; empty for any.
     """
 
-    def __init__(self, entrance: Entrance, refuse: Callable[[Refusal], None]) -> None:
+    def __init__(
+        self, entrance: Entrance, refuse: Callable[[Refusal], None], source: str = ""
+    ) -> None:
         self._entrance = entrance
         self._refuse = refuse
+        self._uplinks = Uplinks(entrance, self._serve_uplink, source)
         self._counters = MailboxCounters()
         self._writers: dict[str, asyncio.StreamWriter] = {}
 
@@ -62,7 +67,10 @@ class MailboxStreams:
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
         """Send packets on a connection; return why not if that cannot be done."""
         writer = self._writers.get(connection)
-        if writer is None or writer.is_closing():
+        if writer is None:
+            frames = [self._counters.frame(connection, packet) for packet in packets]
+            return self._uplinks.send(connection, b"".join(frames))
+        if writer.is_closing():
             return "the connection is closed"
         if writer.transport.get_write_buffer_size() > _MAX_UNSENT:
             writer.transport.abort()
@@ -70,6 +78,18 @@ class MailboxStreams:
         for packet in packets:
             writer.write(self._counters.frame(connection, packet))
         return None
+
+    async def close(self) -> None:
+        """Close the connections to others."""
+        await self._uplinks.close()
+
+    async def _serve_uplink(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str
+    ) -> None:
+        try:
+            await self._take(reader, writer, name)
+        finally:
+            self._entrance.connection_closed(name)
 
     async def _take(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str

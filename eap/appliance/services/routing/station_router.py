@@ -165,6 +165,18 @@ class StationRouter:
         """Say whether a hop is known not to answer now."""
         return self._router.is_down(hop)
 
+    def hop_is_at(self, door: str, address: str, connection: str) -> None:
+        """Take what comes by *connection* for what comes from the hop that is named *address*."""
+        self._router.hop_is_at(door, address, connection)
+
+    def is_wanted(self, hop: Way) -> bool:
+        """Say whether a route leads to a hop."""
+        return any(route.hop == hop for route in self.table)
+
+    def is_awaited(self, hop: Way) -> bool:
+        """Say whether an answer from a hop is waited for."""
+        return self._router.is_awaited(hop)
+
     def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
         """Say whether a packet is for this station or for somebody who waits here."""
         return self._router.expects(header, body, door)

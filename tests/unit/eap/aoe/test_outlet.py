@@ -36,6 +36,19 @@ def test_packets_have_numbers_of_their_own() -> None:
     assert first != second
 
 
+def test_what_comes_from_a_hop() -> None:
+    outlet = Outlet([Door("tcp"), Door("segment"), Door("broker", is_shared=True)])
+    assert outlet.is_from(Way("tcp", "1"), Way("tcp", "1"))
+    assert not outlet.is_from(Way("tcp", "1"), Way("tcp", "2"))
+    assert outlet.is_from(Way("broker", "1"), Way("broker", "2"))
+    assert not outlet.is_from(Way("broker", "1"), Way("tcp", "1"))
+    named = Way("segment", "1.2.3.4.5.6")
+    assert not outlet.is_from(named, Way("segment", "02:00:00:00:00:01"))
+    outlet.note_place(named, "02:00:00:00:00:01")
+    assert outlet.is_from(named, Way("segment", "02:00:00:00:00:01"))
+    assert not outlet.is_from(named, Way("tcp", "02:00:00:00:00:01"))
+
+
 def test_doors_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="two doors 'a'"):
         Outlet([Door("a"), Door("a")])

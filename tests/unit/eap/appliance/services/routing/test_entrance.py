@@ -118,3 +118,25 @@ def test_broken_packet_is_remembered_by_the_first(stations, carrier):
     entrance(*stations).receive(ask("2.2.2.2.2.1:65535", body=b"xx")[:-1], "peer")
     assert carrier.sent == []
     assert [each.record.counts["dropped"] for each in stations] == [1, 0]
+
+
+def test_hops_are_those_of_all_stations(stations, carrier):
+    _, second = stations
+    second.add_route(route("7.7.7.7.1.1"))
+    way_in = entrance(*stations, door="out")
+    assert [way_in.is_wanted(address) for address in ("hop", "other")] == [True, False]
+    assert [way_in.has(NetId.parse(each)) for each in ("2.2.2.2.1.1", "7.7.7.7.1.1")] == [
+        True,
+        False,
+    ]
+    assert not way_in.is_awaited("hop")
+    second.receive(ask(FAR), "door", "peer")
+    assert way_in.is_awaited("hop")
+    way_in.hop_down("hop", "no cable")
+    assert [each.is_down(HOP) for each in stations] == [True, True]
+    way_in.hop_up("hop")
+    assert [each.is_down(HOP) for each in stations] == [False, False]
+    way_in.hop_is_at("hop", "place")
+    second.receive(ask(FAR, invoke_id=2), "door", "peer")
+    way_in.receive(carrier.sent[-1][1].answer(b"far").octets(), "place")
+    assert carrier.sent[-1][1].body == b"far"

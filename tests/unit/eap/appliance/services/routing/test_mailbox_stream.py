@@ -8,10 +8,12 @@ import socket
 import pytest
 
 from eap.aoe.answer import AmsAnswer
-from eap.aoe.way import Door
+from eap.aoe.routes import Route
+from eap.aoe.way import Door, Way
 from eap.appliance.discards import Refusal
 from eap.appliance.services.routing import mailbox_stream
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams
+from eap.ids import NetId
 from tests.support import aoe
 from tests.support.routing import entrance, station, while_serving
 
@@ -118,3 +120,31 @@ def test_client_that_takes_nothing_is_disconnected(monkeypatch):
         raise AssertionError("still connected")
 
     talk(script)
+
+
+def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
+    here, there = station("2.2.2.2.2.1"), station(TARGET)
+    refused: list[Refusal] = []
+    near, far = (MailboxStreams(entrance(each), refused.append) for each in (here, there))
+    here.add_door(Door("door", 2000, is_stream=True), near)
+    there.add_door(Door("door", 2000, is_stream=True), far)
+
+    async def run():
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            listener.setblocking(False)
+            hop = f"127.0.0.1:{listener.getsockname()[1]}"
+            here.add_route(Route(NetId.parse(TARGET), "there", Way("door", hop), is_probed=False))
+            asking = asyncio.ensure_future(here.ask(NetId.parse(TARGET), 0xFFFF, 4, timeout_s=5))
+            connection, _ = await asyncio.get_running_loop().sock_accept(listener)
+            stream = asyncio.ensure_future(far.serve(connection))
+            answer = await asking
+            (name,) = there.record.connections.snapshot()
+            there.add_route(Route(NetId.parse("2.2.2.2.2.1"), "here", name, is_probed=False))
+            back = await there.ask(NetId.parse("2.2.2.2.2.1"), 0xFFFF, 4, timeout_s=5)
+            await near.close()
+            await stream
+            return answer, back
+
+    answers = asyncio.run(while_serving(run(), here, there))
+    assert [each.data for each in answers] == [b"\0\0\0\0\4"] * 2
+    assert refused == []
