@@ -7,6 +7,7 @@ from collections import deque
 import msgspec
 
 from eap.aoe.action import Outcome, Trace
+from eap.aoe.prober import PROBE_PORT, SYSTEM_PORT
 from eap.aoe.routes import RouteKey
 from eap.aoe.traffic import TrafficTable
 from eap.aoe.way import Way
@@ -22,7 +23,7 @@ class Record:
     """The memory of a router.
 
     Attributes:
-        latest: The latest traces, the oldest first.
+        latest: The latest traces, the oldest first; without answers to probes.
         counts: Packets by what became of them.
         connections: What was asked from each, which have not been closed.
         routes: What went by each.
@@ -44,6 +45,8 @@ class Record:
     def enter(self, trace: Trace) -> None:
         """Remember what became of a packet."""
         self.counts[trace.outcome] += 1
+        if _is_life(trace):
+            return
         self.latest.append(trace)
         if trace.outcome is Outcome.ANSWERED and not trace.error_code and not trace.text:
             return
@@ -71,6 +74,18 @@ class Stats(msgspec.Struct, frozen=True):
     routes: int
     counts: dict[Outcome, int]
     missed_traces: int
+
+
+def _is_life(trace: Trace) -> bool:
+    """Say whether a router was told that this one lives, as it is every second."""
+    header = trace.header
+    return (
+        header is not None
+        and header.source_port == PROBE_PORT
+        and header.target_port == SYSTEM_PORT
+        and trace.outcome is Outcome.ANSWERED
+        and not trace.error_code
+    )
 
 
 def describe(header: AmsHeader, way: Way | None = None) -> str:

@@ -15,15 +15,12 @@ from xml.sax.saxutils import escape
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
-from eap.errors import MalformedError
-
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 TCP_IP = "TCP_IP"
 """Type of a route over AMS/TCP."""
 MAX_ROUTES = 10_000
-_LAYOUT = "StaticRoutes"
 _ROOT = "TcConfig"
 _BESIDE = "RemoteConnections"
 
@@ -38,31 +35,27 @@ class StaticRoute(NamedTuple):
     type: str = TCP_IP
 
 
-def decode(xml: str | bytes) -> list[StaticRoute]:
+def parse(xml: str | bytes) -> list[StaticRoute]:
     """Return the routes of a file in their order.
 
     Raises:
-        MalformedError: it is no such file, or one that wants more of its reader than to be read.
+        ValueError: it is no such file, or one that wants more of its reader than to be read.
     """
     try:
         root: Element = ElementTree.fromstring(xml)
     except DefusedXmlException:
-        raise MalformedError(
-            "it declares entities, expected plain elements", layout=_LAYOUT
-        ) from None
+        raise ValueError("it declares entities, expected plain elements") from None
     except (SyntaxError, ValueError, LookupError) as exc:
-        raise MalformedError(f"not XML that can be read: {exc}", layout=_LAYOUT) from None
+        raise ValueError(f"not XML that can be read: {exc}") from None
     if root.tag != _ROOT:
-        raise MalformedError(f"it begins with {root.tag!r}, expected {_ROOT}", layout=_LAYOUT)
+        raise ValueError(f"it begins with {root.tag!r}, expected {_ROOT}")
     found = list(root.iterfind(f"{_BESIDE}/Route"))
     if len(found) > MAX_ROUTES:
-        raise MalformedError(
-            f"it has {len(found)} routes, expected at most {MAX_ROUTES}", layout=_LAYOUT
-        )
+        raise ValueError(f"it has {len(found)} routes, expected at most {MAX_ROUTES}")
     return [_route(each) for each in found]
 
 
-def encode(name: str, net_id: str, routes: Iterable[StaticRoute], *, tcp_port: int) -> str:
+def dump(name: str, net_id: str, routes: Iterable[StaticRoute], *, tcp_port: int) -> str:
     """Return a file with *routes* for the router *name* that has *net_id* and listens there."""
     lines = [
         '<?xml version="1.0" encoding="utf-8"?>',

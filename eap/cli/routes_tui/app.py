@@ -22,6 +22,8 @@ from eap.errors import EapError
 PERIOD_S = 1.0
 """Between two looks."""
 _ALL = "all stations"
+_SCROLLBAR = 1
+"""Columns that one takes when there are more rows than lines."""
 
 
 class RoutesApp(App[None]):
@@ -110,7 +112,9 @@ class RoutesApp(App[None]):
         found = lines(self._view, routers, self._match)
         self._show_head(routers)
         has_station = len(routers) > 1
-        self.query_one(Grid).show_lines(self._view, found, self.size.width, has_station=has_station)
+        self.query_one(Grid).show_lines(
+            self._view, found, self.size.width - _SCROLLBAR, has_station=has_station
+        )
         self._show_detail()
 
     def _show_head(self, routers: list[Router]) -> None:

@@ -28,6 +28,7 @@ from eap.aoe.judge import Limits
 from eap.aoe.judged import AuditEntry
 from eap.aoe.prober import Prober
 from eap.aoe.record import Record, Stats
+from eap.aoe.report import ConnectionReport, RouteReport
 from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
@@ -106,6 +107,14 @@ class StationRouter:
     def record(self) -> Record:
         """What was done: traffic by connection and hop, and the latest traces."""
         return self._router.record
+
+    def report(self, route: Route) -> RouteReport:
+        """Return what is known of one of the routes."""
+        return self._router.report(route)
+
+    def connections(self) -> list[ConnectionReport]:
+        """Return who asks, or asked and is still connected."""
+        return self._router.connections()
 
     def stats(self) -> Stats:
         """Return what is going on, and what was."""

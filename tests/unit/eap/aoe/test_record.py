@@ -22,6 +22,16 @@ def test_what_was_simply_answered_is_no_event() -> None:
     assert (record.counts[Outcome.ANSWERED], record.counts[Outcome.FAILED]) == (3, 1)
 
 
+def test_answers_to_probes_are_counted_only() -> None:
+    record = Record()
+    probe = AmsHeader(NetId.parse("5.1.1.1.1.1"), 10000, NetId.parse("6.1.1.1.1.1"), 1, 4)
+    alive = trace(1, Outcome.ANSWERED, 0)._replace(header=probe)
+    record.enter(alive)
+    record.enter(alive._replace(error_code=6))
+    assert [each.error_code for each in record.latest] == [6]
+    assert record.counts[Outcome.ANSWERED] == 2
+
+
 def test_traces_are_limited() -> None:
     record = Record()
     for number in range(MAX_EVENTS + 3):

@@ -1,0 +1,213 @@
+"""The methods of the control protocol about routes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from time import monotonic_ns
+from typing import Any
+
+from eap.aoe.directory import Directory
+from eap.aoe.routes import Origin
+from eap.aoe.spec import RouteSpec
+from eap.aoe.via import parse_via
+from eap.appliance.control import ErrorCode, near, parameters
+from eap.appliance.control_routes import (
+    Export,
+    ImportRow,
+    RouteRow,
+    RouterRow,
+    RoutesAddParameters,
+    RoutesExportParameters,
+    RoutesImportParameters,
+    RoutesListParameters,
+    RoutesRemoveParameters,
+    RoutesTestParameters,
+    TestResult,
+)
+from eap.appliance.services.route_probe import find_target, probe_target
+from eap.appliance.services.route_rows import RouterView, route_row
+from eap.codec import staticroutes
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.staticroutes import TCP_IP, StaticRoute
+from eap.errors import ControlError, EnvironmentalError
+from eap.ids import NetId
+
+_ANY = NetId(bytes(6))
+"""Stands in a default route."""
+_AMS_TCP = "ams-tcp"
+_USUAL_PORT = f":{AMS_TCP_PORT}"
+
+
+class RouteMethods:
+    """What can be asked about the routers of all stations here.
+
+    Args:
+        views: The routers by the names of their stations.
+        directory: Of the plant.
+    """
+
+    def __init__(self, views: Mapping[str, RouterView], directory: Directory) -> None:
+        self._views = views
+        self._directory = directory
+
+    def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the methods by name."""
+        return {
+            "routes_list": self._list,
+            "routes_add": self._add,
+            "routes_remove": self._remove,
+            "routes_test": self._test,
+            "routes_import": self._import,
+            "routes_export": self._export,
+        }
+
+    def _list(self, params: dict[str, Any]) -> list[RouterRow]:
+        wanted = parameters(params, RoutesListParameters)
+        views = [self._view(wanted.station)] if wanted.station else self._views.values()
+        return [view.row(wanted) for view in views]
+
+    def _add(self, params: dict[str, Any]) -> dict[str, Any]:
+        wanted = parameters(params, RoutesAddParameters)
+        view = self._view(wanted.station)
+        row = self._take(view, wanted)
+        warnings = [text for text in view.warnings() if f"route {row.name} " in text]
+        return {"route": row, "warnings": warnings}
+
+    def _remove(self, params: dict[str, Any]) -> dict[str, RouteRow]:
+        wanted = parameters(params, RoutesRemoveParameters)
+        routes = self._view(wanted.station).routes
+        with _kept():
+            spec = routes.remove(wanted.route, door=wanted.door, address=wanted.address)
+        return {"route": _removed(spec)}
+
+    async def _test(self, params: dict[str, Any]) -> TestResult:
+        wanted = parameters(params, RoutesTestParameters)
+        router = self._view(wanted.station).router
+        target = find_target(router, self._directory, wanted.target)
+        return await probe_target(router, target, wanted.timeout_ms / 1000)
+
+    def _import(self, params: dict[str, Any]) -> list[ImportRow]:
+        wanted = parameters(params, RoutesImportParameters)
+        view = self._view(wanted.station)
+        try:
+            found = staticroutes.parse(wanted.xml)
+        except ValueError as exc:
+            raise ControlError(str(exc), code=ErrorCode.VALUE) from None
+        return [self._import_one(view, route, dry_run=wanted.dry_run) for route in found]
+
+    def _export(self, params: dict[str, Any]) -> Export:
+        view = self._view(parameters(params, RoutesExportParameters).station)
+        routes, left_out = [], []
+        for route in view.router.table:
+            is_plain = route.octets and route.real is None
+            if is_plain and route.hop.door.partition(":")[0] == _AMS_TCP:
+                address = route.hop.connection.removesuffix(_USUAL_PORT)
+                routes.append(StaticRoute(route.name, str(route.net_id), address))
+            else:
+                left_out.append(route.name)
+        router = view.router
+        xml = staticroutes.dump(router.name, str(router.net_id), routes, tcp_port=AMS_TCP_PORT)
+        return Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
+
+    def _import_one(self, view: RouterView, route: StaticRoute, *, dry_run: bool) -> ImportRow:
+        via, reason = f"{_AMS_TCP}:{route.address}", ""
+        wanted = RoutesAddParameters(
+            station=view.router.name, name=route.name, net_id=route.net_id, via=via
+        )
+        if route.type != TCP_IP:
+            reason = f"its type is {route.type!r}, expected {TCP_IP}"
+        elif not route.address or not route.net_id or not route.name:
+            reason = "it lacks Name, NetId or Address"
+        else:
+            try:
+                if dry_run:
+                    self._spec(view, wanted)
+                else:
+                    self._take(view, wanted)
+            except ControlError as exc:
+                reason = str(exc)
+        return ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
+
+    def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
+        spec = self._spec(view, wanted)
+        with _kept():
+            view.routes.add(spec, replaces=wanted.replaces)
+        net_id = NetId.parse(spec.virtual or spec.net_id)
+        route = next(
+            each
+            for each in view.router.table
+            if each.origin is Origin.ADDED and each.net_id == net_id
+        )
+        return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
+
+    def _spec(self, view: RouterView, wanted: RoutesAddParameters) -> RouteSpec:
+        """Return the route that is wanted; raise ControlError if there cannot be one."""
+        try:
+            net_id = self._net_id(wanted)
+            hop = parse_via(
+                wanted.via, net_id, self._directory.stations[wanted.station], self._directory,
+                port=wanted.port,
+            )  # fmt: skip
+        except ValueError as exc:
+            raise ControlError(str(exc), code=ErrorCode.VALUE) from None
+        beside = self._directory.stations.get(wanted.via.partition("/")[0])
+        return RouteSpec(
+            name=wanted.name,
+            net_id=net_id,
+            hop=hop,
+            octets=wanted.octets,
+            router=beside.net_id if beside else "",
+            virtual=wanted.virtual,
+            is_unidirectional=wanted.unidirectional,
+            timeout_ms=wanted.timeout_ms,
+            is_probed=wanted.probed,
+        )
+
+    def _net_id(self, wanted: RoutesAddParameters) -> str:
+        """Return the NetID of a route; raise ValueError if there is none."""
+        stations = self._directory.stations
+        if wanted.net_id:
+            return str(NetId.parse(wanted.net_id))
+        if not wanted.octets:
+            return str(_ANY)
+        if wanted.name in stations:
+            return stations[wanted.name].net_id
+        raise ValueError(
+            f"a NetID is needed: {wanted.name!r} is no station of the plant"
+            f"{near(wanted.name, stations)}"
+        )
+
+    def _view(self, station: str) -> RouterView:
+        try:
+            return self._views[station]
+        except KeyError:
+            reason = f"no station {station!r} here{near(station, self._views)}"
+            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
+
+
+def _removed(spec: RouteSpec) -> RouteRow:
+    kind, port, address = spec.hop.kind, spec.hop.port, spec.hop.address
+    return RouteRow(
+        name=spec.name,
+        net_id=spec.virtual or spec.net_id,
+        octets=spec.octets,
+        door=f"{kind}:{port}" if port else kind,
+        address=address,
+        origin="added",
+        state="down",
+        why="removed",
+        real=spec.net_id if spec.virtual else "",
+        unidirectional=spec.is_unidirectional,
+        timeout_ms=spec.timeout_ms,
+        probed=spec.is_probed,
+    )
+
+
+@contextmanager
+def _kept() -> Iterator[None]:
+    """Refuse what cannot be kept over a restart."""
+    try:
+        yield
+    except EnvironmentalError as exc:
+        raise ControlError(str(exc), code=ErrorCode.UNAVAILABLE) from None

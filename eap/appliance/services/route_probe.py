@@ -1,0 +1,69 @@
+"""A question to another station, and what came of it: how long it took, or what is wrong."""
+
+from __future__ import annotations
+
+from time import monotonic_ns
+
+from eap.aoe.ads_system import SYSTEM_PORT
+from eap.aoe.advice import advise
+from eap.aoe.directory import AmsAddress, Directory
+from eap.appliance.control import ErrorCode
+from eap.appliance.control_routes import TestResult
+from eap.appliance.services.routing.station_router import StationRouter
+from eap.codec.ads import AdsState, AdsStates
+from eap.codec.ams import AmsCommand
+from eap.errors import CodecError, ControlError
+from eap.ids import NetId
+
+_RESULT_SIZE = 4
+"""Octets of an ADS answer before its data."""
+
+
+def find_target(router: StationRouter, directory: Directory, text: str) -> AmsAddress:
+    """Return whom *text* names: a route, a NetID with or without a port, or a name of the plant.
+
+    Raises:
+        ControlError: nobody.
+    """
+    for route in router.table:
+        if text == route.name and route.octets:
+            return AmsAddress(route.net_id, SYSTEM_PORT)
+    try:
+        if text.count(".") == 5 and ":" not in text and "/" not in text:
+            return AmsAddress(NetId.parse(text), SYSTEM_PORT)
+        return directory.find(text)
+    except ValueError as exc:
+        reason = f"{exc}; nor is there a route of that name"
+        raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
+
+
+async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: float) -> TestResult:
+    """Ask *target* for its ADS state by way of *router*, and say what came of it."""
+    found = router.table.find(target.net_id)
+    is_own = target.net_id in router.net_ids
+    route = None if found is None or is_own else found[0]
+    began_ns = monotonic_ns()
+    answer = await router.ask(*target, AmsCommand.READ_STATE, timeout_s=timeout_s)
+    took_us = (monotonic_ns() - began_ns) // 1000
+    report = None if route is None else router.report(route)
+    advice = advise(answer.error_code, target.net_id, report, router.net_id, is_own=is_own)
+    state = _state(answer.data) if not answer.error_code else ""
+    return TestResult(
+        target=str(target),
+        name="" if route is None else route.name,
+        ok=advice.is_reached,
+        rtt_us=took_us if advice.is_reached else None,
+        state=state,
+        error=answer.error_code,
+        text=f"{advice.text}: {state}" if state else advice.text,
+        hint=advice.hint,
+    )
+
+
+def _state(data: bytes) -> str:
+    """Return the ADS state in the answer to ReadState; empty if it tells none."""
+    try:
+        state = AdsStates.decode(data, _RESULT_SIZE).ads_state
+    except CodecError:
+        return ""
+    return AdsState(state).name if state in AdsState._value2member_map_ else f"state {state}"

@@ -1,0 +1,67 @@
+"""Routers of stations with routes that are kept, for tests of what people see of them."""
+
+from __future__ import annotations
+
+from eap.aoe.directory import Directory
+from eap.aoe.spec import (
+    DirectoryPort,
+    DirectoryStation,
+    DoorKind,
+    HopSpec,
+    RouteSpec,
+    RoutingSpec,
+)
+from eap.aoe.way import Door, Way
+from eap.appliance.route_store import RouteStore
+from eap.appliance.services.route_rows import RouterView
+from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.services.routing.system_service import SystemService
+from eap.appliance.services.station_routes import StationRoutes
+from eap.ids import NetId
+from tests.support.routing import KeepingCarrier
+
+DIRECTORY = Directory([
+    DirectoryStation(
+        name, f"127.0.9.{number}.1.1",
+        (DirectoryPort("eap0", False, f"127.0.9.{number}.2.1", f"udp://127.0.9.{number}"),),
+    )
+    for number, name in ((1, "left"), (2, "right"))
+])  # fmt: skip
+RIGHT = RouteSpec(
+    name="right", net_id="127.0.9.2.1.1", hop=HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980"),
+    router="127.0.9.2.1.1", is_derived=True,
+)  # fmt: skip
+
+
+class Left:
+    """Station left: its router has a door by UDP and one by AMS/TCP, and knows station right.
+
+    Attributes:
+        sent: What leaves by any door.
+    """
+
+    def __init__(self) -> None:
+        station = DIRECTORY.stations["left"]
+        net_ids = [NetId.parse(port.net_id) for port in station.ports]
+        net_id = NetId.parse(station.net_id)
+        self.router = StationRouter("left", net_id, net_ids)
+        self.router.add_service(net_id, SystemService("left"))
+        self.carrier = KeepingCarrier()
+        self.router.add_door(Door("udp:eap0", is_hub=True), self.carrier)
+        self.routes = StationRoutes(
+            self.router, RoutingSpec(routes=(RIGHT,)), RouteStore("hall", "left"),
+            open_hop=self._open, close_unused=lambda: None,
+        )  # fmt: skip
+        self.routes.start()
+        self.view = RouterView(self.router, self.routes)
+
+    def _open(self, hop: HopSpec) -> Way:
+        name = f"{hop.kind}:{hop.port or hop.address}"
+        if hop.kind is DoorKind.AMS_TCP and name not in self._doors():
+            self.router.add_door(Door(name, is_stream=True), self.carrier)
+        if name not in self._doors():
+            raise ValueError(f"this station has no door {name}")
+        return Way(name, hop.address)
+
+    def _doors(self) -> object:
+        return self.router._carriers

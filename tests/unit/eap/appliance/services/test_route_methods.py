@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import msgspec
+import pytest
+
+from eap.aoe.routes import Origin
+from eap.appliance.services.route_methods import RouteMethods
+from eap.codec.staticroutes import StaticRoute, dump, parse
+from eap.errors import ControlError, EnvironmentalError
+from tests.support.routeviews import DIRECTORY, Left
+from tests.support.routing import while_serving
+
+PLC = {"station": "left", "name": "plc", "net_id": "5.1.2.3.1.1", "via": "ams-tcp:10.0.0.5"}
+
+
+@pytest.fixture
+def left():
+    return Left()
+
+
+@pytest.fixture
+def ask(left):
+    methods = RouteMethods({"left": left.view}, DIRECTORY).table()
+    return lambda method, **params: methods[f"routes_{method}"](params)
+
+
+def names(left: Left) -> list[str]:
+    return [route.name for route in left.router.table]
+
+
+def refused(ask: Any, method: str, **params: Any) -> tuple[str, str]:
+    with pytest.raises(ControlError) as caught:
+        ask(method, **params)
+    return caught.value.code, str(caught.value)
+
+
+def test_list_of_all_and_of_one(ask):
+    (row,) = ask("list")
+    assert [each.name for each in row.routes] == ["right"]
+    assert ask("list", station="left") == [row]
+    assert refused(ask, "list", station="lefd") == (
+        "unknown_name", "no station 'lefd' here, did you mean left?"
+    )  # fmt: skip
+
+
+def test_add_and_remove(ask, left):
+    answer = ask("add", **PLC, octets=6, timeout_ms=900, unidirectional=True, probed=False)
+    row = answer["route"]
+    assert (row.name, row.door, row.address, row.origin) == (
+        "plc", "ams-tcp:10.0.0.5:48898", "10.0.0.5:48898", "added"
+    )  # fmt: skip
+    assert answer["warnings"] == []
+    (route,) = (each for each in left.router.table if each.name == "plc")
+    assert (route.origin, route.octets, route.timeout_ns) == (Origin.ADDED, 6, 900_000_000)
+    assert (route.is_unidirectional, route.is_probed) == (True, False)
+    assert names(Left()) == ["right", "plc"]  # it is kept
+    removed = ask("remove", station="left", route="plc")["route"]
+    assert (removed.name, removed.net_id, removed.door) == ("plc", "5.1.2.3.1.1", "ams-tcp")
+    assert names(left) == ["right"]
+
+
+def test_route_of_the_plant_needs_no_net_id(ask, left):
+    ask("add", station="left", name="right", via="udp:127.0.9.9", octets=6)
+    assert str(left.routes.added[0].net_id) == "127.0.9.2.1.1"
+    ask("add", station="left", name="others", via="right/eap0", octets=0)
+    assert left.routes.added[1].router == "127.0.9.2.1.1"
+    code, text = refused(ask, "add", station="left", name="rigth", via="udp:127.0.9.9")
+    assert code == "value"
+    assert text == "a NetID is needed: 'rigth' is no station of the plant, did you mean right?"
+
+
+def test_replaced_route_goes(ask, left):
+    ask("add", **PLC)
+    ask("add", **(PLC | {"name": "press", "net_id": "5.1.2.4.1.1"}), replaces="plc")
+    assert names(left) == ["right", "press"]
+
+
+def test_what_speaks_against_a_route_is_told(ask):
+    other = {"station": "left", "name": "other", "net_id": "127.0.9.2.1.1", "octets": 5}
+    answer = ask("add", **other, via="udp:127.0.9.9")
+    assert msgspec.to_builtins(answer["route"])["name"] == "other"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"net_id": "5.1.2"}, "is not an AMS NetID"),
+        ({"via": "nowhere"}, "neither a station of the plant nor one of"),
+        ({"via": "ethernet:02:00:00:00:00:09"}, "no EAP port here is on ethernet"),
+        ({"net_id": "127.0.9.1.1.1"}, "is one of this station itself"),
+        ({"net_id": "127.0.9.2.1.1"}, "of the plant file is for the same NetIDs"),
+        ({"virtual": "x"}, "is not an AMS NetID"),
+        ({"via": "mqtt:line"}, "has no door mqtt:line"),
+    ],
+)
+def test_routes_that_cannot_be_are_refused(ask, left, change, reason):
+    assert reason in refused(ask, "add", **(PLC | change))[1]
+    assert names(left) == ["right"]
+
+
+def test_remove_of_what_was_not_added(ask):
+    assert refused(ask, "remove", station="left", route="right")[0] == "refused"
+    assert "no route 'x' was added" in refused(ask, "remove", station="left", route="x")[1]
+
+
+def test_what_cannot_be_kept_is_refused(ask, left, monkeypatch):
+    def fail(_):
+        raise EnvironmentalError("disk full")
+
+    monkeypatch.setattr(left.routes._store, "save", fail)
+    assert refused(ask, "add", **PLC) == ("unavailable", "disk full")
+
+
+def test_virtual_routes_are_told_by_their_net_ids_here(ask):
+    ask("add", **PLC, virtual="9.9.9.9.1.1")
+    removed = ask("remove", station="left", route="9.9.9.9.1.1")["route"]
+    assert (removed.net_id, removed.real) == ("9.9.9.9.1.1", "5.1.2.3.1.1")
+
+
+def test_test_asks(ask, left):
+    found = asyncio.run(
+        while_serving(ask("test", station="left", target="left", timeout_ms=200), left.router)
+    )
+    assert (found.ok, found.state) == (True, "RUN")
+
+
+def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
+    file = [
+        StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
+        StaticRoute("old", "5.1.2.4.1.1", "3", "PROFIBUS"),
+        StaticRoute("bare", "5.1.2.5.1.1", ""),
+        StaticRoute("wrong", "5.1.2", "10.0.0.6"),
+    ]
+    xml = dump("x", "1.1.1.1.1.1", file, tcp_port=48898)
+    dry = ask("import", station="left", xml=xml, dry_run=True)
+    assert names(left) == ["right"]
+    rows = ask("import", station="left", xml=xml)
+    assert rows == dry
+    assert [(row.name, bool(row.reason)) for row in rows] == [
+        ("plc", False), ("old", True), ("bare", True), ("wrong", True)
+    ]  # fmt: skip
+    assert rows[0].via == "ams-tcp:10.0.0.5"
+    assert rows[1].reason == "its type is 'PROFIBUS', expected TCP_IP"
+    assert names(left) == ["right", "plc"]
+    code, text = refused(ask, "import", station="left", xml="<a/>")
+    assert (code, text) == ("value", "it begins with 'a', expected TcConfig")
+
+
+def test_export_holds_ams_tcp_and_names_the_rest(ask):
+    ask("add", **PLC)
+    ask("add", **(PLC | {"name": "behind", "net_id": "5.1.2.4.1.1", "via": "ams-tcp:plc:1000"}))
+    ask("add", **(PLC | {"name": "nat", "net_id": "5.1.2.5.1.1", "virtual": "9.9.9.9.1.1"}))
+    found = ask("export", station="left")
+    assert found.left_out == ["right", "nat"]
+    assert parse(found.xml) == [
+        StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
+        StaticRoute("behind", "5.1.2.4.1.1", "plc:1000"),
+    ]
+    assert ask("import", station="left", xml=found.xml)[1].reason == ""
