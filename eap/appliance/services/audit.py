@@ -12,7 +12,7 @@ import fcntl
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -103,19 +103,18 @@ class Audit:
             await asyncio.sleep(_TELL_AFTER_S)
             self.tell_skipped()
 
-    def write(self, station: str, entries: Iterable[AuditEntry]) -> None:
+    def write(self, station: str, entry: AuditEntry) -> None:
         """Write down what a station did, or refused."""
+        client = self._client(station, entry.way)
+        door = self._door(station, entry.way.door)
+        head = self._head(station, entry)
+        now = self._clock()
         lines = []
-        for entry in entries:
-            client = self._client(station, entry.way)
-            door = self._door(station, entry.way.door)
-            head = self._head(station, entry)
-            now = self._clock()
-            for each in entry.operations:
-                if client.take(now) and door.take(now):
-                    lines.append(head | _words(each))
-                else:
-                    client.skipped += 1
+        for each in entry.operations:
+            if client.take(now) and door.take(now):
+                lines.append(head | _words(each))
+            else:
+                client.skipped += 1
         if lines:
             self._append(lines)
 

@@ -13,19 +13,25 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
+from eap.aoe.directory import Directory
 from eap.appliance.discards import DiscardCounters
 from eap.appliance.handover import (
     NO_DESCRIPTOR,
     Handover,
+    SocketKind,
     tell_ready,
 )
 from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.services.ams_methods import AmsMethods
+from eap.appliance.services.audit import Audit
 from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.bus_methods import Buses
@@ -38,10 +44,12 @@ from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
 from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
+from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.segment_link import SegmentLink
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.status import ProcessMeter, appliance_status
 from eap.appliance.station_image import StationImage
+from eap.appliance.store import Store
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.ids import NetId
 from eap.net import realtime
@@ -60,6 +68,7 @@ class Services:
         self._handover = handover
         self._resources = resources
         self._folder = ApplianceFolder(Path(handover.folder))
+        self._directory = Directory(handover.directory)
         self._names = [station.name for station in handover.stations]
         self._counters = resources.enter_context(
             DiscardCounters(self._folder.discards("services"), self._names)
@@ -85,6 +94,7 @@ class Services:
             self._resources,
         )
         brokers = open_mqtt_doors(self._handover.routing, devices.routers)
+        audit = self._audit(devices.routers)
         buses = self._buses(link, devices)
         methods = self._methods(images, buses, devices)
         server = ControlServer(methods, buses)
@@ -92,6 +102,7 @@ class Services:
             tasks = [group.create_task(server.serve(self._listener))]
             tasks += [group.create_task(door.serve()) for door in (*doors, *brokers)]
             tasks.append(group.create_task(devices.serve()))
+            tasks.append(group.create_task(audit.serve()))
             watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
             tasks.append(group.create_task(watch.run()))
             tell_ready(self._handover.ready_fd, {})
@@ -150,8 +161,24 @@ class Services:
             images,
             status=status,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
-            more=DeviceMethods(devices.by_station, self._handover.plant_file).table(),
+            more=DeviceMethods(devices.by_station, self._handover.plant_file).table()
+            | AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
         )
+
+    def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:
+        audit = Audit(Store(self._handover.plant).path / "audit.jsonl", self._directory)
+        for name, router in routers.items():
+            router.on_audit.append(partial(audit.write, name))
+        return audit
+
+    def _ams_addresses(self) -> dict[str, str]:
+        """Return where stations are reached by AMS/TCP; the first of several addresses."""
+        found: dict[str, str] = {}
+        for shared in self._handover.sockets:
+            if shared.kind is SocketKind.AMS_TCP:
+                for owner in shared.owners:
+                    found.setdefault(owner.station, shared.address)
+        return found
 
     def _buses(self, link: EngineLink, devices: Devices) -> Buses:
         handover = self._handover

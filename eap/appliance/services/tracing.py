@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 from msgspec.structs import replace
 
 from eap.aoe.access import LOCAL
-from eap.aoe.ads_operation import OperationOutcome, ReadState, ReadWrite
+from eap.aoe.ads_operation import Operation, OperationOutcome, ReadState, ReadWrite
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.answer import AmsAnswer
@@ -111,7 +111,7 @@ async def ask_one(
     station: Station,
     target: NetId,
     port: int,
-    operation: ReadState | ReadWrite,
+    operation: Operation,
     timeout_s: float,
 ) -> OperationOutcome:
     """Return how one operation came out."""

@@ -11,6 +11,7 @@ from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.routing.system_service import SystemService
+from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import StationSpec
 
@@ -22,7 +23,7 @@ def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
     net_id = NetId.parse(station.net_id)
     net_ids = [NetId.parse(port.net_id) for port in station.ports]
     router = StationRouter(station.name, net_id, net_ids, access=access_of(station, routing))
-    router.add_service(net_id, SystemService(station.name))
+    router.add_service(net_id, Whereabouts(router, SystemService(station.name)))
     return router
 
 

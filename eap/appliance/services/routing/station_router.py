@@ -28,7 +28,7 @@ from eap.aoe.judge import Limits
 from eap.aoe.judged import AuditEntry
 from eap.aoe.prober import Prober
 from eap.aoe.record import Record, Stats
-from eap.aoe.report import ConnectionReport, RouteReport
+from eap.aoe.report import ConnectionReport, Location, RouteReport
 from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
@@ -185,6 +185,10 @@ class StationRouter:
     def is_awaited(self, hop: Way) -> bool:
         """Say whether an answer from a hop is waited for."""
         return self._router.is_awaited(hop)
+
+    def locate(self, header: AmsHeader, way: Way) -> Location:
+        """Say where a request would go that came by *way*."""
+        return self._router.locate(header, way)
 
     def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
         """Say whether a packet is for this station or for somebody who waits here."""

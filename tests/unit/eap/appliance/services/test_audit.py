@@ -71,7 +71,7 @@ def lines(audit: Audit) -> list[dict[str, Any]]:
 
 
 def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
-    audit.write("island-01", [entry(result=0x706)])
+    audit.write("island-01", entry(result=0x706))
     assert lines(audit) == [
         {
             "time": "2023-11-14T22:13:20.250+00:00",
@@ -109,22 +109,22 @@ def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
     ],
 )
 def test_what_was_to_be_done(audit: Audit, operation: Operation, said: dict[str, Any]) -> None:
-    audit.write("island-01", [entry(operation)])
+    audit.write("island-01", entry(operation))
     (line,) = lines(audit)
     assert line | said == line
 
 
 def test_a_refusal(audit: Audit) -> None:
     denied = Verdict(AccessService.WRITE, False, "no rule allows it, and other hosts only read")
-    audit.write("island-01", [entry(result=0x723, verdict=denied)])
+    audit.write("island-01", entry(result=0x723, verdict=denied))
     (line,) = lines(audit)
     assert not line["allowed"]
     assert line["error"] == "error 0x723 (access rules forbid it)"
 
 
 def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: Clock) -> None:
-    audit.write("island-01", [entry(count=BURST + 20)])
-    audit.write("island-01", [entry(way=Way("ams-tcp", "10.0.0.6:1"))])
+    audit.write("island-01", entry(count=BURST + 20))
+    audit.write("island-01", entry(way=Way("ams-tcp", "10.0.0.6:1")))
     assert len(lines(audit)) == BURST + 1
     audit.tell_skipped()
     audit.tell_skipped()
@@ -138,30 +138,30 @@ def test_a_flood_is_told_in_numbers_and_hides_nobody_else(audit: Audit, clock: C
         }
     ]
     clock.now += 1
-    audit.write("island-01", [entry(count=BURST)])
+    audit.write("island-01", entry(count=BURST))
     assert len(lines(audit)) == BURST + 2 + BURST // 10
 
 
 def test_a_flood_from_many_addresses_is_bounded_by_its_door(audit: Audit) -> None:
     for number in range(12):
         way = Way("udp:eap0", f"10.0.0.{number}:34980")
-        audit.write("island-01", [entry(way=way, count=BURST)])
-    audit.write("island-01", [entry()])
+        audit.write("island-01", entry(way=way, count=BURST))
+    audit.write("island-01", entry())
     assert len(lines(audit)) == module.DOOR_BURST + 1
 
 
 def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None:
-    audit.write("island-01", [entry(count=BURST + 1)])
+    audit.write("island-01", entry(count=BURST + 1))
     for number in range(1100):
         way = Way("ams-tcp", f"10.1.{number // 250}.{number % 250}:1")
-        audit.write("island-01", [entry(way=way)])
+        audit.write("island-01", entry(way=way))
     assert [line["skipped"] for line in lines(audit) if "skipped" in line] == [1]
 
 
 def test_old_files_go(audit: Audit, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_OCTETS", 1000)
     for number in range(20):
-        audit.write(f"island-{number}", [entry()])
+        audit.write(f"island-{number}", entry())
     names = sorted(path.name for path in audit.path.parent.iterdir())
     older = [f"audit.jsonl.{number}" for number in range(1, KEPT + 1)]
     assert [name for name in names if name != "audit.jsonl"] == older
@@ -174,8 +174,8 @@ def test_a_disk_that_is_full_is_said_once(tmp_path: Path, caplog: pytest.LogCapt
     (tmp_path / "plant").mkdir()
     audit = Audit(tmp_path / "plant", NAMES)
     with caplog.at_level(logging.WARNING):
-        audit.write("island-01", [entry()])
-        audit.write("island-01", [entry()])
+        audit.write("island-01", entry())
+        audit.write("island-01", entry())
     assert [each.getMessage() for each in caplog.records] == [
         f"audit {tmp_path / 'plant'} cannot be written: Is a directory"
     ]
