@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eap.codec.ams import AmsHeader, StateFlags, encode_packet
+from eap.codec.ams import AmsHeader, StateFlags
+
+_RESPONSE = StateFlags.RESPONSE.value  # a plain number: operators of flags are slow
 
 
 class AmsAnswer(NamedTuple):
@@ -19,14 +21,16 @@ class AmsAnswer(NamedTuple):
 
 def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
     """Return the packet that brings *answer* back to who sent the request with *header*."""
+    data = answer.data
     back = AmsHeader(
         header.source,
         header.source_port,
         header.target,
         header.target_port,
         header.command,
-        header.state_flags | StateFlags.RESPONSE,
-        error_code=answer.error_code,
-        invoke_id=header.invoke_id,
+        header.state_flags | _RESPONSE,
+        len(data),
+        answer.error_code,
+        header.invoke_id,
     )
-    return encode_packet(back, answer.data)
+    return back.encode() + data

@@ -165,7 +165,7 @@ def _count_word(item: OdObject) -> bytes:
 
 
 def _check_readable(entry: Entry, index: int, subindex: int, state: OdState) -> None:
-    if not entry.access & state.read_right:
+    if not int(entry.access) & int(state.read_right):  # operators of flags are slow
         readable = entry.access & Access.READ_ANY
         code = AbortCode.DEVICE_STATE if readable else AbortCode.WRITE_ONLY
         raise SdoAbortError(code, index, subindex)

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 from eap.aoe.ads_device import Judge, allow
 from eap.aoe.ads_operation import Operation, OperationOutcome
-from eap.aoe.ads_request import Outcomes, take_request
+from eap.aoe.ads_request import AdsRequest, Outcomes, take_request
 from eap.aoe.answer import AmsAnswer
 
 _AT_ONCE = 64
@@ -31,6 +31,11 @@ async def answer_request(
     request = take_request(command, body)
     if isinstance(request, AmsAnswer):
         return request
+    return await answer_in_steps(request, perform, judge)
+
+
+async def answer_in_steps(request: AdsRequest, perform: Perform, judge: Judge) -> AmsAnswer:
+    """Do as :func:`answer_request` with a request that has been taken apart."""
     outcomes = Outcomes(request)
     for number, operation in enumerate(request.operations, start=1):
         reason = judge(operation)

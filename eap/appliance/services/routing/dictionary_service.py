@@ -22,7 +22,7 @@ class DictionaryService:
     def __init__(self, ads: EapAds) -> None:
         self._ads = ads
 
-    def answer(self, request: LocalRequest) -> Awaitable[AmsAnswer]:
+    def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
         """Read or write the dictionary, states and variables."""
         header = request.header
         client = Client(request.came_by, header.source, header.source_port)

@@ -40,6 +40,8 @@ from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 
 _SHORTEST_WAIT_S = 0.001
+_MOMENT_S = 0.02
+"""How late a time-out may be noticed."""
 
 
 class StationRouter:
@@ -96,7 +98,7 @@ class StationRouter:
         self.add_door(LOCAL_DOOR, self._client)
         self._settling: dict[Way, tuple[int, asyncio.Event]] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._is_serving = False
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     @property
     def net_ids(self) -> Collection[NetId]:
@@ -122,12 +124,12 @@ class StationRouter:
 
     async def serve(self) -> None:
         """Look after time-outs and hops until cancelled."""
-        self._is_serving = True
+        self._loop = asyncio.get_running_loop()
         self._schedule()
         try:
             await asyncio.Event().wait()
         finally:
-            self._is_serving = False
+            self._loop = None
             if self._timer is not None:
                 self._timer.cancel()
             await self._lanes.close()
@@ -275,7 +277,7 @@ class StationRouter:
         for way, (count, event) in self._settling.items():
             if self._router.waiting(way) < count:
                 event.set()
-        self._schedule()
+        self._schedule_soon()
 
     def _tell(self) -> None:
         while (trace := self._router.next_event()) is not None:
@@ -303,19 +305,36 @@ class StationRouter:
     def _schedule(self) -> None:
         """Have the router called when it has something to do."""
         at_ns = self._router.next_timeout()
-        if at_ns is None or not self._is_serving:
+        if at_ns is None or self._loop is None:
             return
         if self._timer is not None:
             if self._timer.when() <= at_ns / 1e9:
                 return
             self._timer.cancel()
-        loop = asyncio.get_running_loop()
-        at_s = max(at_ns / 1e9, loop.time() + _SHORTEST_WAIT_S)
-        self._timer = loop.call_at(at_s, self._handle_timeout)
+        at_s = max(at_ns / 1e9, self._loop.time() + _SHORTEST_WAIT_S)
+        self._timer = self._loop.call_at(at_s, self._handle_timeout)
+
+    def _schedule_soon(self) -> None:
+        """Have the router called after a moment, as something may be due earlier than it was.
+
+        That is cheap; when exactly it is due is looked up then, and not for each packet.
+        """
+        if self._loop is None:
+            return
+        at_s = self._loop.time() + _MOMENT_S
+        if self._timer is not None:
+            if self._timer.when() <= at_s:
+                return
+            self._timer.cancel()
+        self._timer = self._loop.call_at(at_s, self._handle_timeout)
 
     def _handle_timeout(self) -> None:
         self._timer = None
-        self._act(self._router.handle_timeout(monotonic_ns()))
+        actions = self._router.handle_timeout(monotonic_ns())
+        if actions:
+            self._act(actions)
+        else:
+            self._schedule()
 
 
 class _Ports:

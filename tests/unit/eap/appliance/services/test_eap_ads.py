@@ -8,6 +8,7 @@ import struct
 import pytest
 
 from eap.aoe.ads_notifications import Client
+from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.services.eap_ads import EapAds, device_info
 from eap.appliance.services.image_variables import StationSymbols
@@ -38,7 +39,8 @@ class Bench:
         self.ads = EapAds(self.device, "eap0", StationSymbols(image), INFO)
 
     async def ask(self, command, body=b"", **more):
-        return await self.ads.answer(command, body, CLIENT, **more)
+        answer = self.ads.answer(command, body, CLIENT, **more)
+        return answer if isinstance(answer, AmsAnswer) else await answer
 
     async def read(self, offset, group=G.SDO):
         return await self.ask(AmsCommand.READ, aoe.read_body(offset, group=group))
