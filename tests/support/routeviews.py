@@ -25,7 +25,7 @@ DIRECTORY = Directory([
         name, f"127.0.9.{number}.1.1",
         (DirectoryPort("eap0", False, f"127.0.9.{number}.2.1", f"udp://127.0.9.{number}"),),
     )
-    for number, name in ((1, "left"), (2, "right"))
+    for number, name in ((1, "left"), (2, "right"), (3, "third"))
 ])  # fmt: skip
 RIGHT = RouteSpec(
     name="right", net_id="127.0.9.2.1.1", hop=HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980"),

@@ -13,7 +13,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from importlib.metadata import version
@@ -43,6 +43,8 @@ from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
+from eap.appliance.services.route_methods import RouteMethods
+from eap.appliance.services.route_rows import RouterView
 from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.segment_link import SegmentLink
@@ -161,9 +163,19 @@ class Services:
             images,
             status=status,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
-            more=DeviceMethods(devices.by_station, self._handover.plant_file).table()
-            | AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
+            more=self._more_methods(devices),
         )
+
+    def _more_methods(self, devices: Devices) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        views = {
+            name: RouterView(router, devices.routes[name])
+            for name, router in devices.routers.items()
+        }
+        return {
+            **DeviceMethods(devices.by_station, self._handover.plant_file).table(),
+            **RouteMethods(views, self._directory).table(),
+            **AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
+        }
 
     def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:
         audit = Audit(Store(self._handover.plant).path / "audit.jsonl", self._directory)

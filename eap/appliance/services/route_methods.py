@@ -8,7 +8,6 @@ from time import monotonic_ns
 from typing import Any
 
 from eap.aoe.directory import Directory
-from eap.aoe.routes import Origin
 from eap.aoe.spec import RouteSpec
 from eap.aoe.via import parse_via
 from eap.appliance.control import ErrorCode, near, parameters
@@ -122,7 +121,7 @@ class RouteMethods:
         else:
             try:
                 if dry_run:
-                    self._spec(view, wanted)
+                    view.routes.check(self._spec(view, wanted))
                 else:
                     self._take(view, wanted)
             except ControlError as exc:
@@ -132,13 +131,7 @@ class RouteMethods:
     def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
         spec = self._spec(view, wanted)
         with _kept():
-            view.routes.add(spec, replaces=wanted.replaces)
-        net_id = NetId.parse(spec.virtual or spec.net_id)
-        route = next(
-            each
-            for each in view.router.table
-            if each.origin is Origin.ADDED and each.net_id == net_id
-        )
+            route = view.routes.add(spec, replaces=wanted.replaces)
         return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
 
     def _spec(self, view: RouterView, wanted: RoutesAddParameters) -> RouteSpec:

@@ -118,7 +118,11 @@ class StationRoutes:
         spec = self._written.get(route.key)
         return spec is not None and spec.is_derived
 
-    def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> None:
+    def check(self, spec: RouteSpec) -> None:
+        """Say whether a route could be added; raise ControlError with the reason if not."""
+        self._checked(spec, "")
+
+    def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> Route:
         """Add a route, in place of the added one of its name, or to its NetID.
 
         Args:
@@ -130,16 +134,14 @@ class StationRoutes:
             ControlError: there cannot be such a route, or a route of the plant file is before it.
             EnvironmentalError: it cannot be kept.
         """
-        spec = replace(spec, name=_plain(spec.name), is_derived=False)
-        known_as = {spec.name, spec.virtual or spec.net_id, replaces} - {""}
-        old = [each for each in self._added if _names(each) & known_as]
-        self._check(spec, len(self._added) - len(old))
+        spec, old = self._checked(spec, replaces)
         route = self._route(spec, Origin.ADDED)
         if route.key in self._written:
             raise ControlError(_hidden_by(self._written[route.key].name))
         left = {each: kept for each, kept in self._added.items() if each not in old}
         self._change({**left, spec: is_kept}, gone=old)
         self.router.add_route(route)
+        return route
 
     def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
         """Remove an added route by its name or NetID, and return it.
@@ -160,6 +162,14 @@ class StationRoutes:
         left = {each: kept for each, kept in self._added.items() if each != found[0]}
         self._change(left, gone=found[:1])
         return found[0]
+
+    def _checked(self, spec: RouteSpec, replaces: str) -> tuple[RouteSpec, list[RouteSpec]]:
+        """Return a route as it is kept, and the added ones that it takes the place of."""
+        spec = replace(spec, name=_plain(spec.name), is_derived=False)
+        known_as = {spec.name, spec.virtual or spec.net_id, replaces} - {""}
+        old = [each for each in self._added if _names(each) & known_as]
+        self._check(spec, len(self._added) - len(old))
+        return spec, old
 
     def _change(self, added: dict[RouteSpec, bool], gone: Sequence[RouteSpec]) -> None:
         self._store.save([each for each, is_kept in added.items() if is_kept])

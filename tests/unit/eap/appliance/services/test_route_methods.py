@@ -3,13 +3,14 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-import msgspec
 import pytest
 
-from eap.aoe.routes import Origin
+from eap.aoe.routes import Origin, Route
+from eap.aoe.way import Way
 from eap.appliance.services.route_methods import RouteMethods
 from eap.codec.staticroutes import StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
+from eap.ids import NetId
 from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 
@@ -63,8 +64,8 @@ def test_add_and_remove(ask, left):
 
 
 def test_route_of_the_plant_needs_no_net_id(ask, left):
-    ask("add", station="left", name="right", via="udp:127.0.9.9", octets=6)
-    assert str(left.routes.added[0].net_id) == "127.0.9.2.1.1"
+    ask("add", station="left", name="third", via="udp:127.0.9.9", octets=6)
+    assert str(left.routes.added[0].net_id) == "127.0.9.3.1.1"
     ask("add", station="left", name="others", via="right/eap0", octets=0)
     assert left.routes.added[1].router == "127.0.9.2.1.1"
     code, text = refused(ask, "add", station="left", name="rigth", via="udp:127.0.9.9")
@@ -78,10 +79,12 @@ def test_replaced_route_goes(ask, left):
     assert names(left) == ["right", "press"]
 
 
-def test_what_speaks_against_a_route_is_told(ask):
-    other = {"station": "left", "name": "other", "net_id": "127.0.9.2.1.1", "octets": 5}
-    answer = ask("add", **other, via="udp:127.0.9.9")
-    assert msgspec.to_builtins(answer["route"])["name"] == "other"
+def test_what_speaks_against_a_route_is_told(ask, left):
+    net_id = NetId.parse(PLC["net_id"])
+    left.router.add_route(Route(net_id, "first", Way("udp:eap0", "127.0.9.9:34980"), octets=6))
+    (warning,) = ask("add", **PLC)["warnings"]
+    assert warning.startswith("route plc (5.1.2.3.1.1, 10.0.0.5:48898 by ams-tcp:10.0.0.5:48898)")
+    assert "is not taken for 5.1.2.3.1.1: first" in warning
 
 
 @pytest.mark.parametrize(
@@ -133,6 +136,7 @@ def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
         StaticRoute("old", "5.1.2.4.1.1", "3", "PROFIBUS"),
         StaticRoute("bare", "5.1.2.5.1.1", ""),
         StaticRoute("wrong", "5.1.2", "10.0.0.6"),
+        StaticRoute("self", "127.0.9.1.1.1", "10.0.0.7"),
     ]
     xml = dump("x", "1.1.1.1.1.1", file, tcp_port=48898)
     dry = ask("import", station="left", xml=xml, dry_run=True)
@@ -140,7 +144,7 @@ def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
     rows = ask("import", station="left", xml=xml)
     assert rows == dry
     assert [(row.name, bool(row.reason)) for row in rows] == [
-        ("plc", False), ("old", True), ("bare", True), ("wrong", True)
+        ("plc", False), ("old", True), ("bare", True), ("wrong", True), ("self", True)
     ]  # fmt: skip
     assert rows[0].via == "ams-tcp:10.0.0.5"
     assert rows[1].reason == "its type is 'PROFIBUS', expected TCP_IP"
