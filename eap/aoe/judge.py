@@ -149,5 +149,6 @@ class Judge:
             text = f"route {route.name} leads back to where it came from"
             return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
         if self.is_down(hop):
-            return Refusal(AdsError.HOST_UNREACHABLE, f"{route.name} ({hop}) is down", route)
+            text = f"{route.name} ({hop}) is down: {self.why_down(hop)}"
+            return Refusal(AdsError.HOST_UNREACHABLE, text, route)
         return None

@@ -60,7 +60,7 @@ def test_why_nothing_goes_there() -> None:
     assert (back.route, back.why) == ("far", "route far leads back to where it came from")
     station.router.hop_down(*LINK, "cable pulled", 1)
     down = ask(station, FAR, 1)
-    assert (down.state, down.why) == ("down", "far (10.0.0.6 by link) is down")
+    assert (down.state, down.why) == ("down", "far (10.0.0.6 by link) is down: cable pulled")
 
 
 def test_reports_survive_the_wire() -> None:

@@ -48,7 +48,7 @@ def test_hops_go_down_and_up() -> None:
         assert judge.is_down(TCP)
         assert judge.why_down(TCP) == "cut"
         refusal = judge.find_route(ASKED, way)
-        assert refusal == Refusal(AdsError.HOST_UNREACHABLE, "far (1 by tcp) is down", route)
+        assert refusal == Refusal(AdsError.HOST_UNREACHABLE, "far (1 by tcp) is down: cut", route)
         judge.hop_up("tcp", address)
         assert judge.find_route(ASKED, way) == route
     judge.hop_down("tcp", "3", "cut")

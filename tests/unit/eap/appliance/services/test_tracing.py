@@ -77,7 +77,7 @@ def test_a_link_that_a_router_knows_to_be_down() -> None:
     line.stations["island-02"].router.hop_down("link", "island-03", "cable pulled", 1)
     traced = follow(first)
     assert names(traced) == ["island-01", "island-02"]
-    assert traced.why == "island-02: island-03 (island-03 by link) is down"
+    assert traced.why == "island-02: island-03 (island-03 by link) is down: cable pulled"
 
 
 def test_a_missing_route_and_a_missing_port() -> None:

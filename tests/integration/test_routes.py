@@ -1,0 +1,110 @@
+"""Stations that pass requests on, each an appliance of its own: AMS/TCP in, type 5 between them.
+
+The client is written apart from our codec.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+
+import pytest
+
+from tests.integration.test_ams_doors import AmsClient, is_free
+from tests.support import aoe
+from tests.support.appliance import Appliance, Plants, wait_until
+
+pytestmark = pytest.mark.net
+
+WEST, MIDDLE, EAST = (f"127.9.70.{number}" for number in (1, 2, 3))
+UNREACHABLE, TIMEOUT = 0x1B, 0x719
+PLANT = """\
+plant: chain
+defaults: {{cycle_us: 10000}}
+stations:
+  - name: west
+    net_id: 127.9.70.1.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "{scheme}://127.9.70.1", net_id: 127.9.70.1.2.1}}
+    routes:
+      - {{to: east, via: middle/eap0}}
+      - {{to: north, net_id: 127.9.70.4.1.1, via: middle/eap0}}
+  - name: middle
+    net_id: 127.9.70.2.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "{scheme}://127.9.70.2", net_id: 127.9.70.2.2.1}}
+    routes:
+      - {{to: north, net_id: 127.9.70.4.1.1, via: east/eap0}}
+  - name: east
+    net_id: 127.9.70.3.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "{scheme}://127.9.70.3", net_id: 127.9.70.3.2.1}}
+    routes:
+      - {{to: north, net_id: 127.9.70.4.1.1, via: west/eap0}}
+"""
+TARGET = f"{EAST}.2.1"
+
+
+def start(farm: Plants, scheme: str, *stations: str) -> list[Appliance]:
+    wait_until(lambda: all(map(is_free, (WEST, MIDDLE, EAST))))
+    plant = farm.write(PLANT.format(scheme=scheme))
+    return [farm.run(plant, "--station", station) for station in stations]
+
+
+def is_reached(client: AmsClient, target: str = TARGET) -> bool:
+    return client.ask(target, aoe.READ_STATE, b"")[0] == 0
+
+
+@pytest.mark.parametrize("scheme", ["udp", "tcp"])
+def test_two_hops(farm: Plants, scheme: str) -> None:
+    """Each answer comes back to who asked, long ones in fragments."""
+    start(farm, scheme, "east", "middle", "west")
+    with AmsClient(WEST) as one, AmsClient(WEST) as other:
+        wait_until(lambda: is_reached(one))
+        for _ in range(50):
+            assert one.net_id(TARGET) == TARGET
+            assert other.net_id(f"{MIDDLE}.2.1") == f"{MIDDLE}.2.1"
+        names = aoe.read_body(1 << 16, size=60_000, group=0xF3FC)
+        error, data = one.ask(TARGET, aoe.READ, names)
+        assert (error, data[:4]) == (0, bytes(4))
+        (length,) = struct.unpack_from("<I", data, 4)
+        assert len(data) == 8 + length
+        written = one.ask(TARGET, aoe.WRITE, aoe.write_body(0xF200 << 16 | 1, b"\2\0"))
+        assert written == (0, bytes(4))
+        assert other.ask(TARGET, aoe.READ_STATE, b"") == (0, struct.pack("<IHH", 0, 15, 2))
+
+
+@pytest.mark.parametrize("scheme", ["udp", "tcp"])
+def test_dead_hop_is_answered_for_at_once_and_comes_back(farm: Plants, scheme: str) -> None:
+    _, middle, west = start(farm, scheme, "east", "middle", "west")
+    with AmsClient(WEST) as client:
+        wait_until(lambda: is_reached(client))
+        middle.stop()
+        errors = {client.ask(TARGET, aoe.READ_STATE, b"")[0]}
+        assert errors <= {UNREACHABLE, TIMEOUT}
+        wait_until(lambda: client.ask(TARGET, aoe.READ_STATE, b"")[0] == UNREACHABLE)
+        began = time.monotonic()
+        assert client.ask(TARGET, aoe.READ_STATE, b"")[0] == UNREACHABLE
+        assert time.monotonic() - began < 0.5
+        assert client.net_id(f"{WEST}.2.1") == f"{WEST}.2.1"
+        farm.run(farm.folder / "plant.yaml", "--station", "middle")
+        wait_until(lambda: is_reached(client))
+    _, _, text = west.stop()
+    assert f"({MIDDLE}:34980 by {scheme}:eap0)" in text
+    assert "0x1b" in text
+
+
+def test_unknown_and_circles_are_answered_and_named(farm: Plants) -> None:
+    """The route to north runs in a circle through all stations."""
+    _, _, west = start(farm, "udp", "east", "middle", "west")
+    with AmsClient(WEST) as client:
+        assert client.ask("9.9.9.9.1.1", aoe.READ_STATE, b"")[0] == 7
+        wait_until(lambda: client.ask("127.9.70.4.2.1", aoe.READ_STATE, b"")[0] == 7)
+        began = time.monotonic()
+        assert client.ask("127.9.70.4.2.1", aoe.READ_STATE, b"")[0] == 7
+        assert time.monotonic() - began < 1
+        assert client.ask(f"{MIDDLE}.9.1", aoe.READ_STATE, b"")[0] == 7
+        assert client.ask(f"{WEST}.9.1", aoe.READ_STATE, b"")[0] == 7
+    _, _, text = west.stop()
+    assert "no route to 9.9.9.9.1.1" in text
+    assert "routes to 127.9.70.4.2.1 run in a circle" in text
