@@ -11,6 +11,7 @@ octets, as TwinCAT does, in a packet of its own, because AdsLib skips what follo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
@@ -137,9 +138,14 @@ class _Pending:
 
 
 class NotificationTable:
-    """The notifications of one device."""
+    """The notifications of one device.
+
+    Attributes:
+        on_add: Called whenever there is one more.
+    """
 
     def __init__(self) -> None:
+        self.on_add: Callable[[], None] | None = None
         self._notifications: dict[int, _Notification] = {}
         self._clients: dict[Client, _Pending] = {}
         self._due: list[tuple[int, int]] = []
@@ -170,6 +176,8 @@ class NotificationTable:
         notification = _Notification(client, handle, asked, source, now_ns)
         self._notifications[handle] = notification
         heappush(self._due, (notification.next_ns, handle))
+        if self.on_add is not None:
+            self.on_add()
         return handle
 
     def delete(self, client: Client, handle: int) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from ipaddress import IPv4Address
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
@@ -135,20 +135,14 @@ class RouterDictionary(ObjectDictionary):
 _PROFILES = {PortKind.EAP: eap1000.MODULE_PROFILE, PortKind.BUS: profile.MASTER_PROFILE}
 
 
-class _Reader(NamedTuple):
-    """What gives the octets of a live entry."""
-
-    kind: DataType
-    key: Live
-    read: Callable[[Live], Any]
-
-    def __call__(self) -> bytes:
-        value, kind = self.read(self.key), self.kind
-        if kind.is_text:
-            return str(value).encode()[: kind.size]
-        if kind.scalar_range is not None:
-            value = min(value, int(kind.scalar_range[1]))
-        return kind.encode(value)
+def _octets(kind: DataType, key: Live, read: Callable[[Live], Any]) -> bytes:
+    """Return what a live entry shows, as near as its type can hold it."""
+    value = read(key)
+    if kind.is_text:
+        return str(value).encode()[: kind.size]
+    if kind.scalar_range is not None:
+        value = min(value, int(kind.scalar_range[1]))
+    return kind.encode(value)
 
 
 def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, last: int = 0) -> OdObject:
@@ -166,7 +160,7 @@ def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, last: in
 
 def _make_entry(row: EntryRow, subindex: int, read: Callable[[Live], Any]) -> Entry:
     kind = datatypes.parse(row.kind)
-    reader = _Reader(kind, Live(row.live), read) if row.live else None
+    reader = partial(_octets, kind, Live(row.live), read) if row.live else None
     name = row.numbered(subindex)
     return Entry(name, kind, row.access, row.default, read=reader, unit=UNITS[row.unit])
 

@@ -126,7 +126,8 @@ def test_every_dictionary_of_an_address_by_one_connection(appliance: Appliance) 
         assert other.net_id(THIRD) == THIRD
         assert client.ask("9.9.9.9.1.1", aoe.READ_STATE, b"") == (7, b"")
         assert client.net_id(THIRD) == THIRD  # by a route
-        assert client.ask(f"{LEFT}.1.1", aoe.READ_STATE, b"") == (6, b"")
+        router = client.ask(f"{LEFT}.1.1", aoe.READ_STATE, b"")
+        assert router == (0, bytes.fromhex("00000000 0500 0800"))
         wanted = struct.pack("<H", 2)
         written = client.ask(FIRST, aoe.WRITE, aoe.write_body(0xF200 << 16 | 1, wanted))
         assert written == (0, bytes(4))

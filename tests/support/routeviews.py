@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from eap.appliance.services.routing.system_service import SystemService
+
 from eap.aoe.directory import Directory
 from eap.aoe.spec import (
     DirectoryPort,
@@ -15,7 +17,6 @@ from eap.aoe.way import Door, Way
 from eap.appliance.route_store import RouteStore
 from eap.appliance.services.route_rows import RouterView
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.routing.system_service import SystemService
 from eap.appliance.services.station_routes import StationRoutes
 from eap.ids import NetId
 from tests.support.routing import KeepingCarrier

@@ -1,45 +1,61 @@
-"""ADS requests answered by whoever cannot do so at once: one operation after the other."""
+"""ADS requests of which some operations take their time: one after the other, and no detour."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import TypeAlias
 
-from eap.aoe.ads_device import Judge, allow
 from eap.aoe.ads_operation import Operation, OperationOutcome
-from eap.aoe.ads_request import AdsRequest, Outcomes, take_request
+from eap.aoe.ads_request import Outcomes, encode_outcome, take_request
 from eap.aoe.answer import AmsAnswer
 
 _AT_ONCE = 64
 """Operations of a sum command after which others have a turn."""
 
-Perform: TypeAlias = Callable[[Operation], Awaitable[OperationOutcome]]
+Perform: TypeAlias = Callable[[Operation], OperationOutcome | Awaitable[OperationOutcome]]
+"""Does one operation, at once or by the end of what it returns."""
 
 
-async def answer_request(
-    command: int, body: bytes, perform: Perform, *, judge: Judge = allow
-) -> AmsAnswer:
-    """Have *perform* do what a request asks for, as far as *judge* has nothing against it.
+def begin_answer(command: int, body: bytes, perform: Perform) -> AmsAnswer | Awaitable[AmsAnswer]:
+    """Have *perform* do what a request asks for; return the answer, or what is to be awaited.
 
     Args:
         command: Of the AMS header.
         body: What follows the header.
         perform: Does one operation.
-        judge: Looks at each operation, also at those of a sum command.
     """
     request = take_request(command, body)
     if isinstance(request, AmsAnswer):
         return request
-    return await answer_in_steps(request, perform, judge)
+    if request.sum_group:
+        return _go_through(Outcomes(request), request.operations, perform)
+    outcome = perform(request.operations[0])
+    if isinstance(outcome, OperationOutcome):
+        return _encode(command, outcome)
+    return _finish(command, outcome)
 
 
-async def answer_in_steps(request: AdsRequest, perform: Perform, judge: Judge) -> AmsAnswer:
-    """Do as :func:`answer_request` with a request that has been taken apart."""
-    outcomes = Outcomes(request)
-    for number, operation in enumerate(request.operations, start=1):
-        reason = judge(operation)
-        outcomes.add(OperationOutcome(reason) if reason else await perform(operation))
+async def answer_request(command: int, body: bytes, perform: Perform) -> AmsAnswer:
+    """Return the answer to a request; the arguments are those of :func:`begin_answer`."""
+    answer = begin_answer(command, body, perform)
+    return answer if isinstance(answer, AmsAnswer) else await answer
+
+
+async def _finish(command: int, outcome: Awaitable[OperationOutcome]) -> AmsAnswer:
+    return _encode(command, await outcome)
+
+
+def _encode(command: int, outcome: OperationOutcome) -> AmsAnswer:
+    return AmsAnswer(encode_outcome(command, outcome), why=outcome.why)
+
+
+async def _go_through(
+    outcomes: Outcomes, operations: Sequence[Operation], perform: Perform
+) -> AmsAnswer:
+    for number, operation in enumerate(operations, start=1):
+        outcome = perform(operation)
+        outcomes.add(outcome if isinstance(outcome, OperationOutcome) else await outcome)
         if not number % _AT_ONCE:
             await asyncio.sleep(0)
     return outcomes.answer()

@@ -10,13 +10,11 @@ from time import monotonic_ns
 
 from eap.aoe.spec import RoutingSpec
 from eap.appliance.route_store import RouteStore
-from eap.appliance.services.eap_ads import EapAds, device_info
 from eap.appliance.services.image_values import ImageValues
-from eap.appliance.services.image_variables import StationSymbols
-from eap.appliance.services.routing.dictionary_service import DictionaryService
 from eap.appliance.services.routing.planned import make_router, to_way
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sources import SourcePlayer
+from eap.appliance.services.station_ads import StationAds
 from eap.appliance.services.station_device import StationDevice
 from eap.appliance.services.station_keeper import StationEngine, StationKeeper
 from eap.appliance.services.station_routes import StationRoutes
@@ -24,7 +22,6 @@ from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
 from eap.device.eap_content import Identity
 from eap.errors import ImageError
-from eap.ids import NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 from eap.pd.words import StationWord
@@ -48,6 +45,7 @@ class Devices:
         by_station: The devices.
         routers: Of AMS packets, by station.
         routes: Of these routers.
+        ads: What they find at the NetIDs of routers and EAP ports, by station.
     """
 
     def __init__(
@@ -64,6 +62,7 @@ class Devices:
         self.by_station: dict[str, StationDevice] = {}
         self.routers: dict[str, StationRouter] = {}
         self.routes: dict[str, StationRoutes] = {}
+        self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
         self._images = images
         self._has_restarted = asyncio.Event()
@@ -88,11 +87,7 @@ class Devices:
                 router, told, RouteStore(plant, name), open_hop=to_way, close_unused=lambda: None
             )
             routes.start()
-            symbols = StationSymbols(image)
-            for port in device.dictionaries:
-                info = device_info(f"{name}/{port}", release)
-                service = DictionaryService(EapAds(device, port, symbols, info))
-                router.add_service(_net_id(station, port), service)
+            self.ads[name] = StationAds(station, device, image, router, identity)
 
     async def serve(self) -> None:
         """Serve all of them until cancelled.
@@ -105,6 +100,8 @@ class Devices:
                 group.create_task(device.serve())
             for router in self.routers.values():
                 group.create_task(router.serve())
+            for ads in self.ads.values():
+                group.create_task(ads.serve())
             for player in self._players:
                 group.create_task(player.serve())
             group.create_task(self._follow_restarts())
@@ -128,7 +125,3 @@ def _runs(image: StationImage) -> bool:
     """Tell whether an engine has run a cycle of the station just now."""
     ran_at_ns = image.image.words[StationWord.CYCLE_AT_NS]
     return bool(ran_at_ns) and monotonic_ns() - ran_at_ns < _LATELY_NS
-
-
-def _net_id(station: StationSpec, port: str) -> NetId:
-    return next(NetId.parse(each.net_id) for each in station.ports if each.name == port)

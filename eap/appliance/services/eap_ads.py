@@ -11,35 +11,25 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from time import monotonic_ns
 
-from eap.aoe.ads_device import AdsDevice, Judge, allow
+from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_notifications import Client, NotificationTable
 from eap.aoe.ads_objects import ObjectSpace
-from eap.aoe.ads_operation import (
-    AdsRefusedError,
-    Operation,
-    OperationOutcome,
-    Read,
-    ReadDeviceInfo,
-    ReadState,
-    ReadWrite,
-    Write,
-    WriteControl,
-)
-from eap.aoe.ads_request import encode_outcome, take_request
-from eap.aoe.ads_state import al_state_for, states_of
+from eap.aoe.ads_operation import Operation, OperationOutcome, ReadWrite, Write, WriteControl
+from eap.aoe.ads_state import states_of
 from eap.aoe.answer import AmsAnswer
-from eap.appliance.services.ads_requests import answer_in_steps
+from eap.aoe.way import Way
+from eap.appliance.services.ads_requests import begin_answer
 from eap.appliance.services.ads_result import ads_result
 from eap.appliance.services.image_variables import StationSymbols
+from eap.appliance.services.routing.service import LocalRequest
+from eap.appliance.services.state_control import control_state
 from eap.appliance.services.station_device import StationDevice
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsStates, IndexGroup, device_name
-from eap.codec.adsnotification import AddNotification
 from eap.errors import ControlError
 from eap.od.abort import SdoAbortError
 
 DEVICE_PORT = 0xFFFF
 """AMS port of an EAP device."""
-_READS = (Read, ReadState, ReadDeviceInfo)
 _BUSY_PAUSE_S = 0.005
 _BUSY_PAUSES = 20
 """Before a client is told that a writer has stopped in the middle of writing."""
@@ -53,15 +43,13 @@ class EapAds:
         port: Name of the port.
         symbols: The station's variables.
         info: What ReadDeviceInfo tells.
-
-    Attributes:
-        on_watch: Called when a notification was added.
     """
+
+    ports = frozenset((DEVICE_PORT,))
 
     def __init__(
         self, device: StationDevice, port: str, symbols: StationSymbols, info: AdsDeviceInfo
     ) -> None:
-        self.on_watch: Callable[[], None] | None = None
         self._device = device
         self._port = port
         objects = ObjectSpace(device.dictionaries[port], device.od_state, ads_result)
@@ -72,46 +60,30 @@ class EapAds:
         """Whom it tells of what."""
         return self._ads.notifications
 
-    def answer(
-        self, command: int, body: bytes, client: Client, *, judge: Judge = allow
-    ) -> AmsAnswer | Awaitable[AmsAnswer]:
-        """Answer a request: at once if it reads one thing, as most do.
+    def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
+        """Answer a request, at once where nobody has to be waited for."""
+        header = request.header
+        client = Client(request.came_by, header.source, header.source_port)
+        return begin_answer(header.command, request.body, partial(self._perform, client))
 
-        The arguments are those of :meth:`AdsDevice.answer`.
-        """
-        request = take_request(command, body)
-        if isinstance(request, AmsAnswer):
-            return request
-        operation = request.operations[0] if len(request.operations) == 1 else None
-        if isinstance(operation, _READS) and not request.sum_group:
-            reason = judge(operation)
-            outcome = (
-                OperationOutcome(reason)
-                if reason
-                else self._ads.perform(operation, client, monotonic_ns())
-            )
-            if outcome.result != AdsError.BUSY:
-                return AmsAnswer(encode_outcome(command, outcome), why=outcome.why)
-        return answer_in_steps(request, partial(self._perform, client), judge)
+    def client_gone(self, way: Way) -> None:
+        """End the notifications of a connection."""
+        self._ads.notifications.forget(way)
 
-    async def _perform(self, client: Client, operation: Operation) -> OperationOutcome:
-        perform = partial(self._ads.perform, operation, client, monotonic_ns())
+    def _perform(
+        self, client: Client, operation: Operation
+    ) -> OperationOutcome | Awaitable[OperationOutcome]:
         if isinstance(operation, WriteControl):
-            return await self._control(operation)
+            return control_state(self._device, operation)
+        perform = partial(self._ads.perform, operation, client, monotonic_ns())
         if _changes_objects(operation):
-            return await self._change(perform)
+            return self._change(perform)
         outcome = perform()
-        if isinstance(operation, AddNotification) and self.on_watch is not None:
-            self.on_watch()
-        if isinstance(operation, Read | ReadWrite):
-            for _ in range(_BUSY_PAUSES):
-                if outcome.result != AdsError.BUSY:
-                    break
-                await asyncio.sleep(_BUSY_PAUSE_S)
-                outcome = perform()
+        if outcome.result == AdsError.BUSY and not isinstance(operation, Write):
+            return _try_again(perform)
         return outcome
 
-    async def _change(self, perform: partial[OperationOutcome]) -> OperationOutcome:
+    async def _change(self, perform: Callable[[], OperationOutcome]) -> OperationOutcome:
         try:
             return await self._device.change(self._port, perform)
         except SdoAbortError as exc:
@@ -119,22 +91,18 @@ class EapAds:
         except ControlError as exc:
             return OperationOutcome(AdsError.BUSY, why=str(exc))
 
-    async def _control(self, request: WriteControl) -> OperationOutcome:
-        try:
-            wanted = al_state_for(request.ads_state)
-            fault = (await self._device.request_state(wanted)).fault
-        except AdsRefusedError as exc:
-            return OperationOutcome(exc.result, why=f"no way to ADS state {request.ads_state}")
-        except ControlError as exc:
-            return OperationOutcome(AdsError.BUSY, why=str(exc))
-        return (
-            OperationOutcome()
-            if fault is None
-            else OperationOutcome(AdsError.STATE, why=str(fault))
-        )
-
     def _states(self) -> AdsStates:
         return states_of(self._device.status.state)
+
+
+async def _try_again(perform: Callable[[], OperationOutcome]) -> OperationOutcome:
+    """Wait for a writer in the middle of writing; one that died there is told."""
+    for _ in range(_BUSY_PAUSES):
+        await asyncio.sleep(_BUSY_PAUSE_S)
+        outcome = perform()
+        if outcome.result != AdsError.BUSY:
+            break
+    return outcome
 
 
 def device_info(name: str, release: str) -> AdsDeviceInfo:

@@ -66,15 +66,7 @@ class NotificationPump:
     def add(self, table: NotificationTable, net_id: NetId, port: int) -> None:
         """Drive *table* too, which is that of the device behind *net_id* and *port*."""
         self._devices.append(_Device(table, net_id, port))
-
-    def look_soon(self) -> None:
-        """Take note of a notification that was added."""
-        self._wake.set()
-
-    def forget(self, way: Way) -> None:
-        """End all notifications of a connection that is gone."""
-        for device in self._devices:
-            device.table.forget(way)
+        table.on_add = self._wake.set
 
     async def serve(self) -> None:
         """Tell whoever is to be told, until cancelled."""

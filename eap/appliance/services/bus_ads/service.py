@@ -9,9 +9,10 @@ Rule 2: requests do not wait for each other here; turns at a slave's mailbox are
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Container
+from collections.abc import Awaitable, Callable, Container
 from functools import partial
 from time import monotonic_ns
+from typing import TypeAlias
 
 from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_master import MasterSpace
@@ -28,7 +29,7 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
-from eap.appliance.services.ads_requests import Perform, answer_request
+from eap.appliance.services.ads_requests import answer_request
 from eap.appliance.services.bus_ads.master_side import MasterSide
 from eap.appliance.services.bus_ads.raw_command import RawCommands
 from eap.appliance.services.bus_ads.results import refusal
@@ -49,6 +50,8 @@ _IN_HEADER = frozenset((AdsError.HOST_UNREACHABLE, AdsError.TARGET_PORT))
 
 _RESULT_SIZE = 4
 _MAX_NAMED = 8
+
+Perform: TypeAlias = Callable[[Operation], Awaitable[OperationOutcome]]
 
 
 class BusService:

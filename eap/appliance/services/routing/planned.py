@@ -10,8 +10,6 @@ from eap.aoe.routes import Origin, Route
 from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.routing.system_service import SystemService
-from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import StationSpec
 
@@ -19,12 +17,10 @@ _IP_SCHEMES = ("udp", "tcp")
 
 
 def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
-    """Return the router of a station, with the service that every router has, and no routes."""
+    """Return the router of a station, without services and routes."""
     net_id = NetId.parse(station.net_id)
     net_ids = [NetId.parse(port.net_id) for port in station.ports]
-    router = StationRouter(station.name, net_id, net_ids, access=access_of(station, routing))
-    router.add_service(net_id, Whereabouts(router, SystemService(station.name)))
-    return router
+    return StationRouter(station.name, net_id, net_ids, access=access_of(station, routing))
 
 
 def to_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:

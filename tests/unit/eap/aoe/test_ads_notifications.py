@@ -238,7 +238,18 @@ def test_a_last_source_that_fails_ends_its_client(table) -> None:
     assert tuple(table._clients) == ()
 
 
+def test_who_drives_the_table_hears_of_new_ones(table) -> None:
+    heard: list[int] = []
+    table.on_add = lambda: heard.append(table.stats().notifications)
+    table.add(ME, asked(CYCLE), Value(), 0)
+    with pytest.raises(AdsRefusedError):
+        table.add(ME, asked(TransMode.NONE), Value(), 0)
+    assert heard == [1]
+
+
 def test_next_timeout_is_that_of_samples_and_of_packets(table) -> None:
+    assert table.next_timeout() is None
+    table.delete(ME, table.add(ME, asked(CYCLE), Value(), 0))
     assert table.next_timeout() is None
     table.add(ME, asked(CYCLE, cycle_ms=80, delay_ms=5), Value(), 0)
     assert table.next_timeout() == 1

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import struct
 
-from eap.aoe.ads_operation import OperationOutcome, Read
+from eap.aoe.ads_operation import OperationOutcome
 from eap.aoe.answer import AmsAnswer
-from eap.appliance.services.ads_requests import answer_request
+from eap.appliance.services.ads_requests import answer_request, begin_answer
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
 
@@ -21,8 +21,8 @@ async def echo(operation):
     return OperationOutcome(data=operation.offset.to_bytes(4, "little")[: operation.length])
 
 
-def ask(command, body, **more):
-    return asyncio.run(answer_request(command, body, echo, **more))
+def ask(command, body):
+    return asyncio.run(answer_request(command, body, echo))
 
 
 def sum_read(*places):
@@ -35,14 +35,22 @@ def test_one_operation():
     assert got == AmsAnswer(OK + b"\2\0\0\0" + b"\5\0")
 
 
-def test_items_of_a_sum_are_judged_and_done_one_by_one():
-    def judge(operation):
-        return AdsError.ACCESS_DENIED if operation == Read(1, 7, 4) else AdsError.NONE
+def test_items_of_a_sum_are_done_one_by_one():
+    body = sum_read((1, 6, 1), (9, 8, 1))
+    got = ask(AmsCommand.READ_WRITE, body)
+    heads = struct.pack("<4I", 0, 1, AdsError.ACCESS, 0)
+    assert got == AmsAnswer(OK + struct.pack("<I", 17) + heads + b"\6", why="not 8")
 
-    body = sum_read((1, 6, 1), (1, 7, 4), (9, 8, 1))
-    got = ask(AmsCommand.READ_WRITE, body, judge=judge)
-    heads = struct.pack("<6I", 0, 1, AdsError.ACCESS_DENIED, 0, AdsError.ACCESS, 0)
-    assert got == AmsAnswer(OK + struct.pack("<I", 25) + heads + b"\6", why="not 8")
+
+def test_what_is_at_hand_is_answered_without_waiting():
+    def at_once(operation):
+        return OperationOutcome(data=b"\7")
+
+    body = struct.pack("<3I", 1, 5, 2)
+    assert begin_answer(AmsCommand.READ, body, at_once) == AmsAnswer(OK + b"\1\0\0\0\7")
+    assert begin_answer(AmsCommand.READ, b"", at_once) == AmsAnswer(b"\5\7\0\0" + OK)
+    later = begin_answer(AmsCommand.READ_WRITE, sum_read((1, 6, 1)), at_once)
+    assert asyncio.run(later).data.endswith(b"\7")
 
 
 def test_what_is_no_request():

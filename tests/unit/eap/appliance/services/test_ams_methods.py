@@ -4,6 +4,7 @@ import asyncio
 from typing import Any
 
 import pytest
+from eap.appliance.services.routing.system_service import SystemService
 
 from eap.aoe.directory import Directory
 from eap.aoe.routes import Route
@@ -11,7 +12,6 @@ from eap.aoe.spec import DirectoryStation
 from eap.aoe.way import Way
 from eap.appliance.services.ams_methods import AmsMethods
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.routing.system_service import SystemService
 from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.errors import ControlError
 from eap.ids import NetId

@@ -10,12 +10,14 @@ import pytest
 from eap.aoe.ads_notifications import Client
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
-from eap.appliance.services.eap_ads import EapAds, device_info
+from eap.appliance.services.eap_ads import DEVICE_PORT, EapAds, device_info
 from eap.appliance.services.image_variables import StationSymbols
 from eap.appliance.services.jobs import MAX_WAITING
+from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
-from eap.codec.ams import AmsCommand
+from eap.codec.adsnotification import TransMode
+from eap.codec.ams import AmsCommand, AmsHeader
 from eap.device.fault import FaultCode
 from eap.errors import EngineRefusedError
 from eap.ids import NetId
@@ -28,6 +30,7 @@ from tests.support.stationengine import make_device, while_serving
 TXPD, CONTROL = 0xD000, 0xF200
 OK = bytes(4)
 CLIENT = Client(Way("ams-tcp", "1"), NetId.parse("1.2.3.4.1.1"), 30000)
+TARGET = NetId.parse("1.2.3.4.5.1")
 INFO = device_info("left/eap0", "1.2.3")
 
 
@@ -38,8 +41,9 @@ class Bench:
         self.device, self.engine = make_device(spec)
         self.ads = EapAds(self.device, "eap0", StationSymbols(image), INFO)
 
-    async def ask(self, command, body=b"", **more):
-        answer = self.ads.answer(command, body, CLIENT, **more)
+    async def ask(self, command, body=b""):
+        header = AmsHeader(TARGET, DEVICE_PORT, CLIENT.net_id, CLIENT.port, command)
+        answer = self.ads.answer(LocalRequest(header, body, CLIENT.way))
         return answer if isinstance(answer, AmsAnswer) else await answer
 
     async def read(self, offset, group=G.SDO):
@@ -133,15 +137,11 @@ def test_states_are_those_of_the_device(bench):
     assert bench.device.status.fault.code == FaultCode.INVALID_REQUEST
 
 
-def test_each_item_of_a_sum_command_is_judged_and_done(bench):
+def test_items_of_a_sum_command_are_done_one_by_one(bench):
     writes = struct.pack("<6I", G.SDO, CONTROL << 16 | 1, 2, G.SDO, 0x1234_0000, 2)
     body = struct.pack("<4I", G.SUM_WRITE, 2, 8, len(writes) + 4) + writes + b"\2\0" + b"\0\0"
 
     async def script():
-        denied = await bench.ask(
-            AmsCommand.READ_WRITE, body, judge=lambda _: AdsError.ACCESS_DENIED
-        )
-        assert denied.data[8:] == b"\x23\7\0\0" * 2
         done = await bench.ask(AmsCommand.READ_WRITE, body)
         assert done.data[8:] == OK + b"\x0c\7\0\0"
 
@@ -194,5 +194,19 @@ def test_crowd_of_changes_is_busy(bench):
         assert all("wait already" in each.why for each in crowded)
         bench.engine.gate.set()
         await asyncio.gather(*changes)
+
+    bench.run(script)
+
+
+def test_notifications_belong_to_the_connection(bench):
+    async def script():
+        watched = struct.pack("<6I16x", G.DEVICE_DATA, 0, 4, TransMode.SERVER_CYCLE, 0, 0)
+        added = await bench.ask(AmsCommand.ADD_NOTIFICATION, watched)
+        assert result(added) == 0
+        assert bench.ads.notifications.stats().notifications == 1
+        bench.ads.client_gone(Way("ams-tcp", "2"))
+        assert bench.ads.notifications.stats().notifications == 1
+        bench.ads.client_gone(CLIENT.way)
+        assert bench.ads.notifications.stats().notifications == 0
 
     bench.run(script)

@@ -163,7 +163,7 @@ def test_the_end_of_the_last_one_is_the_end_of_looking(bench):
 def test_connection_that_is_gone_is_told_nothing(bench):
     bench.watch("ticks")
     bench.look()
-    bench.pump.forget(WAY)
+    bench.table.forget(WAY)
     bench.engine.run(2)
     assert bench.look() is None
     assert bench.told() == []
@@ -220,7 +220,6 @@ def test_whoever_is_added_is_told_soon(bench):
         await asyncio.sleep(0)
         bench.engine.image.words[StationWord.CYCLE_AT_NS] = monotonic_ns()
         bench.watch("ticks")
-        bench.pump.look_soon()
         await asyncio.sleep(0)
         bench.engine.run()
         async with asyncio.timeout(5):

@@ -7,16 +7,16 @@ from inspect import signature
 import pytest
 
 from eap.appliance.services.ams_door import AmsClients
-from eap.appliance.services.routing.dictionary_service import DictionaryService
+from eap.appliance.services.eap_ads import EapAds
+from eap.appliance.services.router_ads import RouterAds
 from eap.appliance.services.routing.local_client import LocalClient
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.appliance.services.routing.service import Carrier, Service
-from eap.appliance.services.routing.system_service import SystemService
 from tests.support.routing import KeepingCarrier, StubService
 
 
-@pytest.mark.parametrize("service", [DictionaryService, SystemService, StubService])
+@pytest.mark.parametrize("service", [EapAds, RouterAds, StubService])
 def test_services(service):
     for method in ("answer", "client_gone"):
         asked = [*signature(getattr(Service, method)).parameters]
