@@ -110,7 +110,7 @@ def test_reads_and_writes(appliance: Appliance) -> None:
         with pytest.raises(pyads.ADSError) as refused:
             device.read(SDO, 0x20000000, pyads.PLCTYPE_UINT)
         assert refused.value.err_code == 0x70C
-    for net_id, port, code in ((ROUTER, DEVICE, 6), (FIRST, 851, 6), ("9.9.9.9.1.1", DEVICE, 7)):
+    for net_id, port, code in ((ROUTER, 851, 6), (FIRST, 851, 6), ("9.9.9.9.1.1", DEVICE, 7)):
         with pyads.Connection(net_id, port, ADDRESS) as nobody:
             with pytest.raises(pyads.ADSError) as refused:
                 nobody.read_device_info()

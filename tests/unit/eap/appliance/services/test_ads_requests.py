@@ -49,8 +49,9 @@ def test_what_is_at_hand_is_answered_without_waiting():
     body = struct.pack("<3I", 1, 5, 2)
     assert begin_answer(AmsCommand.READ, body, at_once) == AmsAnswer(OK + b"\1\0\0\0\7")
     assert begin_answer(AmsCommand.READ, b"", at_once) == AmsAnswer(b"\5\7\0\0" + OK)
-    later = begin_answer(AmsCommand.READ_WRITE, sum_read((1, 6, 1)), at_once)
-    assert asyncio.run(later).data.endswith(b"\7")
+    asked = sum_read((1, 6, 1), (1, 7, 1))
+    later = begin_answer(AmsCommand.READ_WRITE, asked, at_once)
+    assert asyncio.run(later).data.endswith(b"\7\7")
 
 
 def test_what_is_no_request():

@@ -63,7 +63,7 @@ def test_port_answers_by_its_net_id_and_the_router_by_its_own(devices, stations)
     asked = [
         (stations[0].ports[0].net_id, 0xFFFF, AmsCommand.READ, aoe.read_body(0x1000 << 16)),
         (stations[0].net_id, 10_000, AmsCommand.READ_STATE, b""),
-        (stations[0].net_id, 0xFFFF, AmsCommand.READ_STATE, b""),
+        (stations[0].net_id, 851, AmsCommand.READ_STATE, b""),
         ("9.9.9.9.9.9", 0xFFFF, AmsCommand.READ_STATE, b""),
     ]
     answers = []
@@ -75,7 +75,7 @@ def test_port_answers_by_its_net_id_and_the_router_by_its_own(devices, stations)
     play(devices, script)
     assert [each.error_code for each in answers] == [0, 0, 6, 7]
     assert answers[0].data[8:] == bytes.fromhex("8913e803")
-    assert answers[1].data == bytes.fromhex("00000000 0500 0000")
+    assert answers[1].data == bytes.fromhex("00000000 0500 0800")
 
 
 def test_sources_follow_the_configuration(devices, files, stations):

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from eap.aoe.routes import Origin, Route
-from eap.aoe.way import Way
+from eap.aoe.way import Door, Way
 from eap.appliance.services.router_values import LiveRouter
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.device.eap_content import Identity
@@ -18,6 +18,7 @@ from eap.net.image_file import create_image
 from eap.od.profiles.router9000 import Live
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec, VariableSpec, Writer
+from tests.support.routing import KeepingCarrier
 from tests.support.stationengine import make_device
 
 ROUTE = Route(NetId.parse("5.6.7.8.1.1"), "plc", Way("udp:eap0", "10.0.0.8:34980"), Origin.ADDED)
@@ -40,6 +41,7 @@ def station(stations):
 @pytest.fixture
 def router(station):
     router = StationRouter("left", NetId.parse(station.net_id))
+    router.add_door(Door("udp:eap0"), KeepingCarrier())
     router.add_route(ROUTE)
     return router
 

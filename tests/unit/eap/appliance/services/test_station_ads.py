@@ -13,7 +13,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.station_ads import StationAds
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode, decode_notification
-from eap.codec.ams import AmsCommand, decode_packet
+from eap.codec.ams import AmsCommand
 from eap.device.eap_content import Identity
 from eap.ids import NetId
 from eap.pd.inputs import Inputs
@@ -36,7 +36,7 @@ def router(stations, carrier):
     station = stations[0]
     net_ids = [NetId.parse(port.net_id) for port in station.ports]
     router = StationRouter(station.name, NetId.parse(station.net_id), net_ids)
-    router.add_door(Door("ams-tcp", is_stream=True, is_this_host=True), carrier)
+    router.add_door(Door("ams-tcp", is_stream=True), carrier)
     return router
 
 
@@ -50,10 +50,9 @@ def ask(router, carrier, target, command, body=b"", *, port=0xFFFF):
     before = len(carrier.sent)
     packet = aoe.packet(target, command, body, port=port)
     router.receive(packet, "ams-tcp", CONNECTION)
-    ((_, packets),) = carrier.sent[before:]
-    header, data = decode_packet(packets[0])
-    assert not header.error_code
-    return bytes(data)
+    ((_, answer),) = carrier.sent[before:]
+    assert not answer.error
+    return answer.body
 
 
 @pytest.mark.usefixtures("ads")
@@ -93,11 +92,10 @@ def test_notifications_leave_by_the_router(ads, router, carrier, stations, files
         serving.cancel()
         return added, carrier.sent[-1]
 
-    added, (connection, packets) = asyncio.run(run())
-    header, data = decode_packet(packets[0])
-    assert (connection, header.command) == (CONNECTION, AmsCommand.NOTIFICATION)
-    assert (header.source, header.source_port) == (NetId.parse(target), 0xFFFF)
-    ((sample,),) = [stamp.samples for stamp in decode_notification(data)]
+    added, (connection, told) = asyncio.run(run())
+    assert (connection, told.command) == (CONNECTION, AmsCommand.NOTIFICATION)
+    assert told.source == f"{target}:65535"
+    ((sample,),) = [stamp.samples for stamp in decode_notification(told.body)]
     assert sample == (int.from_bytes(added[4:], "little"), bytes(2))
     router.connection_closed("ams-tcp", CONNECTION)
     assert ads.pump.look(monotonic_ns(), 0) is None

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import pytest
 
 from eap.aoe.routes import Origin, Route
 from eap.aoe.spec import AccessRule, DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.services.routing.planned import access_of, make_router, to_route, to_way
-from eap.codec.ams import AmsCommand
 from eap.ids import NetId
 from tests.unit.eap.appliance.conftest import eap_port, left
 
@@ -60,11 +57,6 @@ def test_addresses_of_the_station_are_this_host():
     assert not access.grants(way, THERE, THERE, 1).may_read
 
 
-def test_router_knows_its_net_ids_and_answers_probes():
+def test_router_knows_its_net_ids():
     router = make_router(left(), RoutingSpec())
     assert {str(each) for each in router.net_ids} == {"1.1.1.1.1.1", "1.2.3.4.5.1"}
-
-    async def script():
-        return await router.ask(router.net_id, 10_000, AmsCommand.READ_STATE, timeout_s=1)
-
-    assert asyncio.run(script()).error_code == 0
