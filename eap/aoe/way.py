@@ -18,7 +18,8 @@ class Way(NamedTuple):
     connection: str
 
     def __str__(self) -> str:
-        return f"{self.connection} by {self.door}"
+        # A door to one address only is named after it, which need not be said twice.
+        return f"{self.connection} by {self.door.removesuffix(f':{self.connection}')}"
 
 
 class Door(msgspec.Struct, frozen=True):

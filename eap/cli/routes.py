@@ -151,10 +151,11 @@ def add(
     if as_json:
         write_json(answer)
         return
+    from eap.aoe.way import Way
+
     route = answer["route"]
-    write_text(
-        f"{station}: added {name} ({route['net_id']}, {route['address']} by {route['door']})"
-    )
+    way = Way(route["door"], route["address"])
+    write_text(f"{station}: added {name} ({route['net_id']}, {way})")
     for warning in answer["warnings"]:
         click.echo(f"{station}: {warning}", err=True)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 
+from eap.aoe.way import Way
 from eap.appliance.control_routes import ConnectionRow, Figures, RequestRow, RouteRow, RouterRow
 from eap.cli import words
 
@@ -25,6 +26,16 @@ def short(number: int) -> str:
 def octets(row: Figures) -> str:
     """Return all octets, both ways."""
     return short(row.octets_in + row.octets_out)
+
+
+def door(row: RouteRow | ConnectionRow) -> str:
+    """Return the door; one to an address of its own is called by its kind."""
+    return row.door.removesuffix(f":{row.address}")
+
+
+def way(row: RouteRow | ConnectionRow) -> str:
+    """Return address and door."""
+    return str(Way(row.door, row.address))
 
 
 def round_trip(us: int | None) -> str:
@@ -79,7 +90,7 @@ def request_line(row: RequestRow) -> str:
 def belongs(request: RequestRow, row: RouteRow | ConnectionRow) -> bool:
     """Say whether a request went by a route, or came by a connection."""
     if isinstance(row, ConnectionRow):
-        return request.came_by == f"{row.address} by {row.door}"
+        return request.came_by == way(row)
     prefix = row.pattern.partition("*")[0]
     is_target = not row.octets or request.target.startswith(prefix)
     return is_target and (request.door, request.address) == (row.door, row.address)

@@ -61,8 +61,8 @@ def _routes(stations: Sequence[RouterRow]) -> RenderableType:
             trip = routes_text.round_trip(row.rtt_us)
             errors = Text(str(row.errors), style="red" if row.errors else "")
             table.add_row(
-                own, row.name, row.pattern, row.door, row.address, state, trip, str(row.requests),
-                errors,
+                own, row.name, row.pattern, routes_text.door(row), row.address, state, trip,
+                str(row.requests), errors,
             )  # fmt: skip
             own = ""
         if not station.routes:
@@ -78,7 +78,7 @@ def _connections(stations: Sequence[RouterRow]) -> RenderableType:
         own = station.station
         for row in station.connections:
             table.add_row(
-                own, row.address, row.door, "\n".join(row.net_ids),
+                own, row.address, routes_text.door(row), "\n".join(row.net_ids),
                 words.duration(row.since_s * 1_000_000), str(row.requests),
                 routes_text.octets(row), str(row.errors),
             )  # fmt: skip
@@ -90,12 +90,12 @@ def _remarks(station: RouterRow) -> Iterator[str]:
     yield from station.warnings
     for row in station.routes:
         if row.why:
-            yield f"{row.name} ({row.door} {row.address}) is down: {row.why}"
+            yield f"{row.name} ({routes_text.way(row)}) is down: {row.why}"
         if row.last_error:
             yield f"{row.name}, last error: {row.last_error}"
     for connection in station.connections:
         if connection.last_error:
-            yield f"{connection.address} by {connection.door}, last error: {connection.last_error}"
+            yield f"{routes_text.way(connection)}, last error: {connection.last_error}"
 
 
 def _table(*headings: str) -> Table:

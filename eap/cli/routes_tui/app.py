@@ -213,9 +213,7 @@ class RoutesApp(App[None]):
                 self._remove(router, row)
 
         station = router.routes.station
-        text = (
-            f"Remove route {row.name} ({row.pattern}, by {row.door} to {row.address}) of {station}?"
-        )
+        text = f"Remove route {row.name} ({row.pattern}, {routes_text.way(row)}) of {station}?"
         self.push_screen(Question(text), answered)
 
     def action_test(self) -> None:

@@ -147,7 +147,8 @@ def _route_line(router: Router, row: RouteRow) -> Line:
     station = router.routes.station
     key = f"{router.plant}/{station}/{row.net_id}/{row.door}/{row.address}"
     cells = (
-        station, row.name, row.pattern, row.door, "?" if row.state == "unknown" else row.state,
+        station, row.name, row.pattern, routes_text.door(row),
+        "?" if row.state == "unknown" else row.state,
         routes_text.round_trip(row.rtt_us), routes_text.short(row.requests),
         routes_text.octets(row), routes_text.short(row.errors), row.address, row.origin,
         row.last_error,
@@ -159,7 +160,7 @@ def _connection_line(router: Router, row: ConnectionRow) -> Line:
     station = router.routes.station
     key = f"{router.plant}/{station}/{row.door}/{row.address}"
     cells = (
-        station, row.address, row.door, " ".join(row.net_ids),
+        station, row.address, routes_text.door(row), " ".join(row.net_ids),
         words.duration(row.since_s * 1_000_000), routes_text.short(row.requests),
         routes_text.octets(row), routes_text.short(row.errors), row.last_error,
     )  # fmt: skip
@@ -175,12 +176,12 @@ def detail(line: Line | None) -> list[tuple[str, str]]:
         return [(line.cells[1], "down")]
     if isinstance(row, RouteRow):
         texts = [
-            (f"{row.name}  {row.pattern}  by {row.door} to {row.address}", "bold"),
+            (f"{row.name}  {row.pattern}  {routes_text.way(row)}", "bold"),
             (f"{routes_text.route_kind(row)}; {routes_text.route_state(row)}", row.state),
         ]
     else:
         asked = f"asked by {', '.join(row.net_ids)}" if row.net_ids else "nothing asked yet"
-        texts = [(f"{row.address} by {row.door}", "bold"), (asked, "")]
+        texts = [(routes_text.way(row), "bold"), (asked, "")]
     texts.append((routes_text.figures(row), ""))
     if row.last_error:
         texts.append((f"last error: {row.last_error}", "down"))

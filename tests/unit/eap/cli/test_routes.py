@@ -35,7 +35,7 @@ def test_list(command, stub):
     assert row == ["island-01", "island-02", "127.0.1.2.*.*", "udp:eap0", "127.0.1.2:34980", "up",
                    "840", "µs", "12", "0"]  # fmt: skip
     assert "Worth a look" in output
-    assert "press (ams-tcp 192.168.1.5:48898) is down: connection refused" in output
+    assert "press (192.168.1.5:48898 by ams-tcp) is down: connection refused" in output
     assert "127.0.0.1:40112#3" in output
     assert output == command().output  # no terminal here
     assert stub.requests[0] == ("routes_list", {"station": "", "match": "", "requests": 0})

@@ -24,7 +24,7 @@ def test_tables_of_routes_and_connections() -> None:
             "47.3k", "3"] in rows  # fmt: skip
     remarks = text.partition("Worth a look\n")[2].splitlines()
     assert [each.strip().partition(":")[2][:22] for each in remarks] == [
-        " route press (5.1.2.3.", " press (ams-tcp 192.16", " press, last error: pr",
+        " route press (5.1.2.3.", " press (192.168.1.5:48", " press, last error: pr",
         " 127.0.0.1:40112#3 by ",
     ]  # fmt: skip
 

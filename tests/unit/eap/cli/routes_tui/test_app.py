@@ -51,7 +51,7 @@ def test_everything_fits_80_by_24(stub):
             "island-01", "island-02", "127.0.1.2.*.*", "udp:eap0", "up", "840", "µs", "12",
             "46.9k", "0",
         ]  # fmt: skip
-        assert shown[16] == " island-02  127.0.1.2.*.*  by udp:eap0 to 127.0.1.2:34980"
+        assert shown[16] == " island-02  127.0.1.2.*.*  127.0.1.2:34980 by udp:eap0"
         assert shown[17] == " derived; up: round trip 840 µs"
         assert "READ 127.0.1.2.2.1:65535 < 127.0.0.1.1.1:32905: 1.2 ms" in shown[19]
         assert shown[23] == (
@@ -81,7 +81,7 @@ def test_figures_move_and_the_cursor_stays_on_its_row(stub, fake):
         fake.set_routes("island-01", new, ISLAND, later)
         shown = await look(screen)
         assert "9.1.1.1.1.1" in shown
-        assert " press  5.1.2.3.1.1  by ams-tcp" in shown
+        assert " press  5.1.2.3.1.1  192.168.1.5:48898" in shown
         fake.set_routes("island-01")
         assert "0 routes, 1 connection" in await look(screen)
 
@@ -208,7 +208,7 @@ def test_added_route_is_changed_and_others_are_not(stub, fake):
 def test_route_is_removed_when_that_is_wanted(stub, fake):
     async def script(screen):
         shown = await screen.press("down", "d")
-        assert "Remove route press (5.1.2.3.1.1, by ams-tcp to 192.168.1.5:48898)" in shown
+        assert "Remove route press (5.1.2.3.1.1, 192.168.1.5:48898 by ams-tcp)" in shown
         await screen.press("n")
         assert len(fake.stations["island-01"].routes) == 2
         await screen.press("d")
