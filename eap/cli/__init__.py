@@ -26,9 +26,11 @@ from eap.cli.group import LazyGroup
         "rollback": "eap.cli.apply:rollback",
         "routes": "eap.cli.routes:routes",
         "run": "eap.cli.run:run",
+        "scan": "eap.cli.scan:scan",
         "sim": "eap.cli.sim:sim",
         "state": "eap.cli.state:state",
         "status": "eap.cli.status:status",
+        "trace": "eap.cli.trace:trace",
     },
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
