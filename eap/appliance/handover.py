@@ -36,6 +36,9 @@ class SocketKind(StrEnum):
     """One listener, for services; the ports of an address share it."""
     AMS_UDP = "ams_udp"
     """One socket for services, on which tools ask for the routers at an address."""
+    AMS_BROADCAST = "ams_broadcast"
+    """One socket for services, on which they ask all hosts of the address's network; none where
+    that does not work.  Without a group it is the broadcast address of the network."""
 
 
 class PortName(Record, frozen=True, order=True):

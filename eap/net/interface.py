@@ -11,6 +11,7 @@ from eap.errors import EnvironmentalError
 
 _SIOCGIFCONF = 0x8912
 _SIOCGIFFLAGS = 0x8913
+_SIOCGIFBRDADDR = 0x8919
 _IFF_UP = 0x1
 _IFF_RUNNING = 0x40
 _IFREQ_SIZE = 40
@@ -24,8 +25,11 @@ def interface_of(address: str) -> str:
     Raises:
         EnvironmentalError: none has it.
     """
-    if address.startswith("127."):
-        return "lo"
+    return "lo" if address.startswith("127.") else _label_of(address).partition(":")[0]
+
+
+def _label_of(address: str) -> str:
+    """Return by what name the kernel lists *address*: ``eth0``, or perhaps ``eth0:1``."""
     memory = ctypes.create_string_buffer(_INTERFACES * _IFREQ_SIZE)
     request = struct.pack("@iP", len(memory), ctypes.addressof(memory))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
@@ -34,9 +38,27 @@ def interface_of(address: str) -> str:
     data = memory.raw
     for offset in range(0, size, _IFREQ_SIZE):
         if data[offset + 20 : offset + 24] == wanted:
-            label = data[offset : offset + 16].split(b"\0", 1)[0].decode()
-            return label.partition(":")[0]
+            return data[offset : offset + 16].split(b"\0", 1)[0].decode()
     raise EnvironmentalError(foreign_address(address))
+
+
+def broadcast_of(address: str) -> str:
+    """Return the broadcast address of the network that *address* of this machine is in.
+
+    Empty if it has none, as on a line with two ends.
+    """
+    if address.startswith("127."):
+        return "127.255.255.255"  # which the kernel knows, but does not tell
+    # Name and address together find one of several addresses of an interface.
+    name = _label_of(address).encode()
+    request = struct.pack("@16sHH4s16x", name, socket.AF_INET, 0, socket.inet_aton(address))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        try:
+            answer = fcntl.ioctl(sock.fileno(), _SIOCGIFBRDADDR, request)
+        except OSError:
+            return ""
+    found = socket.inet_ntoa(answer[20:24])
+    return "" if found in {"0.0.0.0", address} else found  # noqa: S104  a comparison
 
 
 def foreign_address(address: str) -> str:

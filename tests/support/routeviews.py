@@ -51,7 +51,7 @@ class Left:
         self.router.add_door(Door("udp:eap0", is_hub=True), self.carrier)
         self.routes = StationRoutes(
             self.router, RoutingSpec(routes=(RIGHT,)), RouteStore("hall", "left"),
-            open_hop=self._open, close_unused=lambda: None,
+            open_hop=self._open,
         )  # fmt: skip
         self.routes.start()
         self.view = RouterView(self.router, self.routes)

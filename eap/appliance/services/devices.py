@@ -11,7 +11,7 @@ from time import monotonic_ns
 from eap.aoe.spec import RoutingSpec
 from eap.appliance.route_store import RouteStore
 from eap.appliance.services.image_values import ImageValues
-from eap.appliance.services.routing.planned import make_router, to_way
+from eap.appliance.services.routing.planned import make_router
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sources import SourcePlayer
 from eap.appliance.services.station_ads import StationAds
@@ -83,10 +83,8 @@ class Devices:
             self.by_station[name] = device
             told = routing.get(name, RoutingSpec())
             self.routers[name] = router = make_router(station, told)
-            self.routes[name] = routes = StationRoutes(
-                router, told, RouteStore(plant, name), open_hop=to_way, close_unused=lambda: None
-            )
-            routes.start()
+            self.routes[name] = StationRoutes(router, told, RouteStore(plant, name))
+            self.routes[name].start()
             self.ads[name] = StationAds(station, device, image, router, identity)
 
     async def serve(self) -> None:

@@ -13,16 +13,21 @@ from typing import Protocol
 from msgspec.structs import replace
 
 from eap.aoe.routes import Origin, Route, RouteTable
-from eap.aoe.spec import HopSpec, RouteSpec, RoutingSpec
+from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.route_store import RouteStore
-from eap.appliance.services.routing.planned import to_route
+from eap.appliance.services.neighbours import Scanner
+from eap.appliance.services.routing.planned import to_route, to_way
+from eap.codec.amstcp import AMS_TCP_PORT
 from eap.errors import ControlError
 from eap.ids import NetId
 
 MAX_ADDED = 1000
 """Routes that can be added to one station."""
 MAX_NAME = 80
+LEARNED_NS = 600_000_000_000
+"""After which a learned route is forgotten, unless its router answers again."""
+_COMMON = 4
 _WHOLE = 6
 
 logger = logging.getLogger(__name__)
@@ -53,12 +58,11 @@ class StationRoutes:
         router: Of the station.
         spec: What the plant file says.
         store: Of the added routes.
-        open_hop: Returns door and address of a hop, which begins to connect if it has to; raises
-            ValueError if there is no such door.
-        close_unused: Called when routes have gone.
+        open_hop: Returns door and address of a hop; raises ValueError if there is no such door.
 
     Attributes:
         router: Of the station.
+        scanners: Who asks for the routers of other hosts, one for each address of the station.
     """
 
     def __init__(
@@ -67,14 +71,13 @@ class StationRoutes:
         spec: RoutingSpec,
         store: RouteStore,
         *,
-        open_hop: Callable[[HopSpec], Way],
-        close_unused: Callable[[], None],
+        open_hop: Callable[[HopSpec], Way] = to_way,
     ) -> None:
         self.router = router
+        self.scanners: list[Scanner] = []
         self._spec = spec
         self._store = store
         self._open_hop = open_hop
-        self._close_unused = close_unused
         self._added: dict[RouteSpec, bool] = {}
         """With whether it is kept over restarts."""
         self._written: dict[tuple[NetId, Way], RouteSpec] = {}
@@ -111,7 +114,6 @@ class StationRoutes:
                 self._take(each, Origin.ADDED)
             except ControlError as exc:
                 logger.warning("added route %s is left out: %s", each.name, exc)
-        self._close_unused()
 
     def is_derived(self, route: Route) -> bool:
         """Tell whether a route follows from the ports of the plant."""
@@ -142,6 +144,28 @@ class StationRoutes:
         self._change({**left, spec: is_kept}, gone=old)
         self.router.add_route(route)
         return route
+
+    def learn(self, net_id: NetId, name: str, address: str, now_ns: int) -> bool:
+        """Take a route to a router that answered, by AMS/TCP; tell whether it was taken.
+
+        It is gone after ten minutes, and never before a route that somebody wrote or added.
+        """
+        prefix = net_id[:_COMMON]
+        found = self.router.table.find(net_id)
+        if not self._spec.learn or any(own.startswith(prefix) for own in self.router.net_ids):
+            return False
+        if found is not None and found[1] >= _COMMON and found[0].origin is not Origin.LEARNED:
+            return False
+        hop = to_way(HopSpec(DoorKind.AMS_TCP, "", f"{address}:{AMS_TCP_PORT}"))
+        route = Route(
+            net_id,
+            _plain(name) or address,
+            hop,
+            Origin.LEARNED,
+            expires_at_ns=now_ns + LEARNED_NS,
+            is_probed=False,
+        )
+        return self.router.add_route(route)
 
     def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
         """Remove an added route by its name or NetID, and return it.
@@ -176,7 +200,6 @@ class StationRoutes:
         self._added = added
         for each in gone:
             self._forget(each)
-        self._close_unused()
 
     def _take_spec(self) -> None:
         for spec in self._spec.routes:

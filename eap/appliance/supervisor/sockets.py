@@ -21,7 +21,7 @@ from eap.appliance.supervisor.bus_sockets import open_buses, open_message_pair
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.amssocket import open_ams_listener, open_ams_socket
+from eap.net.amssocket import open_ams_broadcast, open_ams_listener, open_ams_socket
 from eap.net.packetsocket import open_arp, open_packet_pair
 from eap.net.tcp import open_tcp_listener
 from eap.net.udpsocket import open_udp_group_pair, open_udp_pair
@@ -45,8 +45,7 @@ def plan_sockets(stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
     every = any(address == EVERY_ADDRESS for _, address in ams)
     for name, address in ams:
         if address:
-            for kind in (SocketKind.AMS_TCP, SocketKind.AMS_UDP):
-                wanted = SharedSocket(kind, EVERY_ADDRESS if every else address)
+            for wanted in _ams_sockets(EVERY_ADDRESS if every else address):
                 owners.setdefault(wanted, []).append(name)
     planned = [
         msgspec.structs.replace(wanted, owners=tuple(names)) for wanted, names in owners.items()
@@ -68,6 +67,14 @@ def _sockets_of(port: PortSpec) -> Iterator[SharedSocket]:
             yield SharedSocket(SocketKind.GROUP, uri.host, number, group=BROADCAST)
     if uri.scheme in {"udp", "tcp"}:
         yield SharedSocket(SocketKind.TCP, uri.host, number)
+
+
+def _ams_sockets(address: str) -> Iterator[SharedSocket]:
+    yield SharedSocket(SocketKind.AMS_TCP, address)
+    yield SharedSocket(SocketKind.AMS_UDP, address)
+    if address != EVERY_ADDRESS:  # which broadcasts arrive at too
+        yield SharedSocket(SocketKind.AMS_BROADCAST, address)
+        yield SharedSocket(SocketKind.AMS_BROADCAST, address, group=BROADCAST)
 
 
 def _ams_address(port: PortSpec) -> str:
@@ -134,6 +141,12 @@ def _existing(*descriptors: int) -> list[int]:
 
 
 def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:
+    if planned.kind is SocketKind.AMS_BROADCAST:
+        broadcast = open_ams_broadcast(planned.address, planned.group)
+        if broadcast is None:
+            return planned
+        opened.enter_context(broadcast)
+        return msgspec.structs.replace(planned, services_fd=broadcast.fileno())
     if (single := _open_single(planned)) is not None:
         opened.enter_context(single)
         return msgspec.structs.replace(planned, services_fd=single.fileno())

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from eap.errors import EnvironmentalError
-from eap.net.interface import check_interface, interface_of, link_is_up
+from eap.net.interface import broadcast_of, check_interface, interface_of, link_is_up
 from tests.unit.eap.net.conftest import ip
 
 pytestmark = pytest.mark.net
@@ -15,6 +15,19 @@ pytestmark = pytest.mark.net
 
 def test_loopback_addresses_belong_to_lo():
     assert interface_of("127.9.8.7") == "lo"
+
+
+def test_loopback_has_a_broadcast_address():
+    assert broadcast_of("127.9.8.7") == "127.255.255.255"
+
+
+@pytest.mark.root
+def test_each_address_has_the_broadcast_address_of_its_network(cable):
+    ip("addr add 10.1.2.3/24 broadcast + dev left")
+    ip("addr add 10.1.2.4/30 broadcast + dev left label left:1")
+    ip("addr add 10.7.0.1/31 dev left")
+    found = [broadcast_of(address) for address in ("10.1.2.3", "10.1.2.4", "10.7.0.1")]
+    assert found == ["10.1.2.255", "10.1.2.7", ""]
 
 
 def test_foreign_address_belongs_to_none():

@@ -10,7 +10,6 @@ from eap.aoe.routes import Origin
 from eap.aoe.spec import AmsUser, DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.appliance.route_store import RouteStore
 from eap.appliance.services.route_desk import BURST, RouteDesk
-from eap.appliance.services.routing.planned import to_way
 from eap.appliance.services.station_routes import StationRoutes
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import (
@@ -41,13 +40,8 @@ def state(tmp_path, monkeypatch):
 
 
 def routes(name="left", **told) -> StationRoutes:
-    found = StationRoutes(
-        station(OWN, name=name),
-        RoutingSpec(**told),
-        RouteStore("demo", name),
-        open_hop=to_way,
-        close_unused=lambda: None,
-    )
+    router = station(OWN, name=name)
+    found = StationRoutes(router, RoutingSpec(**told), RouteStore("demo", name))
     found.start()
     return found
 

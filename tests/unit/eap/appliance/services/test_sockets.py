@@ -14,7 +14,6 @@ from eap.aoe.spec import RoutingSpec
 from eap.appliance.discards import DiscardCounters
 from eap.appliance.handover import Handover
 from eap.appliance.route_store import RouteStore
-from eap.appliance.services.routing.planned import to_way
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.station_routes import StationRoutes
 from eap.appliance.supervisor.sockets import SharedSockets
@@ -48,13 +47,7 @@ def script_on(tmp_path):
                 resources.enter_context(ours)
                 resources.enter_context(theirs)
                 routes = {
-                    name: StationRoutes(
-                        router,
-                        RoutingSpec(),
-                        RouteStore("plant", name),
-                        open_hop=to_way,
-                        close_unused=lambda: None,
-                    )
+                    name: StationRoutes(router, RoutingSpec(), RouteStore("plant", name))
                     for name, router in routers.items()
                 }
                 doors = open_doors(handover, routers, routes, counters, ours, resources)

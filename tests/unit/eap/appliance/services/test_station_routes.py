@@ -7,7 +7,7 @@ from eap.aoe.routes import Origin, Route, RouteTable
 from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.route_store import RouteStore
-from eap.appliance.services.station_routes import MAX_ADDED, StationRoutes
+from eap.appliance.services.station_routes import LEARNED_NS, MAX_ADDED, StationRoutes
 from eap.errors import ControlError
 from eap.ids import NetId
 
@@ -37,20 +37,14 @@ class House:
 
     def __init__(self, spec=WITH_STATIC):
         self.router = Router()
-        self.closed = 0
         self.store = RouteStore("demo", "left")
-        self.routes = StationRoutes(
-            self.router, spec, self.store, open_hop=self.open, close_unused=self.close
-        )
+        self.routes = StationRoutes(self.router, spec, self.store, open_hop=self.open)
         self.routes.start()
 
     def open(self, hop):
         if hop.port == "gone":
             raise ValueError("there is no door udp:gone")
         return Way(f"{hop.kind}:{hop.port}", hop.address)
-
-    def close(self):
-        self.closed += 1
 
     def names(self):
         return {route.name: route.origin for route in self.router.table}
@@ -70,7 +64,6 @@ def test_an_added_route_is_there_again_after_a_new_start():
     assert again.routes.added == (PLC,)
     again.routes.remove("plc")
     assert House().names() == {"mill": Origin.STATIC}
-    assert again.closed == 1
 
 
 @pytest.mark.parametrize(
@@ -195,3 +188,37 @@ def test_what_cannot_be_taken_is_told_and_kept_for_later(caplog):
     assert "added route plc is left out" in caplog.text
     house.routes.replace_spec(RoutingSpec())
     assert len(house.routes.added) == 1
+
+
+def learned(house, net_id="8.1.1.1.1.1", name="seen", now_ns=0):
+    return house.routes.learn(NetId.parse(net_id), name, "10.0.0.9", now_ns)
+
+
+def test_who_answered_has_a_route_for_ten_minutes():
+    house = House()
+    assert learned(house, name="seen\n")
+    [route] = [each for each in house.router.table if each.origin is Origin.LEARNED]
+    assert (route.name, route.hop) == ("seen", Way("ams-tcp:10.0.0.9:48898", "10.0.0.9:48898"))
+    assert learned(house, now_ns=5)
+    assert house.router.table.expire(LEARNED_NS) == []
+    assert [each.name for each in house.router.table.expire(LEARNED_NS + 5)] == ["seen"]
+    assert House().names() == {"mill": Origin.STATIC}
+
+
+@pytest.mark.parametrize("net_id", ["10.0.0.1.7.7", "10.0.0.2.7.7", "5.1.2.3.9.9"])
+def test_nobody_makes_a_route_in_place_of_another_by_an_answer(net_id):
+    house = House()
+    house.routes.add(PLC)
+    assert not learned(house, net_id)
+    assert len(house.router.table) == 2
+
+
+def test_nothing_is_learned_where_that_is_switched_off():
+    assert not learned(House(RoutingSpec(learn=False)))
+
+
+def test_a_default_route_is_no_reason_not_to_learn():
+    house = House()
+    house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0))
+    assert learned(house, name="")
+    assert house.router.table.find(NetId.parse("8.1.1.1.5.5"))[0].name == "10.0.0.9"

@@ -30,6 +30,10 @@ def test_a_udp_port_needs_a_pair_and_a_listener():
         (SocketKind.AMS_TCP, "127.9.2.2", 0, (RIGHT,)),
         (SocketKind.AMS_UDP, "127.9.2.1", 0, (LEFT,)),
         (SocketKind.AMS_UDP, "127.9.2.2", 0, (RIGHT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.1", 0, (LEFT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.2", 0, (RIGHT,)),
+        (SocketKind.AMS_BROADCAST, "127.9.2.2", 0, (RIGHT,)),
     ]
 
 
@@ -74,6 +78,8 @@ def test_groups_and_broadcasts_have_their_own():
         (SocketKind.TCP, "", 5000),
         (SocketKind.AMS_TCP, "", 0),
         (SocketKind.AMS_UDP, "", 0),
+        (SocketKind.AMS_BROADCAST, "", 0),
+        (SocketKind.AMS_BROADCAST, "255.255.255.255", 0),
     ]
 
 
