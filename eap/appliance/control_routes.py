@@ -108,27 +108,7 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
     """Base of what is told; a field that somebody newer tells is not looked at."""
 
 
-class Figures(Document, frozen=True, kw_only=True):
-    """Packets since the router started.
-
-    Attributes:
-        requests: That went out by a route, or came in by a connection.
-        answers: To them.
-        errors: Requests that did not get to their targets.
-        octets_out: Of packets that left here.
-        octets_in: Of packets that came here.
-        last_error: In words, empty while there was none.
-    """
-
-    requests: int = 0
-    answers: int = 0
-    errors: int = 0
-    octets_out: int = 0
-    octets_in: int = 0
-    last_error: str = ""
-
-
-class RouteRow(Figures, frozen=True, kw_only=True):
+class RouteRow(Document, frozen=True, kw_only=True):
     """One route.
 
     Attributes:
@@ -146,6 +126,12 @@ class RouteRow(Figures, frozen=True, kw_only=True):
         unidirectional: Whether nothing may be asked from there.
         timeout_ms: How long an answer may take; 0 for as long as usual.
         probed: Whether the next hop is asked from time to time.
+        requests: That went out by it.
+        answers: To them.
+        errors: Requests that did not get to their targets.
+        octets_out: Of packets that left here.
+        octets_in: Of packets that came here.
+        last_error: In words, empty while there was none.
     """
 
     name: str
@@ -162,6 +148,12 @@ class RouteRow(Figures, frozen=True, kw_only=True):
     unidirectional: bool = False
     timeout_ms: int = 0
     probed: bool = True
+    requests: int = 0
+    answers: int = 0
+    errors: int = 0
+    octets_out: int = 0
+    octets_in: int = 0
+    last_error: str = ""
 
     @property
     def pattern(self) -> str:
@@ -170,7 +162,7 @@ class RouteRow(Figures, frozen=True, kw_only=True):
         return ".".join([*octets, *["*"] * (6 - self.octets)]) if self.octets else "default"
 
 
-class ConnectionRow(Figures, frozen=True, kw_only=True):
+class ConnectionRow(Document, frozen=True, kw_only=True):
     """One connection that requests came by, or one sender where there are none.
 
     Attributes:
@@ -179,6 +171,12 @@ class ConnectionRow(Figures, frozen=True, kw_only=True):
         since_s: For how many seconds it has been used.
         net_ids: That asked by it, the first few.
         took_us: How long the latest answer took; None before the first.
+        requests: That came in by it.
+        answers: To them.
+        errors: Requests that did not get to their targets.
+        octets_out: Of packets that left here.
+        octets_in: Of packets that came here.
+        last_error: In words, empty while there was none.
     """
 
     door: str
@@ -186,6 +184,12 @@ class ConnectionRow(Figures, frozen=True, kw_only=True):
     since_s: int
     net_ids: list[str] = []
     took_us: int | None = None
+    requests: int = 0
+    answers: int = 0
+    errors: int = 0
+    octets_out: int = 0
+    octets_in: int = 0
+    last_error: str = ""
 
 
 class RequestRow(Document, frozen=True, kw_only=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from eap.aoe.way import Way
-from eap.appliance.control_routes import ConnectionRow, Figures, RequestRow, RouteRow, RouterRow
+from eap.appliance.control_routes import ConnectionRow, RequestRow, RouteRow, RouterRow
 from eap.cli import words
 
 _UNITS = ("", "k", "M", "G", "T", "P", "E")
@@ -23,7 +23,7 @@ def short(number: int) -> str:
     )
 
 
-def octets(row: Figures) -> str:
+def octets(row: RouteRow | ConnectionRow) -> str:
     """Return all octets, both ways."""
     return short(row.octets_in + row.octets_out)
 
@@ -65,7 +65,7 @@ def route_state(row: RouteRow) -> str:
     return f"{row.state}: {rest}" if rest else row.state
 
 
-def figures(row: Figures) -> str:
+def figures(row: RouteRow | ConnectionRow) -> str:
     """Return all figures of a row in words."""
     return (
         f"{words.count(row.requests, 'request')}, {words.count(row.answers, 'answer')},"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from eap.appliance.services.routing.system_service import SystemService
-
+from eap.aoe.ads_system import SYSTEM_PORT
+from eap.aoe.answer import AmsAnswer
 from eap.aoe.directory import Directory
 from eap.aoe.spec import (
     DirectoryPort,
@@ -16,10 +16,11 @@ from eap.aoe.spec import (
 from eap.aoe.way import Door, Way
 from eap.appliance.route_store import RouteStore
 from eap.appliance.services.route_rows import RouterView
+from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.station_routes import StationRoutes
 from eap.ids import NetId
-from tests.support.routing import KeepingCarrier
+from tests.support.routing import KeepingCarrier, StubService
 
 DIRECTORY = Directory([
     DirectoryStation(
@@ -34,6 +35,12 @@ RIGHT = RouteSpec(
 )  # fmt: skip
 
 
+def _run(request: LocalRequest) -> AmsAnswer:
+    """Tell ADS state RUN, whatever is asked."""
+    del request
+    return AmsAnswer(bytes.fromhex("00000000 0500 0000"))
+
+
 class Left:
     """Station left: its router has a door by UDP and one by AMS/TCP, and knows station right.
 
@@ -46,7 +53,7 @@ class Left:
         net_ids = [NetId.parse(port.net_id) for port in station.ports]
         net_id = NetId.parse(station.net_id)
         self.router = StationRouter("left", net_id, net_ids)
-        self.router.add_service(net_id, SystemService("left"))
+        self.router.add_service(net_id, StubService(_run, SYSTEM_PORT))
         self.carrier = KeepingCarrier()
         self.router.add_door(Door("udp:eap0", is_hub=True), self.carrier)
         self.routes = StationRoutes(

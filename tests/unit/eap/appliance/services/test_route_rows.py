@@ -129,5 +129,7 @@ def test_all_of_a_request_is_told() -> None:
     assert (found.service, found.target) == ("READ", "127.0.9.2.1.1:851")
     assert (found.source, found.came_by) == ("5.1.1.1.1.1:30000", "127.0.0.1:1 by ams-tcp")
     assert (found.door, found.address, found.error, found.took_us) == (*HOP, 6, 2000)
+    said = "READ of 127.0.9.2.1.1:851 for 5.1.1.1.1.1:30000 (127.0.0.1:1 by ams-tcp): cut"
+    assert request_row(trace._replace(text=said), 4 * 10**9).text == "cut"
     bare = request_row(trace._replace(came_by=None, hop=None, header=None), 4 * 10**9)
     assert (bare.service, bare.came_by, bare.door, bare.text) == ("", "", "", "no such port")
