@@ -95,6 +95,26 @@ def cable(*, addresses: bool = False) -> Iterator[tuple[Namespace, Namespace]]:
         yield ends
 
 
+@contextmanager
+def row(count: int) -> Iterator[list[Namespace]]:
+    """Make namespaces in a row, with a cable from the ``east0`` of each to ``west0`` of the next.
+
+    The first cable has addresses: 10.88.170.1/24 and 10.88.170.2/24.
+    """
+    with ExitStack() as stack:
+        found = [stack.enter_context(namespace()) for _ in range(count)]
+        for left, right in itertools.pairwise(found):
+            _run(
+                *("ip", "link", "add", "east0", "netns", left.name, "type", "veth"),
+                *("peer", "name", "west0", "netns", right.name),
+            )
+            left.ip("link", "set", "east0", "up")
+            right.ip("link", "set", "west0", "up")
+        found[0].ip("addr", "add", "10.88.170.1/24", "dev", "east0")
+        found[1].ip("addr", "add", "10.88.170.2/24", "dev", "west0")
+        yield found
+
+
 def _enter(descriptor: int) -> None:
     if _library.setns(descriptor, _CLONE_NEWNET):
         raise OSError(ctypes.get_errno(), "setns")
