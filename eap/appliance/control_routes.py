@@ -104,6 +104,17 @@ class RoutesExportParameters(Parameters, frozen=True, kw_only=True):
     station: str
 
 
+class RoutesScanParameters(Parameters, frozen=True, kw_only=True):
+    """``routes_scan``: asks for routers of other hosts, from one station or from all.
+
+    Asks *address*, of a host or a network, or the networks of the stations.
+    """
+
+    station: str = ""
+    address: Text = ""
+    wait_ms: Annotated[int, Meta(ge=10, le=60_000)] = 1_000
+
+
 class Document(msgspec.Struct, frozen=True, kw_only=True):
     """Base of what is told; a field that somebody newer tells is not looked at."""
 
@@ -258,6 +269,28 @@ class TestResult(Document, frozen=True, kw_only=True):
     error: int = 0
     text: str
     hint: str = ""
+
+
+class NeighbourRow(Document, frozen=True, kw_only=True):
+    """A router of another host that answered.
+
+    Attributes:
+        station: That asked.
+        name: Of the router or its host.
+        net_id: Of the router.
+        address: IPv4 address that the answer came from.
+        version: Of its software; empty if it does not tell.
+        route: Name of the route that leads there; empty for none.
+        is_learned: Whether that was learned.
+    """
+
+    station: str
+    name: str
+    net_id: str
+    address: str
+    version: str
+    route: str
+    is_learned: bool
 
 
 class ImportRow(Document, frozen=True, kw_only=True):

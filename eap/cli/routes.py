@@ -27,6 +27,7 @@ _MARGIN_S = 5.0
         "import": "eap.cli.routes_file:import_routes",
         "list": "eap.cli.routes:list_all",
         "remove": "eap.cli.routes:remove",
+        "scan": "eap.cli.routes_scan:scan",
         "test": "eap.cli.routes:test",
     },
     short_help="Show, add, remove and test routes; without a command: a live view.",

@@ -10,7 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from eap.appliance.control_routes import ImportRow, RouterRow, TestResult
+from eap.appliance.control_routes import ImportRow, NeighbourRow, RouterRow, TestResult
 from eap.cli import routes_text, words
 
 _STYLES = {"up": "green", "down": "bold red", "unknown": "dim"}
@@ -37,6 +37,17 @@ def result_table(results: Iterable[tuple[str, TestResult]]) -> RenderableType:
             said.append(f"\n{result.hint}", style="none")
         target = f"{result.name} {result.target}".strip()
         table.add_row(station, target, routes_text.round_trip(result.rtt_us), said)
+    return table
+
+
+def neighbour_table(rows: Iterable[NeighbourRow]) -> RenderableType:
+    """Return the routers of other hosts, and by which route they are reached."""
+    table = _table("Station", "Found", "NetID", "Address", "Version", "Route")
+    for row in rows:
+        route = Text(row.route or "none", style=_STYLES["up" if row.route else "unknown"])
+        if row.is_learned:
+            route.append(" (learned)", style="none")
+        table.add_row(row.station, row.name, row.net_id, row.address, row.version, route)
     return table
 
 

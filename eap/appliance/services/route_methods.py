@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import Any
 
@@ -14,6 +16,7 @@ from eap.appliance.control import ErrorCode, near, parameters
 from eap.appliance.control_routes import (
     Export,
     ImportRow,
+    NeighbourRow,
     RouteRow,
     RouterRow,
     RoutesAddParameters,
@@ -21,9 +24,11 @@ from eap.appliance.control_routes import (
     RoutesImportParameters,
     RoutesListParameters,
     RoutesRemoveParameters,
+    RoutesScanParameters,
     RoutesTestParameters,
     TestResult,
 )
+from eap.appliance.services.neighbours import Found, find_neighbours
 from eap.appliance.services.route_probe import find_target, probe_target
 from eap.appliance.services.route_rows import RouterView, route_row
 from eap.codec import staticroutes
@@ -56,6 +61,7 @@ class RouteMethods:
             "routes_list": self._list,
             "routes_add": self._add,
             "routes_remove": self._remove,
+            "routes_scan": self._scan,
             "routes_test": self._test,
             "routes_import": self._import,
             "routes_export": self._export,
@@ -85,6 +91,23 @@ class RouteMethods:
         router = self._view(wanted.station).router
         target = find_target(router, self._directory, wanted.target)
         return await probe_target(router, target, wanted.timeout_ms / 1000)
+
+    async def _scan(self, params: dict[str, Any]) -> list[NeighbourRow]:
+        wanted = parameters(params, RoutesScanParameters)
+        if wanted.address:
+            _check_address(wanted.address)
+        if wanted.station:
+            return await self._scan_from(self._view(wanted.station), wanted)
+        views = [view for view in self._views.values() if view.routes.scanners]
+        rows = await asyncio.gather(*(self._scan_from(view, wanted) for view in views))
+        return [row for each in rows for row in each]
+
+    async def _scan_from(
+        self, view: RouterView, wanted: RoutesScanParameters
+    ) -> list[NeighbourRow]:
+        with _kept():
+            found = await find_neighbours(view.routes, wanted.address, wanted.wait_ms / 1000)
+        return [_neighbour_row(view, each) for each in found]
 
     def _import(self, params: dict[str, Any]) -> list[ImportRow]:
         wanted = parameters(params, RoutesImportParameters)
@@ -179,6 +202,28 @@ class RouteMethods:
             raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
 
 
+def _neighbour_row(view: RouterView, found: Found) -> NeighbourRow:
+    name, net_id, address, version = found.neighbour
+    route = view.router.table.find(net_id)
+    is_own = route is not None and route[1] > 0  # a default route leads anywhere
+    return NeighbourRow(
+        station=view.router.name,
+        name=name,
+        net_id=str(net_id),
+        address=address,
+        version=version,
+        route=route[0].name if route is not None and is_own else "",
+        is_learned=found.is_learned,
+    )
+
+
+def _check_address(text: str) -> None:
+    try:
+        IPv4Address(text)
+    except ValueError as exc:
+        raise ControlError(f"address: {exc}", code=ErrorCode.VALUE) from None
+
+
 def _removed(spec: RouteSpec) -> RouteRow:
     kind, port, address = spec.hop.kind, spec.hop.port, spec.hop.address
     return RouteRow(
@@ -199,7 +244,7 @@ def _removed(spec: RouteSpec) -> RouteRow:
 
 @contextmanager
 def _kept() -> Iterator[None]:
-    """Refuse what cannot be kept over a restart."""
+    """Refuse what this machine cannot do: keep a route over a restart, ask a network."""
     try:
         yield
     except EnvironmentalError as exc:

@@ -1,9 +1,15 @@
 from __future__ import annotations
 
+import msgspec
 from rich.console import Console
 
-from eap.appliance.control_routes import ImportRow, TestResult
-from eap.cli.routes_view import import_table, result_table, routes_tables
+from eap.appliance.control_routes import ImportRow, NeighbourRow, TestResult
+from eap.cli.routes_view import (
+    import_table,
+    neighbour_table,
+    result_table,
+    routes_tables,
+)
 from tests.support.fakeroutes import FakeRoutes
 
 
@@ -54,3 +60,14 @@ def test_imports() -> None:
     assert "b" in text
     assert "no NetID" in text
     assert "Would be added" in shown(import_table(rows, is_done=False))
+
+
+def test_routers_of_other_hosts() -> None:
+    cx = NeighbourRow(
+        station="left", name="cx", net_id="5.1.2.3.1.1", address="10.0.0.5", version="3.1.4024",
+        route="cx", is_learned=True,
+    )  # fmt: skip
+    lone = msgspec.structs.replace(cx, name="pc", version="", route="", is_learned=False)
+    rows = [line.split() for line in shown(neighbour_table([cx, lone])).splitlines()]
+    assert ["left", "cx", "5.1.2.3.1.1", "10.0.0.5", "3.1.4024", "cx", "(learned)"] in rows
+    assert ["left", "pc", "5.1.2.3.1.1", "10.0.0.5", "none"] in rows

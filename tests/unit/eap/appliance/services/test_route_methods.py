@@ -7,6 +7,7 @@ import pytest
 
 from eap.aoe.routes import Origin, Route
 from eap.aoe.way import Way
+from eap.appliance.services.neighbours import Neighbour
 from eap.appliance.services.route_methods import RouteMethods
 from eap.codec.staticroutes import StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
@@ -164,3 +165,45 @@ def test_export_holds_ams_tcp_and_names_the_rest(ask):
         StaticRoute("behind", "5.1.2.4.1.1", "plc:1000"),
     ]
     assert ask("import", station="left", xml=found.xml)[1].reason == ""
+
+
+class Scanner:
+    """Finds two routers, one of them is known."""
+
+    def __init__(self):
+        self.asked = []
+
+    async def scan(self, address="", *, wait_s):
+        self.asked.append((address, wait_s))
+        return [
+            Neighbour("right", NetId.parse("127.0.9.2.1.1"), "127.0.9.2", "1.2.3"),
+            Neighbour("cx", NetId.parse("5.1.2.3.1.1"), "10.0.0.5", ""),
+        ]
+
+
+def test_scan_tells_who_is_there_and_learns(ask, left):
+    left.routes.scanners.append(scanner := Scanner())
+    known, new = asyncio.run(ask("scan", station="left", address="10.0.0.255", wait_ms=20))
+    assert scanner.asked == [("10.0.0.255", 0.02)]
+    assert (known.name, known.route, known.is_learned) == ("right", "right", False)
+    assert (new.station, new.net_id, new.address) == ("left", "5.1.2.3.1.1", "10.0.0.5")
+    assert (new.route, new.is_learned) == ("cx", True)
+    assert asyncio.run(ask("scan"))[1].is_learned  # again, which makes it younger
+
+
+def test_scan_from_a_default_route_knows_no_route(ask, left):
+    left.routes.scanners.append(Scanner())
+    ask("add", station="left", name="others", via="right/eap0", octets=0)
+    row = asyncio.run(ask("scan"))[1]
+    assert (row.route, row.is_learned) == ("cx", True)
+
+
+def test_scan_that_cannot_be(ask):
+    assert asyncio.run(ask("scan")) == []  # nobody here has an address
+    for params, code, text in (
+        ({"station": "left"}, "unavailable", "no IP address at which it serves AMS"),
+        ({"address": "plc"}, "value", "address: Expected 4 octets in 'plc'"),
+    ):
+        with pytest.raises(ControlError, match=text) as caught:
+            asyncio.run(ask("scan", **params))
+        assert caught.value.code == code
