@@ -9,6 +9,7 @@ from typing import NamedTuple
 from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.spec import DirectoryPort, DirectoryStation
 from eap.ids import NetId
+from eap.od.profiles.router9000 import ROUTER
 
 DEVICE_PORT = 0xFFFF
 """AMS port of an EAP device, of a master, and of the dictionary of a router."""
@@ -36,13 +37,16 @@ class Directory:
         }
         self._net_ids = {NetId.parse(station.net_id): station.name for station in stations}
         for station in stations:
+            own = AmsAddress(NetId.parse(station.net_id), DEVICE_PORT)
+            self._names[own] = f"{station.name}/{ROUTER}"
             for port in station.ports:
                 self._enter(f"{station.name}/{port.name}", port)
 
     def find(self, text: str) -> AmsAddress:
         """Return the address of ``STATION``, ``STATION/PORT[/SLAVE]`` or ``NETID[:PORT]``.
 
-        A station stands for the system service of its router.
+        A station stands for the system service of its router, ``STATION/router`` for the router's
+        dictionary.
 
         Raises:
             ValueError: there is no such name here, or it is no name; the message says what is.
@@ -58,6 +62,8 @@ class Directory:
         port_name, slash, slave = rest.partition("/")
         ports = {port.name: port for port in station.ports}
         port = ports.get(port_name)
+        if port is None and rest == ROUTER:
+            return AmsAddress(NetId.parse(station.net_id), DEVICE_PORT)
         if port is None:
             hint = _near(port_name, ports) or f"; it has {', '.join(ports) or 'none'}"
             raise ValueError(f"station {name} has no port {port_name!r}{hint}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -13,9 +13,11 @@ from eap.appliance.control import ErrorCode, near, parameters
 from eap.appliance.control_bus import to_octets
 from eap.appliance.services.station_device import StationDevice
 from eap.device.eap_dictionary import EapDictionary
+from eap.device.router_dictionary import RouterDictionary
 from eap.errors import ControlError
 from eap.od.model import Access, OdObject
 from eap.od.profiles import eap1000 as profile
+from eap.od.profiles.router9000 import ROUTER
 
 _FLAGS = {
     "rx": Access.RX_MAPPABLE,
@@ -30,11 +32,18 @@ class DeviceMethods:
 
     Args:
         devices: By station.
+        routers: What the routers of these stations are.
         plant_file: With which the appliance was started.
     """
 
-    def __init__(self, devices: Mapping[str, StationDevice], plant_file: str) -> None:
+    def __init__(
+        self,
+        devices: Mapping[str, StationDevice],
+        routers: Mapping[str, RouterDictionary],
+        plant_file: str,
+    ) -> None:
         self._devices = devices
+        self._routers = routers
         self._plant_file = plant_file
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
@@ -60,7 +69,7 @@ class DeviceMethods:
 
     def _list(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdListParameters)
-        dictionary = self._dictionary(wanted.target)
+        dictionary = self._find(wanted.target).dictionary
         flag = _FLAGS.get(wanted.list)
         chosen = (
             item
@@ -71,28 +80,34 @@ class DeviceMethods:
 
     def _describe(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdDescribeParameters)
-        dictionary = self._dictionary(wanted.target)
-        item = _existing_or_new(dictionary, wanted.index, wanted.subindex)
+        dictionary = self._find(wanted.target).dictionary
+        if isinstance(dictionary, EapDictionary):
+            item = _existing_or_new(dictionary, wanted.index, wanted.subindex)
+        else:
+            item = dictionary[wanted.index]
         rows = [words.entry_row(*each) for each in item.entries.items()]
         return _object_row(dictionary, item) | {"entries": rows}
 
     def _read(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdReadParameters)
-        device, port = self._find(wanted.target)
-        data = device.upload(port, wanted.index, wanted.subindex, complete=wanted.complete)
-        return {"data": data.hex()}
+        found = self._find(wanted.target)
+        read = found.dictionary.upload_complete if wanted.complete else found.dictionary.upload
+        return {"data": read(wanted.index, wanted.subindex, found.device.od_state()).hex()}
 
     async def _write(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdWriteParameters)
-        device, port = self._find(wanted.target)
-        data = to_octets(wanted.data)
-        await device.download(port, wanted.index, wanted.subindex, data, complete=wanted.complete)
+        found = self._find(wanted.target)
+        place, data = (wanted.index, wanted.subindex), to_octets(wanted.data)
+        if isinstance(found.dictionary, EapDictionary):
+            await found.device.download(found.port, *place, data, complete=wanted.complete)
+        else:
+            found.dictionary.download(*place, data, found.device.od_state())
         return {}
 
     def _dump(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.OdDumpParameters)
-        device, port = self._find(wanted.target)
-        dictionary, state = device.dictionaries[port], device.od_state()
+        found = self._find(wanted.target)
+        dictionary, state = found.dictionary, found.device.od_state()
 
         def row(item: OdObject) -> dict[str, Any]:
             entries = [
@@ -105,12 +120,12 @@ class DeviceMethods:
         return _page(dictionary, wanted.first, row)
 
     def _state(self, params: dict[str, Any]) -> dict[str, Any]:
-        device, _ = self._find(parameters(params, words.TargetParameters).target)
-        return words.state_document(device.status)
+        found = self._find(parameters(params, words.TargetParameters).target)
+        return words.state_document(found.device.status)
 
     async def _request_state(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.RequestStateParameters)
-        device, _ = self._find(wanted.target)
+        device = self._find(wanted.target).device
         return words.state_document(await device.request_state(words.state_of(wanted.state)))
 
     def _export(self, params: dict[str, Any]) -> dict[str, Any]:
@@ -138,26 +153,32 @@ class DeviceMethods:
             hint = near(station, self._devices)
             raise _unknown(f"no station {station!r} here{hint}") from None
 
-    def _find(self, target: str) -> tuple[StationDevice, str]:
-        """Return device and port of a target; raise ControlError that says which there are."""
+    def _find(self, target: str) -> _Target:
+        """Return who is meant by a target; raise ControlError that says which there are."""
         station, _, port = target.partition("/")
         device = self._device(station)
         ports = list(device.dictionaries)
+        if port == ROUTER and port not in ports:
+            return _Target(device, port, self._routers[station])
         if not ports:
-            raise _unknown(f"station {station} has no EAP port, so there is no dictionary")
-        if not port:
-            return device, ports[0]
+            reason = f"station {station} has no EAP port; the dictionary of its router is at"
+            raise _unknown(f"{reason} {station}/{ROUTER}")
+        port = port or ports[0]
         if port not in ports:
             known = f"its EAP ports are {', '.join(ports)}"
-            raise _unknown(f"{target} has no dictionary; {known}{near(port, ports)}")
-        return device, port
-
-    def _dictionary(self, target: str) -> EapDictionary:
-        device, port = self._find(target)
-        return device.dictionaries[port]
+            raise _unknown(f"{target} has no dictionary; {known}{near(port, [*ports, ROUTER])}")
+        return _Target(device, port, device.dictionaries[port])
 
 
-def _object_row(dictionary: EapDictionary, item: OdObject) -> dict[str, Any]:
+class _Target(NamedTuple):
+    """Whose dictionary is meant."""
+
+    device: StationDevice
+    port: str
+    dictionary: EapDictionary | RouterDictionary
+
+
+def _object_row(dictionary: EapDictionary | RouterDictionary, item: OdObject) -> dict[str, Any]:
     is_there = item.index in dictionary
     return words.object_row(item, dictionary.name_of(item.index) if is_there else "")
 

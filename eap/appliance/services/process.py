@@ -171,8 +171,10 @@ class Services:
             name: RouterView(router, devices.routes[name])
             for name, router in devices.routers.items()
         }
+        routers = {name: ads.dictionary for name, ads in devices.ads.items()}
+        plant_file = self._handover.plant_file
         return {
-            **DeviceMethods(devices.by_station, self._handover.plant_file).table(),
+            **DeviceMethods(devices.by_station, routers, plant_file).table(),
             **RouteMethods(views, self._directory).table(),
             **AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
         }

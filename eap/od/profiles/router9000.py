@@ -16,6 +16,8 @@ from eap.od.profiles.forms import Form
 from eap.od.profiles.table import EntryRow, ObjectRange, fixed, live
 
 MODULE_PROFILE = 9000
+ROUTER = "router"
+"""What people call the router of a station, beside its ports; a port of that name goes before."""
 MASTER_PROFILE = 1100
 """Sub-profile of a bus port."""
 

@@ -25,6 +25,7 @@ HERE = Directory([DirectoryStation("island-01", "5.1.1.1.1.1", PORTS)])
     ("text", "address"),
     [
         ("island-01", "5.1.1.1.1.1:10000"),
+        ("island-01/router", "5.1.1.1.1.1:65535"),
         ("island-01/eap0", "5.1.1.1.2.1:65535"),
         ("island-01/bus0", "5.1.1.1.3.1:65535"),
         ("island-01/bus0/drive", "5.1.1.1.3.1:1001"),

@@ -12,8 +12,8 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.router9000 import Live
 from eap.pd.spec import PortKind, PortSpec, StationSpec
+from tests.support.routervalues import MAC, Values
 
-MAC = bytes.fromhex("020000000005")
 STATION = StationSpec(
     "tower",
     "1.2.3.4.1.1",
@@ -24,32 +24,9 @@ STATION = StationSpec(
         PortSpec("bus0", PortKind.BUS, "sim://bus.yaml", "1.2.3.4.3.1"),
     ),
 )
-STATES = {"eap0": 8, "eap1": 4, "bus0": 2}
 
 
-class Values:
-    """A router that counts from 1 on, by key; routes are dicts of what they show."""
-
-    def __init__(self) -> None:
-        self.all: list[dict[Live, object]] = []
-
-    def number(self, key):
-        return list(Live).index(key)
-
-    def state_of(self, port):
-        return STATES[port]
-
-    def mac_of(self, port):
-        return MAC if port == "eap1" else bytes(6)
-
-    def routes(self):
-        return self.all
-
-    def of_route(self, key, route):
-        return route[key]
-
-
-def route(name, **more):
+def route(name):
     return {
         Live.ROUTE_NET_ID: NetId.parse("5.6.7.8.1.1"),
         Live.ROUTE_OCTETS: 4,

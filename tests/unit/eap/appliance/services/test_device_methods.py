@@ -14,10 +14,13 @@ from eap.appliance.configuration import digest_of
 from eap.appliance.control import ErrorCode
 from eap.appliance.services.device_methods import DeviceMethods
 from eap.appliance.store import Store
+from eap.device.eap_content import Identity
+from eap.device.router_dictionary import RouterDictionary
 from eap.errors import ControlError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000keys import Frame, Tx
 from eap.pd.spec import PortKind, PortSpec, StationSpec
+from tests.support.routervalues import Values
 from tests.support.stationengine import make_device
 
 BUS_ONLY = StationSpec(
@@ -33,7 +36,8 @@ def device(stations):
 @pytest.fixture
 def methods(device, stations):
     devices = [device[0], make_device(stations[1])[0], make_device(BUS_ONLY)[0]]
-    return DeviceMethods({each.name: each for each in devices}, "/x/plant.yaml").table()
+    routers = {each.name: RouterDictionary(each.spec, Values(), Identity()) for each in devices}
+    return DeviceMethods({each.name: each for each in devices}, routers, "/x/plant.yaml").table()
 
 
 @pytest.fixture
@@ -227,12 +231,34 @@ def test_refused_apply(call, stations, device):
     ]
 
 
+def test_router_has_a_dictionary_beside_those_of_ports(call):
+    for station in ("left", "io"):
+        rows = call("od_list", target=f"{station}/router")["objects"]
+        assert [row["index"] for row in rows][:2] == [0x1000, 0x1008]
+        assert call("od_read", target=f"{station}/router", index=0x1000, subindex=0) == {
+            "data": "89132823"
+        }
+    whole = call("od_read", target="io/router", index=0xF010, subindex=0, complete=True)
+    assert whole == {"data": "01004c040000"}
+    described = call("od_describe", target="io/router", index=0x8000, subindex=7)
+    assert (described["label"], described["entries"][7]["name"]) == ("bus0", "Name")
+    assert call("od_dump", target="left/router")["objects"][0]["entries"][0]["data"] == "89132823"
+    assert call("state", target="io/router")["state"] == "OP"
+    with pytest.raises(SdoAbortError) as refused:
+        call("od_write", target="left/router", index=0xF000, subindex=1, data="0100")
+    assert refused.value.code == AbortCode.READ_ONLY
+    with pytest.raises(SdoAbortError) as refused:
+        call("od_describe", target="left/router", index=0x9000)
+    assert refused.value.code == AbortCode.NO_OBJECT
+
+
 @pytest.mark.parametrize(
     ("method", "params", "message"),
     [
         ("od_list", {"target": "lft"}, "no station 'lft' here, did you mean left"),
         ("od_list", {"target": "left/eap1"}, "its EAP ports are eap0, did you mean eap0"),
-        ("od_list", {"target": "io"}, "station io has no EAP port"),
+        ("od_list", {"target": "io"}, "no EAP port; the dictionary of its router is at io/router"),
+        ("od_list", {"target": "left/routr"}, "did you mean router"),
         ("export", {"station": "x"}, "no station 'x' here"),
     ],
 )
