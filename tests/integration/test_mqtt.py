@@ -1,0 +1,114 @@
+"""Stations that reach each other through a real broker and nothing else, as separate appliances."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.ams import Ams
+from tests.support.appliance import Appliance, plants, wait_until
+from tests.support.mosquitto import Broker, broker
+from tests.support.mqttclient import PahoPeer
+from tests.support.mqtthalls import (
+    BROKER,
+    NORTH,
+    SOUTH,
+    VENDOR_OF_DRIVE,
+    read,
+    until_read,
+    write_plant,
+)
+
+pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
+
+pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
+
+STATUS = 0x60410000
+UNREACHABLE, DENIED = 0x1B, 0x723
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    with broker(tmp_path_factory.mktemp("broker"), BROKER) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def halls(server: Broker) -> Iterator[tuple[Appliance, Appliance]]:
+    """Two appliances that know nothing of each other."""
+    with plants() as farm:
+        north = farm.run(write_plant(farm.folder, "north", NORTH))
+        south = farm.run(write_plant(farm.folder, "south", SOUTH))
+        until_read(NORTH, NORTH)
+        until_read(SOUTH, SOUTH)
+        yield north, south
+
+
+def test_slaves_are_reached_both_ways_and_only_read(halls):
+    until_read(SOUTH, by=NORTH)
+    until_read(NORTH, by=SOUTH)
+    assert read(SOUTH, NORTH, STATUS) == read(SOUTH, SOUTH, STATUS) >= 0
+    with pyads.Connection(f"{SOUTH}.3.1", 1001, NORTH) as drive:
+        assert drive.read_device_info()[0] == "drive"
+        with pytest.raises(pyads.ADSError) as refused:
+            drive.write(0xF302, 0x60650000, 2000, pyads.PLCTYPE_UDINT)
+        assert refused.value.err_code == DENIED
+
+
+def test_broker_is_restarted_in_mid_run_and_service_resumes(halls, server):
+    until_read(SOUTH, by=NORTH)
+    server.stop()
+    wait_until(lambda: read(SOUTH, NORTH) == -UNREACHABLE)
+    began = time.monotonic()
+    assert read(SOUTH, NORTH) == -UNREACHABLE
+    assert time.monotonic() - began < 1
+    assert read(NORTH, NORTH) == VENDOR_OF_DRIVE
+    server.start()
+    until_read(SOUTH, by=NORTH)
+    until_read(NORTH, by=SOUTH)
+
+
+def test_station_whose_services_die_is_down_at_once_and_comes_back(halls):
+    until_read(SOUTH, by=NORTH)
+    _, south = halls
+    supervisor = south.process.pid
+    os.kill(supervisor, signal.SIGSTOP)  # so that nobody starts them again yet
+    try:
+        os.kill(south_services := _services_of(supervisor), signal.SIGKILL)
+        wait_until(lambda: read(SOUTH, NORTH) == -UNREACHABLE)
+    finally:
+        os.kill(supervisor, signal.SIGCONT)
+    until_read(SOUTH, by=NORTH)
+    assert south.pid("services") != south_services
+
+
+def _services_of(supervisor: int) -> int:
+    children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
+    return next(
+        int(child)
+        for child in children
+        if b"services" in Path(f"/proc/{child}/cmdline").read_bytes()
+    )
+
+
+def test_client_of_another_make_is_served_and_hostile_ones_are_not(halls):
+    north, _ = halls
+    octets = read(SOUTH, SOUTH).to_bytes(4, "little")
+    before = north.pid("services")
+    with PahoPeer(BROKER, "works", "9.9.9.9.1.1", is_prefixed=True) as peer:
+        peer.wait_for_router(f"{SOUTH}.1.1", "south")
+        body = bytes.fromhex("02f30000 01001810 04000000")
+        asked = Ams(f"{SOUTH}.3.1:1001", "9.9.9.9.1.1:800", body=body)
+        assert peer.ask(f"{SOUTH}.1.1", asked).body == bytes(4) + b"\4\0\0\0" + octets
+        for payload in (b"", b"\0" * 31, b"\xff" * 70_000, asked.octets()[:40], bytes(900_000)):
+            for rest in ("ams", "ams/res", "info"):
+                peer.publish(f"{NORTH}.1.1", rest, payload)
+        peer.publish("7.7.7.7.1.1", "info", b"<!DOCTYPE a [<!ENTITY b 'c'>]><info>&b;</info>")
+        assert peer.ask(f"{SOUTH}.1.1", asked).body[:8] == bytes(4) + b"\4\0\0\0"
+    until_read(SOUTH, by=NORTH)
+    assert north.pid("services") == before

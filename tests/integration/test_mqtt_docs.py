@@ -1,0 +1,70 @@
+"""docs/mqtt.md tells the truth: its examples run, and its broker lets pass what it says."""
+
+from __future__ import annotations
+
+import doctest
+
+import pytest
+
+from tests.support.mosquitto import broker, write_certificates, write_passwords
+from tests.support.mqtthalls import BROKER, NORTH, ROOT, SOUTH, read, until_read, write_plant
+
+pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
+
+pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
+
+PAGE = ROOT / "docs" / "mqtt.md"
+TIMEOUT = 0x719
+
+
+def test_rights_of_the_broker_are_as_the_page_says(farm, tmp_path):
+    """North may ask south, and not the other way round."""
+    users = {f"{NORTH}.1.1": "n", f"{SOUTH}.1.1": "s", "5.23.91.23.1.1": "e"}
+    files = write_certificates(tmp_path, BROKER)
+    text = (ROOT / "config" / "mosquitto" / "plant.conf").read_text()
+    for name, file in (
+        ("certs/ca.pem", files["ca"]),
+        ("certs/broker.pem", files["broker"]),
+        ("certs/broker.key", files["broker_key"]),
+        ("eap.passwords", write_passwords(tmp_path, **users)),
+        ("eap.acl", ROOT / "config" / "mosquitto" / "plant.acl"),
+    ):
+        text = text.replace(f"/etc/mosquitto/{name}", str(file))
+    settings = [line for line in text.splitlines()
+                if not line.startswith(("listener", "persistence"))]  # fmt: skip
+    with broker(tmp_path / "broker", BROKER, *settings, port=8883):
+        for name, address in (("north", NORTH), ("south", SOUTH)):
+            user = f"{address}.1.1"
+            (tmp_path / user).write_text(f"{users[user]}\n")
+            entry = (f'mqtt: "mqtts://{BROKER}", user: {user}, password_file: {user},'
+                     " tls: {ca: ca.pem}")  # fmt: skip
+            farm.run(write_plant(tmp_path, name, address, broker=entry))
+        until_read(SOUTH, SOUTH)
+        until_read(SOUTH, by=NORTH)
+        assert read(NORTH, SOUTH) == -TIMEOUT
+
+
+def test_examples_of_the_page(farm, tmp_path):
+    settings = (ROOT / "config" / "mosquitto" / "open.conf").read_text().splitlines()
+    assert f"listener 1883 {BROKER}" in settings
+    for line in ("mosquitto -c config/mosquitto/open.conf\n", "eapctl run config/mqtt.yaml\n"):
+        assert line in PAGE.read_text()
+    settings.remove(f"listener 1883 {BROKER}")
+    with broker(tmp_path, BROKER, *settings):
+        farm.run(ROOT / "config" / "mqtt.yaml")
+        until_read(SOUTH, by=NORTH)
+        test = doctest.DocTestParser().get_doctest(PAGE.read_text(), {}, PAGE.name, PAGE.name, 0)
+        told: list[str] = []
+        result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(
+            test, out=told.append
+        )
+        assert not result.failed, "".join(told)
+        assert result.attempted == 6
+
+
+def test_rights_on_the_page_are_those_of_the_example():
+    rights = (ROOT / "config" / "mosquitto" / "plant.acl").read_text().splitlines()
+    page = PAGE.read_text()
+    for line in rights:
+        if line.startswith(("pattern", "user 127", "topic write works/127")):
+            assert f"\n{line}\n" in page
