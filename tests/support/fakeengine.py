@@ -132,7 +132,7 @@ def _slave(unit: Any) -> SlaveReport:
         revision=identity.revision,
         serial=identity.serial,
         alias=unit.found.alias,
-        state=unit.state,
+        state=0 if unit.is_lost else unit.state,
         target=unit.target,
         to_slave=box.sizes.to_slave if box else 0,
         to_master=box.sizes.to_master if box else 0,

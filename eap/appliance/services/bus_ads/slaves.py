@@ -92,6 +92,8 @@ class Slaves:
                 raise AdsRefusedError(AdsError.INDEX_GROUP)
             why = f"slave {slave.station} does not speak {protocol.name}"
             raise AdsRefusedError(AdsError.SERVICE, why)
+        if not slave.state:
+            raise AdsRefusedError(AdsError.TIMEOUT, f"slave {slave.station} does not answer")
         if not slave.to_slave:
             state = state_name(slave.state)
             why = f"slave {slave.station} is in {state}, where it has no mailbox"

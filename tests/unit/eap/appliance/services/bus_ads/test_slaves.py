@@ -47,6 +47,21 @@ def test_slave_without_a_mailbox_in_its_state():
     play(scene)
 
 
+def test_slave_that_is_gone():
+    async def scene(client, engine):
+        with engine.buses[0].line.lost("drive"):
+
+            async def is_gone():
+                return (await client.good(DRIVE, ReadState())) == bytes(4)
+
+            await until(is_gone)
+            outcome = await client.do(DRIVE, Read(IndexGroup.SDO, 0x1018_0001, 4))
+            assert outcome.result == AdsError.TIMEOUT
+            assert client.why == "slave 1001 does not answer"
+
+    play(scene)
+
+
 def test_there_are_no_notifications():
     async def scene(client, engine):
         asked = AddNotification(IndexGroup.SDO, 0x1018_0001, 4, TransMode.SERVER_CYCLE, 0, 0)
