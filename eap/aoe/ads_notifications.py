@@ -154,6 +154,9 @@ class NotificationTable:
         self._packets = 0
         self._ended = 0
 
+    def __len__(self) -> int:
+        return len(self._notifications)
+
     def add(self, client: Client, asked: AddNotification, source: Source, now_ns: int) -> int:
         """Return the handle of a new notification; its first sample is due in the next cycle.
 

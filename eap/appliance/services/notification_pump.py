@@ -34,6 +34,8 @@ _WANTED_NS = 1_000_000_000
 _CYCLE_TAKES_NS = 200_000
 """How long after its time a cycle has mostly ended."""
 _SOON_NS = 1_000_000
+_AT_ONCE = 500
+"""Values after which others of this process have a turn."""
 _IDLE_NS = 10_000_000
 """How soon to look again while the engine does not run."""
 
@@ -105,30 +107,38 @@ class NotificationPump:
             self._told = image.words[StationWord.CYCLE]
         if self._samples is None or self._samples.image is not image:
             self._samples = Samples(image)
-        self._tell(self._samples, unix_ns - now_ns)
+        is_done = self._tell(self._samples, unix_ns - now_ns)
         self._samples.want(2 + _WANTED_NS // (1000 * image.layout.cycle_us))
-        return self._delay_ns(now_ns)
+        return self._delay_ns(now_ns) if is_done else _SOON_NS
 
-    def _tell(self, samples: Samples, unix_at_0_ns: int) -> None:
-        """Go through the cycles since the last look."""
+    def _tell(self, samples: Samples, unix_at_0_ns: int) -> bool:
+        """Go through the cycles since the last look; return whether that was all of them."""
+        room = _AT_ONCE
         for cycle in samples.since(self._told):
+            if room <= 0:
+                return False
             self._told = cycle
             at_ns, due_ns = samples.ran_at_ns(cycle), self._due_ns()
             if due_ns is None:
-                return
+                return True
             if at_ns is None or at_ns < due_ns:
                 continue
             sample = samples.read(cycle)
             if sample is not None:
                 with self._symbols.store.shown(sample):
-                    self._tell_of_cycle(at_ns, to_filetime(at_ns + unix_at_0_ns))
+                    room -= self._tell_of_cycle(at_ns, to_filetime(at_ns + unix_at_0_ns))
+        return True
 
-    def _tell_of_cycle(self, at_ns: int, time: int) -> None:
+    def _tell_of_cycle(self, at_ns: int, time: int) -> int:
+        """Tell of one cycle; return how many values were looked at, at most."""
+        looked_at = 0
         for table, net_id, port in self._devices:
             due_ns = table.next_timeout()
             if due_ns is not None and due_ns <= at_ns:
+                looked_at += len(table)
                 for notice in table.handle_cycle(at_ns, time):
                     self._send(notice.client.way, notice.encode(net_id, port))
+        return looked_at
 
     def _due_ns(self) -> int | None:
         times = (device.table.next_timeout() for device in self._devices)

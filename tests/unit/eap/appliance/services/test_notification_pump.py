@@ -131,6 +131,18 @@ def test_as_many_cycles_are_told_as_are_kept(bench):
     assert bench.told() == [(n, n) for n in range(11, count + 11)]
 
 
+def test_others_have_a_turn_while_many_are_told(bench):
+    for _ in range(300):
+        bench.watch("ticks")
+    bench.look()
+    bench.engine.run(5)
+    assert bench.look() == MS
+    assert {cycle for cycle, _ in bench.told()} == {1, 2}
+    assert bench.look() == MS
+    assert bench.look() > MS
+    assert {cycle for cycle, _ in bench.told()} == {3, 4, 5}
+
+
 def test_only_what_is_due_is_told_and_looked_for(bench):
     bench.engine.run()
     bench.watch("ticks", cycle_ns=5 * CYCLE)
