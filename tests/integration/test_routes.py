@@ -5,6 +5,7 @@ The client is written apart from our codec.
 
 from __future__ import annotations
 
+import socket
 import struct
 import time
 
@@ -17,6 +18,7 @@ from tests.support.appliance import Appliance, Plants, wait_until
 pytestmark = pytest.mark.net
 
 WEST, MIDDLE, EAST = (f"127.9.70.{number}" for number in (1, 2, 3))
+HOLE = "127.9.70.5"
 UNREACHABLE, TIMEOUT = 0x1B, 0x719
 PLANT = """\
 plant: chain
@@ -29,6 +31,7 @@ stations:
     routes:
       - {{to: east, via: middle/eap0}}
       - {{to: north, net_id: 127.9.70.4.1.1, via: middle/eap0}}
+      - {{to: hole, net_id: 127.9.70.5.1.1, via: 127.9.70.5, probe: false}}
   - name: middle
     net_id: 127.9.70.2.1.1
     ports:
@@ -108,3 +111,41 @@ def test_unknown_and_circles_are_answered_and_named(farm: Plants) -> None:
     _, _, text = west.stop()
     assert "no route to 9.9.9.9.1.1" in text
     assert "routes to 127.9.70.4.2.1 run in a circle" in text
+
+
+def test_hop_that_swallows_everything(farm: Plants) -> None:
+    """The one that waits is answered before clients give up; those that are too many at once."""
+    (west,) = start(farm, "udp", "west")
+    hole = f"{HOLE}.2.1"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as swallows:
+        swallows.bind((HOLE, 34980))
+        with AmsClient(WEST) as client, aoe.UdpClient(WEST, hole) as crowd:
+            for number in range(600):
+                packet = aoe.packet(hole, aoe.READ_STATE, b"", invoke_id=number)
+                crowd.socket.sendto(aoe.frame(packet), crowd.peer)
+                if not number % 50:
+                    time.sleep(0.01)  # the first ones are for the hole, not for a full socket
+            errors = [aoe.answer(crowd.socket.recv(2048)).error for _ in range(88)]
+            assert errors == [4] * 88
+            began = time.monotonic()
+            assert client.ask(hole, aoe.READ_STATE, b"") == (TIMEOUT, b"")
+            assert 4 < time.monotonic() - began < 5
+            assert client.net_id(f"{WEST}.2.1") == f"{WEST}.2.1"
+    _, _, text = west.stop()
+    assert f"no answer from hole ({HOLE}:34980 by udp:eap0) within 4.5 s" in text
+    assert "more packets met errors" in text
+
+
+def test_notifications_come_through(farm: Plants) -> None:
+    start(farm, "udp", "east", "middle", "west")
+    asked = struct.pack("<6I16x", 0xF100, 0, 2, 3, 0, 500_000)  # the state, each 50 ms
+    with AmsClient(WEST) as client:
+        wait_until(lambda: is_reached(client))
+        error, data = client.ask(TARGET, 6, asked)
+        assert (error, data[:4]) == (0, bytes(4))
+        for _ in range(3):
+            client._number = 0  # as in notifications
+            error, notice = client.receive()
+            stamps, _, samples, handle, size = struct.unpack_from("<IQIII", notice, 4)
+            assert (stamps, samples, handle, size) == (1, 1, *struct.unpack("<I", data[4:8]), 2)
+            assert notice[-2:] == b"\5\0"
