@@ -31,7 +31,7 @@ stations:
     routes:
       - {{to: east, via: middle/eap0}}
       - {{to: north, net_id: 127.9.70.4.1.1, via: middle/eap0}}
-      - {{to: hole, net_id: 127.9.70.5.1.1, via: 127.9.70.5, probe: false}}
+      - {{to: hole, net_id: 127.9.70.5.1.1, via: "{hole}", probe: false}}
   - name: middle
     net_id: 127.9.70.2.1.1
     ports:
@@ -50,7 +50,8 @@ TARGET = f"{EAST}.2.1"
 
 def start(farm: Plants, scheme: str, *stations: str) -> list[Appliance]:
     wait_until(lambda: all(map(is_free, (WEST, MIDDLE, EAST))))
-    plant = farm.write(PLANT.format(scheme=scheme))
+    hole = HOLE if scheme == "udp" else f"{scheme}://{HOLE}"
+    plant = farm.write(PLANT.format(scheme=scheme, hole=hole))
     return [farm.run(plant, "--station", station) for station in stations]
 
 
