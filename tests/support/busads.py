@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +33,23 @@ class Client:
 
     Attributes:
         service: That it asks.
+        told: Notifications, with the ways that they went.
         why: What was told of the last answer, for people.
     """
 
-    def __init__(self, service: BusService, bus: BusClient, net_id: NetId = TOOL) -> None:
+    def __init__(
+        self,
+        service: BusService,
+        bus: BusClient,
+        told: Sequence[tuple[Way, bytes]] = (),
+        net_id: NetId = TOOL,
+    ) -> None:
         self.service = service
         self.net_id = net_id
         self.way = Way("ams-tcp", "1")
         self.why = ""
         self.bus = bus
+        self.told = told
 
     async def answer(self, port: int, command: int, body: bytes) -> AmsAnswer:
         """Return the answer as it is."""
@@ -136,10 +144,13 @@ def play(scene: Callable[[Client, FakeEngine], Awaitable[Any]], name: str = "dri
         engine = FakeEngine(FakeBus(_line(name)))
         link = EngineLink(engine.services, look_s=0.05)
         bus = BusClient(link, [PORT])
-        service = BusService(bus, PORT, BUS, "1.2.3")
+        told: list[tuple[Way, bytes]] = []
+        service = BusService(
+            bus, PORT, BUS, "1.2.3", lambda way, packet: told.append((way, packet))
+        )
         try:
             async with asyncio.timeout(20):
-                return await scene(Client(service, bus), engine)
+                return await scene(Client(service, bus, told), engine)
         finally:
             service.close()
             link.close()

@@ -204,8 +204,9 @@ class Services:
         client = BusClient(link, [bus.owner for bus in handover.buses])
         for bus in handover.buses:
             net_id = NetId.parse(handover.port(bus.owner).net_id)
-            service = BusService(client, bus.owner, net_id, RELEASE)
-            devices.routers[bus.owner.station].add_service(net_id, service)
+            router = devices.routers[bus.owner.station]
+            service = BusService(client, bus.owner, net_id, RELEASE, router.send_notification)
+            router.add_service(net_id, service)
         return Buses(handover.stations, client if handover.buses else None, segments)
 
 

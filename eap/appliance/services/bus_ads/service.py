@@ -31,6 +31,7 @@ from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
 from eap.appliance.services.ads_requests import answer_request
 from eap.appliance.services.bus_ads.master_side import MasterSide
+from eap.appliance.services.bus_ads.master_watch import MasterWatch, Send
 from eap.appliance.services.bus_ads.raw_command import RawCommands
 from eap.appliance.services.bus_ads.results import refusal
 from eap.appliance.services.bus_ads.slave_space import Asked
@@ -62,12 +63,15 @@ class BusService:
         port: Which bus.
         net_id: Of the port.
         release: Of this software, such as ``0.1.0``.
+        send: Sends a notification to a client.
 
     Attributes:
         ports: AMS ports that it answers for; it knows itself which slaves there are.
     """
 
-    def __init__(self, bus: BusClient, port: PortName, net_id: NetId, release: str) -> None:
+    def __init__(
+        self, bus: BusClient, port: PortName, net_id: NetId, release: str, send: Send
+    ) -> None:
         self.ports: Container[int] = range(1, MASTER_PORT + 1)
         self._bus = bus
         self._port = port
@@ -79,6 +83,8 @@ class BusService:
             [MasterSpace(self._master)],
             control=self._master.control,
         )
+        notifications = self._device.notifications
+        self._watch = MasterWatch(notifications, self._look, send, net_id, MASTER_PORT)
 
     async def answer(self, request: LocalRequest) -> AmsAnswer:
         """Do what a request asks for."""
@@ -104,7 +110,11 @@ class BusService:
     def close(self) -> None:
         """End what goes on."""
         self._slaves.close()
+        self._watch.close()
         self._master.close()
+
+    async def _look(self) -> None:
+        self._master.report = await self._bus.describe(self._port)
 
     def _performer(self, ams_port: int, report: BusReport, client: Client) -> Perform:
         """Return who does operations for a port, or raise AdsRefusedError if nobody has it."""

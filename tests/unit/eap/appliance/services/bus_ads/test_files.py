@@ -120,7 +120,7 @@ def test_handle_belongs_to_a_net_id_through_any_connection():
         client.service.client_gone(client.way)
         client.way = client.way._replace(connection="2")
         assert await client.ask(DISK, READ, handle, length=5) == b"first"
-        stranger = Client(client.service, client.bus, NetId.parse("8.8.8.8.1.1"))
+        stranger = Client(client.service, client.bus, net_id=NetId.parse("8.8.8.8.1.1"))
         theirs = await stranger.do(DISK, ReadWrite(READ, handle, 5, b""))
         assert theirs.result == AdsError.INDEX_OFFSET
         elsewhere = await client.do(OTHER, ReadWrite(READ, handle, 5, b""))
