@@ -106,6 +106,11 @@ class Ledger:
             client.waiting.discard(frame)
             self._in_flight -= 1
 
+    def waiting(self, way: Way) -> int:
+        """Return how many requests of a client wait."""
+        client = self._clients.get(way)
+        return len(client.waiting) if client else 0
+
     def counts_of(self, way: Way) -> Counts | None:
         """Return what was done for a client that is known."""
         client = self._clients.get(way)

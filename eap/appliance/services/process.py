@@ -40,6 +40,7 @@ from eap.appliance.services.device_methods import DeviceMethods
 from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_client import EngineClient
 from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.gateway.opening import open_gateways
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
@@ -87,17 +88,20 @@ class Services:
         link = EngineLink(socket.socket(fileno=self._handover.bus_fd))
         self._resources.callback(link.close)
         devices = self._devices(images, link)
+        client = BusClient(link, [bus.owner for bus in self._handover.buses])
+        gateways = open_gateways(self._handover, client, RELEASE)
         doors = open_doors(
             self._handover,
             devices.routers,
             devices.routes,
+            gateways,
             self._counters,
             self._link,
             self._resources,
         )
         brokers = open_mqtt_doors(self._handover.routing, devices.routers)
         audit = self._audit(devices.routers)
-        buses = self._buses(link, devices)
+        buses = self._buses(client, devices)
         methods = self._methods(images, buses, devices)
         server = ControlServer(methods, buses)
         async with asyncio.TaskGroup() as group:
@@ -194,14 +198,13 @@ class Services:
                     found.setdefault(owner.station, shared.address)
         return found
 
-    def _buses(self, link: EngineLink, devices: Devices) -> Buses:
+    def _buses(self, client: BusClient, devices: Devices) -> Buses:
         handover = self._handover
         segments = {}
         for bus in handover.buses:
             if bus.command_fd != NO_DESCRIPTOR:
                 segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
                 self._resources.callback(segments[bus.owner].close)
-        client = BusClient(link, [bus.owner for bus in handover.buses])
         for bus in handover.buses:
             net_id = NetId.parse(handover.port(bus.owner).net_id)
             router = devices.routers[bus.owner.station]

@@ -14,6 +14,8 @@ from eap.appliance.handover import NO_DESCRIPTOR, Handover, PortName, SharedSock
 from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.ams_door import AmsClients, AmsDoor
 from eap.appliance.services.ams_uplinks import AmsUplinks
+from eap.appliance.services.gateway.door import GatewayDoor
+from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.intake import FrameIntake, watch_channel
 from eap.appliance.services.route_desk import RouteDesk
 from eap.appliance.services.routing.entrance import Entrance
@@ -42,6 +44,7 @@ def open_doors(
     handover: Handover,
     routers: Mapping[str, StationRouter],
     routes: Mapping[str, StationRoutes],
+    gateways: Mapping[str, MailboxGateway],
     counters: DiscardCounters,
     link: socket.socket,
     resources: ExitStack,
@@ -52,6 +55,7 @@ def open_doors(
         handover: What the supervisor opened.
         routers: Of the stations, by name; they get their doors.
         routes: Of these routers; tools may add some.
+        gateways: To the first bus of each station that has one.
         counters: Of what is not taken.
         link: To the engine, for connections that belong there.
         resources: Closes what is opened here.
@@ -59,7 +63,7 @@ def open_doors(
     Returns:
         The listeners for TCP, the connections to others and the watch over links, to be served.
     """
-    return _Sockets(handover, routers, routes, counters, resources).open(link)
+    return _Sockets(handover, routers, routes, gateways, counters, resources).open(link)
 
 
 class _Sockets:
@@ -68,12 +72,14 @@ class _Sockets:
         handover: Handover,
         routers: Mapping[str, StationRouter],
         routes: Mapping[str, StationRoutes],
+        gateways: Mapping[str, MailboxGateway],
         counters: DiscardCounters,
         resources: ExitStack,
     ) -> None:
         self._handover = handover
         self._routers = routers
         self._routes = routes
+        self._gateways = gateways
         self._counters = counters
         self._resources = resources
         self._batch = ReceiveBatch()
@@ -108,10 +114,16 @@ class _Sockets:
 
     def _entrance(self, kind: str, owners: Sequence[PortName]) -> Entrance:
         """Return the way in to the stations of *owners*, by the doors of their ports."""
-        doors: dict[str, str] = {}
-        for owner in owners:
-            doors.setdefault(owner.station, f"{kind}:{owner.port}")
+        doors = _doors(kind, owners)
         return Entrance([(self._routers[station], door) for station, door in doors.items()])
+
+    def _gateway(self, kind: str, owners: Sequence[PortName]) -> GatewayDoor:
+        """Return the way in to their gateways."""
+        doors = _doors(kind, owners)
+        gateways = self._gateways
+        return GatewayDoor(
+            [(gateways[station], door) for station, door in doors.items() if station in gateways]
+        )
 
     def _watch_unicast(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
@@ -120,22 +132,25 @@ class _Sockets:
             door = Door(f"udp:{owner.port}", MAX_UDP_FRAME - FRAME_OVERHEAD, is_hub=True)
             self._routers[owner.station].add_door(door, carrier)
             self._watch_link(shared.address, owner, door)
-        self._take_datagrams(shared.owners, channel, lambda data: False)
+        self._take_datagrams(shared.owners, channel, carrier, lambda data: False)
         watch_channel(channel)
 
     def _watch_group(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
+        carrier = ChannelCarrier(channel)
         for owner in shared.owners:
-            self._take_datagrams([owner], channel, lambda data: True)
+            self._take_datagrams([owner], channel, carrier, lambda data: True)
         watch_channel(channel)
 
     def _take_datagrams(
         self,
         owners: Sequence[PortName],
         channel: UdpChannel,
+        carrier: ChannelCarrier,
         is_for_many: Callable[[memoryview], bool],
     ) -> None:
-        mailbox = MailboxIntake(self._entrance("udp", owners), is_for_many)
+        entrance, gateway = self._entrance("udp", owners), self._gateway("udp", owners)
+        mailbox = MailboxIntake(entrance, gateway, carrier, is_for_many)
         stations = list(dict.fromkeys(owner.station for owner in owners))
         intake = FrameIntake(stations, self._counters, self._now_ns, mailbox.take)
         channel.takers.append(intake.take)
@@ -160,8 +175,12 @@ class _Sockets:
             if owner.station not in {each.station for each in in_vlan}:
                 in_vlan[owner] = port
         for vlan_id, intake in intakes.items():
-            segment = Segment(self._entrance("ethernet", [*ports[vlan_id]]), interface.address)
-            intake.mailbox = MailboxIntake(segment, interface.is_for_many).take
+            there = [*ports[vlan_id]]
+            segment = Segment(self._entrance("ethernet", there), interface.address)
+            carrier = ChannelCarrier(ports[vlan_id][there[0]])
+            gateway = self._gateway("ethernet", there)
+            mailbox = MailboxIntake(segment, gateway, carrier, interface.is_for_many)
+            intake.mailbox = mailbox.take
             for owner, port in ports[vlan_id].items():
                 router = self._routers[owner.station]
                 door = Door(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
@@ -208,7 +227,11 @@ class _Sockets:
 
     def _door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
         refuse = self._refuser(_stations_of(shared))
-        streams = MailboxStreams(self._entrance("tcp", shared.owners), refuse, shared.address)
+        entrance, gateway = (
+            self._entrance("tcp", shared.owners),
+            self._gateway("tcp", shared.owners),
+        )
+        streams = MailboxStreams(entrance, gateway, refuse, shared.address)
         for owner in shared.owners:
             room = LARGEST_FRAME - FRAME_OVERHEAD
             door = Door(f"tcp:{owner.port}", room, is_stream=True, is_hub=True)
@@ -243,6 +266,14 @@ class _Sockets:
     def _takes_tcp(self, name: PortName) -> bool:
         port = self._handover.port(name)
         return port.tcp or InterfaceUri.parse(port.interface).scheme == "tcp"
+
+
+def _doors(kind: str, owners: Sequence[PortName]) -> dict[str, str]:
+    """Return by what name each station of *owners* knows the door: that of its first port."""
+    doors: dict[str, str] = {}
+    for owner in owners:
+        doors.setdefault(owner.station, f"{kind}:{owner.port}")
+    return doors
 
 
 def _stations_of(shared: SharedSocket) -> list[str]:

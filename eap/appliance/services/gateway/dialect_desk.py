@@ -82,7 +82,7 @@ class DialectDesk:
         if not self._may(way, station, operation_of(task)):
             raise _refusal(Reason.DENIED)
         if station == MASTER_ADDRESS:
-            return encode_done(body, task, self._open_master().perform(task))
+            return encode_done(body, task, await self._open_master().perform(task))
         slave = await self._book.find(station)
         reason = slave if isinstance(slave, Reason) else find_refusal(kind, b"", slave)
         if isinstance(slave, Reason) or reason is not None:

@@ -145,6 +145,11 @@ class MailboxGateway:
         for key in [key for key in self._masters if key[0] == way]:
             self._masters.pop(key).close()
 
+    async def wait_below(self, way: Way, count: int) -> None:
+        """Wait until fewer than *count* requests of a client wait."""
+        while self.ledger.waiting(way) >= count and self._tasks:
+            await asyncio.wait(self._tasks, return_when=asyncio.FIRST_COMPLETED)
+
     async def wait_idle(self) -> None:
         """Wait until everybody has an answer."""
         while self._tasks:
@@ -204,7 +209,8 @@ class MailboxGateway:
             replies = await self._ask_slave(request, station, is_step=operation is None)
         elif isinstance(found, Master):
             key = request.way, station, kind
-            replies = self._session(self._masters, key, self._open_master).ask(kind, body)
+            master = self._session(self._masters, key, self._open_master)
+            replies = await master.ask(kind, body)
         else:
             text = "the slave of another station is reached by AoE"
             replies = [Reply(*refuse(kind, body, Reason.NO_SLAVE, text), reason=Reason.NO_SLAVE)]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.aoe.access import place_of
 from eap.appliance.services.gateway.dialect_task import DialectError
 from eap.appliance.services.gateway.slave_session import Reply
 from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.gateway.dialect import Failure, ReadSdo, Task, WriteSdo
 from eap.gateway.refusal import Reason, mailbox_error, refuse
+from eap.gateway.rights import operation_of
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
@@ -21,27 +25,36 @@ class MasterSession:
     Args:
         dictionary: Of the master.
         room: Octets of the longest answer behind its mailbox header.
+        refresh: Sees to it that what an object shows is not old; it gets the object's index.
     """
 
     is_running = False
 
-    def __init__(self, dictionary: ObjectDictionary, room: int) -> None:
+    def __init__(
+        self,
+        dictionary: ObjectDictionary,
+        room: int,
+        refresh: Callable[[int], Awaitable[None]],
+    ) -> None:
         self._dictionary = dictionary
+        self._refresh = refresh
         size = room + MailboxHeader.SIZE
         self._server = CoeServer(dictionary, _op, MailboxSizes(size, size))
 
-    def ask(self, kind: MailboxType, body: bytes) -> list[Reply]:
+    async def ask(self, kind: MailboxType, body: bytes) -> list[Reply]:
         """Return the answers to a request."""
         if kind is not MailboxType.COE:
             reason = Reason.NO_PROTOCOL
             return [Reply(*refuse(kind, body, reason), reason=reason)]
+        touched = operation_of(kind, body)
+        await self._refresh(place_of(touched)[1] >> 16 if touched else 0)
         try:
             answers = self._server.receive_message(body, 0)
         except MailboxRefusedError as exc:
             return [Reply(*mailbox_error(exc.detail))]
         return [Reply(MailboxType.COE, answer) for answer in answers]
 
-    def perform(self, task: Task) -> bytes:
+    async def perform(self, task: Task) -> bytes:
         """Do a task of the dialect; return what was read.
 
         Raises:
@@ -50,6 +63,7 @@ class MasterSession:
         try:
             match task:
                 case ReadSdo(index, subindex, complete):
+                    await self._refresh(index)
                     read = self._dictionary.upload_complete if complete else self._dictionary.upload
                     return read(index, subindex, OdState.OP)
                 case WriteSdo(index, subindex, data):

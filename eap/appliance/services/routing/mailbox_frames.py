@@ -1,7 +1,6 @@
 """AMS packets in frames of type 5: what is for the router of a station, and how packets are packed.
 
-That is AoE to address 0; every other mailbox belongs to a bus, and nothing in this release passes
-it on.
+That is AoE to address 0; every other mailbox belongs to a bus, whose gateway passes it on.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from eap.codec.ams import AmsHeader
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame, encode_frame
 from eap.codec.wire import Buffer
-from eap.errors import CodecError
+from eap.errors import CodecError, MalformedError
 
 FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
 _MAX_PEERS = 1024
@@ -26,6 +25,8 @@ def aoe_packet(data: Buffer) -> bytes | Refusal:
         header, body = decode_frame(data)
         if header.type is not MailboxType.AOE or header.address:
             return Refusal.MAILBOX
+    except MalformedError:
+        return Refusal.MAILBOX  # of a protocol that nobody knows
     except CodecError:
         return Refusal.TRUNCATED
     return bytes(body) if len(body) >= AmsHeader.SIZE else Refusal.MAILBOX

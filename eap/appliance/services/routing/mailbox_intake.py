@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import monotonic_ns
 from typing import Protocol
 
 from eap.appliance.discards import Refusal
+from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
 from eap.pd.link import Channel, Origin, OutFrame
 
@@ -23,15 +24,21 @@ class MailboxIntake:
 
     Args:
         entrance: To these stations.
+        gateway: For what is no AoE to a station; a frame for many is for no gateway.
+        carrier: Sends what the gateway answers.
         is_for_many: Tells of a frame whether it was meant for many.
     """
 
     def __init__(
         self,
         entrance: WayIn,
+        gateway: GatewayDoor,
+        carrier: ChannelCarrier,
         is_for_many: Callable[[memoryview], bool],
     ) -> None:
         self._entrance = entrance
+        self._gateway = gateway
+        self._carrier = carrier
         self._is_for_many = is_for_many
 
     def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
@@ -39,10 +46,12 @@ class MailboxIntake:
         del at_ns
         sender = origin.sender_of(data)
         packet = aoe_packet(data[:size])
-        if isinstance(packet, Refusal):
-            return packet
         if not sender:
             return Refusal.MAILBOX
+        if isinstance(packet, Refusal):
+            if packet is not Refusal.MAILBOX or self._is_for_many(data):
+                return packet
+            return self._gateway.receive(data[:size], sender, self._carrier.send_frame)
         self._entrance.receive(packet, sender, for_all=self._is_for_many(data))
         return None
 
@@ -51,7 +60,7 @@ def judge(data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | 
     """Leave a frame to another intake that gets it too; return why that does not take it."""
     del at_ns, origin
     packet = aoe_packet(data[:size])
-    return packet if isinstance(packet, Refusal) else None
+    return packet if packet is Refusal.TRUNCATED else None
 
 
 class ChannelCarrier:
@@ -63,11 +72,18 @@ class ChannelCarrier:
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
         """Send packets to the address *connection*; return why not if that cannot be done."""
+        return self._send(connection, [self._counters.frame(connection, each) for each in packets])
+
+    def send_frame(self, connection: str, frame: bytes) -> str | None:
+        """Send a frame of type 5; returns as :meth:`send` does."""
+        return self._send(connection, [frame])
+
+    def _send(self, connection: str, frames: Sequence[bytes]) -> str | None:
         header = self._channel.link_header(connection)
-        frames = []
-        for packet in packets:
-            buffer = bytearray(header + self._counters.frame(connection, packet))
+        sent = []
+        for frame in frames:
+            buffer = bytearray(header + frame)
             buffer += bytes(max(0, self._channel.minimum_size - len(buffer)))
-            frames.append(OutFrame(buffer, len(header), connection))
-        failed = self._channel.send(frames, monotonic_ns())
+            sent.append(OutFrame(buffer, len(header), connection))
+        failed = self._channel.send(sent, monotonic_ns())
         return "the network took no frame" if failed else None

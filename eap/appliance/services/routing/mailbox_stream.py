@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.accepting import connection_name
+from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
 from eap.appliance.services.routing.uplink import Uplinks
@@ -20,6 +21,8 @@ SLOW_READER_S = 10.0
 """A client that takes nothing for this long while answers wait for it is disconnected."""
 MAX_UNANSWERED = 64
 """Requests of one connection that wait; what it sends ahead stays in the connection."""
+MAX_AT_GATEWAY = 16
+"""Likewise, requests for slaves and the master."""
 _MAX_UNSENT = 1 << 20
 """Octets that wait for a client that does not take them."""
 
@@ -29,14 +32,20 @@ class MailboxStreams:
 
     Args:
         entrance: To the stations behind the port.
+        gateway: For what is no AoE to a station.
         refuse: Counts a frame that is not taken.
         source: Own address to connect from; empty for any.
     """
 
     def __init__(
-        self, entrance: Entrance, refuse: Callable[[Refusal], None], source: str = ""
+        self,
+        entrance: Entrance,
+        gateway: GatewayDoor,
+        refuse: Callable[[Refusal], None],
+        source: str = "",
     ) -> None:
         self._entrance = entrance
+        self._gateway = gateway
         self._refuse = refuse
         self._uplinks = Uplinks(entrance, self._serve_uplink, source)
         self._counters = MailboxCounters()
@@ -55,6 +64,7 @@ class MailboxStreams:
             async with asyncio.timeout(SLOW_READER_S):
                 # Who has only closed its sending side still listens.
                 await self._entrance.wait_below(name, 1)
+                await self._gateway.wait_below(name, 1)
                 writer.close()
                 await writer.wait_closed()
         except (OSError, TimeoutError):
@@ -63,20 +73,24 @@ class MailboxStreams:
             writer.transport.abort()
             del self._writers[name]
             self._entrance.connection_closed(name)
+            self._gateway.connection_closed(name)
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
         """Send packets on a connection; return why not if that cannot be done."""
+        frames = b"".join(self._counters.frame(connection, packet) for packet in packets)
+        if connection not in self._writers:
+            return self._uplinks.send(connection, frames)
+        return self.send_frame(connection, frames)
+
+    def send_frame(self, connection: str, frame: bytes) -> str | None:
+        """Send what is packed already on a connection that came; returns as :meth:`send` does."""
         writer = self._writers.get(connection)
-        if writer is None:
-            frames = [self._counters.frame(connection, packet) for packet in packets]
-            return self._uplinks.send(connection, b"".join(frames))
-        if writer.is_closing():
+        if writer is None or writer.is_closing():
             return "the connection is closed"
         if writer.transport.get_write_buffer_size() > _MAX_UNSENT:
             writer.transport.abort()
             return "the other side takes nothing"
-        for packet in packets:
-            writer.write(self._counters.frame(connection, packet))
+        writer.write(frame)
         return None
 
     async def close(self) -> None:
@@ -106,7 +120,12 @@ class MailboxStreams:
             except asyncio.IncompleteReadError:
                 return
             packet = aoe_packet(frame)
-            if isinstance(packet, Refusal):
+            if packet is Refusal.MAILBOX:
+                refusal = self._gateway.receive(frame, name, self.send_frame)
+                if refusal is not None:
+                    self._refuse(refusal)
+                await self._gateway.wait_below(name, MAX_AT_GATEWAY)
+            elif isinstance(packet, Refusal):
                 self._refuse(packet)
             else:
                 self._entrance.receive(packet, name)

@@ -50,7 +50,7 @@ def script_on(tmp_path):
                     name: StationRoutes(router, RoutingSpec(), RouteStore("plant", name))
                     for name, router in routers.items()
                 }
-                doors = open_doors(handover, routers, routes, counters, ours, resources)
+                doors = open_doors(handover, routers, routes, {}, counters, ours, resources)
                 serving = [
                     asyncio.ensure_future(each.serve()) for each in (*routers.values(), *doors)
                 ]

@@ -13,6 +13,7 @@ from eap.appliance.discards import Refusal
 from eap.appliance.handover import PortName
 from eap.appliance.passing import take_connection
 from eap.appliance.services import tcp_door
+from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import EtherCatHeader
@@ -61,7 +62,7 @@ def play(
         services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with services, engine, socket.create_server(("127.0.0.1", 0)) as listener:
             there = station(TARGET)
-            streams = MailboxStreams(entrance(there), refused.append)
+            streams = MailboxStreams(entrance(there), GatewayDoor([]), refused.append)
             there.add_door(Door("door", is_stream=True), streams)
             door = TcpDoor(
                 listener, takers, services, refused.append, streams, first_frame_s=first_frame_s

@@ -43,6 +43,10 @@ MASTER = ObjectDictionary(
 )
 
 
+async def nothing(index: int) -> None:
+    """All that the dictionary shows is up to date."""
+
+
 class Desk:
     """A gateway and its clients.
 
@@ -55,7 +59,7 @@ class Desk:
         self._link = EngineLink(self.engine.services)
         self.gateway = MailboxGateway(
             PortLink(BusClient(self._link, [PORT]), PORT),
-            lambda: MasterSession(MASTER, settings.room),
+            lambda: MasterSession(MASTER, settings.room, nothing),
             AccessList(rules),
             settings,
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from eap.appliance.services.gateway.dialect_task import DialectError
@@ -15,39 +17,43 @@ from eap.od.model import RW, variable
 COE = MailboxType.COE
 
 
+async def nothing(index: int) -> None:
+    """All that the dictionary shows is up to date."""
+
+
 def session(room: int = 100) -> MasterSession:
-    return MasterSession(ObjectDictionary([variable(0x2000, "A", "UDINT", RW)]), room)
+    return MasterSession(ObjectDictionary([variable(0x2000, "A", "UDINT", RW)]), room, nothing)
 
 
 def test_segments_of_two_clients_do_not_meet() -> None:
     objects = ObjectDictionary([variable(0x1008, "N", "STRING(200)", value="n" * 200)])
-    first, second = MasterSession(objects, 100), MasterSession(objects, 100)
+    first, second = (MasterSession(objects, 100, nothing) for _ in range(2))
     upload = bytes.fromhex("0020 40 0810 00 00000000")
-    ((_, head, _, _),) = first.ask(COE, upload)
+    ((_, head, _, _),) = asyncio.run(first.ask(COE, upload))
     assert head[2] == 0x41
-    ((_, other, _, _),) = second.ask(COE, bytes.fromhex("0020 60 00000000000000"))
+    ((_, other, _, _),) = asyncio.run(second.ask(COE, bytes.fromhex("0020 60 00000000000000")))
     assert other[2] == 0x80
-    ((_, segment, _, _),) = first.ask(COE, bytes.fromhex("0020 60 00000000000000"))
+    ((_, segment, _, _),) = asyncio.run(first.ask(COE, bytes.fromhex("0020 60 00000000000000")))
     assert segment[2] >> 5 == 0
     first.close()
-    ((_, segment, _, _),) = first.ask(COE, bytes.fromhex("0020 70 00000000000000"))
+    ((_, segment, _, _),) = asyncio.run(first.ask(COE, bytes.fromhex("0020 70 00000000000000")))
     assert segment[2] == 0x80
 
 
 def test_refusals() -> None:
-    (reply,) = session().ask(MailboxType.FOE, b"\1\0\0\0\0\0f")
+    (reply,) = asyncio.run(session().ask(MailboxType.FOE, b"\1\0\0\0\0\0f"))
     assert (reply.type, reply.reason) == (MailboxType.ERR, Reason.NO_PROTOCOL)
-    (reply,) = session().ask(COE, b"\0")
+    (reply,) = asyncio.run(session().ask(COE, b"\0"))
     assert (reply.type, reply.body) == (MailboxType.ERR, bytes.fromhex("0100 0600"))
 
 
 def test_tasks_of_the_dialect() -> None:
     one = session()
-    assert one.perform(WriteSdo(0x2000, 0, bytes(4))) == b""
-    assert one.perform(ReadSdo(0x2000, 0, complete=False)) == bytes(4)
+    assert asyncio.run(one.perform(WriteSdo(0x2000, 0, bytes(4)))) == b""
+    assert asyncio.run(one.perform(ReadSdo(0x2000, 0, complete=False))) == bytes(4)
     with pytest.raises(DialectError) as caught:
-        one.perform(ReadSdo(0x3000, 0, complete=False))
+        asyncio.run(one.perform(ReadSdo(0x3000, 0, complete=False)))
     assert (caught.value.failure, caught.value.code) == (Failure.GENERAL, 0x06020000)
     with pytest.raises(DialectError, match="only a CoE dictionary") as caught:
-        one.perform(ReadIdn(32, 0, 0x40))
+        asyncio.run(one.perform(ReadIdn(32, 0, 0x40)))
     assert caught.value.failure is Failure.NOT_SUPPORTED

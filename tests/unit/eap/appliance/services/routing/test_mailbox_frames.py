@@ -22,7 +22,7 @@ def test_aoe_to_address_0_is_taken(frame):
     [
         (aoe.frame(PACKET, address=1001), Refusal.MAILBOX),
         (aoe.frame(PACKET, kind=3), Refusal.MAILBOX),
-        (aoe.frame(PACKET, kind=9), Refusal.TRUNCATED),
+        (aoe.frame(PACKET, kind=9), Refusal.MAILBOX),
         (aoe.frame(PACKET)[:-1], Refusal.TRUNCATED),
         (aoe.frame(b"too short"), Refusal.MAILBOX),
         (b"\x00\x50", Refusal.TRUNCATED),

@@ -11,6 +11,7 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.routes import Route
 from eap.aoe.way import Door, Way
 from eap.appliance.discards import Refusal
+from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing import mailbox_stream
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.ids import NetId
@@ -30,7 +31,7 @@ def talk(script, there=None) -> list[Refusal]:
     """Run ``script(reader, writer)`` on a connection that is being served."""
     there = there or station(TARGET)
     refused: list[Refusal] = []
-    streams = MailboxStreams(entrance(there), refused.append)
+    streams = MailboxStreams(entrance(there), GatewayDoor([]), refused.append)
     there.add_door(Door("door", 2000, is_stream=True), streams)
 
     async def run():
@@ -125,7 +126,9 @@ def test_client_that_takes_nothing_is_disconnected(monkeypatch):
 def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
     here, there = station("2.2.2.2.2.1"), station(TARGET)
     refused: list[Refusal] = []
-    near, far = (MailboxStreams(entrance(each), refused.append) for each in (here, there))
+    near, far = (
+        MailboxStreams(entrance(each), GatewayDoor([]), refused.append) for each in (here, there)
+    )
     here.add_door(Door("door", 2000, is_stream=True), near)
     there.add_door(Door("door", 2000, is_stream=True), far)
 

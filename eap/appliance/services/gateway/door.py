@@ -1,0 +1,73 @@
+"""Frames of type 5 that are no AoE to a station: they go to the gateway of its first bus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from eap.aoe.way import Way
+from eap.appliance.discards import Refusal
+from eap.appliance.services.gateway.gateway import MailboxGateway
+from eap.codec.mailbox import MailboxError, MailboxHeader, decode_frame, encode_frame
+from eap.codec.wire import Buffer
+from eap.errors import MalformedError, TruncatedError
+from eap.gateway.refusal import mailbox_error
+
+_ADDRESS = slice(4, 6)
+
+
+class GatewayDoor:
+    """One socket or listener, and the gateway behind it.
+
+    Args:
+        behind: Gateways of the stations there, and by what name each knows the door; a frame does
+            not say which one it is for, so the first is asked.
+    """
+
+    def __init__(self, behind: Sequence[tuple[MailboxGateway, str]]) -> None:
+        self._gateway: MailboxGateway | None = None
+        self._name = ""
+        if behind:
+            self._gateway, self._name = behind[0]
+
+    def receive(
+        self, frame: Buffer, connection: str, send: Callable[[str, bytes], object]
+    ) -> Refusal | None:
+        """Act on a frame; return why not if it is not taken.
+
+        Args:
+            frame: From its EtherCAT header on.
+            connection: That it came by, or its sender's address.
+            send: Sends a frame to *connection*.
+        """
+        if self._gateway is None:
+            return Refusal.MAILBOX
+
+        def answer(frame: bytes) -> None:
+            send(connection, frame)
+
+        try:
+            header, body = decode_frame(frame)
+        except TruncatedError:
+            return Refusal.TRUNCATED
+        except MalformedError:
+            _refuse_type(bytes(frame), answer)
+            return Refusal.MAILBOX
+        self._gateway.receive(header, bytes(body), Way(self._name, connection), answer)
+        return None
+
+    def connection_closed(self, connection: str) -> None:
+        """Forget a client whose connection is closed."""
+        if self._gateway is not None:
+            self._gateway.connection_closed(Way(self._name, connection))
+
+    async def wait_below(self, connection: str, count: int) -> None:
+        """Wait until fewer than *count* requests of a connection wait."""
+        if self._gateway is not None:
+            await self._gateway.wait_below(Way(self._name, connection), count)
+
+
+def _refuse_type(frame: bytes, answer: Callable[[bytes], None]) -> None:
+    """Say that nobody speaks the protocol of a frame."""
+    kind, body = mailbox_error(MailboxError.UNSUPPORTED_PROTOCOL)
+    address = int.from_bytes(frame[_ADDRESS], "little")
+    answer(encode_frame(MailboxHeader(0, address, type=kind), body))

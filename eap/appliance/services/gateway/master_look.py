@@ -1,0 +1,67 @@
+"""What a master reads of its slaves to tell how they are, and who is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from devicebus.master.access import fprd
+from devicebus.master.procedure import Procedure
+from devicebus.master.scan import Identity, count_slaves, read_identity, read_stations
+from devicebus.wire.register import AlStatus, DlStatus, Register
+
+PORTS = 4
+LOOPS = Register.DL_CONTROL + 1
+"""Where the loop control of the four ports stands, two bits each."""
+
+
+class Seen(NamedTuple):
+    """The registers of one slave; nothing of one that does not answer."""
+
+    al: AlStatus = AlStatus(0)
+    dl: DlStatus = DlStatus()
+    dl_word: int = 0
+    loops: int = 0
+    errors: tuple[int, ...] = (0,) * PORTS
+
+
+class Found(NamedTuple):
+    """A slave that a scan has found."""
+
+    station: int
+    identity: Identity
+    dl_word: int
+
+
+def look_at(stations: Sequence[int]) -> Procedure[dict[int, Seen]]:
+    """Read the registers that diagnosis shows."""
+    found: dict[int, Seen] = {}
+    for station in stations:
+        replies, _ = yield [
+            fprd(station, Register.AL_STATUS, AlStatus.SIZE),
+            fprd(station, Register.DL_STATUS, DlStatus.SIZE),
+            fprd(station, LOOPS, 1),
+            fprd(station, Register.RX_ERROR, 2 * PORTS),
+        ]
+        al, dl, loops, errors = replies
+        if all(reply.wkc for reply in replies):
+            found[station] = Seen(
+                AlStatus.decode(al.data),
+                DlStatus.decode(dl.data),
+                int.from_bytes(dl.data, "little"),
+                loops.data[0],
+                tuple(errors.data[::2]),
+            )
+    return found
+
+
+def detect() -> Procedure[tuple[Found, ...]]:
+    """Find out who is there; nothing of what slaves do is disturbed."""
+    count = yield from count_slaves()
+    stations = yield from read_stations(count)
+    found = []
+    for station in stations:
+        identity = yield from read_identity(station)
+        replies, _ = yield [fprd(station, Register.DL_STATUS, DlStatus.SIZE)]
+        found.append(Found(station, identity, int.from_bytes(replies[0].data, "little")))
+    return tuple(found)

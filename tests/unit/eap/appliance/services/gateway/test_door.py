@@ -1,0 +1,60 @@
+"""Frames that are no AoE to a station."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from eap.aoe.way import Way
+from eap.appliance.discards import Refusal
+from eap.appliance.services.gateway.door import GatewayDoor
+
+UPLOAD = bytes.fromhex("10 50 0a 00 e9 03 00 23 00 20 41 18 10 02 00 00 00 00")
+
+
+class Gateway:
+    def __init__(self) -> None:
+        self.heard: list[Any] = []
+
+    def receive(self, header, body, way, send) -> None:
+        self.heard.append((header.address, body, way))
+        send(b"answer")
+
+    def connection_closed(self, way) -> None:
+        self.heard.append(("closed", way))
+
+    async def wait_below(self, way, count) -> None:
+        self.heard.append(("below", way, count))
+
+
+def test_the_first_station_with_a_bus_has_the_gateway() -> None:
+    first, second = Gateway(), Gateway()
+    door = GatewayDoor([(first, "udp:a"), (second, "udp:b")])
+    sent = []
+    assert door.receive(UPLOAD, "me", lambda *each: sent.append(each)) is None
+    assert first.heard == [(1001, UPLOAD[8:], Way("udp:a", "me"))]
+    assert not second.heard
+    assert sent == [("me", b"answer")]
+    door.connection_closed("me")
+    asyncio.run(door.wait_below("me", 3))
+    assert first.heard[1:] == [("closed", Way("udp:a", "me")), ("below", Way("udp:a", "me"), 3)]
+
+
+def test_without_a_bus_nobody_answers() -> None:
+    door = GatewayDoor([])
+    assert door.receive(UPLOAD, "me", lambda *each: None) is Refusal.MAILBOX
+    door.connection_closed("me")
+    asyncio.run(door.wait_below("me", 1))
+
+
+def test_a_protocol_that_nobody_knows_is_refused_by_a_mailbox_error() -> None:
+    door = GatewayDoor([(Gateway(), "udp:a")])
+    sent = []
+    frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
+    assert door.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
+    assert sent == [("me", bytes.fromhex("0a50 0400 e903 00 00 0100 0200"))]
+
+
+def test_a_frame_that_is_cut_is_counted() -> None:
+    door = GatewayDoor([(Gateway(), "udp:a")])
+    assert door.receive(UPLOAD[:-2], "me", lambda *each: None) is Refusal.TRUNCATED

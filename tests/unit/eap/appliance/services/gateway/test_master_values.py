@@ -1,0 +1,143 @@
+"""What the master tells of slaves in memory."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from eap.appliance.bus_request import Bring, Transfer
+from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.gateway.master_values import FRESH_S, MasterView
+from eap.od.abort import SdoAbortError
+from eap.od.profiles.master1100 import Live
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.loopbus import LoopBus
+
+
+def play(scene: Callable[[MasterView, FakeEngine], Awaitable[None]], bus: str = "io") -> None:
+    async def run() -> None:
+        engine = FakeEngine(FakeBus(LoopBus(bus)))
+        link = EngineLink(engine.services)
+        view = MasterView(BusClient(link, [PORT]), PORT)
+        try:
+            await scene(view, engine)
+        finally:
+            view.close()
+            link.close()
+            engine.close()
+
+    asyncio.run(run())
+
+
+async def soon(condition: Callable[[], bool]) -> None:
+    for _ in range(5000):
+        if condition():
+            return
+        await asyncio.sleep(0.001)
+    pytest.fail("it does not happen")
+
+
+def test_what_is_configured_and_what_is_there() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        assert view.configured() == ()
+        await view.refresh(with_registers=True)
+        assert view.configured() == view.detected() == (1001, 1002, 1003, 1004)
+        assert view.of_configured(1001, Live.NAME) == "coupler"
+        assert view.of_configured(1009, Live.NAME) == ""
+        assert view.of_configured(1009, Live.VENDOR) == 0
+        assert view.of_detected(1002, Live.DL_STATUS)
+        assert view.of_detected(1002, Live.VENDOR) == view.of_configured(1002, Live.VENDOR)
+        assert view.of_diagnosis(1001, Live.AL_STATUS) == 2
+        assert view.of_diagnosis(1009, Live.AL_STATUS) == 0
+        assert view.of_master(Live.STATE) == 2
+
+    play(scene)
+
+
+def test_who_is_wired_to_whom() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        await view.refresh(with_registers=True)
+        ports = (Live.NEIGHBOUR_0, Live.NEIGHBOUR_1, Live.NEIGHBOUR_2, Live.NEIGHBOUR_3)
+        wired = [[view.of_diagnosis(at, port) for port in ports] for at in (1001, 1002, 1004)]
+        assert wired == [[0, 1002, 1004, 0], [1001, 1003, 0, 0], [1001, 0, 0, 0]]
+
+    play(scene)
+
+
+def test_one_look_serves_all_who_ask_at_once() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        await asyncio.gather(*(view.refresh(with_registers=True) for _ in range(9)))
+        looks = len(engine.of(Transfer))
+        await view.refresh(with_registers=True)
+        assert len(engine.of(Transfer)) == looks
+        await asyncio.sleep(FRESH_S + 0.01)
+        await view.refresh(with_registers=False)
+        assert len(engine.of(Transfer)) == looks
+
+    play(scene)
+
+
+def test_a_scan_is_started_by_a_write() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        await view.refresh(with_registers=False)
+        view.write_master(Live.DETECT_REQUEST, b"\1\0")
+        view.write_master(Live.DETECT_REQUEST, b"\1\0")
+        assert view.of_master(Live.DETECT_STATUS) == 255
+        await soon(lambda: view.of_master(Live.DETECT_STATUS) == 0)
+        assert view.of_master(Live.DETECT_RESPONSE) == bytes((0, 0, 0, 0, 4, 0))
+        assert view.of_detected(1001, Live.ADDRESS) == 1001
+        assert view.of_detected(1001, Live.PRODUCT) == view.of_configured(1001, Live.PRODUCT)
+
+    play(scene)
+
+
+def test_states_and_loops_are_written() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        await view.refresh(with_registers=True)
+        view.write_slave(1001, Live.AL_CONTROL, 1)
+        await soon(lambda: bool(engine.of(Bring)))
+        assert engine.of(Bring)[0].target == 1
+        assert view.of_diagnosis(1001, Live.AL_CONTROL) == 1
+        with pytest.raises(SdoAbortError, match="no AL state 5"):
+            view.write_slave(1001, Live.AL_CONTROL, 5)
+        view.write_slave(1004, Live.LINK_CONTROL, 0x0C)
+        await asyncio.sleep(0.01)
+        await view.refresh(with_registers=True)
+        assert view.of_diagnosis(1004, Live.LINK_CONTROL) == 0x0C
+        view.write_slave(1004, Live.FIXED_LINKS, 1)
+        assert view.of_diagnosis(1004, Live.FIXED_LINKS) is True
+        view.write_slave(1004, Live.FIXED_LINKS, 0)
+        assert view.of_diagnosis(1004, Live.FIXED_LINKS) is False
+
+    play(scene)
+
+
+def test_counters_begin_again_at_a_reset() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        def total() -> int:
+            ports = (Live.CRC_0, Live.CRC_1, Live.CRC_2, Live.CRC_3)
+            return sum(view.of_diagnosis(at, port) for at in view.configured() for port in ports)
+
+        engine.buses[0].line.fault(kind="corrupt", slave="inputs", every=3)
+        await view.refresh(with_registers=True)
+        await asyncio.sleep(FRESH_S + 0.01)
+        await view.refresh(with_registers=True)
+        view.write_master(Live.RESET, b"\0")
+        assert total() > 0, "only a rising edge resets"
+        view.write_master(Live.RESET, b"\1")
+        assert total() == 0
+
+    play(scene)
+
+
+def test_a_bus_that_is_down_shows_nothing() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        engine.buses[0].is_up = False
+        await view.refresh(with_registers=True)
+        assert view.configured() == view.detected() == ()
+        assert view.of_master(Live.STATE) == 1
+
+    play(scene)
