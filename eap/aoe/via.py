@@ -2,12 +2,14 @@
 
     island-02/eap0        ams-tcp:192.168.1.5        udp:10.0.0.5        mqtt:line
 
+As in a plant file ``10.0.0.5`` stands for UDP too, and a MAC address or a NetID for Ethernet.
 Type 5 leaves by an EAP port of the station's own that can reach the address: by UDP, TCP or an
 Ethernet interface, as the two interfaces say.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from ipaddress import AddressValueError, IPv4Address
 
@@ -19,6 +21,9 @@ from eap.ids import InterfaceUri, MacAddr, NetId
 
 FORMS = "STATION/PORT, ams-tcp:HOST, udp:ADDRESS, tcp:ADDRESS, ethernet:MAC or mqtt:NETWORK"
 _IP = ("udp", "tcp")
+_ADDRESS = re.compile(r"\d+(\.\d+){3}(:\d+)?", re.ASCII)
+_MAC = re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}")
+_NET_ID_DOTS = 5
 _MAX_PORT = 0xFFFF
 
 
@@ -37,9 +42,11 @@ def parse_via(
     Raises:
         ValueError: that is nowhere; the message says what is expected.
     """
-    kind, colon, rest = text.partition(":")
+    kind, colon, rest = _complete(text).partition(":")
+    if kind == DoorKind.MQTT and rest:
+        return _by_mqtt(rest, net_id, directory)
     if colon and rest and kind in _READERS:
-        return _READERS[kind](rest, net_id, _ports(own, port))
+        return _READERS[kind](rest, _ports(own, port))
     name, _, other = text.partition("/")
     if name not in directory.stations:
         raise ValueError(f"via {text!r} is neither a station of the plant nor one of {FORMS}")
@@ -79,24 +86,33 @@ def _hop(mine: DirectoryPort, there: DirectoryPort) -> HopSpec | None:
     return None
 
 
-def _by_ams_tcp(rest: str, net_id: str, ports: Sequence[DirectoryPort]) -> HopSpec:
-    del net_id, ports
+def _complete(text: str) -> str:
+    """Return *text* with the kind of its door in front."""
+    kind, colon, rest = text.partition("://")
+    if colon:
+        return f"{kind}:{rest}"
+    if "/" in text or text.partition(":")[0] in _READERS:
+        return text
+    if text.count(".") == _NET_ID_DOTS or _MAC.fullmatch(text):
+        return f"{DoorKind.ETHERNET}:{text}"
+    return f"{DoorKind.UDP}:{text}" if _ADDRESS.fullmatch(text) else text
+
+
+def _by_ams_tcp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
+    del ports
     host, port = _split(rest, AMS_TCP_PORT)
     return HopSpec(DoorKind.AMS_TCP, "", f"{host}:{port}")
 
 
-def _by_udp(rest: str, net_id: str, ports: Sequence[DirectoryPort]) -> HopSpec:
-    del net_id
+def _by_udp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
     return HopSpec(DoorKind.UDP, _first(ports, ("udp",)), _ip_address(rest))
 
 
-def _by_tcp(rest: str, net_id: str, ports: Sequence[DirectoryPort]) -> HopSpec:
-    del net_id
+def _by_tcp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
     return HopSpec(DoorKind.TCP, _first(ports, _IP), _ip_address(rest))
 
 
-def _by_ethernet(rest: str, net_id: str, ports: Sequence[DirectoryPort]) -> HopSpec:
-    del net_id
+def _by_ethernet(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
     name = _first(ports, ("ethernet",))
     try:
         address = NetId.parse(rest) if rest.count(".") else MacAddr.parse(rest)
@@ -105,18 +121,18 @@ def _by_ethernet(rest: str, net_id: str, ports: Sequence[DirectoryPort]) -> HopS
     return HopSpec(DoorKind.ETHERNET, name, str(address))
 
 
-def _by_mqtt(rest: str, net_id: str, ports: Sequence[DirectoryPort]) -> HopSpec:
-    del ports
+def _by_mqtt(rest: str, net_id: str, directory: Directory) -> HopSpec:
     network, _, router = rest.partition("/")
-    return HopSpec(DoorKind.MQTT, network, str(NetId.parse(router or net_id)))
+    known = directory.stations.get(router)
+    router = known.net_id if known else router or net_id
+    return HopSpec(DoorKind.MQTT, network, str(NetId.parse(router)))
 
 
-_READERS: dict[str, Callable[[str, str, Sequence[DirectoryPort]], HopSpec]] = {
+_READERS: dict[str, Callable[[str, Sequence[DirectoryPort]], HopSpec]] = {
     DoorKind.AMS_TCP: _by_ams_tcp,
     DoorKind.UDP: _by_udp,
     DoorKind.TCP: _by_tcp,
     DoorKind.ETHERNET: _by_ethernet,
-    DoorKind.MQTT: _by_mqtt,
 }
 
 

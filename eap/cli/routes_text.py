@@ -43,6 +43,11 @@ def round_trip(us: int | None) -> str:
     return "" if us is None else words.duration(us)
 
 
+def age(seconds: int) -> str:
+    """Return for how long."""
+    return f"{seconds} s" if seconds < 120 else words.duration(seconds * 1_000_000)
+
+
 def route_kind(row: RouteRow) -> str:
     """Return where a route is from, and what is special about it."""
     marks = {
@@ -51,7 +56,7 @@ def route_kind(row: RouteRow) -> str:
         f"real NetID {row.real}": bool(row.real),
         f"answers within {row.timeout_ms} ms": bool(row.timeout_ms),
     }
-    ends = "" if row.expires_s is None else f"ends in {words.duration(row.expires_s * 1_000_000)}"
+    ends = "" if row.expires_s is None else f"ends in {age(row.expires_s)}"
     return ", ".join(
         filter(None, [row.origin, ends, *(word for word, is_so in marks.items() if is_so)])
     )

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from eap.appliance.control_routes import ImportRow, NeighbourRow, RouterRow, TestResult
-from eap.cli import routes_text, words
+from eap.cli import routes_text
 
 _STYLES = {"up": "green", "down": "bold red", "unknown": "dim"}
 
@@ -20,9 +20,11 @@ def routes_tables(stations: Sequence[RouterRow]) -> Iterator[RenderableType]:
     """Yield what to print for the routers of *stations*, top to bottom."""
     yield _routes(stations)
     if any(each.connections for each in stations):
+        yield ""
         yield _connections(stations)
     remarks = [f"{each.station}: {text}" for each in stations for text in _remarks(each)]
     if remarks:
+        yield ""
         yield Text("Worth a look", style="bold")
         yield from (Padding(Text(remark), (0, 0, 0, 1)) for remark in remarks)
 
@@ -90,7 +92,7 @@ def _connections(stations: Sequence[RouterRow]) -> RenderableType:
         for row in station.connections:
             table.add_row(
                 own, row.address, routes_text.door(row), "\n".join(row.net_ids),
-                words.duration(row.since_s * 1_000_000), str(row.requests),
+                routes_text.age(row.since_s), str(row.requests),
                 routes_text.octets(row), str(row.errors),
             )  # fmt: skip
             own = ""
@@ -110,7 +112,7 @@ def _remarks(station: RouterRow) -> Iterator[str]:
 
 
 def _table(*headings: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for heading in headings:
         table.add_column(heading, overflow="fold", vertical="top")
     return table

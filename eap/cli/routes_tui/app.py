@@ -245,9 +245,12 @@ class RoutesApp(App[None]):
         except EapError as exc:
             text = str(exc)
         else:
-            text = "\n".join(filter(None, [f"{result.target}: {result.text}", result.hint]))
+            trip = f" in {routes_text.round_trip(result.rtt_us)}" if result.ok else ""
+            said = f"{result.target}{trip}: {result.text}"
+            text = "\n".join(filter(None, [said, result.hint]))
         title = f"{router.routes.station} to {row.name}"
         self.call_from_thread(self._tell, title, text)
+        self.call_from_thread(self.look)
 
     def _ask_for(self, router: Router, title: str, values: dict[str, Any]) -> None:
         def ended(warnings: list[str] | None) -> None:

@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from eap.appliance.control_routes import ConnectionRow, RouteRow
-from eap.cli import routes_text, words
+from eap.cli import routes_text
 from eap.cli.routes_tui.link import Router
 
 _GAP = 1
@@ -161,7 +161,7 @@ def _connection_line(router: Router, row: ConnectionRow) -> Line:
     key = f"{router.plant}/{station}/{row.door}/{row.address}"
     cells = (
         station, row.address, routes_text.door(row), " ".join(row.net_ids),
-        words.duration(row.since_s * 1_000_000), routes_text.short(row.requests),
+        routes_text.age(row.since_s), routes_text.short(row.requests),
         routes_text.octets(row), routes_text.short(row.errors), row.last_error,
     )  # fmt: skip
     return Line(key, router, row, cells, "")

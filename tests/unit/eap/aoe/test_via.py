@@ -48,6 +48,12 @@ PLANT = Directory([
         ),
         ("ethernet:9.1.1.1.2.1", HopSpec(DoorKind.ETHERNET, "eap1", "9.1.1.1.2.1")),
         ("mqtt:line", HopSpec(DoorKind.MQTT, "line", FAR)),
+        ("10.0.0.9", HopSpec(DoorKind.UDP, "eap0", "10.0.0.9:34980")),
+        ("10.0.0.9:35000", HopSpec(DoorKind.UDP, "eap0", "10.0.0.9:35000")),
+        ("tcp://10.0.0.9", HopSpec(DoorKind.TCP, "eap0", "10.0.0.9:34980")),
+        ("02:00:00:00:00:09", HopSpec(DoorKind.ETHERNET, "eap1", "02:00:00:00:00:09")),
+        ("9.1.1.1.2.1", HopSpec(DoorKind.ETHERNET, "eap1", "9.1.1.1.2.1")),
+        ("mqtt:line/s5", HopSpec(DoorKind.MQTT, "line", "5.1.1.5.1.1")),
         ("mqtt:line/9.9.9.9.1.1", HopSpec(DoorKind.MQTT, "line", "9.9.9.9.1.1")),
     ],
 )

@@ -26,6 +26,15 @@ def test_round_trips() -> None:
     assert [routes_text.round_trip(us) for us in (None, 840, 1_200)] == ["", "840 µs", "1.2 ms"]
 
 
+def test_ages() -> None:
+    assert [routes_text.age(each) for each in (0, 119, 180, 7200)] == [
+        "0 s",
+        "119 s",
+        "3 min",
+        "2 h",
+    ]
+
+
 def test_kinds_and_states() -> None:
     assert routes_text.route_kind(ISLAND) == "derived"
     special = msgspec.structs.replace(
@@ -33,7 +42,7 @@ def test_kinds_and_states() -> None:
         real="9.1.1.1.1.1",
     )  # fmt: skip
     assert routes_text.route_kind(special) == (
-        "learned, ends in 61.0 s, unidirectional, not probed, real NetID 9.1.1.1.1.1,"
+        "learned, ends in 61 s, unidirectional, not probed, real NetID 9.1.1.1.1.1,"
         " answers within 900 ms"
     )
     assert routes_text.route_state(PRESS) == "down: connection refused"

@@ -26,7 +26,7 @@ def test_tables_of_routes_and_connections() -> None:
     rows = [line.split() for line in text.splitlines()]
     assert ["island-02", "none"] in rows
     assert ["press", "5.1.2.3.1.1", "ams-tcp", "192.168.1.5:48898", "down", "3", "3"] in rows
-    assert ["island-01", "127.0.0.1:40112#3", "ams-tcp", "127.0.0.1.1.1", "75.0", "s", "15",
+    assert ["island-01", "127.0.0.1:40112#3", "ams-tcp", "127.0.0.1.1.1", "75", "s", "15",
             "47.3k", "3"] in rows  # fmt: skip
     remarks = text.partition("Worth a look\n")[2].splitlines()
     assert [each.strip().partition(":")[2][:22] for each in remarks] == [
