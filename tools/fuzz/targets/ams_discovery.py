@@ -1,20 +1,94 @@
-"""Datagrams of UDP port 48899."""
+"""Datagrams of UDP port 48899, and routes that are asked for by them."""
 
 from __future__ import annotations
 
-from eap.codec.amsdiscovery import decode_discovery, decode_text, encode_discovery, encode_text
+import logging
+import socket
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from eap.aoe.routes import Route, RouteTable
+from eap.aoe.spec import AmsUser, RouteSpec, RoutingSpec
+from eap.aoe.way import Way
+from eap.appliance.discards import Refusal
+from eap.appliance.route_store import RouteStore
+from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
+from eap.appliance.services.route_desk import RouteDesk
+from eap.appliance.services.station_routes import StationRoutes
+from eap.codec.amsdiscovery import (
+    decode_discovery,
+    decode_text,
+    decode_version,
+    encode_discovery,
+    encode_text,
+)
 from eap.errors import CodecError
+from eap.ids import NetId
+
+OWN = NetId.parse("10.0.0.1.1.1")
+_MAX_ANSWER = 64
+_PASSWORD = "/dev/null"  # noqa: S105  a file: nobody's password is right
+
+logging.getLogger("eap").addHandler(logging.NullHandler())
+
+
+class _Store(RouteStore):
+    """Keeps nothing."""
+
+    def __init__(self) -> None:
+        self.path = Path()
+
+    def load(self) -> tuple[RouteSpec, ...]:
+        return ()
+
+    def save(self, routes: Sequence[RouteSpec]) -> None:
+        del routes
+
+
+class _Router:
+    def __init__(self) -> None:
+        self.table = RouteTable()
+        self.net_ids: Collection[NetId] = (OWN,)
+
+    def add_route(self, route: Route) -> bool:
+        return self.table.add(route)
+
+    def remove_route(self, net_id: NetId, hop: Way) -> bool:
+        return self.table.remove(net_id, hop)
 
 
 def fuzz_one(data: bytes) -> None:
-    """Read a datagram and write it again; only CodecError may pass."""
+    """Read a datagram and write it again, then answer it; only CodecError may pass."""
     try:
         read = decode_discovery(data)
     except CodecError:
-        return
-    if not data.startswith(encode_discovery(read.header, read.tags)):
-        raise AssertionError("the datagram encodes to other octets")
-    for _, content in read.tags:
-        text = decode_text(content)
-        if decode_text(encode_text(text)) != text:
-            raise AssertionError(f"{text!r} is read as another text")
+        pass
+    else:
+        if not data.startswith(encode_discovery(read.header, read.tags)):
+            raise AssertionError("the datagram encodes to other octets")
+        for _, content in read.tags:
+            decode_version(content)
+            text = decode_text(content)
+            if decode_text(encode_text(text)) != text:
+                raise AssertionError(f"{text!r} is read as another text")
+    for users in ((), (AmsUser("Administrator", _PASSWORD),)):
+        _answer(data, users)
+
+
+def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
+    """Answer *data* as who is on this host, twice: the second time changes nothing any more."""
+    routes = StationRoutes(_Router(), RoutingSpec(users=users), _Store())
+    refused: list[Refusal] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        desk = RouteDesk([routes])
+        discovery = AmsDiscovery(sock, [RouterName("left", OWN)], desk, refused.append)
+        answers = discovery.answers_to(data, "127.0.0.1")
+        added = routes.added
+        if discovery.answers_to(data, "127.0.0.1") != answers or routes.added != added:
+            raise AssertionError("the same datagram does another thing the second time")
+    if any(len(each) > _MAX_ANSWER for each in answers):
+        raise AssertionError(f"an answer of {max(map(len, answers))} octets")
+    if added and users:
+        raise AssertionError("a route was added without a password")
+    if any(route.net_id in routes.router.net_ids for route in routes.router.table):
+        raise AssertionError("a route leads to the station itself")
