@@ -13,6 +13,8 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Protocol, TypeAlias
 
+from eap.appliance.services.backoff import Backoff
+
 CONNECT_S = 3.0
 """How long the other side may take to accept."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0
@@ -78,7 +80,7 @@ class Uplinks:
 
     async def _run(self, address: str, uplink: _Uplink) -> None:
         loop = asyncio.get_running_loop()
-        pause_s = FIRST_PAUSE_S
+        backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         try:
             while True:
                 began_s = loop.time()
@@ -88,9 +90,8 @@ class Uplinks:
                     return  # nobody misses it
                 self._hops.hop_down(address, text or "the connection was closed")
                 if loop.time() - began_s > _LASTING_S:
-                    pause_s = FIRST_PAUSE_S
-                await asyncio.sleep(pause_s)
-                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+                    backoff.reset()
+                await asyncio.sleep(backoff.next_s())
                 if not self._hops.is_wanted(address):
                     return
         finally:
