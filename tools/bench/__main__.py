@@ -30,7 +30,7 @@ from tools.bench.settings import Settings, quick
 
 NAMES = (
     "throughput", "latency", "poll", "lateness", "solar", "limits", "receive", "objects", "change",
-    "routing", "ads", "startup", "acyclic", "cycle", "plantbus", "recovery", "segment",
+    "routing", "ads", "files", "startup", "acyclic", "cycle", "plantbus", "recovery", "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
 BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"
