@@ -130,12 +130,14 @@ class Router:
         """
         way = Way(door, connection)
         try:
-            header, body = decode_packet(data)
-            if header.command == AmsCommand.FRAGMENT:
-                return self._receive_fragment(header, bytes(body), way, now_ns, for_all=for_all)
+            header = AmsHeader.decode(data)
             end = AmsHeader.SIZE + header.length
-            packet = data if len(data) == end else data[:end]
-            return self._receive_whole(header, packet, way, now_ns, for_all=for_all)
+            if header.command == AmsCommand.FRAGMENT or len(data) != end:
+                _, body = decode_packet(data)
+                if header.command == AmsCommand.FRAGMENT:
+                    return self._receive_fragment(header, bytes(body), way, now_ns, for_all=for_all)
+                data = data[:end]
+            return self._receive_whole(header, data, way, now_ns, for_all=for_all)
         except CodecError as exc:
             return self._refuser.drop(way, None, Outcome.DROPPED, str(exc), now_ns)
 

@@ -7,6 +7,8 @@ from eap.codec.wire import Buffer, WireStruct, u16, u32
 from eap.errors import MalformedError
 
 AMS_TCP_PORT = 48898
+_LENGTH_AT = 16
+"""Bit of the prefix; *reserved* is before it."""
 
 
 class AmsTcpHeader(WireStruct, frozen=True):
@@ -41,6 +43,6 @@ def decode_prefix(data: Buffer, offset: int = 0) -> int:
     return prefix.length
 
 
-def encode_with_prefix(packet: Buffer) -> bytes:
+def encode_with_prefix(packet: bytes) -> bytes:
     """Return a whole AMS packet with its prefix."""
-    return AmsTcpHeader(0, len(packet)).encode() + bytes(packet)
+    return (len(packet) << _LENGTH_AT).to_bytes(AmsTcpHeader.SIZE, "little") + packet

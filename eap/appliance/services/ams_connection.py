@@ -123,7 +123,7 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._go_on()
         else:
             self._take(packet)
-            if self._is_full:
+            if not self._is_ours and (self._is_blocked or self._window.is_full):
                 self._hold()
 
     def eof_received(self) -> bool:
@@ -181,10 +181,6 @@ class AmsConnection(asyncio.BufferedProtocol):
         elif now - self._late_since >= patience_s:
             self._give_up()
 
-    @property
-    def _is_full(self) -> bool:
-        return not self._is_ours and (self._is_blocked or self._window.is_full)
-
     def _give_up(self) -> None:
         if not self._has_ended:
             self._taker.refuse(Refusal.AMS_SLOW)
@@ -206,7 +202,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         for _ in range(_PER_TURN):
             if self._transport.is_closing():
                 return
-            if self._is_full:
+            if not self._is_ours and (self._is_blocked or self._window.is_full):
                 self._hold()
                 return
             try:

@@ -14,11 +14,12 @@ MAX_REQUESTS = 64
 """Requests of one connection that wait for their answers."""
 MAX_OCTETS = 256 << 10
 """Of these requests and of the answers that they ask for; one request may have more."""
-_FLAGS = struct.Struct("<16xHH")
+_COMMAND, _COMMAND_GROUP, _FLAGS = 16, 17, 18
+"""Octets of the AMS header: both of the command, the lower one of the state flags."""
 _LENGTH = struct.Struct("<8xI")
 _WITHOUT_ANSWER = (StateFlags.RESPONSE | StateFlags.NO_RETURN).value
 _RESPONSE = StateFlags.RESPONSE.value
-_NEVER_ANSWERED = frozenset((AmsCommand.NOTIFICATION.value, AmsCommand.FRAGMENT.value))
+_NOTIFICATION = AmsCommand.NOTIFICATION.value
 _READS = frozenset((AmsCommand.READ.value, AmsCommand.READ_WRITE.value))
 
 
@@ -42,20 +43,21 @@ class AmsWindow:
 
     def take_in(self, packet: bytes) -> bool:
         """Note a packet that came in; return whether it is an answer."""
-        command, flags = _FLAGS.unpack_from(packet)
-        if flags & _WITHOUT_ANSWER or command in _NEVER_ANSWERED:
+        flags, command = packet[_FLAGS], packet[_COMMAND]
+        # Those with a group of their own are fragments, of which nothing waits for an answer.
+        if flags & _WITHOUT_ANSWER or packet[_COMMAND_GROUP] or command == _NOTIFICATION:
             return bool(flags & _RESPONSE)
+        size = len(packet)
         self.requests += 1
-        self._octets += len(packet)
-        if command in _READS and len(packet) >= AmsHeader.SIZE + _LENGTH.size:
+        self._octets += size
+        if command in _READS and size >= AmsHeader.SIZE + _LENGTH.size:
             (asked,) = _LENGTH.unpack_from(packet, AmsHeader.SIZE)
-            self._octets += min(asked, MAX_OCTETS)
+            self._octets += min(MAX_OCTETS, asked)
         return False
 
     def take_out(self, packet: bytes) -> bool:
         """Note a packet that goes out; return whether it is the answer to one that came in."""
-        command, flags = _FLAGS.unpack_from(packet)
-        if not flags & _RESPONSE or command in _NEVER_ANSWERED or not self.requests:
+        if not packet[_FLAGS] & _RESPONSE or packet[_COMMAND_GROUP] or not self.requests:
             return False
         # Answers come in any order and do not say how long their requests were; the average does,
         # and nothing is left when all have come.

@@ -266,13 +266,13 @@ class StationRouter:
 
     def _act(self, actions: list[Action]) -> None:
         for action in actions:
-            match action:
-                case Reply(way, packets):
-                    self._carriers[way.door].send(way.connection, packets)
-                case Forward(hop, packets, ticket):
-                    self._forward(hop, packets, ticket)
-                case _:
-                    self._deliver(action)
+            if isinstance(action, Reply):
+                door, connection = action.way
+                self._carriers[door].send(connection, action.packets)
+            elif isinstance(action, Forward):
+                self._forward(*action)
+            else:
+                self._deliver(action)
         self._tell()
         for way, (count, event) in self._settling.items():
             if self._router.waiting(way) < count:
