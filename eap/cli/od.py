@@ -29,8 +29,9 @@ _TYPE = click.option(
 def od() -> None:
     """Read and write the object dictionary of a station.
 
-    TARGET is STATION or STATION/PORT for an EAP port of a running station, and STATION/PORT/SLAVE
-    for a slave behind its bus.  INDEX and SUB are hexadecimal (0xD000:7) or decimal.
+    TARGET is STATION or STATION/PORT for an EAP port of a running station, STATION/router for its
+    router, and STATION/PORT/SLAVE for a slave behind its bus.  INDEX and SUB are hexadecimal
+    (0xD000:7) or decimal.
     """
 
 
