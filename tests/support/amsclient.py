@@ -34,9 +34,11 @@ class AmsClient:
         assert struct.unpack_from("<I", packet, 28) == (self._number,)
         return int.from_bytes(packet[24:28], "little"), packet[32:]
 
-    def ask(self, target: str, command: int, body: bytes) -> tuple[int, bytes]:
+    def ask(
+        self, target: str, command: int, body: bytes, *, port: int = aoe.DEVICE
+    ) -> tuple[int, bytes]:
         self._number += 1
-        self.send(aoe.packet(target, command, body, invoke_id=self._number))
+        self.send(aoe.packet(target, command, body, port=port, invoke_id=self._number))
         return self.receive()
 
     def net_id(self, target: str) -> str:

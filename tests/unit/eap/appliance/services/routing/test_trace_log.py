@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 
 from eap.aoe.action import Outcome, Trace
-from eap.appliance.services.routing.trace_log import BURST, LINES_PER_S, TraceLog
+from eap.aoe.way import Way
+from eap.appliance.services.routing.trace_log import BURST, LINES_PER_S, MAX_CLIENTS, TraceLog
 
 
 def trace(outcome: Outcome = Outcome.FAILED, at_ns: int = 0) -> Trace:
@@ -49,3 +50,24 @@ def test_what_nobody_wants_to_see_takes_no_room(caplog):
         log.write(trace(Outcome.DROPPED))
     log.write(trace())
     assert caplog.messages == ["island: no way (0x1b)"]
+
+
+def denied(address: str) -> Trace:
+    return trace(Outcome.DENIED)._replace(came_by=Way("ams-tcp", address))
+
+
+def test_a_client_that_goes_on_trying_hides_no_other(caplog):
+    log = TraceLog("island")
+    for number in range(1000):
+        log.write(denied(f"10.0.0.5:{number}"))
+    assert len(caplog.messages) == BURST
+    log.write(denied("10.0.0.6:1"))
+    log.write(trace())
+    assert len(caplog.messages) == BURST + 2
+
+
+def test_clients_are_forgotten(caplog):
+    log = TraceLog("island")
+    for number in range(3 * MAX_CLIENTS):
+        log.write(denied(f"10.0.{number // 250}.{number % 250}:1"))
+    assert len(caplog.messages) == 3 * MAX_CLIENTS
