@@ -32,6 +32,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 15.0
 _STABLE_S = 10.0
 """How long a connection has to last to be a good one."""
 _GOODBYE_S = 0.3
+_KNOCK_S = 3.0
 _UNCONFIRMED = 16
 """Messages of QoS 1 and 2 on their way at a time."""
 
@@ -77,6 +78,8 @@ class MqttLink:
         self._octets = 0
         self._is_connected = False
         self._is_old = False
+        self._is_silent = False
+        self._connections = 0
         self._said = ""
 
     def send(self, message: Outgoing) -> str | None:
@@ -94,10 +97,12 @@ class MqttLink:
         pause_s = FIRST_PAUSE_S
         loop = asyncio.get_running_loop()
         while True:
-            began_s = loop.time()
+            began_s, count = loop.time(), self._connections
             why = await self._connect_once()
             if loop.time() - began_s > _STABLE_S:
-                pause_s = FIRST_PAUSE_S
+                pause_s, self._connections = FIRST_PAUSE_S, 0
+            elif self._connections > max(count, 1):
+                why += f"; has another client the name {self._client_id!r} (client_id) too?"
             if why != self._said:  # a broker that is away for long is no flood of lines
                 logger.warning("%s: %s; trying again", self._name, why)
                 self._said = why
@@ -109,13 +114,15 @@ class MqttLink:
         from eap.net.mqttclient import MqttError, describe, is_too_new, make_client, tls_context
 
         try:
+            if self._is_silent:
+                await self._knock()
             client = make_client(
                 self._spec.host, self._spec.port, self._client_id,
                 login=self._login(), tls=tls_context(self._spec.tls), will=self._will,
                 keepalive_s=KEEPALIVE_S, is_old=self._is_old,
             )  # fmt: skip
         except (OSError, UnicodeError) as exc:  # files of password and certificates
-            return str(exc)
+            return str(exc) or "timed out"
         try:
             async with client:
                 await self._serve(client)
@@ -124,6 +131,7 @@ class MqttLink:
             if not self._is_connected and is_too_new(exc):
                 self._is_old = not self._is_old
             why = describe(exc, client, self._spec.user)
+            self._is_silent = "timed out" in why
         finally:
             client.close()
         if self._is_connected:
@@ -131,10 +139,22 @@ class MqttLink:
             self._handlers.lost(f"no connection to {self._name}: {why}")
         return why
 
+    async def _knock(self) -> None:
+        """Raise OSError if nobody is there.
+
+        This can be cancelled; paho waits in a thread, which cannot, and holds the end of the
+        process up.
+        """
+        async with asyncio.timeout(_KNOCK_S):
+            _, writer = await asyncio.open_connection(self._spec.host, self._spec.port)
+        writer.close()
+        await writer.wait_closed()
+
     async def _serve(self, client: Client) -> None:
         self._outbox = asyncio.Queue()
         self._octets = 0
         self._is_connected = True
+        self._connections += 1  # without a good one in between
         logger.info("%s: connected as %s", self._name, self._client_id)
         self._said = ""
         if self._is_old:
@@ -150,7 +170,8 @@ class MqttLink:
                     await _publish(client, self._will)
             raise
         except ExceptionGroup as group_error:
-            raise group_error.exceptions[0] from None
+            first = group_error.exceptions[0]
+            raise first from first.__cause__
 
     async def _read(self, client: Client) -> None:
         has_said = False

@@ -35,6 +35,8 @@ _UNSUPPORTED = frozenset({1, 0x84})
 _LOGIN = frozenset({4, 5, 0x86, 0x87})
 """Reasons of brokers that do not want this user."""
 
+_UNSPECIFIED = 0x80
+
 
 class Inbox(asyncio.Queue[Message]):
     """Messages that wait; what has no room is thrown away and counted."""
@@ -182,11 +184,12 @@ def describe(error: MqttError, client: Client, user: str) -> str:
         if not user:
             return "it wants to know who connects: give 'user' and 'password_file', or 'tls'"
         return f"it refuses user {user!r} or the password: look at 'user' and 'password_file'"
-    if client.complaints.latest:
-        return client.complaints.latest
-    return str(error.__cause__ or error) or type(error).__name__
+    cause = error.__cause__ or error
+    if _code(cause) == _UNSPECIFIED:
+        return client.complaints.latest or "the connection broke"
+    return client.complaints.latest or str(cause) or type(error).__name__
 
 
-def _code(error: MqttError) -> int | None:
+def _code(error: BaseException) -> int | None:
     reason = getattr(error, "rc", None)
     return reason.value if isinstance(reason, ReasonCode) else reason

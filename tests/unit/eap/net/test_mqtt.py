@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 import sys
+import time
 from collections.abc import Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 
 import pytest
 
 from eap.aoe.mqtt_network import Publish, Subscribe
 from eap.aoe.spec import MqttSpec, TlsSpec
 from eap.errors import EnvironmentalError
-from eap.net import mqtt
+from eap.net import mqtt, mqttclient
 from eap.net.mqtt import Handlers, MqttLink
 from tests.support.mosquitto import broker, write_certificates, write_passwords
 
 pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
 
 ADDRESS = "127.0.3.40"
+NAME = "MQTT broker 127.0.3.40:1883"
 WILL = Publish("hall/1/info", b"gone", 2, is_retained=True)
 HELLO = Publish("hall/1/info", b"here", 2, is_retained=True)
 
@@ -97,6 +100,7 @@ def test_link_comes_back_with_its_broker(tmp_path, caplog):
             await until(lambda: peer.heard)
             server.stop()
             await until(lambda: peer.lost)
+            assert peer.lost == [f"no connection to {NAME}: the connection broke"]
             assert peer.link.send(HELLO).startswith("no connection")
             await asyncio.sleep(1)
             server.start()
@@ -224,3 +228,72 @@ def test_without_aiomqtt_one_is_told_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "aiomqtt", None)
     with pytest.raises(EnvironmentalError, match=r"pip install 'eap-appliance\[mqtt\]'"):
         Peer()
+
+
+@pytest.mark.parametrize("refusal", [b"\x20\x02\0\x01", b"\x20\x03\0\x84\0", b""], ids=repr)
+def test_broker_of_before_is_spoken_to_as_it_understands(refusal, caplog, monkeypatch):
+    monkeypatch.setattr(mqttclient, "ANSWER_S", 0.3)
+    versions = []
+
+    async def serve(reader, writer):
+        """As a broker that speaks MQTT 3.1.1: it refuses version 5, or just closes."""
+        _, length = await reader.readexactly(2)
+        connect = await reader.readexactly(length)
+        versions.append(connect[6])
+        if connect[6] == 4:
+            writer.write(b"\x20\x02\0\0")
+            kind, length = await reader.readexactly(2)
+            subscribe = await reader.readexactly(length)
+            assert kind == 0x82
+            writer.write(b"\x90\x03" + subscribe[:2] + b"\2")
+            writer.write(b"\x30\x0b\0\6hall/xhey")
+            await reader.read()
+        else:
+            writer.write(refusal)
+            await writer.drain()
+        writer.close()
+
+    async def story():
+        peer = Peer()
+        async with await asyncio.start_server(serve, ADDRESS, 1883), running(peer):
+            await until(lambda: peer.heard)
+            assert peer.heard == [("hall/x", b"hey", False)]
+
+    play(story)
+    assert versions == [5, 4]
+    assert "speaks no MQTT 5: the longest message is its own affair" in caplog.text
+
+
+def test_broker_behind_a_wall_does_not_hold_the_end_up(monkeypatch, caplog):
+    monkeypatch.setattr(mqttclient, "CONNECT_S", 0.2)
+    with socket.socket() as wall, ExitStack() as crowd:
+        wall.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        wall.bind((ADDRESS, 1883))
+        wall.listen(0)
+        for _ in range(3):  # who comes after them gets no answer at all
+            other = crowd.enter_context(socket.socket())
+            other.setblocking(False)
+            other.connect_ex((ADDRESS, 1883))
+
+        async def story():
+            async with running(Peer()):
+                await until(lambda: "timed out; trying again" in caplog.text)
+                await asyncio.sleep(0.6)  # by now it knocks, and waits
+
+        began = time.monotonic()
+        play(story)
+        assert time.monotonic() - began < 2
+
+
+def test_second_client_of_a_name_is_told_of(tmp_path, caplog):
+    async def story():
+        one, two = Peer("same"), Peer("same")
+        async with running(one):
+            await until(lambda: one.heard)
+            async with running(two):
+                await until(
+                    lambda: "has another client the name 'same' (client_id) too?" in caplog.text
+                )
+
+    with broker(tmp_path, ADDRESS):
+        play(story)

@@ -77,6 +77,7 @@ def test_refused_subscriptions_are_named(codes, monkeypatch):
         (MqttError("[Errno 111] Connection refused"), "", "[Errno 111] Connection refused"),
         (MqttError(), "", "MqttError"),
         (MqttCodeError(7), "", "The connection was lost"),
+        (MqttCodeError(ReasonCode(PacketTypes.DISCONNECT, "Unspecified error")), "", "broke"),
     ],
 )
 def test_reason_is_told_in_words(error, user, text):
