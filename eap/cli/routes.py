@@ -51,10 +51,15 @@ def routes(ctx: click.Context, plant: str | None) -> None:
         if plant:
             raise click.UsageError("--plant goes behind the command")
         return
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not is_terminal():
         ctx.invoke(list_all, plant=plant, station=None, match="", as_json=False)
         return
     _run_view(plant)
+
+
+def is_terminal() -> bool:
+    """Say whether somebody sits before a screen."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def _run_view(plant: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from time import monotonic
 from typing import Any, ClassVar
 
 from rich.text import Text
@@ -21,6 +22,8 @@ from eap.errors import EapError
 
 PERIOD_S = 1.0
 """Between two looks."""
+PATIENCE_S = 2.5
+"""For an answer, before it is said that there is none."""
 _ALL = "all stations"
 _SCROLLBAR = 1
 """Columns that one takes when there are more rows than lines."""
@@ -58,7 +61,7 @@ class RoutesApp(App[None]):
         self._view = View.ROUTES
         self._station = _ALL
         self._match = ""
-        self._is_looking = False
+        self._looks_since: float | None = None
 
     def compose(self) -> ComposeResult:
         """Yield the parts of the screen, top to bottom."""
@@ -83,9 +86,13 @@ class RoutesApp(App[None]):
 
     def look(self) -> None:
         """Ask the appliances, unless they are still being asked."""
-        if not self._is_looking:
-            self._is_looking = True
+        if self._looks_since is None:
+            self._looks_since = monotonic()
             self._look(self._match if self._view is View.ROUTES else "")
+        elif (waited_s := monotonic() - self._looks_since) > PATIENCE_S:
+            problem = f"no answer for {waited_s:.0f} s"
+            self._picture = self._picture._replace(problem=problem)
+            self._show()
 
     @work(thread=True)
     def _look(self, match: str) -> None:
@@ -93,7 +100,7 @@ class RoutesApp(App[None]):
         self.call_from_thread(self._take, picture)
 
     def _take(self, picture: Picture) -> None:
-        self._is_looking = False
+        self._looks_since = None
         if picture.problem:
             picture = Picture(self._picture.routers, picture.problem)
         self._picture = picture

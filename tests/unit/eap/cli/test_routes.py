@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from contextlib import ExitStack
 
 import pytest
@@ -124,3 +125,25 @@ def test_test_of_everything(command):
     assert result.exit_code == 1
     assert "see whether it is switched on" in result.output
     assert "island-02 127.0.1.2.1.1:10000" in " ".join(result.output.split())
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    monkeypatch.setattr("eap.cli.routes.is_terminal", lambda: True)
+
+
+def test_terminal_gets_the_live_view(command, terminal, monkeypatch):
+    shown = []
+    monkeypatch.setattr("eap.cli.routes_tui.app.run_view", shown.append)
+    assert command("--plant", "line").exit_code == 0
+    assert shown == ["line"]
+
+
+def test_without_textual_the_way_to_it_is_told(command, terminal, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("eap.cli.routes_tui")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "textual", None)
+    result = command()
+    assert result.exit_code == 2
+    assert "pip install 'eap-appliance[tui]'" in result.stderr
+    assert "eapctl routes list" in result.stderr

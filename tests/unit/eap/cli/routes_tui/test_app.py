@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from threading import Event
 
 import msgspec
 import pytest
@@ -247,6 +248,28 @@ def test_nothing_to_work_with(runtime):
         assert await screen.press("a", "w", "r") == before
         assert "Choose a route first." in await screen.press("t")
 
+    run(script)
+
+
+def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
+    answer, goes_on = fake.table()["routes_list"], Event()
+
+    def hang(params):
+        assert goes_on.wait(20)
+        return answer(params)
+
+    monkeypatch.setattr("eap.cli.routes_tui.app.PATIENCE_S", 0.0)
+
+    async def script(screen):
+        stub._methods["routes_list"] = hang
+        screen.app.look()
+        screen.app.look()
+        await screen.pilot.pause()
+        assert screen.text().startswith(" no answer for 0 s")
+        goes_on.set()
+        assert (await screen.settle()).startswith(" line, 2 stations")
+
+    stub._methods = fake.table()
     run(script)
 
 
