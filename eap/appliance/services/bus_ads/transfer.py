@@ -154,6 +154,8 @@ class Transfer:
         await self._wait(lambda: is_so() or self.has_ended)
         if self._error is not None:
             raise self._error
+        if self.has_ended and not self.is_complete:
+            raise BusError(f"file {self._name!r}: the transfer was given up")
 
     async def _wait(self, is_so: Callable[[], bool]) -> None:
         while not is_so():

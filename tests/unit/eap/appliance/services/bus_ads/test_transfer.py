@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from devicebus.errors import FoeError
+from devicebus.errors import BusError, FoeError
 from devicebus.mailbox.conversation import Message
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
@@ -128,8 +128,11 @@ def test_end_in_the_middle_is_told_to_the_slave():
 
     async def scene(transfer, task):
         await transfer.wait_open()
+        waiting = asyncio.ensure_future(transfer.read(1 << 20))
+        await asyncio.sleep(0)
         task.cancel()
-        await asyncio.wait([task])
+        with pytest.raises(BusError, match="given up"):  # and not less than there is
+            await waiting
         assert (transfer.has_ended, transfer.is_complete) == (True, False)
 
     play(scene, talk)
