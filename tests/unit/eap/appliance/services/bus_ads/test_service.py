@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 
 import pytest
 
@@ -16,11 +17,12 @@ from eap.aoe.ads_operation import (
     WriteControl,
 )
 from eap.appliance.bus_request import AskMailbox
-from eap.appliance.services.bus_ads import service
+from eap.appliance.services.bus_ads import files, idns, service
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,
     AdsRange,
+    AdsReadWrite,
     AdsState,
     AdsStates,
     IndexGroup,
@@ -186,5 +188,32 @@ def test_answer_has_to_fit(length):
         outcome = await client.do(DRIVE, VENDOR._replace(length=length))
         assert outcome == OperationOutcome(AdsError.SIZE)
         assert client.why == f"4 octets, the client has room for {length}"
+
+    play(scene)
+
+
+def test_whatever_is_asked_is_answered(monkeypatch):
+    monkeypatch.setattr(files, "ANSWER_S", 0.01)
+    monkeypatch.setattr(idns, "ANSWER_S", 0.01)
+    pick = random.Random(7)
+    groups = [*IndexGroup, 0, 0x8000_0000]
+    offsets = [0, 1, 0x1018_0001, 0x1018_0100, 0x0040_0020, 0x0800_0063, 0xFFFF_FFFF]
+
+    def body(command: int) -> bytes:
+        group, offset = pick.choice(groups), pick.choice(offsets)
+        data = pick.randbytes(pick.choice((0, 1, 4, 6, 40, 300)))
+        length = pick.choice((0, 4, 100, 1 << 20, 0xFFFF_FFFF))
+        if command == AmsCommand.READ_WRITE:
+            return AdsReadWrite(group, offset, length, len(data)).encode() + data
+        return AdsRange(group, offset, length if command == 2 else len(data)).encode() + data
+
+    async def scene(client, engine):
+        for number in range(300):
+            command = pick.choice((2, 3, 9, 9, pick.randrange(12)))
+            port = pick.choice((DRIVE, DRIVE, MASTER, 1002))
+            octets = body(command)
+            cut = pick.randrange(len(octets)) if not number % 10 else len(octets)
+            answer = await client.answer(port, command, octets[:cut])
+            assert answer.error_code or len(answer.data) >= 4
 
     play(scene)
