@@ -43,12 +43,13 @@ class Gate:
         record: Where refusals of items are remembered; the router itself does it for whole ones.
 
     Attributes:
+        access: The rules, which may become others.
         missed: Entries of the audit that nobody took in time.
     """
 
     def __init__(self, access: AccessList, record: Record) -> None:
         self.missed = 0
-        self._access = access
+        self.access = access
         self._record = record
         self._entries: deque[AuditEntry] = deque()
 
@@ -58,12 +59,12 @@ class Gate:
 
     def may(self, header: AmsHeader, way: Way) -> dict[AccessService, bool | None]:
         """Return what a client may do with its target; None if that depends on the object."""
-        grants = self._access.grants(way, header.source, header.target, header.target_port)
+        grants = self.access.grants(way, header.source, header.target, header.target_port)
         return {service: grants.may(service) for service in AccessService}
 
     def is_this_host(self, way: Way) -> bool:
         """Say whether only a program of this host can have come by *way*."""
-        return self._access.is_this_host(way)
+        return self.access.is_this_host(way)
 
     def let_through(
         self, header: AmsHeader, data: bytes, way: Way, now_ns: int, route: str = ""
@@ -79,7 +80,7 @@ class Gate:
         """
         if header.command == AmsCommand.NOTIFICATION:
             return data, None  # nobody gets one who has not asked for it
-        grants = self._access.grants(way, header.source, header.target, header.target_port)
+        grants = self.access.grants(way, header.source, header.target, header.target_port)
         if grants.may_read and header.command in _READS:
             return data, None
         try:

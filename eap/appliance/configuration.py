@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from eap.aoe.spec import RoutingSpec
 from eap.appliance.durable import digest, seal, unseal
 from eap.errors import ConfigError
 from eap.pd.device import DeviceState
@@ -49,7 +50,7 @@ def new_cause() -> str:
     return f"{time.time_ns():020d}"
 
 
-def digest_of(spec: StationSpec) -> str:
+def digest_of(spec: StationSpec | RoutingSpec) -> str:
     """Return what tells *spec* from any other.
 
     Fields that hold their defaults do not count: a release that adds one does not change it.

@@ -43,7 +43,9 @@ def apply(
         is_on = keep_going or not refusing
         chosen = {name: spec for name, spec in wanted.items() if is_on and name not in refusing}
         order = steps_to(link, chosen)
-        done = _take(apply_steps(link, order, keep_going=keep_going), as_json=as_json)
+        done = _take(
+            apply_steps(link, order, keep_going=keep_going, routed=chosen), as_json=as_json
+        )
         _finish(ctx, link, done, refusing, as_json=as_json)
 
 

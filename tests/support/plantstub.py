@@ -25,6 +25,8 @@ class PlantStub:
         unable: Stations that say so when they are planned.
         refuses: Tells whether a station refuses a specification when it is applied.
         taken: Everything that was applied, in order.
+        told: What each router was told that was told anything, and not before: its rules' names.
+        routing_causes: Which change of a router that was.
     """
 
     def __init__(self, plant: str, specs: Sequence[StationSpec], stack: ExitStack,
@@ -36,9 +38,15 @@ class PlantStub:
         self.unable: set[str] = set()
         self.refuses: Callable[[StationSpec], bool] = lambda _: False
         self.taken: list[StationSpec] = []
+        self.told: dict[str, list[str]] = {}
+        self.routing_causes: dict[str, str] = {}
         methods = {
-            each.__name__: each for each in (self.export, self.plan, self.apply, self.rollback)
-        }
+            each.__name__: each
+            for each in (
+                self.export, self.plan, self.apply, self.rollback,
+                self.routing_export, self.routing_plan, self.routing_apply, self.routing_rollback,
+            )
+        }  # fmt: skip
         self.stub = ControlStub(plant, list(self.specs), methods, stack, plant_file=plant_file)
 
     def export(self, params: dict[str, Any]) -> Any:
@@ -76,6 +84,32 @@ class PlantStub:
             self.previous[name] = before
             self.undone ^= {name}
         return answer
+
+    def routing_export(self, params: dict[str, Any]) -> Any:
+        name = params["station"]
+        if name not in self.told:
+            return {"routing": {}}
+        cause = self.routing_causes[name]
+        undone = not self.told[name]
+        return {"routing": {}, "previous": {}, "cause": cause, "undone": undone}
+
+    def routing_plan(self, params: dict[str, Any]) -> Any:
+        rules = [rule["name"] for rule in params["routing"].get("access", [])]
+        is_same = self.told.get(params["station"], []) == rules
+        changes = [] if is_same else [f"access rule {rule}: added" for rule in rules]
+        return {"changes": changes, "refused": []}
+
+    def routing_apply(self, params: dict[str, Any]) -> Any:
+        answer = self.routing_plan(params)
+        name = params["station"]
+        self.told[name] = [rule["name"] for rule in params["routing"].get("access", [])]
+        self.routing_causes[name] = params["cause"]
+        return answer
+
+    def routing_rollback(self, params: dict[str, Any]) -> Any:
+        name = params["station"]
+        self.told[name] = [] if self.told[name] else ["again"]
+        return {"changes": ["access rules: changed"], "refused": []}
 
     def _asked(self, params: dict[str, Any]) -> tuple[str, StationSpec]:
         return params["station"], msgspec.convert(params["spec"], StationSpec)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -18,6 +19,7 @@ import msgspec
 from eap.appliance.commands.plant_link import Outcome, PlantLink, StationPlan
 from eap.appliance.configuration import new_cause
 from eap.appliance.control import near
+from eap.appliance.control_routing import RoutingDifference
 from eap.appliance.plantfile import load_plant
 from eap.config.load import Plant
 from eap.device.rollout import Step, steps, without_alternates
@@ -71,9 +73,13 @@ def steps_to(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[Step]:
 
 
 def apply_steps(
-    link: PlantLink, order: Iterable[Step], *, keep_going: bool = False
+    link: PlantLink,
+    order: Iterable[Step],
+    *,
+    keep_going: bool = False,
+    routed: Iterable[str] = (),
 ) -> Iterator[Done]:
-    """Take *order* step by step, and yield what became of each.
+    """Take *order* step by step, and yield what became of each; last the routers of *routed*.
 
     A station that refused one is asked for nothing more.  What goes on with a change that was
     broken off belongs to it, so that a rollback takes back both.
@@ -81,7 +87,17 @@ def apply_steps(
     running = [link.export(name) for name in link.stations]
     under_way = [each.cause for each in running if _is_under_way(each.spec)]
     cause = max(under_way, default="") or new_cause()
-    yield from _walk(order, partial(link.apply, cause=cause), keep_going=keep_going)
+    refused = set()
+    for done in _walk(order, partial(link.apply, cause=cause), keep_going=keep_going):
+        yield done
+        if not done.outcome.ok:
+            refused.add(done.station)
+    if keep_going or not refused:
+        names = [name for name in routed if name not in refused]
+        yield from _tell_routers(
+            [name for name in names if link.routing.plan(name).changes],
+            partial(link.routing.apply, cause=cause),
+        )
 
 
 def roll_back(
@@ -96,17 +112,32 @@ def roll_back(
     now = {name: each.spec for name, each in running.items()}
     goal = {name: without_alternates(now[name]) for name in stations}
     known = {name: running[name] for name in goal if running[name].previous is not None}
-    last = max((each.cause for each in known.values()), default="")
+    routers = {name: told for name in goal if (told := link.routing.export(name)) is not None}
+    routers = {name: told for name, told in routers.items() if told.previous is not None}
+    causes = [each.cause for each in known.values()] + [each.cause for each in routers.values()]
+    last = max(causes, default="")
     part = {name: each for name, each in known.items() if each.cause == last}
     left = {n: each for n, each in part.items() if not each.undone and each.previous != goal[n]}
-    if not left and not any(_is_under_way(each.spec) for each in part.values()):
-        left = part
+    routed = [name for name, told in routers.items() if told.cause == last]
+    told_left = [name for name in routed if not routers[name].undone]
+    if not (left or told_left or any(_is_under_way(each.spec) for each in part.values())):
+        left, told_left = part, routed
     goal |= {name: each.previous for name, each in left.items() if each.previous is not None}
-    return _walk(steps(now, {**now, **goal}), link.rollback, keep_going=keep_going)
+    back = _walk(steps(now, {**now, **goal}), link.rollback, keep_going=keep_going)
+    return chain(back, _tell_routers(told_left, link.routing.rollback))
 
 
 def _is_under_way(spec: StationSpec) -> bool:
     return any(pd.alternates for pd in spec.subscriptions)
+
+
+def _tell_routers(
+    stations: Iterable[str], tell: Callable[[str], RoutingDifference]
+) -> Iterator[Done]:
+    for name in stations:
+        told = tell(name)
+        outcome = Outcome(ok=not told.refused, results=[], refused=told.refused)
+        yield Done(name, f"({', '.join(told.changes) or 'routes'})", outcome)
 
 
 def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[Done]:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
 
+from eap.aoe.spec import RoutingSpec
 from eap.appliance.commands.client import Client, connect_those
+from eap.appliance.commands.routing_link import RoutingLink
 from eap.appliance.control import ErrorCode
 from eap.config.load import Plant
 from eap.errors import ControlError
@@ -26,7 +29,7 @@ class StationPlan(msgspec.Struct, frozen=True):
     changes: list[dict[str, Any]]
     """Objects of its ports: port, index, subindex, name, change, old, new."""
     notes: list[str]
-    """What is no object: sources, links, buses."""
+    """What is no object: sources, links, buses, routes, access rules."""
     refused: list[str]
     """Why it cannot be as the file says."""
 
@@ -64,11 +67,20 @@ class PlantLink:
         clients: The appliance of each station.
         file: The plant file.
         absent: Its stations that do not run here.
+        routing: What it says of their routers.
+
+    Attributes:
+        routing: Asks about routers.
     """
 
     def __init__(
-        self, clients: Mapping[str, Client], file: Path, absent: tuple[str, ...] = ()
+        self,
+        clients: Mapping[str, Client],
+        file: Path,
+        absent: tuple[str, ...] = (),
+        routing: Mapping[str, RoutingSpec] = MappingProxyType({}),
     ) -> None:
+        self.routing = RoutingLink(self._ask, routing)
         self._clients = clients
         self._file = str(file.resolve())
         self.absent = absent
@@ -89,7 +101,9 @@ class PlantLink:
     def plan(self, spec: StationSpec) -> StationPlan:
         """Return what differs between *spec* and the station of its name."""
         answer = self._ask("plan", spec.name, spec=msgspec.to_builtins(spec))
-        return StationPlan(spec.name, answer["changes"], answer["station"], answer["refused"])
+        router = self.routing.plan(spec.name)
+        notes, refused = answer["station"] + router.changes, answer["refused"] + router.refused
+        return StationPlan(spec.name, answer["changes"], notes, refused)
 
     def apply(self, spec: StationSpec, cause: str) -> Outcome:
         """Let the station of its name be as *spec* says, as a step of the change named *cause*."""
@@ -131,7 +145,8 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
             )
         order = [station.name for station in plant.stations]
         here = {name: found[name] for name in order if name in found}
-        yield PlantLink(here, file, tuple(name for name in order if name not in found))
+        absent = tuple(name for name in order if name not in found)
+        yield PlantLink(here, file, absent, plant.routing)
     finally:
         for client in clients:
             client.close()

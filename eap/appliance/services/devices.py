@@ -6,18 +6,20 @@ import asyncio
 import platform
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from time import monotonic_ns
 
 from eap.aoe.spec import RoutingSpec
-from eap.appliance.route_store import RouteStore
+from eap.appliance.route_store import RouteStore, RoutingStore
 from eap.appliance.services.image_values import ImageValues
-from eap.appliance.services.routing.planned import make_router
+from eap.appliance.services.routing.planned import access_of, make_router
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sources import SourcePlayer
 from eap.appliance.services.station_ads import StationAds
 from eap.appliance.services.station_device import StationDevice
 from eap.appliance.services.station_keeper import StationEngine, StationKeeper
 from eap.appliance.services.station_routes import StationRoutes
+from eap.appliance.services.station_routing import StationRouting
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
 from eap.device.eap_content import Identity
@@ -44,7 +46,7 @@ class Devices:
     Attributes:
         by_station: The devices.
         routers: Of AMS packets, by station.
-        routes: Of these routers.
+        routing: What these routers are told, their routes among it.
         ads: What they find at the NetIDs of routers and EAP ports, by station.
     """
 
@@ -61,7 +63,7 @@ class Devices:
         store = Store(plant)
         self.by_station: dict[str, StationDevice] = {}
         self.routers: dict[str, StationRouter] = {}
-        self.routes: dict[str, StationRoutes] = {}
+        self.routing: dict[str, StationRouting] = {}
         self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
         self._images = images
@@ -83,8 +85,13 @@ class Devices:
             self.by_station[name] = device
             told = routing.get(name, RoutingSpec())
             self.routers[name] = router = make_router(station, told)
-            self.routes[name] = StationRoutes(router, told, RouteStore(plant, name))
-            self.routes[name].start()
+            self.routing[name] = StationRouting(
+                name,
+                StationRoutes(router, told, RouteStore(plant, name)),
+                RoutingStore(plant, name),
+                partial(_set_access, station, router),
+            )
+            self.routing[name].start()
             self.ads[name] = StationAds(station, device, image, router, identity)
 
     async def serve(self) -> None:
@@ -117,6 +124,10 @@ class Devices:
                     image.catch_up()  # an engine that died may have retired nothing
             for device in self.by_station.values():
                 await device.tell_again()
+
+
+def _set_access(station: StationSpec, router: StationRouter, told: RoutingSpec) -> None:
+    router.set_access(access_of(station, told))
 
 
 def _runs(image: StationImage) -> bool:

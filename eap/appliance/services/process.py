@@ -48,6 +48,7 @@ from eap.appliance.services.route_methods import RouteMethods
 from eap.appliance.services.route_rows import RouterView
 from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
 from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.services.routing_methods import RoutingMethods
 from eap.appliance.services.segment_link import SegmentLink
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.status import ProcessMeter, appliance_status
@@ -93,7 +94,7 @@ class Services:
         doors = open_doors(
             self._handover,
             devices.routers,
-            devices.routes,
+            {name: each.routes for name, each in devices.routing.items()},
             gateways,
             self._counters,
             self._link,
@@ -172,7 +173,7 @@ class Services:
 
     def _more_methods(self, devices: Devices) -> dict[str, Callable[[dict[str, Any]], Any]]:
         views = {
-            name: RouterView(router, devices.routes[name])
+            name: RouterView(router, devices.routing[name].routes)
             for name, router in devices.routers.items()
         }
         routers = {name: ads.dictionary for name, ads in devices.ads.items()}
@@ -180,6 +181,7 @@ class Services:
         return {
             **DeviceMethods(devices.by_station, routers, plant_file).table(),
             **RouteMethods(views, self._directory).table(),
+            **RoutingMethods(devices.routing).table(),
             **AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
         }
 

@@ -92,15 +92,16 @@ class StationRoutes:
         """The added routes, the oldest first."""
         return tuple(self._added)
 
-    def start(self) -> None:
-        """Take the routes of the plant file, then those that were added before."""
+    def start(self, spec: RoutingSpec | None = None) -> None:
+        """Take the routes of the plant file, or of *spec*, then those that were added before."""
+        self._spec = spec or self._spec
         self._take_spec()
-        for spec in self._store.load():
+        for added in self._store.load():
             try:
-                self._take(spec, Origin.ADDED)
+                self._take(added, Origin.ADDED)
             except ControlError as exc:
-                logger.warning("added route %s is left out: %s", spec.name, exc)
-            self._added[spec] = True  # what cannot be today may be one after the next start
+                logger.warning("added route %s is left out: %s", added.name, exc)
+            self._added[added] = True  # what cannot be today may be one after the next start
 
     def replace_spec(self, spec: RoutingSpec) -> None:
         """Go on with what another plant file says; added and learned routes stay."""
@@ -196,7 +197,7 @@ class StationRoutes:
         return spec, old
 
     def _change(self, added: dict[RouteSpec, bool], gone: Sequence[RouteSpec]) -> None:
-        self._store.save([each for each, is_kept in added.items() if is_kept])
+        self._store.save(tuple(each for each, is_kept in added.items() if is_kept))
         self._added = added
         for each in gone:
             self._forget(each)

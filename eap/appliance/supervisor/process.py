@@ -23,6 +23,7 @@ from msgspec.structs import replace
 from eap.aoe.spec import RoutingSpec
 from eap.appliance.handover import EngineOptions, Handover, SegmentHandover
 from eap.appliance.plantfile import load_plant, require_own_buses
+from eap.appliance.route_store import bring_routes_back, set_routes_aside
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
 from eap.appliance.store import Store, effective, settle
@@ -80,7 +81,10 @@ def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> 
         for station in plant.stations:
             if resume:
                 store.bring_back(station.name)
-            elif store.set_aside(station.name):
+                bring_routes_back(plant.name, station.name)
+                continue
+            set_routes_aside(plant.name, station.name)
+            if store.set_aside(station.name):
                 logger.warning(
                     "station %s starts blank; --resume goes on with what it was configured to be",
                     station.name,

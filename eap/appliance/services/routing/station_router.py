@@ -118,6 +118,10 @@ class StationRouter:
         """Return who asks, or asked and is still connected."""
         return self._router.connections()
 
+    def set_access(self, access: AccessList) -> None:
+        """Judge requests by other rules from now on."""
+        self._router.gate.access = access
+
     def stats(self) -> Stats:
         """Return what is going on, and what was."""
         return self._router.stats()

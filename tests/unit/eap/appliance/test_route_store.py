@@ -2,9 +2,16 @@ from __future__ import annotations
 
 import pytest
 
-from eap.aoe.spec import DoorKind, HopSpec, RouteSpec
+from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.appliance.durable import seal
-from eap.appliance.route_store import VERSION, RouteStore
+from eap.appliance.route_store import (
+    AppliedRouting,
+    RouteStore,
+    RoutingStore,
+    bring_routes_back,
+    set_routes_aside,
+)
+from eap.appliance.station_file import VERSION
 from eap.errors import EnvironmentalError
 
 ROUTES = (
@@ -44,3 +51,25 @@ def test_what_cannot_be_read_or_written_says_so(store, caplog):
     assert "cannot be read (Is a directory)" in caplog.text
     with pytest.raises(EnvironmentalError, match=r"routes cannot be kept in .*; set EAP_STATE_DIR"):
         store.save(ROUTES)
+
+
+def test_what_was_applied_is_kept_beside_the_added_routes(store, tmp_path):
+    routing = RoutingStore("demo", "left")
+    assert routing.read() is None
+    applied = AppliedRouting(base="x", spec=RoutingSpec(routes=ROUTES), previous=RoutingSpec())
+    routing.save(applied)
+    assert RoutingStore("demo", "left").read() == applied
+    assert store.load() == ()
+    assert routing.path == tmp_path / "demo/routing/left.json"
+
+
+def test_a_station_can_start_as_if_nothing_was_kept_and_go_on_with_it_later(store):
+    store.save(ROUTES)
+    set_routes_aside("demo", "left")
+    assert store.load() == ()
+    bring_routes_back("demo", "left")
+    assert store.load() == ROUTES
+    set_routes_aside("demo", "left")
+    store.save(())
+    bring_routes_back("demo", "left")
+    assert store.load() == ()

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 import pytest
 from msgspec.structs import replace
 
+from eap.aoe.spec import AccessRule
 from eap.appliance.commands.plant_change import (
     apply_steps,
     choose,
@@ -216,3 +217,51 @@ def test_a_rollback_that_was_broken_off_goes_on_or_is_turned_round(plant, link, 
 
 def test_nothing_to_go_back_to(link):
     assert list(roll_back(link, NAMES)) == []
+
+
+@pytest.fixture
+def ruled(plant):
+    """Return the plant with one more access rule at the first station."""
+    first, rule = NAMES[0], AccessRule("engineers")
+    told = replace(plant.routing[first], access=(rule,))
+    return replace(plant, routing={**plant.routing, first: told})
+
+
+def test_routers_are_told_last_and_taken_back(ruled, stub, file):
+    with link_to(ruled, file) as link:
+        wanted = changed(ruled, "station-01")
+        notes = [each.notes for each in plan_all(link, wanted)]
+        assert notes == [["access rule engineers: added"], [], []]
+        done = list(apply_steps(link, steps_to(link, wanted), routed=NAMES))
+        assert (done[-1].station, done[-1].why) == (NAMES[0], "(access rule engineers: added)")
+        assert stub.told == {NAMES[0]: ["engineers"]}
+        back = list(roll_back(link, NAMES))
+        assert [each.station for each in back][-1] == NAMES[0]
+        assert stub.told == {NAMES[0]: []}
+        assert stub.specs == {spec.name: spec for spec in ruled.stations}
+        list(roll_back(link, NAMES))
+        assert stub.told == {NAMES[0]: ["again"]}
+        assert stub.specs == wanted
+
+
+def test_a_change_of_a_router_alone_is_taken_back_alone(ruled, stub, file):
+    with link_to(ruled, file) as link:
+        wanted = changed(ruled, "station-01")
+        list(apply_steps(link, steps_to(link, wanted)))
+        assert stub.told == {}
+        (done,) = apply_steps(link, steps_to(link, wanted), routed=NAMES)
+        assert done.outcome.ok
+        (back,) = roll_back(link, NAMES)
+        assert back.station == NAMES[0]
+        assert stub.told == {NAMES[0]: []}
+        assert stub.specs == wanted
+
+
+def test_a_router_is_not_told_when_a_station_refused(ruled, stub, file):
+    stub.refuses = lambda spec: spec.name == NAMES[1]
+    with link_to(ruled, file) as link:
+        order = steps_to(link, changed(ruled, "station-01"))
+        list(apply_steps(link, order, routed=NAMES))
+        assert stub.told == {}
+        list(apply_steps(link, order, keep_going=True, routed=NAMES))
+        assert stub.told == {NAMES[0]: ["engineers"]}
