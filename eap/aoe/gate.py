@@ -53,6 +53,11 @@ class Gate:
         self._record = record
         self._entries: deque[AuditEntry] = deque()
 
+    @property
+    def has_entries(self) -> bool:
+        """Whether :meth:`next_entry` has one."""
+        return bool(self._entries)
+
     def next_entry(self) -> AuditEntry | None:
         """Take the oldest entry of the audit."""
         return self._entries.popleft() if self._entries else None

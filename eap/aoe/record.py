@@ -38,6 +38,11 @@ class Record:
         self.missed = 0
         self._events: deque[Trace] = deque()
 
+    @property
+    def has_events(self) -> bool:
+        """Whether :meth:`next_event` has one."""
+        return bool(self._events)
+
     def next_event(self) -> Trace | None:
         """Take the oldest trace of what was not simply answered."""
         return self._events.popleft() if self._events else None

@@ -214,6 +214,11 @@ class Router:
                     actions.append(self._outlet.forward(probe.hop, probe.packet, _NOBODY))
         return actions
 
+    @property
+    def has_news(self) -> bool:
+        """Whether there are traces or entries of the audit to be taken."""
+        return self.record.has_events or self.gate.has_entries
+
     def next_event(self) -> Trace | None:
         """Take the oldest trace of what was not simply answered."""
         return self.record.next_event()
