@@ -10,10 +10,16 @@ from eap.aoe.routes import Origin, Route
 from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.ids import InterfaceUri, NetId
+from eap.codec.ethercat import EAP_PORT
+from eap.ids import Destination, DestinationKind, InterfaceUri, NetId
 from eap.pd.spec import StationSpec
 
 _IP_SCHEMES = ("udp", "tcp")
+_ADDRESSES = {
+    DoorKind.UDP: (DestinationKind.IP,),
+    DoorKind.TCP: (DestinationKind.IP,),
+    DoorKind.ETHERNET: (DestinationKind.MAC, DestinationKind.NET_ID),
+}
 
 
 def make_router(station: StationSpec, routing: RoutingSpec) -> StationRouter:
@@ -41,9 +47,22 @@ def to_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:
 
 
 def to_way(hop: HopSpec) -> Way:
-    """Return door and address of a hop; each AMS/TCP connection to others is a door of its own."""
-    where = hop.address if hop.kind is DoorKind.AMS_TCP else hop.port
-    return Way(f"{hop.kind}:{where}", hop.address)
+    """Return door and address of a hop; each AMS/TCP connection to others is a door of its own.
+
+    Raises:
+        ValueError: the address is none of one station, or none for this door.
+    """
+    if hop.kind is DoorKind.AMS_TCP:
+        return Way(f"{hop.kind}:{hop.address}", hop.address)
+    address = hop.address
+    if hop.kind in _ADDRESSES:
+        where = Destination.parse(address)
+        if where.kind not in _ADDRESSES[hop.kind] or where.is_group:
+            raise ValueError(f"{address!r} is no address of a station by {hop.kind}")
+        address = where.host
+        if where.kind is DestinationKind.IP:
+            address += f":{where.port or EAP_PORT}"
+    return Way(f"{hop.kind}:{hop.port}", address)
 
 
 def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:

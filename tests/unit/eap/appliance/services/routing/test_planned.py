@@ -48,6 +48,34 @@ def test_hops(hop, way):
     assert to_way(hop) == way
 
 
+@pytest.mark.parametrize(
+    ("kind", "text", "address"),
+    [
+        (DoorKind.UDP, "10.0.0.5", "10.0.0.5:34980"),
+        (DoorKind.TCP, "10.0.0.5:7", "10.0.0.5:7"),
+        (DoorKind.ETHERNET, "02-00-00-00-0A-01", "02:00:00:00:0a:01"),
+    ],
+)
+def test_each_address_is_written_in_one_way(kind, text, address):
+    assert to_way(HopSpec(kind, "eap0", text)).connection == address
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (DoorKind.UDP, "mill"),
+        (DoorKind.UDP, "10.0.0.5:0x10"),
+        (DoorKind.TCP, "02:00:00:00:00:01"),
+        (DoorKind.UDP, "239.1.1.1"),
+        (DoorKind.ETHERNET, "10.0.0.5"),
+        (DoorKind.ETHERNET, "01:01:05:04:00:00"),
+    ],
+)
+def test_what_is_no_address_of_a_station_is_refused(kind, text):
+    with pytest.raises(ValueError, match=r"10\.0|0x10|mill|239|01:01|02:00"):
+        to_way(HopSpec(kind, "eap0", text))
+
+
 def test_addresses_of_the_station_are_this_host():
     station = left(eap_port(1, interface="udp://10.0.0.1"))
     access = access_of(station, RoutingSpec(access=(AccessRule("no", allow=False),)))
