@@ -30,15 +30,9 @@ def interface_of(address: str) -> str:
 
 def _label_of(address: str) -> str:
     """Return by what name the kernel lists *address*: ``eth0``, or perhaps ``eth0:1``."""
-    memory = ctypes.create_string_buffer(_INTERFACES * _IFREQ_SIZE)
-    request = struct.pack("@iP", len(memory), ctypes.addressof(memory))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        size = struct.unpack("@iP", fcntl.ioctl(sock.fileno(), _SIOCGIFCONF, request))[0]
-    wanted = socket.inet_aton(address)
-    data = memory.raw
-    for offset in range(0, size, _IFREQ_SIZE):
-        if data[offset + 20 : offset + 24] == wanted:
-            return data[offset : offset + 16].split(b"\0", 1)[0].decode()
+    for label, own in own_addresses():
+        if own == address:
+            return label
     raise EnvironmentalError(foreign_address(address))
 
 
@@ -59,6 +53,20 @@ def broadcast_of(address: str) -> str:
             return ""
     found = socket.inet_ntoa(answer[20:24])
     return "" if found in {"0.0.0.0", address} else found  # noqa: S104  a comparison
+
+
+def own_addresses() -> list[tuple[str, str]]:
+    """Return all IPv4 addresses of this machine now, each behind its label (``eth0:1``)."""
+    memory = ctypes.create_string_buffer(_INTERFACES * _IFREQ_SIZE)
+    request = struct.pack("@iP", len(memory), ctypes.addressof(memory))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        size = struct.unpack("@iP", fcntl.ioctl(sock.fileno(), _SIOCGIFCONF, request))[0]
+    data = memory.raw
+    found = []
+    for offset in range(0, size, _IFREQ_SIZE):
+        label = data[offset : offset + 16].split(b"\0", 1)[0].decode()
+        found.append((label, socket.inet_ntoa(data[offset + 20 : offset + 24])))
+    return found
 
 
 def foreign_address(address: str) -> str:

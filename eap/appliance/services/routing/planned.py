@@ -12,6 +12,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import Destination, DestinationKind, InterfaceUri, NetId
+from eap.net.interface import own_addresses
 from eap.pd.spec import StationSpec
 
 _IP_SCHEMES = ("udp", "tcp")
@@ -73,5 +74,10 @@ def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
 def _own_addresses(station: StationSpec) -> Iterator[IPv4Address]:
     for port in station.ports:
         uri = InterfaceUri.parse(port.interface)
-        if uri.scheme in _IP_SCHEMES:
-            yield IPv4Address(uri.host)
+        if uri.scheme not in _IP_SCHEMES:
+            continue
+        address = IPv4Address(uri.host)
+        if address.is_unspecified:
+            yield from (IPv4Address(own) for _, own in own_addresses())
+        else:
+            yield address

@@ -7,7 +7,13 @@ import time
 import pytest
 
 from eap.errors import EnvironmentalError
-from eap.net.interface import broadcast_of, check_interface, interface_of, link_is_up
+from eap.net.interface import (
+    broadcast_of,
+    check_interface,
+    interface_of,
+    link_is_up,
+    own_addresses,
+)
 from tests.unit.eap.net.conftest import ip
 
 pytestmark = pytest.mark.net
@@ -28,6 +34,10 @@ def test_each_address_has_the_broadcast_address_of_its_network(cable):
     ip("addr add 10.7.0.1/31 dev left")
     found = [broadcast_of(address) for address in ("10.1.2.3", "10.1.2.4", "10.7.0.1")]
     assert found == ["10.1.2.255", "10.1.2.7", ""]
+
+
+def test_loopback_is_among_the_addresses():
+    assert ("lo", "127.0.0.1") in own_addresses()
 
 
 def test_foreign_address_belongs_to_none():

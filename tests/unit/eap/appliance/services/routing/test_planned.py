@@ -7,6 +7,7 @@ import pytest
 from eap.aoe.routes import Origin, Route
 from eap.aoe.spec import AccessRule, DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
+from eap.appliance.services.routing import planned
 from eap.appliance.services.routing.planned import access_of, make_router, to_route, to_way
 from eap.ids import NetId
 from tests.unit.eap.appliance.conftest import eap_port, left
@@ -88,3 +89,10 @@ def test_addresses_of_the_station_are_this_host():
 def test_router_knows_its_net_ids():
     router = make_router(left(), RoutingSpec())
     assert {str(each) for each in router.net_ids} == {"1.1.1.1.1.1", "1.2.3.4.5.1"}
+
+
+def test_all_addresses_of_the_machine_are_those_of_a_port_at_any(monkeypatch):
+    monkeypatch.setattr(planned, "own_addresses", lambda: [("eth7", "10.0.0.7")])
+    access = access_of(left(eap_port(1, interface="udp://0.0.0.0")), RoutingSpec())
+    assert access.is_this_host(Way("ams-tcp", "10.0.0.7:4711#1"))
+    assert not access.is_this_host(Way("ams-tcp", "10.0.0.8:4711#1"))
