@@ -78,11 +78,13 @@ def objects_of(operation: Operation) -> ObjectRange | None:
     if group not in _OF_OBJECTS:
         return None
     index, subindex = offset >> 16, offset & 0xFF
-    if group == IndexGroup.OBJECT_DESCRIPTION or (group == IndexGroup.SDO and offset & 0xFF00):
-        return ObjectRange(index, index)  # complete access: all of it
+    if group == IndexGroup.OBJECT_DESCRIPTION or (group == IndexGroup.SDO and offset & _WHOLE):
+        return ObjectRange(index, index)
     return ObjectRange(index, index, subindex, subindex)
 
 
+_WHOLE = 0xFD00
+"""Bits of an offset with which it is not about one entry: complete access, and unknown ones."""
 _OF_OBJECTS = frozenset(
     (IndexGroup.SDO, IndexGroup.OBJECT_DESCRIPTION, IndexGroup.ENTRY_DESCRIPTION)
 )

@@ -70,6 +70,13 @@ class Directory:
         number = _slave(f"{name}/{port_name}", port, slave) if slash else DEVICE_PORT
         return AmsAddress(NetId.parse(port.net_id), number)
 
+    def find_device(self, text: str) -> AmsAddress:
+        """As :meth:`find`, but a station stands for its first EAP port, if it has one."""
+        station = self.stations.get(text)
+        ports = () if station is None else station.ports
+        first = next((port for port in ports if not port.is_bus), None)
+        return self.find(text if first is None else f"{text}/{first.name}")
+
     def name_of(self, net_id: NetId, port: int) -> str:
         """Return who has an address, as people call it; empty if nobody here knows."""
         known = self._names.get(AmsAddress(net_id, port))

@@ -32,10 +32,14 @@ class TraceParameters(ViaParameters, frozen=True, kw_only=True):
 
 
 class AskParameters(TraceParameters, frozen=True, kw_only=True):
-    """``ams_ask``: one ADS request; *data* is what follows the header, in hexadecimal digits."""
+    """``ams_ask``: one ADS request; *data* is what follows the header, in hexadecimal digits.
+
+    With *device* a station stands for its first EAP port, not for its router.
+    """
 
     command: Annotated[int, Meta(ge=1, le=0xFFFF)]
     data: str = ""
+    device: bool = False
     timeout_ms: Annotated[int, Meta(ge=1, le=MAX_TIMEOUT_MS)] = 5000
 
 

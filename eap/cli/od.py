@@ -29,9 +29,10 @@ _TYPE = click.option(
 def od() -> None:
     """Read and write the object dictionary of a station.
 
-    TARGET is STATION or STATION/PORT for an EAP port of a running station, STATION/router for its
-    router, and STATION/PORT/SLAVE for a slave behind its bus.  INDEX and SUB are hexadecimal
-    (0xD000:7) or decimal.
+    TARGET is STATION or STATION/PORT for an EAP port of a station, STATION/router for its router,
+    STATION/PORT for the master of a bus port, and STATION/PORT/SLAVE for a slave behind it.  What
+    does not run here, by name or as NETID:PORT, is asked through routes.  INDEX and SUB are
+    hexadecimal (0xD000:7) or decimal.
     """
 
 

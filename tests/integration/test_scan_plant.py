@@ -93,6 +93,7 @@ def test_one_connection_lists_every_port_and_slave(row: Row) -> None:
         ]
     check_lines_to_paste(row)
     check_trace(row)
+    check_devices(row)
     row.others.close()
     check_what_is_left(row)
 
@@ -118,6 +119,30 @@ def check_trace(row: Row) -> None:
     assert [hop["station"] for hop in found["hops"]] == [name(1), name(9)]
     assert found["answer"]["error"] == 0
     assert found["hops"][0]["route"] == name(9)
+
+
+def check_devices(row: Row) -> None:
+    """Objects and states of stations that run elsewhere, by name and by address."""
+    slave = f"{name(9)}/bus0/sensor"
+
+    def ask(*words: str) -> Any:
+        done = row.eapctl(*words, "--json")
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    assert ask("od", "write", slave, "0x8000:1", "77")["value"] == 77
+    assert ask("od", "read", f"{address(9)}.3.1:1003", "0x8000:1")["value"] == 77
+    assert ask("od", "read", name(9), "0xF920:1")["value"] == f"{address(9)}.2.1"
+    assert ask("state", slave)["state"] == "OP"
+    for wanted in ("SAFEOP", "OP"):
+        assert ask("state", slave, wanted)["state"] == wanted
+    assert ask("state", f"{name(9)}/bus0")["state"] == "OP"
+    assert ask("state", name(9), "PREOP")["state"] == "PREOP"
+    assert ask("state", name(9), "OP") == {"target": name(9), "state": "OP", "error": None}
+    assert "0x8000" in row.eapctl("od", "list", slave).stdout
+    refused = row.eapctl("od", "read", slave, "0x9999")
+    assert refused.returncode == 1
+    assert "0x9999:00: there is no such object or entry (error 0x70c)" in refused.stderr
 
 
 def check_what_is_left(row: Row) -> None:

@@ -53,7 +53,7 @@ class AmsMethods:
 
     async def _trace(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.TraceParameters)
-        router, address = self._router(wanted.via), self._find(wanted.target)
+        router, address = self._router(wanted.via), _found(self._directory.find, wanted.target)
         found = await trace(router, *address)
         return {
             "target": wanted.target,
@@ -67,7 +67,8 @@ class AmsMethods:
 
     async def _ask(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, words.AskParameters)
-        router, address = self._router(wanted.via), self._find(wanted.target)
+        find = self._directory.find_device if wanted.device else self._directory.find
+        router, address = self._router(wanted.via), _found(find, wanted.target)
         timeout_s = wanted.timeout_ms / 1000
         data = to_octets(wanted.data)
         answer = await router.ask(*address, wanted.command, data, timeout_s=timeout_s)
@@ -81,11 +82,12 @@ class AmsMethods:
             hint = near(via, self._routers)
             raise _unknown(f"no station {via!r} runs here{hint}") from None
 
-    def _find(self, target: str) -> AmsAddress:
-        try:
-            return self._directory.find(target)
-        except ValueError as exc:
-            raise _unknown(str(exc)) from None
+
+def _found(find: Callable[[str], AmsAddress], target: str) -> AmsAddress:
+    try:
+        return find(target)
+    except ValueError as exc:
+        raise _unknown(str(exc)) from None
 
 
 def _hop_rows(found: Traced) -> list[dict[str, Any]]:

@@ -41,6 +41,7 @@ _MAX_CLIENTS = 1024
 _PLAIN = 8
 """Octets of a value that is written as it is; of longer ones there is a digest."""
 _TELL_AFTER_S = 1.0
+_COMPLETE = 0x100
 
 _Client: TypeAlias = tuple[str, str, str]
 """Station, door, and address without its TCP port."""
@@ -217,7 +218,7 @@ def _what(operation: Operation) -> Iterator[tuple[str, Any]]:
         yield "group", f"0x{group:X}"
         yield "offset", f"0x{offset:X}"
     if group == IndexGroup.SDO:
-        whole = " (complete access)" if offset & 0xFF00 else ""
+        whole = " (complete access)" if offset & _COMPLETE else ""
         yield "object", entry_name(offset >> 16, offset & 0xFF) + whole
     if isinstance(operation, WriteControl):
         yield "states", [operation.ads_state, operation.device_state]

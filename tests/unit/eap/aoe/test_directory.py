@@ -62,6 +62,7 @@ def test_what_is_no_name_here(text: str, reason: str) -> None:
     [
         ("5.1.1.1.1.1", 10000, "island-01"),
         ("5.1.1.1.1.1", 300, "island-01:300"),
+        ("5.1.1.1.1.1", 0xFFFF, "island-01/router"),
         ("5.1.1.1.2.1", 0xFFFF, "island-01/eap0"),
         ("5.1.1.1.3.1", 1001, "island-01/bus0/drive"),
         ("5.1.1.1.3.1", 1009, "island-01/bus0:1009"),
@@ -75,3 +76,12 @@ def test_names_of_addresses(net_id: str, port: int, name: str) -> None:
 def test_station_of_a_net_id() -> None:
     assert HERE.station_of(NetId.parse("5.1.1.1.3.1")) == "island-01"
     assert not HERE.station_of(NetId.parse("9.8.7.6.1.1"))
+
+
+def test_devices() -> None:
+    assert str(HERE.find_device("island-01")) == "5.1.1.1.2.1:65535"
+    assert str(HERE.find_device("island-01/bus0/drive")) == "5.1.1.1.3.1:1001"
+    alone = Directory([DirectoryStation("x", "5.1.1.2.1.1", ())])
+    assert str(alone.find_device("x")) == "5.1.1.2.1.1:10000"
+    with pytest.raises(ValueError, match="no station 'y'"):
+        alone.find_device("y")

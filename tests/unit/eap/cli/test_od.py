@@ -8,7 +8,9 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
+from eap.appliance.control import ErrorCode
 from eap.cli import main
+from eap.errors import ControlError
 from eap.od.model import OdState
 from tests.support.controlstub import ControlStub
 from tests.support.oddevice import MemoryDevice, methods, mixer
@@ -21,8 +23,23 @@ def device():
 
 @pytest.fixture
 def stub(device, runtime):
+    ports = [{"name": "eap0", "kind": "eap"}, {"name": "bus0", "kind": "bus"}]
+    status = {"stations": [{"name": "mixer", "ports": ports}]}
+    far = methods(device) | {"status": lambda _: status, "ams_ask": ams_ask}
     with ExitStack() as stack:
-        yield ControlStub("line", ["mixer"], methods(device), stack)
+        yield ControlStub("line", ["mixer"], far, stack)
+
+
+def ams_ask(params):
+    """Answer for a master whose dictionary has one entry, and for nobody else."""
+    if params["target"] not in {"mixer/bus0", "5.1.1.9.3.1:1001"}:
+        reason = "no station 'mixr' in this plant, did you mean mixer?"
+        raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+    if params["command"] == 4:
+        return {"error": 0, "data": "0000000005000800"}
+    is_known = params["data"].startswith("02f30000 00000010".replace(" ", ""))
+    data = "00000000 04000000 01020304" if is_known else "02070000 00000000"
+    return {"error": 0, "data": data.replace(" ", "")}
 
 
 @pytest.fixture
@@ -43,7 +60,8 @@ def test_list(command, stub):
         "code": "VAR",
         "max_subindex": 0,
     }
-    assert {params["target"] for _, params in stub.requests} == {"mixer", "mixer/eap0"}
+    asked = {params["target"] for method, params in stub.requests if method != "status"}
+    assert asked == {"mixer", "mixer/eap0"}
 
 
 @pytest.mark.parametrize(
@@ -171,6 +189,15 @@ def test_station_that_does_not_run(command):
     result = command("read", "mixr", "0x1000")
     assert result.exit_code == 1
     assert "did you mean mixer?" in result.stderr
+
+
+@pytest.mark.parametrize("target", ["mixer/bus0", "5.1.1.9.3.1:1001"])
+def test_masters_and_what_is_behind_routes(command, stub, target):
+    assert json.loads(command("read", target, "0x1000", "--json").output)["data"] == "01020304"
+    assert stub.requests[-1][1]["device"] is True
+    refused = command("read", target, "0x1001")
+    assert refused.exit_code == 1
+    assert f"{target}: 0x1001:00: the device has no such thing (error 0x702)" in refused.stderr
 
 
 def test_a_dump_is_for_people(command):

@@ -1,0 +1,110 @@
+"""The object dictionary of any device that ADS reaches (ETG.1020, AoE: CoE by index groups)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+from msgspec.structs import replace
+
+from eap.aoe.ads_operation import Read, Write
+from eap.appliance.commands.ams_device import AmsDevice, AmsRefusedError
+from eap.appliance.commands.bus_sdo import kind_of
+from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.sdoinfo import EntryDescription, ObjectDescription
+from eap.errors import CodecError, ControlError
+from eap.od.abort import entry_name
+from eap.od.info import ListType, ValueInfo
+from eap.od.model import Access, ObjectCode
+
+_ROOM = 0x20002
+"""Octets of the longest description: a list of all indexes there can be."""
+_COMPLETE = 0x100
+_PADDED = 2
+"""Octets of subindex 0 in a whole object."""
+_UNTOLD = frozenset((AdsError.NOT_FOUND, AdsError.SERVICE, AdsError.INDEX_GROUP, AdsError.GENERAL))
+
+
+class AdsOd:
+    """The objects of one device.
+
+    Raises:
+        AmsRefusedError: (every method) the device refuses, or nobody gets to it.
+    """
+
+    def __init__(self, device: AmsDevice) -> None:
+        self._device = device
+
+    def objects(self) -> list[ObjectInfo]:
+        """Return all objects that the device describes, without their entries."""
+        body = self._read(IndexGroup.OBJECT_LIST, ListType.ALL << 16, "object list")
+        _, *indexes = struct.unpack(f"<{len(body) // 2}H", body[: len(body) // 2 * 2])
+        return [self._object(index) for index in indexes]
+
+    def describe(self, index: int) -> ObjectInfo:
+        """Return one object with its entries."""
+        found = self._object(index)
+        known = (self.entry(index, subindex) for subindex in range(found.max_subindex + 1))
+        return replace(found, entries=tuple(each for each in known if each is not None))
+
+    def entry(self, index: int, subindex: int) -> EntryInfo | None:
+        """Return what the device says of an entry; None if it says nothing."""
+        offset = index << 16 | int(~ValueInfo(0)) << 8 | subindex
+        name = entry_name(index, subindex)
+        try:
+            body = self._read(IndexGroup.ENTRY_DESCRIPTION, offset, name)
+            found = EntryDescription.decode(body)
+        except AmsRefusedError as exc:
+            if exc.result in _UNTOLD:
+                return None
+            raise
+        except CodecError:
+            return None
+        reads = "r" if found.access & Access.READ_ANY else ""
+        writes = "w" if found.access & Access.WRITE_ANY else ""
+        return EntryInfo(subindex, found.name, kind_of(found), reads + writes)
+
+    def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
+        """Return the octets of an entry or of an object."""
+        name = entry_name(index, subindex)
+        if not complete:
+            return self._read(IndexGroup.SDO, index << 16 | subindex, name)
+        octets = self._read(IndexGroup.SDO, index << 16 | _COMPLETE, name)
+        return octets[_PADDED:] if subindex else octets
+
+    def write(self, index: int, subindex: int, octets: bytes, *, complete: bool = False) -> None:
+        """Write an entry or an object."""
+        name = entry_name(index, subindex)
+        if complete and subindex:
+            raise ControlError(f"{name}: by ADS a whole object is written from subindex 0 on")
+        offset = index << 16 | (_COMPLETE if complete else subindex)
+        self._device.demand(Write(IndexGroup.SDO, offset, octets), name)
+
+    def contents(self) -> Iterator[Content]:
+        """Yield all entries of all objects, as they come in."""
+        for found in self.objects():
+            for entry in self.describe(found.index).entries:
+                yield self._content(found, entry)
+
+    def _object(self, index: int) -> ObjectInfo:
+        name = f"0x{index:04X}"
+        body = self._read(IndexGroup.OBJECT_DESCRIPTION, index << 16, name)
+        try:
+            found = ObjectDescription.decode(body)
+        except CodecError as exc:
+            raise ControlError(f"{name}: its description cannot be read: {exc}") from None
+        known = found.code in ObjectCode._value2member_map_
+        code = ObjectCode(found.code).name if known else str(found.code)
+        return ObjectInfo(index, found.name, code, found.max_subindex)
+
+    def _content(self, found: ObjectInfo, entry: EntryInfo) -> Content:
+        if "r" not in entry.access:
+            return Content(found, entry, None)
+        try:
+            return Content(found, entry, self.read(found.index, entry.subindex))
+        except AmsRefusedError as exc:
+            return Content(found, entry, None, str(exc))
+
+    def _read(self, group: int, offset: int, what: str) -> bytes:
+        return self._device.demand(Read(group, offset, _ROOM), what)
