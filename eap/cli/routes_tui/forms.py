@@ -127,8 +127,9 @@ class RouteForm(ModalScreen[list[str]]):
 
 
 class Question(ModalScreen[bool]):
-    """Yes or no."""
+    """Yes or no; Enter alone is no."""
 
+    AUTO_FOCUS = "#no"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("y", "answer(True)", "Yes"),
         Binding("n,escape", "answer(False)", "No"),
