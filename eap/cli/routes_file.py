@@ -15,6 +15,8 @@ from eap.cli.params import json_option, plant_option
 if TYPE_CHECKING:
     from eap.appliance.control_routes import ImportRow
 
+_PATIENCE_S = 60.0
+"""For a file with many routes, each of which is written to disk."""
 _FILE = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
 
 
@@ -91,5 +93,7 @@ def _import(station: str, xml: str, plant: str | None, *, dry_run: bool) -> list
     from eap.appliance.control_routes import ImportRow, read_document
 
     with connect_station(station, plant) as client:
-        answer = client.request("routes_import", station=station, xml=xml, dry_run=dry_run)
+        answer = client.request_within(
+            _PATIENCE_S, "routes_import", station=station, xml=xml, dry_run=dry_run
+        )
     return read_document(answer, list[ImportRow])

@@ -109,14 +109,18 @@ class RouteMethods:
             found = await find_neighbours(view.routes, wanted.address, wanted.wait_ms / 1000)
         return [_neighbour_row(view, each) for each in found]
 
-    def _import(self, params: dict[str, Any]) -> list[ImportRow]:
+    async def _import(self, params: dict[str, Any]) -> list[ImportRow]:
         wanted = parameters(params, RoutesImportParameters)
         view = self._view(wanted.station)
         try:
             found = staticroutes.parse(wanted.xml)
         except ValueError as exc:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
-        return [self._import_one(view, route, dry_run=wanted.dry_run) for route in found]
+        rows = []
+        for route in found:
+            rows.append(self._import_one(view, route, dry_run=wanted.dry_run))
+            await asyncio.sleep(0)  # each is written to disk: others have their turns between
+        return rows
 
     def _export(self, params: dict[str, Any]) -> Export:
         view = self._view(parameters(params, RoutesExportParameters).station)

@@ -140,9 +140,9 @@ def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
         StaticRoute("self", "127.0.9.1.1.1", "10.0.0.7"),
     ]
     xml = dump("x", "1.1.1.1.1.1", file, tcp_port=48898)
-    dry = ask("import", station="left", xml=xml, dry_run=True)
+    dry = asyncio.run(ask("import", station="left", xml=xml, dry_run=True))
     assert names(left) == ["right"]
-    rows = ask("import", station="left", xml=xml)
+    rows = asyncio.run(ask("import", station="left", xml=xml))
     assert rows == dry
     assert [(row.name, bool(row.reason)) for row in rows] == [
         ("plc", False), ("old", True), ("bare", True), ("wrong", True), ("self", True)
@@ -150,7 +150,9 @@ def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
     assert rows[0].via == "ams-tcp:10.0.0.5"
     assert rows[1].reason == "its type is 'PROFIBUS', expected TCP_IP"
     assert names(left) == ["right", "plc"]
-    code, text = refused(ask, "import", station="left", xml="<a/>")
+    with pytest.raises(ControlError) as caught:
+        asyncio.run(ask("import", station="left", xml="<a/>"))
+    code, text = caught.value.code, str(caught.value)
     assert (code, text) == ("value", "it begins with 'a', expected TcConfig")
 
 
@@ -164,7 +166,7 @@ def test_export_holds_ams_tcp_and_names_the_rest(ask):
         StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
         StaticRoute("behind", "5.1.2.4.1.1", "plc:1000"),
     ]
-    assert ask("import", station="left", xml=found.xml)[1].reason == ""
+    assert asyncio.run(ask("import", station="left", xml=found.xml))[1].reason == ""
 
 
 class Scanner:
