@@ -75,6 +75,21 @@ class IoSpace(AdsSpace):
         raise AdsRefusedError(AdsError.INDEX_OFFSET)
 
 
+class NoSegmentSpace(AdsSpace):
+    """Raw EtherCAT commands to a device that has no segment.
+
+    They are answered as by a master with nothing connected: adstool, when it lists masters, asks
+    every device that the I/O server has, and gives up at any other error (ECatAccess.cpp again).
+    """
+
+    groups: Collection[int] = frozenset((IndexGroup.RAW_COMMAND,))
+
+    def read_write(self, group: int, offset: int, length: int, data: bytes) -> bytes:
+        """Refuse with TIMEOUT."""
+        del group, offset, length, data
+        raise AdsRefusedError(AdsError.TIMEOUT, "no segment: this is no bus port")
+
+
 _OF_ONE: dict[int, Callable[[IoDevice], bytes]] = {
     _Offset.IDS_OR_NAME: lambda device: encode_text(device.name) + b"\0",
     _Offset.NET_ID: lambda device: bytes(device.net_id),

@@ -12,6 +12,7 @@ from functools import partial
 from time import monotonic_ns
 
 from eap.aoe.ads_device import AdsDevice
+from eap.aoe.ads_io import NoSegmentSpace
 from eap.aoe.ads_notifications import Client, NotificationTable
 from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.ads_operation import Operation, OperationOutcome, ReadWrite, Write, WriteControl
@@ -53,7 +54,7 @@ class EapAds:
         self._device = device
         self._port = port
         objects = ObjectSpace(device.dictionaries[port], device.od_state, ads_result)
-        self._ads = AdsDevice(info, self._states, [objects, symbols])
+        self._ads = AdsDevice(info, self._states, [objects, symbols, NoSegmentSpace()])
 
     @property
     def notifications(self) -> NotificationTable:

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from eap.aoe.ads_io import IoDevice, IoDeviceType, IoSpace
+from eap.aoe.ads_io import IoDevice, IoDeviceType, IoSpace, NoSegmentSpace
 from eap.aoe.ads_operation import AdsRefusedError
+from eap.codec.ads import IndexGroup
 from eap.ids import NetId
 
 SPACE = IoSpace(
@@ -39,3 +40,10 @@ def test_what_adstool_reads(group: int, offset: int, octets: str) -> None:
 def test_what_is_not_there(group: int, offset: int, result: str) -> None:
     with pytest.raises(AdsRefusedError, match=result):
         SPACE.read(group, offset, 4)
+
+
+def test_device_without_segment_answers_as_an_empty_one() -> None:
+    space = NoSegmentSpace()
+    assert IndexGroup.RAW_COMMAND in space.groups
+    with pytest.raises(AdsRefusedError, match="TIMEOUT: no segment"):
+        space.read_write(IndexGroup.RAW_COMMAND, 0, 16, bytes(16))

@@ -105,7 +105,9 @@ def test_missing_objects_are_refused_with_their_abort_code(bench):
         refused = await bench.read(0x2000_0000)
         assert result(refused) == AdsError.NOT_FOUND
         assert refused.why == "0x2000:00: object does not exist (0x06020000)"
-        assert result(await bench.read(0, group=G.RAW_COMMAND)) == AdsError.INDEX_GROUP
+        assert result(await bench.read(0, group=0x1234)) == AdsError.INDEX_GROUP
+        raw = struct.pack("<4I", G.RAW_COMMAND, 0, 16, 16) + bytes(16)
+        assert result(await bench.ask(AmsCommand.READ_WRITE, raw)) == AdsError.TIMEOUT
 
     bench.run(script)
 
