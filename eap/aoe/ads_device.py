@@ -26,14 +26,6 @@ from eap.codec.adsnotification import AddNotification
 
 Control: TypeAlias = Callable[[WriteControl], None]
 """Acts on a WriteControl, or raises AdsRefusedError."""
-Judge: TypeAlias = Callable[[Operation], AdsError]
-"""Says why a client may not have an operation done; NONE if it may."""
-
-
-def allow(operation: Operation) -> AdsError:
-    """Let anybody do anything."""
-    del operation
-    return AdsError.NONE
 
 
 def refuse_control(request: WriteControl) -> None:
@@ -69,27 +61,21 @@ class AdsDevice:
         self._spaces = (*spaces, DeviceDataSpace(states))
         self._control = control
 
-    def answer(
-        self, command: int, body: bytes, client: Client, now_ns: int, *, judge: Judge = allow
-    ) -> AmsAnswer:
-        """Do what a request asks for, as far as *judge* has nothing against it.
+    def answer(self, command: int, body: bytes, client: Client, now_ns: int) -> AmsAnswer:
+        """Do what a request asks for.
 
         Args:
             command: Of the AMS header.
             body: What follows the header.
             client: Whom notifications belong to.
             now_ns: The time on the monotonic clock.
-            judge: Looks at each operation, also at those of a sum command.
         """
         request = take_request(command, body)
         if isinstance(request, AmsAnswer):
             return request
         outcomes = Outcomes(request)
         for operation in request.operations:
-            reason = judge(operation)
-            outcomes.add(
-                OperationOutcome(reason) if reason else self.perform(operation, client, now_ns)
-            )
+            outcomes.add(self.perform(operation, client, now_ns))
         return outcomes.answer()
 
     def perform(self, operation: Operation, client: Client, now_ns: int) -> OperationOutcome:

@@ -126,21 +126,6 @@ def test_sums_are_done_item_by_item(bench) -> None:
     assert answer.data == bytes.fromhex("00000000 0b000000 00000000 02070000 0180 00")
 
 
-def test_each_operation_is_judged(bench) -> None:
-    def judge(operation) -> AdsError:
-        return AdsError.ACCESS_DENIED if isinstance(operation, Write) else AdsError.NONE
-
-    handle = bench.handle("flags")
-    wanted = struct.pack("<3I", G.VALUE_BY_HANDLE, handle, 2) * 2 + bytes(4)
-    form = f"4I{len(wanted)}s"
-    answer = bench.ask(9, form, G.SUM_WRITE, 2, 8, len(wanted), wanted, judge=judge)
-    assert answer.data == bytes.fromhex("00000000 08000000 23070000 23070000")
-    body = (AmsCommand.WRITE, "3IH", G.VALUE_BY_HANDLE, handle, 2, 7)
-    assert bench.result(*body, judge=judge) == AdsError.ACCESS_DENIED
-    assert bench.result(AmsCommand.READ, "3I", G.VALUE_BY_HANDLE, handle, 2, judge=judge) == 0
-    assert bench.store.get("flags") == 0x8001
-
-
 def test_operations_can_be_done_one_by_one(bench) -> None:
     handle = bench.handle("flags")
     assert bench.device.perform(Read(G.VALUE_BY_HANDLE, handle, 2), CLIENT, 0) == (0, b"\1\x80", "")
