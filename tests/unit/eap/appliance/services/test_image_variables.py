@@ -60,6 +60,20 @@ def test_variables_of_others_are_only_read(symbols):
         symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "load"), b"\0")
 
 
+def test_octets_that_are_no_value_are_refused(symbols):
+    with pytest.raises(AdsRefusedError, match="VALUE: name: "):
+        symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "name"), b"\xff" * 8)
+
+
+def test_variable_that_has_just_gone_is_refused(symbols, stations, files):
+    store = symbols.store
+    spec = replace(stations[0], variables=stations[0].variables[:1], frames=())
+    gone = r"SYMBOL_VERSION: .*no variable 'running'"
+    create_image(files["left"].path, plan_layout(spec)).close()
+    with pytest.raises(AdsRefusedError, match=gone):
+        store.write("running", b"\1")
+
+
 def test_program_that_writes_keeps_others_out_for_now(symbols, files):
     with open_image(files["left"].path) as other:
         other.acquire_writer(Writer.APPLICATION)

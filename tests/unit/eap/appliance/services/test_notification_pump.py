@@ -20,7 +20,7 @@ from eap.ids import NetId
 from eap.net.image_file import create_image
 from eap.pd.inputs import Inputs
 from eap.pd.layout import plan_layout
-from eap.pd.samples import Sampler
+from eap.pd.samples import Sampler, Samples
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
 
@@ -212,6 +212,33 @@ def test_new_layout_is_followed(bench, stations, files):
         bench.engine.run(2)
         bench.look()
         assert bench.told() == [(1, 1), (2, 2), (3, 3)]
+
+
+def test_the_last_one_whose_variable_is_gone_ends(bench, stations, files):
+    bench.watch("ticks")
+    bench.look()
+    spec = replace(stations[0], variables=stations[0].variables[1:], sources=(), frames=())
+    with create_image(files["left"].path, plan_layout(spec)) as fresh:
+        bench.engine.attach(fresh)
+        bench.look()
+        for cycle in (1, 2):
+            fresh.image.words[StationWord.CYCLE] = cycle
+            bench.engine.sampler.end_cycle(cycle, cycle * CYCLE)
+        assert bench.look() == 0
+        assert bench.look() is None
+    ((_, packet),) = bench.sent
+    ((sample,),) = [stamp.samples for stamp in decode_notification(decode_packet(packet)[1])]
+    assert sample.data == b""
+
+
+def test_sample_that_is_overwritten_while_it_is_read_is_missed(bench, monkeypatch):
+    bench.watch("ticks")
+    bench.look()
+    bench.engine.run(3)
+    read = Samples.read
+    monkeypatch.setattr(Samples, "read", lambda self, n: None if n == 2 else read(self, n))
+    bench.look()
+    assert bench.told() == [(1, 1), (3, 3)]
 
 
 def test_image_that_is_gone_is_waited_for(bench, files, stations):
