@@ -78,6 +78,10 @@ class AdsDevice:
             outcomes.add(self.perform(operation, client, now_ns))
         return outcomes.answer()
 
+    def read(self, group: int, offset: int, length: int) -> bytes:
+        """Return what a Read reads; raise AdsRefusedError."""
+        return _fitting(self._space(group).read(group, offset, length), length)
+
     def perform(self, operation: Operation, client: Client, now_ns: int) -> OperationOutcome:
         """Do one operation."""
         try:
@@ -88,7 +92,7 @@ class AdsDevice:
     def _perform(self, operation: Operation, client: Client, now_ns: int) -> bytes:
         match operation:
             case Read(group, offset, length):
-                return _fitting(self._space(group).read(group, offset, length), length)
+                return self.read(group, offset, length)
             case Write(group, offset, data):
                 self._space(group).write(group, offset, data)
             case ReadWrite(group, offset, length, data):

@@ -140,6 +140,15 @@ class Passage:
         actions += self._send_back(pending, pending.came_by, packet, header.error_code, now_ns)
         return actions
 
+    def answer_now(
+        self, header: AmsHeader, way: Way, answer: AmsAnswer, took_ns: int, now_ns: int
+    ) -> list[Action]:
+        """Send back what a service had at hand for a request that never waited."""
+        packet = response_to(header, answer)
+        self._record.connections.of(way, now_ns).answer(len(packet), took_ns)
+        self._record.enter(Trace(now_ns, Outcome.ANSWERED, way, None, header, 0, took_ns, ""))
+        return [self._outlet.reply(way, packet)]
+
     def answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
         """Send back what a service says to the request with *ticket*, if it still waits."""
         pending = self.in_flight.get(ticket)

@@ -6,7 +6,8 @@ an error of the AMS header that says why it did not get there.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
+from typing import TypeAlias
 
 from eap.aoe.access import AccessList
 from eap.aoe.action import Action, Deliver, Outcome, Reply, Trace
@@ -32,6 +33,11 @@ _NOBODY = 0
 """Ticket of a request that has no answer."""
 
 
+AnswerNow: TypeAlias = Callable[[AmsHeader, bytes, Way], tuple[AmsAnswer, int] | None]
+"""Returns the answer to a request, with its header, body and origin, and how many nanoseconds it
+took; None to have the request delivered."""
+
+
 class Router:
     """What becomes of every packet.
 
@@ -43,6 +49,8 @@ class Router:
         limits: How much it takes on.
         prober: Finds dead hops; without one only doors tell of them.
         access: Who may do what; without rules others than this host only read.
+        answer_now: Answers what a service of this station has at hand: then there is no ``Deliver``
+            and nothing waits.
 
     Attributes:
         record: What it did.
@@ -59,6 +67,7 @@ class Router:
         limits: Limits | None = None,
         prober: Prober | None = None,
         access: AccessList | None = None,
+        answer_now: AnswerNow | None = None,
     ) -> None:
         self.record = Record()
         self.gate = Gate(access or AccessList(), self.record)
@@ -66,6 +75,7 @@ class Router:
         self._outlet = Outlet(doors)
         self._refuser = Refuser(self._outlet, self.record)
         self._prober = prober
+        self._answer_now = answer_now
         self._devices: dict[NetId, Container[int]] = {}
         self._fragments = Reassembly()
         self._passage = Passage(
@@ -304,6 +314,10 @@ class Router:
             return self._refuser.refuse(header, way, through, now_ns)
         data, judged = through
         body = data[AmsHeader.SIZE :]
+        if judged is None and self._answer_now is not None and wants_answer(header):
+            answer = self._answer_now(header, body, way)
+            if answer is not None:
+                return self._passage.answer_now(header, way, *answer, now_ns)
         if not wants_answer(header):
             if judged is not None:
                 self.gate.give_up(judged)

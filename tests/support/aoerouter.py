@@ -8,7 +8,7 @@ from eap.aoe.access import AccessList
 from eap.aoe.action import Action, Deliver, Forward, Outcome, Reply
 from eap.aoe.judge import Limits
 from eap.aoe.prober import Prober
-from eap.aoe.router import Router
+from eap.aoe.router import AnswerNow, Router
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.spec import AccessRule
 from eap.aoe.way import Door, Way
@@ -43,13 +43,14 @@ class Station:
 
     def __init__(self, routes: Iterable[Route] = (), *, first_id: int = 1000,
                  limits: Limits | None = None, is_probing: bool = False,
-                 rules: Iterable[AccessRule] = (ANYTHING,)) -> None:  # fmt: skip
+                 rules: Iterable[AccessRule] = (ANYTHING,),
+                 answer_now: AnswerNow | None = None) -> None:  # fmt: skip
         self.table = RouteTable([*routes])
         net_id = NetId.parse(ROUTER)
         prober = Prober(net_id, self.table) if is_probing else None
         self.router = Router(
             net_id, self.table, DOORS, first_invoke_id=first_id, limits=limits, prober=prober,
-            access=AccessList([*rules]),
+            access=AccessList([*rules]), answer_now=answer_now,
         )  # fmt: skip
         self.router.add_device(NetId.parse(ROUTER), {10000})
         self.router.add_device(NetId.parse("5.1.1.1.2.1"), {65535})

@@ -46,6 +46,10 @@ class Lanes:
         self._tasks: set[asyncio.Task[None]] = set()
         self._octets = 0
 
+    def has_work(self, way: Way, header: AmsHeader) -> bool:
+        """Say whether something is under way, or waits, of the client and port of a request."""
+        return bool(self._lanes) and (way, _addresses(header)) in self._lanes
+
     def put(self, ticket: int, service: Service, request: LocalRequest) -> None:
         """Have *service* answer a request when its turn comes."""
         key = request.came_by, _addresses(request.header)

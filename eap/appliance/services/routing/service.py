@@ -8,8 +8,8 @@ running loop only, so neither needs locks.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Container
-from typing import NamedTuple, Protocol
+from collections.abc import Awaitable, Callable, Container
+from typing import NamedTuple, Protocol, TypeAlias
 
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
@@ -28,8 +28,16 @@ class LocalRequest(NamedTuple):
     came_by: Way
 
 
+AnswerNow: TypeAlias = Callable[[AmsHeader, bytes], AmsAnswer | None]
+"""Returns the answer to a request, with its header and body, or None for "in the usual way"."""
+
+
 class Service(Protocol):
-    """Whoever answers behind a NetID."""
+    """Whoever answers behind a NetID.
+
+    One that has a method ``answer_now``, an :data:`AnswerNow`, is asked by that first: what it says
+    there goes back without anything being kept for the request.  It has to change nothing.
+    """
 
     @property
     def ports(self) -> Container[int]:

@@ -11,7 +11,7 @@ from eap.aoe.fragment import Assembler, iter_fragments
 from eap.aoe.judge import Limits
 from eap.aoe.routes import Origin
 from eap.aoe.way import Door, Way
-from eap.codec.ams import StateFlags, decode_packet
+from eap.codec.ams import AmsHeader, StateFlags, decode_packet
 from eap.ids import NetId
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams, parse
 from tests.support.aoerouter import (
@@ -43,6 +43,25 @@ def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
     assert back == (TCP, asked.answer(b"data"))
     assert station.router.receive_answer(delivered.ticket, answer, 6) == []
     assert station.events() == []
+
+
+def test_what_is_at_hand_goes_back_at_once() -> None:
+    asked = []
+
+    def answer_now(header: AmsHeader, body: bytes, way: Way) -> tuple[AmsAnswer, int] | None:
+        asked.append((header.invoke_id, body, way))
+        return (AmsAnswer(b"data"), 77) if body == b"known" else None
+
+    station = Station(answer_now=answer_now)
+    known = Ams(DEVICE, CLIENT, invoke_id=7, body=b"known")
+    assert only_reply(station.give(known, TCP)) == (TCP, known.answer(b"data"))
+    (trace,) = station.router.record.latest
+    assert (trace.outcome, trace.took_ns, trace.header.invoke_id) == (Outcome.ANSWERED, 77, 7)
+    other = Ams(DEVICE, CLIENT, invoke_id=8, body=b"other")
+    assert station.delivered(other, TCP).body == b"other"
+    station.give(known._replace(flags=6), TCP)  # wants no answer, so it is delivered
+    assert [number for number, *_ in asked] == [7, 8]
+    assert station.router.stats().in_flight == 1
 
 
 def test_what_a_service_says_of_a_refusal_is_kept() -> None:

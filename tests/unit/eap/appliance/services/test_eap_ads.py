@@ -80,6 +80,20 @@ def test_device_says_who_it_is(release, numbers):
     assert device_info("island-01/eap0", release) == AdsDeviceInfo(*numbers, name)
 
 
+def test_reads_are_at_hand_unless_something_speaks_against_them(bench):
+    def now(command, body):
+        packet = aoe.packet("1.1.1.1.2.1", command, body)
+        return bench.ads.answer_now(AmsHeader.decode(packet), body)
+
+    body = aoe.read_body(0x10000000, 4)
+    assert now(AmsCommand.READ, body).data == OK + struct.pack("<II", 4, 1000 << 16 | 5001)
+    assert now(AmsCommand.READ, body[:-1]) is None
+    assert now(AmsCommand.READ, aoe.read_body(0x20000000)) is None
+    assert now(AmsCommand.READ, aoe.read_body(0x10000000, 3)) is None
+    assert now(AmsCommand.READ_STATE, b"") is None
+    assert now(AmsCommand.WRITE, aoe.write_body(0x10000000, b"1234")) is None
+
+
 def test_its_dictionary_is_read_and_written(bench):
     async def script():
         info = await bench.ask(AmsCommand.READ_DEVICE_INFO)

@@ -13,6 +13,7 @@ from eap.aoe.routes import Route
 from eap.aoe.spec import AccessRule
 from eap.aoe.way import Door, Way
 from eap.appliance.services.routing.station_router import StationRouter
+from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from tests.support import aoe
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
@@ -81,6 +82,47 @@ def test_first_service_that_has_the_port_answers(scene):
         (0, b"1001"),
         (6, b""),
     ]
+
+
+class PromptService(StubService):
+    """Has some answers at hand, and fails at a body that says so."""
+
+    def answer_now(self, header: AmsHeader, body: bytes) -> AmsAnswer | None:
+        if body == b"fail":
+            raise RuntimeError("a fault")
+        return AmsAnswer(b"now " + body) if body[:4] == b"fast" else None
+
+
+def test_what_a_service_has_at_hand_is_answered_without_its_lane(scene):
+    scene.station.remove_service(DEVICE, scene.service)
+    scene.station.add_service(DEVICE, PromptService())
+    for number, body in enumerate((b"fast", b"slow", b"fail")):
+        scene.ask(body=body, invoke_id=number)
+    found = [(each.invoke_id, each.body) for each in scene.sent]
+    assert found == [(0, b"now fast"), (1, bytes(4) + b"\2wols"), (2, bytes(4) + b"\2liaf")]
+    assert scene.station.stats().in_flight == 0
+    traffic = scene.station.record.connections.snapshot()[PEER]
+    assert (traffic.requests, traffic.answers) == (3, 3)
+
+
+def test_what_is_at_hand_does_not_overtake_what_its_client_asked_before(scene):
+    gate = asyncio.Event()
+
+    async def wait(request):
+        await gate.wait()
+        return AmsAnswer(request.body)
+
+    async def script():
+        scene.station.add_service(DEVICE, PromptService(wait, 1001))
+        other = Way("in", "other")
+        scene.ask(f"{DEVICE}:1001", body=b"slow")
+        scene.ask(f"{DEVICE}:1001", body=b"fast")
+        scene.ask(f"{DEVICE}:1001", other, body=b"fast of another")
+        gate.set()
+        await asyncio.sleep(0.01)
+
+    asyncio.run(while_serving(script(), scene.station))
+    assert [each.body for each in scene.sent] == [b"now fast of another", b"slow", b"fast"]
 
 
 def test_long_answer_goes_in_fragments_where_the_door_is_narrow(scene):
