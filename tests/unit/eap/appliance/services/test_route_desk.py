@@ -170,7 +170,7 @@ def test_a_route_that_cannot_be_kept_is_not_added(monkeypatch, caplog):
     found = routes()
     assert ask(found, is_this_host=True) == AdsError.INTERNAL
     assert found.added == ()
-    assert "not added: station left: routes cannot be kept" in caplog.text
+    assert "not added: station left: added routes cannot be kept" in caplog.text
 
 
 def test_all_stations_of_an_address_get_the_route():
