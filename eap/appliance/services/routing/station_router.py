@@ -271,6 +271,8 @@ class StationRouter:
             del self._settling[way]
 
     def _act(self, actions: list[Action]) -> None:
+        if self._router.has_news:
+            self._tell()  # first: what is audited is written before it is answered
         for action in actions:  # told apart by class, which is faster than by pattern
             kind = type(action)
             if kind is Reply:
@@ -279,8 +281,6 @@ class StationRouter:
                 self._forward(*action)
             else:
                 self._deliver(*action)
-        if self._router.has_news:
-            self._tell()
         for way, (count, event) in self._settling.items():
             if self._router.waiting(way) < count:
                 event.set()

@@ -140,6 +140,14 @@ def test_access_rules_come_before_services():
     assert [each.header.target for each in entries] == [DEVICE]
 
 
+def test_audit_is_kept_before_the_answer_leaves():
+    scene = Scene(access=AccessList([AccessRule("nobody", allow=False)]))
+    sent = []
+    scene.station.on_audit.append(lambda _: sent.append(len(scene.sent)))
+    scene.ask(body=aoe.read_body(0))
+    assert (sent, len(scene.sent)) == ([0], 1)
+
+
 def test_source_of_this_station_is_believed_to_programs_of_this_host_only(scene):
     packet = Ams(f"{DEVICE}:65535", f"{ROUTER}:300", command=aoe.READ_STATE).octets()
     scene.station.receive(packet, "ams-tcp", "10.0.0.9:4711#1")

@@ -1,0 +1,73 @@
+"""Traces along a row of namespaces: every hop is named, and the one where the way ends."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.integration.test_routes_ethernet import PLANT, Row
+from tests.support.appliance import Plants, run_eapctl, wait_until
+from tests.support.namespaces import row
+
+pytestmark = [pytest.mark.net, pytest.mark.root]
+
+SLAVE = "c/bus0/1001"
+CLOSED = PLANT.replace(
+    "access: [{allow: [all], net_ids: [10.88.170.1], doors: [ethernet]}]",
+    "access: [{name: nobody, deny: [all], to: [c/bus0]}]",
+)
+
+
+@pytest.fixture
+def line(farm: Plants) -> Iterator[Row]:
+    with row(4) as namespaces:
+        yield Row(farm, namespaces)
+
+
+def trace(line: Row, *words: str) -> tuple[int, dict[str, Any]]:
+    done = run_eapctl(line.appliances["a"].runtime, "trace", SLAVE, "--json", *words)
+    return done.returncode, json.loads(done.stdout)
+
+
+def hops(found: dict[str, Any]) -> list[tuple[str, str, bool]]:
+    return [(each["station"], each["door"], each["opaque"]) for each in found["hops"]]
+
+
+WHOLE = [("a", "ethernet:eap0", False), ("b", "ethernet:eap1", False), ("c", "", False)]
+
+
+def test_every_hop_is_named_and_the_one_that_fails(line: Row) -> None:
+    for name in "cba":
+        line.start(name)
+    wait_until(lambda: trace(line)[0] == 0)
+    code, found = trace(line)
+    assert (code, hops(found), found["why"]) == (0, WHOLE, "")
+    assert found["answer"]["ads_state"] == 5
+    times = [each["took_us"] for each in found["hops"]]
+    assert times == sorted(times)
+    rules = [each["may"]["write"] for each in found["hops"]]
+    assert rules == [True, False, False], "b and c know the tool, and not the station a"
+
+    line.appliances["c"].close()
+    wait_until(lambda: trace(line)[0] == 1)
+    code, found = trace(line)
+    assert (code, found["answer"]) == (1, None)
+    assert hops(found)[:2] == WHOLE[:2]
+    assert "c" in found["why"]
+    assert found["why"].startswith(("b: c (", "c: it does not answer b at "))
+
+    line.places[1].ip("link", "set", "west0", "down")
+    wait_until(lambda: trace(line)[1]["why"].startswith(("a: ", "b: it does not answer a")))
+
+
+def test_rules_that_refuse_are_named(line: Row) -> None:
+    for name in "cba":
+        line.start(name, CLOSED if name == "c" else PLANT)
+    wait_until(lambda: len(trace(line)[1]["hops"]) == 3)
+    code, found = trace(line)
+    assert code == 1
+    assert found["hops"][2]["may"]["read"] is False
+    assert found["why"] == "c: error 0x723 (access rules forbid it)"
