@@ -23,6 +23,7 @@ from eap.config.derive import derive
 from eap.config.derive_routing import derive_directory, derive_routing
 from eap.config.document import read
 from eap.config.finding import Finding, Report
+from eap.config.follow_routes import follow_routes
 from eap.config.index import Index
 from eap.pd.spec import StationSpec
 
@@ -45,6 +46,8 @@ class LoadResult(msgspec.Struct, frozen=True):
     findings: tuple[Finding, ...]
     lines: Mapping[str, int] = {}
     """Of a plant: the line of each path of its file."""
+    warnings: tuple[Finding, ...] = ()
+    """Of a plant: what is worth a look."""
 
 
 def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
@@ -74,4 +77,4 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
         derive_routing(index, path.parent),
         derive_directory(index),
     )
-    return LoadResult(plant, (), report.lines)
+    return LoadResult(plant, (), report.lines, follow_routes(index, plant.routing, report))

@@ -1,4 +1,7 @@
-"""What is worth a warning in a plant file that is well: stations that tools cannot reach whole."""
+"""What is worth a warning in a plant file that is well: stations that tools cannot reach whole.
+
+What routes come to is told by those who load the file.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ def check_plant(path: Path) -> tuple[LoadResult, tuple[Finding, ...]]:
             )
             expected = "no more than an object dictionary holds"
             warnings.append(Finding(str(path), line, place, message, expected))
-    return result, tuple(warnings)
+    return result, (*warnings, *result.warnings)
 
 
 def _misfits(station: StationSpec) -> list[tuple[str, str]]:
