@@ -4,8 +4,8 @@ import asyncio
 from typing import Any
 
 import pytest
-from eap.appliance.services.routing.system_service import SystemService
 
+from eap.aoe.answer import AmsAnswer
 from eap.aoe.directory import Directory
 from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryStation
@@ -15,6 +15,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.errors import ControlError
 from eap.ids import NetId
+from tests.support.routing import StubService
 
 NET_ID = NetId.parse("5.1.1.1.1.1")
 PLANT = Directory([DirectoryStation("island-01", str(NET_ID), ())])
@@ -23,7 +24,10 @@ PLANT = Directory([DirectoryStation("island-01", str(NET_ID), ())])
 def call(method: str, **params: Any) -> Any:
     async def get() -> Any:
         router = StationRouter("island-01", NET_ID)
-        router.add_service(NET_ID, Whereabouts(router, SystemService("island-01")))
+        router.add_service(
+            NET_ID,
+            Whereabouts(router, StubService(lambda _: AmsAnswer(bytes(4) + b"\5\0\0\0"), 10_000)),
+        )
         router.add_route(
             Route(NetId.parse("6.1.1.1.1.1"), "far", Way("udp:none", "10.0.0.6:34980"))
         )
