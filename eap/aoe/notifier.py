@@ -107,6 +107,29 @@ class Notifier:
             replies.append(self._outlet.reply(way, encode_packet(head, part)))
         return replies
 
+    def end_unwanted(self, header: AmsHeader, body: bytes, way: Way) -> list[Reply]:
+        """Return what ends a notification that nobody here has, at the server that sent it.
+
+        It is the first that a packet tells of: one may have many handles, and ask for many packets.
+        Others come again.
+
+        Raises:
+            CodecError: the notification is shorter or longer than it says.
+        """
+        handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
+        handle = next(handles, None)
+        if handle is None:
+            return []
+        head = AmsHeader(
+            header.source,
+            header.source_port,
+            header.target,
+            header.target_port,
+            AmsCommand.DELETE_NOTIFICATION,
+            StateFlags.ADS | StateFlags.NO_RETURN,
+        )
+        return [self._outlet.reply(way, encode_packet(head, handle.to_bytes(4, "little")))]
+
     def _delete(self, onward: bytes, handles: bytes, way: Way) -> None:
         for at in range(0, len(handles) - _HANDLE + 1, _HANDLE):
             handle = int.from_bytes(handles[at : at + _HANDLE], "little")

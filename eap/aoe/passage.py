@@ -85,8 +85,7 @@ class Passage:
         found = self._let_on(header, data, way, now_ns)
         if isinstance(found, Refusal):
             if header.command == AmsCommand.NOTIFICATION and found.error == AdsError.TARGET_MACHINE:
-                text = "nobody here asked for it, or not any more"
-                return self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
+                return self._end_unwanted(header, data, way, now_ns)
             return self._refuser.refuse(header, way, found, now_ns)
         route, data, judged = found
         onward = _ADDRESSES.pack(
@@ -345,6 +344,17 @@ class Passage:
         if pending.judged is not None:
             self._gate.give_up(pending.judged, error_code)
             pending.judged = None
+
+    def _end_unwanted(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
+        """Have a notification ended that nobody here has, as after a new start of this router.
+
+        Not while the answer may still come that tells its handle: datagrams overtake each other.
+        """
+        text = "nobody here asked for it, or not any more"
+        self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
+        if any(pending.handles for pending in self.in_flight.on(way.door, None)):
+            return []
+        return list(self.notifier.end_unwanted(header, data[AmsHeader.SIZE :], way))
 
     def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
         """Ask the server to end a notification, for nobody and if there is room to wait for it."""

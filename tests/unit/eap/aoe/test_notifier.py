@@ -48,14 +48,28 @@ def test_notification_goes_to_who_asked_for_it_with_one_address_for_both() -> No
     assert parts == {ONE: stream((5, {1: b"a"})), TWO: stream((5, {2: b"b"}))}
 
 
-def test_notification_that_nobody_asked_for_goes_nowhere() -> None:
+def test_notification_that_nobody_asked_for_is_ended_where_it_comes_from() -> None:
     station = subscribed(ONE)
-    assert station.give(NOTICE._replace(body=stream((5, {9: b""}))), LINK) == []
-    assert station.give(NOTICE._replace(body=stream((5, {1: b""}))), SECOND_LINK) == []
+    end = Ams(NOTICE.source, NOTICE.target, DELETE_NOTIFICATION, flags=6, invoke_id=0)
+    unknown = NOTICE._replace(body=stream((5, {9: b"", 10: b""})))
+    assert station.replied(unknown, LINK) == (LINK, end._replace(body=b"\x09\0\0\0"))
+    elsewhere = NOTICE._replace(body=stream((5, {1: b""})))
+    ended = end._replace(body=b"\1\0\0\0")
+    assert station.replied(elsewhere, SECOND_LINK) == (SECOND_LINK, ended)
+    assert station.give(NOTICE._replace(body=stream()), LINK) == []
     assert station.give(NOTICE._replace(body=b"short"), LINK) == []
     assert [outcome for outcome, _ in station.events()] == [
-        Outcome.LATE, Outcome.LATE, Outcome.DROPPED
+        Outcome.LATE, Outcome.LATE, Outcome.LATE, Outcome.DROPPED
     ]  # fmt: skip
+
+
+def test_notification_that_comes_before_its_answer_is_not_ended() -> None:
+    station = Station([route(FAR, LINK)])
+    onward = station.forwarded(ADD, ONE)
+    notice = NOTICE._replace(body=stream((5, {1: b"data"})))
+    assert station.give(notice, LINK) == []
+    station.replied(onward.answer(granted(1)), LINK)
+    assert station.replied(notice, LINK) == (ONE, notice)
 
 
 def test_notification_comes_from_the_address_that_was_asked() -> None:
