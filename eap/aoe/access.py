@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 from eap.aoe.ads_operation import Operation, Read, ReadWrite, Write, WriteControl
 from eap.aoe.ads_sum import SUM_COMMANDS
-from eap.aoe.spec import AccessRule, AccessService, ObjectRange
+from eap.aoe.spec import AccessRule, AccessService, DoorKind, ObjectRange
 from eap.aoe.way import Way
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
-from eap.ids import NetId
+from eap.ids import MacAddr, NetId
 
 LOCAL = "local"
 """Door of those who ask inside this process."""
@@ -201,6 +201,7 @@ class _Matcher:
     def __init__(self, rule: AccessRule) -> None:
         self.rule = rule
         self._networks = tuple(map(IPv4Network, rule.networks))
+        self._macs = frozenset(str(MacAddr.parse(text)) for text in rule.macs)
         self._net_ids = tuple(map(_prefix, rule.net_ids))
         self._targets = tuple((_prefix(each.net_id), each.port) for each in rule.targets)
 
@@ -210,8 +211,10 @@ class _Matcher:
             return False
         if self._net_ids and not source.startswith(self._net_ids):
             return False
-        if not self._networks:
+        if not (self._networks or self._macs):
             return True
+        if _kind(way) == DoorKind.ETHERNET:
+            return way.connection in self._macs
         return address is not None and any(address in each for each in self._networks)
 
     def is_to(self, target: NetId, port: int) -> bool:

@@ -123,6 +123,7 @@ class AccessRule(Record, frozen=True):
         name: For logs and people.
         allow: Whether it grants or refuses.
         networks: IPv4 networks that a connection comes from (``10.0.0.0/24``).
+        macs: MAC addresses that frames come from on Ethernet; who is in one of the two fits.
         net_ids: Source NetIDs, by their first four, five or all six octets; they prove nothing.
         doors: Doors (``mqtt:line``) or kinds of them (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
             ``mqtt``, ``local``).
@@ -139,6 +140,7 @@ class AccessRule(Record, frozen=True):
     targets: tuple[AccessTarget, ...] = ()
     services: tuple[AccessService, ...] = ()
     objects: tuple[ObjectRange, ...] = ()
+    macs: tuple[str, ...] = ()
 
 
 class AmsUser(Record, frozen=True):

@@ -17,8 +17,8 @@ from eap.config.reach import without_prefix
 from eap.config.routes import MisfitError
 from eap.config.rules import (
     access_rules,
-    parse_network,
     parse_objects,
+    parse_sender,
     parse_services,
     parse_source,
     parse_target,
@@ -71,7 +71,7 @@ def _check_rule(
         is_fine = False
     key = "allow" if access.allow else "deny"
     try_all(key, access.allow or access.deny, lambda text: parse_services((text,)))
-    try_all("from", access.networks, parse_network)
+    try_all("from", access.networks, parse_sender)
     try_all("net_ids", access.net_ids, lambda text: parse_source(index, text, loose))
     try_all("to", access.to, lambda text: parse_target(index, text, loose))
     try_all("objects", access.objects, parse_objects)
@@ -114,8 +114,10 @@ def _check_order(index: Index, station: Station, loose: set[str], report: Report
 
 
 def _why_never(rule: AccessRule) -> str:
-    if rule.networks and rule.doors and not any(_kind(door) in _IP_DOORS for door in rule.doors):
-        return f"who comes by {', '.join(rule.doors)} has no IPv4 address"
+    kinds = {_kind(door) for door in rule.doors}
+    is_known = kinds.isdisjoint(_IP_DOORS) if rule.networks else bool(rule.macs)
+    if kinds and is_known and not (rule.macs and DoorKind.ETHERNET in kinds):
+        return f"who comes by {', '.join(rule.doors)} has no such address"
     if rule.objects and rule.services and _OBJECT_SERVICES.isdisjoint(rule.services):
         return f"{', '.join(rule.services)} is not about objects"
     return ""
@@ -124,7 +126,7 @@ def _why_never(rule: AccessRule) -> str:
 def _covers(one: AccessRule, other: AccessRule) -> bool:
     """Tell whether *one* fits whenever *other* does."""
     return (
-        _all_in(one.networks, other.networks, _in_network)
+        _covers_senders(one, other)
         and _all_in(one.net_ids, other.net_ids, _begins)
         and _all_in(one.doors, other.doors, lambda outer, inner: outer in {inner, _kind(inner)})
         and _all_in(
@@ -139,11 +141,23 @@ def _covers(one: AccessRule, other: AccessRule) -> bool:
     )
 
 
+def _covers_senders(one: AccessRule, other: AccessRule) -> bool:
+    if not (one.networks or one.macs):
+        return True
+    by_address = not other.networks or _within(one.networks, other.networks, _in_network)
+    is_any = not (other.networks or other.macs)
+    return not is_any and by_address and set(other.macs) <= set(one.macs)
+
+
+def _within(outer: tuple[T, ...], inner: tuple[T, ...], is_in: Callable[[T, T], bool]) -> bool:
+    return all(any(is_in(each, item) for each in outer) for item in inner)
+
+
 def _all_in(outer: tuple[T, ...], inner: tuple[T, ...], is_in: Callable[[T, T], bool]) -> bool:
     """Tell whether each of *inner* is in one of *outer*; nothing given stands for everything."""
     if not outer:
         return True
-    return bool(inner) and all(any(is_in(each, item) for each in outer) for item in inner)
+    return bool(inner) and _within(outer, inner, is_in)
 
 
 def _in_network(outer: str, inner: str) -> bool:

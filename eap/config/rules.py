@@ -12,7 +12,7 @@ from eap.config.index import Index
 from eap.config.reach import COMMON, WHOLE, net_ids_of
 from eap.config.routes import MisfitError
 from eap.config.structs import Access, Port, Station
-from eap.ids import NetId
+from eap.ids import MacAddr, NetId
 from eap.pd.spec import PortKind
 
 ALL = "all"
@@ -24,6 +24,7 @@ _OBJECT = re.compile(r"(?:0x([0-9A-Fa-f]{1,4})|(\d{1,5}))")
 _TOP_INDEX = 0xFFFF
 _TOP_SUBINDEX = 0xFF
 _TOP_PORT = 0xFFFF
+_MAC_COLONS = 5
 
 
 def access_rules(index: Index, station: Station, loose: set[str]) -> Iterator[AccessRule]:
@@ -36,7 +37,8 @@ def access_rules(index: Index, station: Station, loose: set[str]) -> Iterator[Ac
         yield AccessRule(
             name=rule_name(access, number),
             allow=bool(access.allow),
-            networks=tuple(parse_network(text) for text in access.networks),
+            networks=tuple(parse_sender(text) for text in access.networks if not _is_mac(text)),
+            macs=tuple(parse_sender(text) for text in access.networks if _is_mac(text)),
             net_ids=tuple(
                 net_id for text in access.net_ids for net_id in parse_source(index, text, loose)
             ),
@@ -69,13 +71,17 @@ def parse_services(texts: tuple[str, ...]) -> tuple[AccessService, ...]:
 _SERVICES = one_of(SERVICES)
 
 
-def parse_network(text: str) -> str:
-    """Return an IPv4 network or address in its usual form."""
+def parse_sender(text: str) -> str:
+    """Return an IPv4 network, or address, or a MAC address in its usual form."""
     try:
-        return str(IPv4Network(text, strict=False))
+        return str(MacAddr.parse(text) if _is_mac(text) else IPv4Network(text, strict=False))
     except ValueError:
-        message = f"{text!r} is no IPv4 network"
+        message = f"{text!r} is no IPv4 network and no MAC address"
         raise MisfitError("", message, "a network such as 10.0.0.0/24, or an address") from None
+
+
+def _is_mac(text: str) -> bool:
+    return text.count(":") == _MAC_COLONS or text.count("-") == _MAC_COLONS
 
 
 def parse_source(index: Index, text: str, loose: set[str]) -> list[str]:

@@ -197,3 +197,20 @@ def test_what_is_remembered_of_clients_is_bounded() -> None:
     for port in range(5000):
         access.grants(LAPTOP, ENGINEER, SLAVE[0], port)
     assert access.grants(LAPTOP, ENGINEER, *SLAVE) is not first
+
+
+@pytest.mark.parametrize(
+    ("door", "connection", "fits"),
+    [
+        ("ethernet:eap0", "02:00:00:00:00:0a", True),
+        ("ethernet:eap0", "02:00:00:00:00:0b", False),
+        ("udp:eap0", "10.0.0.5:34980", True),
+        ("udp:eap0", "10.0.0.6:34980", False),
+        ("mqtt:line", "5.1.2.3.1.1", False),
+    ],
+)
+def test_senders_on_ethernet_have_mac_addresses(door, connection, fits) -> None:
+    rule = AccessRule("x", networks=("10.0.0.5/32",), macs=("02-00-00-00-00-0A",))
+    assert grants(rule, way=Way(door, connection)).judge(WRITE).is_allowed is fits
+    only = AccessRule("x", networks=("0.0.0.0/0",))
+    assert not grants(only, way=Way("ethernet:eap0", "02:00:00:00:00:0a")).judge(WRITE).is_allowed

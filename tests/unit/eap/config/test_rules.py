@@ -6,8 +6,8 @@ from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
 from eap.config.routes import MisfitError
 from eap.config.rules import (
     access_rules,
-    parse_network,
     parse_objects,
+    parse_sender,
     parse_services,
     parse_source,
     parse_target,
@@ -25,8 +25,8 @@ def plant(index):
 
 def test_a_rule_says_what_its_texts_stand_for(index):
     access = (
-        "access: [{deny: [write], from: [10.0.0.7/24], net_ids: [left], doors: [mqtt],"
-        " to: [5.1.2.3:851], objects: [0x6000-0x6FFF]}, {name: rest, allow: [all]}]"
+        "access: [{deny: [write], from: [10.0.0.7/24, 02-00-00-00-00-0A], net_ids: [left],"
+        " doors: [mqtt], to: [5.1.2.3:851], objects: [0x6000-0x6FFF]}, {name: rest, allow: [all]}]"
     )
     plant = index((LEFT_PORT, f"{LEFT_PORT}\n    {access}"))
     writes = AccessService.WRITE, AccessService.CONTROL, AccessService.FILES, AccessService.RAW
@@ -35,6 +35,7 @@ def test_a_rule_says_what_its_texts_stand_for(index):
             "1",
             allow=False,
             networks=("10.0.0.0/24",),
+            macs=("02:00:00:00:00:0a",),
             net_ids=("127.0.9.1",),
             doors=("mqtt",),
             targets=(AccessTarget("5.1.2.3", 851),),
@@ -132,11 +133,12 @@ def test_what_names_no_objects_says_so(text, message):
         parse_objects(text)
 
 
-def test_a_network_is_one_of_ipv4():
-    assert parse_network("10.0.0.5") == "10.0.0.5/32"
-    assert parse_network("10.1.2.3/8") == "10.0.0.0/8"
+def test_a_sender_is_a_network_or_a_mac_address():
+    assert parse_sender("10.0.0.5") == "10.0.0.5/32"
+    assert parse_sender("10.1.2.3/8") == "10.0.0.0/8"
+    assert parse_sender("02-00-00-00-00-0A") == "02:00:00:00:00:0a"
     with pytest.raises(MisfitError, match=r"'10\.0\.0\.0/33' is no IPv4 network"):
-        parse_network("10.0.0.0/33")
+        parse_sender("10.0.0.0/33")
 
 
 def test_access_that_there_is_not_is_told():
