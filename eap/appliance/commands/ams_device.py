@@ -20,7 +20,7 @@ _WORDS: dict[int, str] = {
     AdsError.NOT_FOUND: "there is no such object or entry",
     AdsError.STATE: "not in the state that the device is in",
     AdsError.SERVICE: "the device cannot do that",
-    AdsError.INDEX_GROUP: "the device has no such thing",
+    AdsError.INDEX_GROUP: "the device has no object dictionary",
     AdsError.GENERAL: "the device refuses",
 }
 

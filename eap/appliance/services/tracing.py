@@ -35,6 +35,8 @@ from eap.ids import NetId
 HERE = Way(LOCAL, "trace")
 TARGET_PATIENCE_S = 5.0
 """For the target itself: a router gives up before."""
+SUSPECT_PATIENCE_S = 2.0
+"""For a target behind a router that said nothing."""
 _PATIENCE_S = 1.0
 _MORE_S = 0.25
 """For each router that hands a question on: who is nearer waits longer."""
@@ -154,6 +156,28 @@ async def trace(
     station: Station, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
 ) -> Traced:
     """Follow the way from *station* to *target*, and ask that for its state."""
+    hops, why = await _follow(station, target, port, clock)
+    last = hops[-1]
+    if why and not last.is_opaque:
+        return Traced(tuple(hops), None, 0, why)
+    # Who does not answer a question that is ours alone may pass requests on all the same.
+    patience_s = SUSPECT_PATIENCE_S if why else TARGET_PATIENCE_S
+    began_ns = clock()
+    answer = await ask_one(station, target, port, ReadState(), patience_s)
+    took_ns = clock() - began_ns
+    if answer.result not in _ON_THE_WAY:
+        return Traced(tuple(hops), answer, took_ns, "")
+    if why:
+        return Traced(tuple(hops), None, 0, why)
+    where = last.report.station + ("" if last.report.is_here else " or behind it")
+    why = f"{where}: {AdsError.words_of(answer.result)}"
+    return Traced(tuple(hops), answer, took_ns, why)
+
+
+async def _follow(
+    station: Station, target: NetId, port: int, clock: Callable[[], int]
+) -> tuple[list[Hop], str]:
+    """Return the routers on the way, and why it goes no further than the last one."""
     hops: list[Hop] = []
     why = ""
     while not why and (not hops or _goes_on(hops[-1])):
@@ -172,16 +196,7 @@ async def trace(
             hops.append(Hop(report, took_ns))
         if len(hops) > MAX_FURTHER:
             why = why or f"more than {MAX_FURTHER} routers, and no end of the way"
-    if why:
-        return Traced(tuple(hops), None, 0, why)
-    began_ns = clock()
-    answer = await ask_one(station, target, port, ReadState(), TARGET_PATIENCE_S)
-    took_ns = clock() - began_ns
-    if answer.result in _ON_THE_WAY:
-        last = hops[-1].report
-        where = last.station if last.is_here else f"{last.station} or behind it"
-        why = f"{where}: {AdsError.words_of(answer.result)}"
-    return Traced(tuple(hops), answer, took_ns, why)
+    return hops, why
 
 
 def _goes_on(hop: Hop) -> bool:

@@ -197,7 +197,9 @@ def test_masters_and_what_is_behind_routes(command, stub, target):
     assert stub.requests[-1][1]["device"] is True
     refused = command("read", target, "0x1001")
     assert refused.exit_code == 1
-    assert f"{target}: 0x1001:00: the device has no such thing (error 0x702)" in refused.stderr
+    assert (
+        f"{target}: 0x1001:00: the device has no object dictionary (error 0x702)" in refused.stderr
+    )
 
 
 def test_a_dump_is_for_people(command):

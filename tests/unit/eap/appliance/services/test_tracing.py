@@ -3,12 +3,14 @@ from __future__ import annotations
 import asyncio
 from itertools import count
 
+from eap.aoe.ads_system import SYSTEM_PORT
+from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule
 from eap.aoe.spec import AccessService as Service
 from eap.appliance.services.tracing import Traced, trace
-from eap.codec.ads import AdsStates
+from eap.codec.ads import AdsError, AdsStates
 from eap.ids import NetId
-from tests.support.tracedplant import Line, Station, to
+from tests.support.tracedplant import Line, Station, run_state, to
 
 FAR = NetId.parse("5.1.1.3.3.1")
 
@@ -106,6 +108,22 @@ def test_a_router_that_is_not_ours_is_opaque_and_its_target_is_asked_all_the_sam
     assert traced.hops[1].report.net_id == "5.1.1.2.1.1"
     assert not traced.why
     assert traced.states is not None
+
+
+def test_a_router_that_is_silent_may_pass_requests_on_all_the_same() -> None:
+    line, first = line_of_three()
+    line.stations["island-03"].is_ours = False
+    line.stations["island-03"].serve = silent_router
+    traced = follow(first)
+    assert [each.is_opaque for each in traced.hops] == [False, False, True]
+    assert not traced.why
+    assert traced.states is not None
+
+
+def silent_router(port: int, command: int, body: bytes) -> AmsAnswer:
+    if port == SYSTEM_PORT:
+        return AmsAnswer(error_code=AdsError.TIMEOUT)
+    return run_state(port, command, body)
 
 
 def test_access_rules_that_refuse_the_question_are_named() -> None:
