@@ -28,7 +28,15 @@ class BusPort(NamedTuple):
         return f"{self.station}/{self.port}"
 
 
-Place: TypeAlias = BusPort | InterfaceUri
+class GatewayPlace(NamedTuple):
+    """A mailbox gateway (``eapctl gw``)."""
+
+    host: str
+    port: int
+    tcp: bool = False
+
+
+Place: TypeAlias = BusPort | InterfaceUri | GatewayPlace
 
 
 class BusCommand(click.Command):
@@ -106,6 +114,11 @@ def bus_options(command: CommandT) -> CommandT:
     return place(interface(plant(command)))
 
 
+def place_parameters() -> frozenset[str]:
+    """Return the names of the parameters that say which bus."""
+    return frozenset((_PLACE, _INTERFACE, _PLANT))
+
+
 def parse_port(text: str) -> BusPort | None:
     """Read STATION/PORT; return None if it is something else."""
     station, slash, port = text.partition("/")
@@ -131,6 +144,10 @@ def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
         from eap.appliance.commands.bus_running import open_running
 
         return open_running(*bus)
+    if isinstance(bus, GatewayPlace):
+        from eap.appliance.commands.bus_gateway import open_gateway
+
+        return open_gateway(bus.host, bus.port, tcp=bus.tcp)
     from eap.appliance.commands import bus_session
 
     return bus_session.open_bus(bus)

@@ -117,15 +117,20 @@ def dump_table(rows: Iterable[Row]) -> Table:
     """Return the table of all entries with their values."""
     table = _table("Entry", "Name", "Type", "Access", "Value")
     for row in rows:
-        if "error" in row:
-            value = Text(row["error"], style="red")
-        else:
-            value = Text(_value(row) if row["data"] is not None else "")
         own, whole = row["name"], row["object"]
         name = own if own == whole or not own else f"{whole}: {own}"
         access = row.get("access", "")
-        table.add_row(entry_name(row), name or whole, row.get("type") or "", access, value)
+        table.add_row(
+            entry_name(row), name or whole, row.get("type") or "", access, dumped_value(row)
+        )
     return table
+
+
+def dumped_value(row: Row) -> Text:
+    """Return the value of an entry, or why there is none."""
+    if "error" in row:
+        return Text(row["error"], style="red")
+    return Text(_value(row) if row["data"] is not None else "")
 
 
 def idn_lines(row: Row) -> Iterator[str]:

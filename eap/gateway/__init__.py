@@ -1,5 +1,5 @@
-"""The mailbox gateway of ETG.8200: mailbox messages from Ethernet to slaves and to the master.
+"""Mailbox gateways (ETG.8200): mailbox messages from Ethernet to slaves and to the master.
 
-Decisions only: what a message is, whom it is for, whether it may pass and what goes back.  Nothing
-here sends, waits or knows a clock.
+What a gateway decides stands here without sockets and clocks: what a message is, whom it is for,
+whether it may pass and what goes back.  Beside it are the clients of any gateway, which have both.
 """

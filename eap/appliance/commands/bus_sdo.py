@@ -127,7 +127,7 @@ def _dumped(bus: SlaveBus, unit: Slave, index: int, subindex: int) -> dict[str, 
             unit, lambda _: coeinfo_client.entry_description(index, subindex), name
         )
     except SdoAbortError as exc:
-        gaps = {AbortCode.NO_SUBINDEX, AbortCode.NO_OBJECT}
+        gaps = {AbortCode.NO_SUBINDEX, AbortCode.NO_OBJECT, AbortCode.NOT_STORED}
         return None if exc.code in gaps else {"name": "", "error": str(exc)}
     except MailboxProtocolError as exc:  # one bad description is no reason to lose all others
         return {"name": "", "error": str(exc)}

@@ -1,0 +1,127 @@
+"""A bus behind a mailbox gateway, ours or anybody's, as a command uses it (ETG.8200).
+
+What a gateway passes is mailbox messages: slaves are known by the master's dictionary, and nobody
+reads registers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import NoReturn, TypeVar
+
+import msgspec
+
+from devicebus.errors import BusError, MailboxRefusedError
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.procedure import Procedure
+from devicebus.wire.alstatus import AlState, state_name
+from devicebus.wire.register import AlStatus
+from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
+from eap.gateway.address import MASTER_ADDRESS
+from eap.gateway.client import GatewayClient
+from eap.gateway.slaves import MasterSlave
+from eap.od.abort import SdoAbortError
+
+T = TypeVar("T")
+
+_MASTER_SIZE = 1480
+
+
+class GatewayBus:
+    """A bus behind a gateway; fits :class:`eap.appliance.commands.bus_slave.SlaveBus`.
+
+    Slave 0 is the master itself, with its dictionary.
+    """
+
+    def __init__(self, client: GatewayClient) -> None:
+        self._client = client
+        self._slaves: list[MasterSlave] | None = None
+
+    def scan(self) -> Sequence[Slave]:
+        """Return the slaves that the master tells of."""
+        self._slaves = self._client.slaves()
+        return [_slave(each) for each in self._slaves]
+
+    def find(self, name: str) -> Slave:
+        """Return the slave with a station address or a name, the master for 0."""
+        if name in {"0", "master"}:
+            return msgspec.structs.replace(_unknown(MASTER_ADDRESS), name="master")
+        try:
+            slaves = self.scan()
+        except (SdoAbortError, MailboxRefusedError):
+            if not name.isdecimal():
+                raise
+            slaves = [_unknown(int(name))]  # of a master without a dictionary
+        return choose(slaves, name)
+
+    def converse(
+        self,
+        slave: Slave,
+        begin: Begin[T],
+        name: str,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> T:
+        """Talk to a slave's mailbox, or to the master; return the result or raise."""
+        del name
+        conversation = begin(self._sizes(slave))
+        return self._client.converse(slave.station, conversation, meanwhile)
+
+    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
+        """Refuse: states are asked for by the master's dictionary, 0xAnnn:02."""
+        del slaves
+        _refuse(f"state {target.name}")
+
+    def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
+        """Refuse: a gateway passes mailbox messages, and no datagrams."""
+        procedure.close()
+        _refuse(name)
+
+    def frame_counts(self) -> FrameCounts:
+        """Refuse likewise."""
+        _refuse("counters of frames")
+
+    def _sizes(self, slave: Slave) -> MailboxSizes:
+        if slave.station == MASTER_ADDRESS:
+            return MailboxSizes(_MASTER_SIZE, _MASTER_SIZE)
+        for each in self._slaves or ():
+            if each.station == slave.station and each.to_slave:
+                return MailboxSizes(each.to_slave, each.to_master)
+        if self._slaves is None:
+            return MailboxSizes()
+        raise no_mailbox(slave, state_name(slave.status.state))
+
+
+def _unknown(station: int) -> Slave:
+    return _slave(MasterSlave(station, "", 0, 0, 0, 0, 0, 0, 0))
+
+
+def _slave(slave: MasterSlave) -> Slave:
+    return Slave(
+        station=slave.station,
+        name=slave.name,
+        vendor=slave.vendor,
+        product=slave.product,
+        revision=slave.revision,
+        serial=slave.serial,
+        alias=0,
+        status=AlStatus.decode(slave.al_status.to_bytes(AlStatus.SIZE, "little")),
+        protocols=0,
+        parent=None,
+        ports=(),
+    )
+
+
+def _refuse(what: str) -> NoReturn:
+    raise BusError(f"{what}: a mailbox gateway passes mailbox messages only")
+
+
+@contextmanager
+def open_gateway(host: str, port: int, *, tcp: bool) -> Iterator[GatewayBus]:
+    """Talk to a gateway for the length of a block.
+
+    Raises:
+        EnvironmentalError: it has no address, or takes no connection.
+    """
+    with GatewayClient(host, port, tcp=tcp) as client:
+        yield GatewayBus(client)

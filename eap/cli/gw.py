@@ -1,0 +1,85 @@
+"""``eapctl gw``: what ``eapctl bus`` does, through any mailbox gateway (ETG.8200)."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import click
+
+from eap.cli.bus_place import GatewayPlace, place_parameters
+from eap.cli.group import LazyGroup
+from eap.cli.params import examples
+
+_PORT = 34980
+
+
+def _parse_place(ctx: click.Context, param: click.Parameter, text: str) -> GatewayPlace:
+    del ctx, param
+    host, colon, digits = text.partition(":")
+    if not colon:
+        return GatewayPlace(host, _PORT)
+    if not host or not digits.isdecimal() or not 0 < int(digits) <= 0xFFFF:
+        raise click.BadParameter(f"{text!r} is not HOST[:PORT], such as 10.0.0.5 or plc:34981")
+    return GatewayPlace(host, int(digits))
+
+
+class GatewayGroup(LazyGroup):
+    """Commands of ``eapctl bus``, whose bus is the gateway."""
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import one subcommand, and give it the gateway in the place of a bus."""
+        command = super().get_command(ctx, cmd_name)
+        return None if command is None else _behind_gateway(command)
+
+
+def _behind_gateway(command: click.Command) -> click.Command:
+    if isinstance(command, click.Group):
+        found = {name: _behind_gateway(each) for name, each in command.commands.items()}
+        return click.Group(command.name, found, help=command.help, epilog=None)
+    left_out = place_parameters()
+    params = [each for each in command.params if each.name not in left_out]
+    if len(params) == len(command.params):
+        return command
+    return click.Command(
+        command.name,
+        context_settings=command.context_settings,
+        callback=partial(_call, command),
+        params=params,
+        help=command.help,
+    )
+
+
+def _call(command: click.Command, **values: Any) -> Any:
+    context = click.get_current_context()
+    place = context.find_object(GatewayPlace)
+    return context.invoke(command.callback, bus=place, **values) if command.callback else None
+
+
+@click.group(
+    cls=GatewayGroup,
+    commands_at={
+        "foe": "eap.cli.bus_foe:foe",
+        "idn": "eap.cli.bus_idn:idn",
+        "od": "eap.cli.gw_od:od",
+        "scan": "eap.cli.bus:scan",
+        "sdo": "eap.cli.bus_sdo:sdo",
+        "voe": "eap.cli.bus:voe",
+    },
+    epilog=examples(
+        "eapctl gw 127.0.1.1 scan",
+        "eapctl gw 127.0.1.1 sdo read 1001 0x1018:1",
+        "eapctl gw 127.0.1.1 od 0",
+        "eapctl gw --tcp 127.0.1.1 foe put 1001 new.bin firmware.bin",
+    ),
+)
+@click.option("--tcp", is_flag=True, help="Connect by TCP; otherwise datagrams are sent (UDP).")
+@click.argument("place", metavar="HOST[:PORT]", callback=_parse_place)
+@click.pass_context
+def gw(ctx: click.Context, place: GatewayPlace, tcp: bool) -> None:
+    """Talk to a master and its slaves through a mailbox gateway, any vendor's.
+
+    SLAVE is a station address (1001 is the first slave) or the slave's name as the master knows it;
+    0 is the master itself.  The port is 34980 if it is left out.
+    """
+    ctx.obj = place._replace(tcp=tcp)

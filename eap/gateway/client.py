@@ -1,0 +1,258 @@
+"""A client of any mailbox gateway (ETG.8200), blocking or asynchronous, over UDP or TCP.
+
+    with GatewayClient("10.0.0.5") as gateway:
+        vendor = gateway.sdo_read(1001, 0x1018, 1)
+        gateway.foe_write(1001, "firmware.bin", Path("new.bin").read_bytes())
+
+Address 0 is the master itself, 1001 usually the first slave.  What is refused raises SdoAbortError,
+SoeError, FoeError or MailboxRefusedError; who does not answer, MailboxTimeoutError.
+"""
+
+from __future__ import annotations
+
+import io
+import select
+import socket
+from collections.abc import Callable
+from time import monotonic
+from types import TracebackType
+from typing import Self, TypeVar
+
+from devicebus.errors import BusError
+from devicebus.mailbox import (
+    coe_client,
+    coeinfo_client,
+    foe_client,
+    soe_browse,
+    soe_client,
+    voe_client,
+)
+from devicebus.mailbox.conversation import Conversation, Progress
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.soe_browse import IdnDescription
+from eap.codec.ethercat import EtherCatHeader
+from eap.codec.sdo import EXPEDITED_SIZE
+from eap.codec.sdoinfo import EntryDescription, ObjectDescription
+from eap.codec.soe import Element, Idn
+from eap.errors import EnvironmentalError
+from eap.gateway.async_client import PORT, TIMEOUT_S, TRIES, AsyncGatewayClient
+from eap.gateway.dialogue import Dialogue
+from eap.gateway.slaves import MasterSlave, read_slaves, sizes_of
+
+T = TypeVar("T")
+
+__all__ = ["AsyncGatewayClient", "GatewayClient"]
+
+_S = 1_000_000_000
+_LARGEST = 4096
+_DEFAULT_SIZES = MailboxSizes(128, 128)
+
+
+class GatewayClient:
+    """A blocking client.
+
+    Args:
+        host: Name or address of the gateway.
+        port: Its port.
+        tcp: Whether to connect by TCP instead of sending datagrams.
+        timeout_s: How long an answer may take before the request is sent again.
+        tries: How often a datagram is sent; by TCP the client waits as long in all.
+
+    Raises:
+        EnvironmentalError: the host has no address, or does not take the connection.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int = PORT,
+        *,
+        tcp: bool = False,
+        timeout_s: float = TIMEOUT_S,
+        tries: int = TRIES,
+    ) -> None:
+        self._tries = 1 if tcp else tries
+        self._timeout_s = timeout_s * tries if tcp else timeout_s
+        self._is_stream = tcp
+        self._counter = 0
+        self._rest = b""
+        kind = socket.SOCK_STREAM if tcp else socket.SOCK_DGRAM
+        self._socket = socket.socket(socket.AF_INET, kind)
+        self._socket.settimeout(self._timeout_s)
+        try:
+            self._socket.connect((host, port))
+        except OSError as exc:
+            self._socket.close()
+            raise EnvironmentalError(f"gateway {host}:{port}: {exc.strerror or exc}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._socket.close()
+
+    def sdo_read(
+        self, address: int, index: int, subindex: int = 0, *, complete: bool = False
+    ) -> bytes:
+        """Read an entry, or with *complete* a whole object."""
+        return self.converse(address, coe_client.upload(index, subindex, complete=complete))
+
+    def sdo_write(
+        self, address: int, index: int, subindex: int, data: bytes, *, complete: bool = False
+    ) -> None:
+        """Write an entry, or with *complete* a whole object."""
+        sizes = self.sizes_of(address) if len(data) > EXPEDITED_SIZE else _DEFAULT_SIZES
+        talk = coe_client.download(index, subindex, data, sizes, complete=complete)
+        self.converse(address, talk)
+
+    def od_list(self, address: int) -> list[int]:
+        """Read the indexes of all objects."""
+        return self.converse(address, coeinfo_client.object_list())
+
+    def od_object(self, address: int, index: int) -> ObjectDescription:
+        """Read what is said of an object."""
+        return self.converse(address, coeinfo_client.object_description(index))
+
+    def od_entry(self, address: int, index: int, subindex: int) -> EntryDescription:
+        """Read what is said of an entry."""
+        return self.converse(address, coeinfo_client.entry_description(index, subindex))
+
+    def idn_read(
+        self, address: int, idn: Idn, elements: int = Element.VALUE, *, drive: int = 0
+    ) -> bytes:
+        """Read elements of an IDN, one behind the other."""
+        return self.converse(address, soe_client.read(idn, elements, drive=drive))
+
+    def idn_describe(self, address: int, idn: Idn, *, drive: int = 0) -> IdnDescription:
+        """Read all elements of an IDN in one view."""
+        return self.converse(address, soe_browse.describe(idn, drive=drive))
+
+    def idn_write(
+        self,
+        address: int,
+        idn: Idn,
+        data: bytes,
+        *,
+        element: int = Element.VALUE,
+        drive: int = 0,
+    ) -> None:
+        """Write an element of an IDN; a list or text with its head."""
+        sizes = self.sizes_of(address)
+        talk = soe_client.write(idn, data, sizes, elements=element, drive=drive)
+        self.converse(address, talk)
+
+    def foe_read(
+        self, address: int, name: str, *, password: int = 0, progress: Progress | None = None
+    ) -> bytes:
+        """Read a file."""
+        content = io.BytesIO()
+        sizes = self.sizes_of(address)
+        talk = foe_client.read(name, content.write, sizes, password=password, progress=progress)
+        self.converse(address, talk)
+        return content.getvalue()
+
+    def foe_write(
+        self,
+        address: int,
+        name: str,
+        data: bytes,
+        *,
+        password: int = 0,
+        progress: Progress | None = None,
+    ) -> None:
+        """Write a file."""
+        sizes = self.sizes_of(address)
+        source = io.BytesIO(data).read
+        talk = foe_client.write(name, source, sizes, password=password, progress=progress)
+        self.converse(address, talk)
+
+    def voe(self, address: int, vendor_id: int, vendor_type: int, data: bytes) -> bytes:
+        """Send data of a vendor's protocol; return the data of its answer."""
+        return self.converse(address, voe_client.exchange(vendor_id, vendor_type, data))
+
+    def slaves(self) -> list[MasterSlave]:
+        """Return the slaves that the master knows."""
+        return self.converse(0, read_slaves())
+
+    def sizes_of(self, address: int) -> MailboxSizes:
+        """Return the mailboxes of a slave, as the master's dictionary has them.
+
+        Raises:
+            BusError: the master knows no such slave, or the slave has no mailbox.
+        """
+        return sizes_of(self.slaves(), address)
+
+    def converse(
+        self,
+        address: int,
+        conversation: Conversation[T],
+        meanwhile: Callable[[], None] | None = None,
+    ) -> T:
+        """Lead any conversation; *meanwhile* is called after each step."""
+        dialogue = Dialogue(conversation, address, self._counter)
+        try:
+            while not dialogue.is_done:
+                self._step(dialogue)
+                if meanwhile is not None:
+                    meanwhile()
+        finally:
+            self._counter = dialogue.counter
+            dialogue.close()
+        return dialogue.result()
+
+    def _step(self, dialogue: Dialogue[T]) -> None:
+        if dialogue.delay_ns:
+            select.select([], [], [], dialogue.delay_ns / _S)
+        for _ in range(self._tries):
+            if dialogue.frame is not None:
+                self._send(dialogue.frame)
+                if not dialogue.expects_reply:
+                    dialogue.sent()
+                    return
+            deadline_s = monotonic() + self._timeout_s
+            while (octets := self._receive(deadline_s)) is not None:
+                if dialogue.receive(octets):
+                    return
+        dialogue.expire()
+
+    def _send(self, frame: bytes) -> None:
+        try:
+            self._socket.sendall(frame)
+        except OSError as exc:
+            raise BusError(f"the gateway takes nothing: {exc.strerror or exc}") from None
+
+    def _receive(self, deadline_s: float) -> bytes | None:
+        """Return the next frame, None if there is none in time."""
+        while (rest_s := deadline_s - monotonic()) > 0:
+            self._socket.settimeout(rest_s)
+            try:
+                octets = self._socket.recv(_LARGEST)
+            except TimeoutError:
+                return None
+            except OSError as exc:
+                raise BusError(f"the gateway does not answer: {exc.strerror or exc}") from None
+            if not self._is_stream:
+                return octets
+            frame, self._rest = cut_frame(self._rest + octets)
+            if frame is not None:
+                return frame
+            if not octets:
+                raise BusError("the gateway has closed the connection")
+        return None
+
+
+def cut_frame(octets: bytes) -> tuple[bytes | None, bytes]:
+    """Return the first whole frame of a stream, None if there is none yet, and what is left."""
+    if len(octets) < EtherCatHeader.SIZE:
+        return None, octets
+    end = EtherCatHeader.SIZE + EtherCatHeader.decode(octets).length
+    return (octets[:end], octets[end:]) if len(octets) >= end else (None, octets)

@@ -1,0 +1,72 @@
+"""The slaves behind a gateway, as the dictionary of its master tells of them (ETG.1510)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from devicebus.errors import BusError
+from devicebus.mailbox import coe_client
+from devicebus.mailbox.conversation import Conversation
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.gateway.address import VIRTUAL_BIT
+
+
+class MasterSlave(NamedTuple):
+    """A slave as the master's dictionary tells of it."""
+
+    station: int
+    name: str
+    vendor: int
+    product: int
+    revision: int
+    serial: int
+    to_slave: int
+    to_master: int
+    al_status: int
+
+
+def read_slaves() -> Conversation[list[MasterSlave]]:
+    """Read the slaves from the master's dictionary (address 0)."""
+    count = int.from_bytes((yield from coe_client.upload(0xF020, 0)), "little")
+    slaves = []
+    for number in range(count):
+        found = yield from _read_slave(number)
+        slaves.append(found)
+    return slaves
+
+
+def _read_slave(number: int) -> Conversation[MasterSlave]:
+    index = 0x8000 + number
+    values = {}
+    for subindex in (1, 5, 6, 7, 8, 33, 34):
+        octets = yield from coe_client.upload(index, subindex)
+        values[subindex] = int.from_bytes(octets, "little")
+    name = yield from coe_client.upload(index, 3)
+    state = yield from coe_client.upload(0xA000 + number, 1)
+    return MasterSlave(
+        station=values[1],
+        name=name.rstrip(b"\0").decode(errors="replace"),
+        vendor=values[5],
+        product=values[6],
+        revision=values[7],
+        serial=values[8],
+        to_slave=values[33],
+        to_master=values[34],
+        al_status=int.from_bytes(state, "little"),
+    )
+
+
+def sizes_of(slaves: Sequence[MasterSlave], address: int) -> MailboxSizes:
+    """Return the mailboxes of a slave.
+
+    Raises:
+        BusError: the master knows no such slave, or the slave has no mailbox.
+    """
+    for slave in slaves:
+        if slave.station in {address, address & ~VIRTUAL_BIT}:
+            if not slave.to_slave:
+                raise BusError(f"slave {address} ({slave.name}) has no mailbox in its state")
+            return MailboxSizes(slave.to_slave, slave.to_master)
+    known = ", ".join(f"{slave.station} ({slave.name})" for slave in slaves) or "none"
+    raise BusError(f"the master knows no slave {address}; it knows {known}")

@@ -1,0 +1,165 @@
+"""A mailbox gateway in a thread: one slave and a master, without a bus."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from typing import Self
+
+from devicebus.mailbox.coe_server import CoeServer
+from devicebus.mailbox.foe_server import FoeServer
+from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.server import MailboxServer
+from devicebus.mailbox.soe_parameter import SoeParameter
+from devicebus.mailbox.soe_server import SoeServer
+from devicebus.mailbox.voe_server import VoeServer
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.mailbox import (
+    MailboxError,
+    MailboxErrorReply,
+    MailboxHeader,
+    MailboxType,
+    decode_message,
+    encode_message,
+)
+from eap.codec.soe import SoeAttribute
+from eap.device.eap_content import Identity
+from eap.device.master_dictionary import MasterDictionary
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RW, OdState, variable
+from eap.od.profiles.master1100 import Live
+
+SIZES = MailboxSizes(128, 128)
+FILE = bytes(range(256)) * 4
+
+
+class _OneSlave:
+    """Values of a master with one slave, 1001."""
+
+    def configured(self) -> list[int]:
+        return [1001]
+
+    detected = configured
+
+    def of_configured(self, station: int, key: Live) -> int | str:
+        texts = {Live.NAME: "drive", Live.TYPE: "D1"}
+        return {Live.ADDRESS: 1001, Live.VENDOR: 5, Live.MAILBOX_OUT: 128, Live.MAILBOX_IN: 128,
+                **texts}.get(key, 0)  # fmt: skip
+
+    of_detected = of_configured
+
+    def of_diagnosis(self, station: int, key: Live) -> int:
+        return 8 if key is Live.AL_STATUS else 0
+
+    def of_master(self, key: Live) -> int | bytes:
+        return {Live.DETECT_REQUEST: bytes(2), Live.DETECT_RESPONSE: bytes(6)}.get(key, 0)
+
+    def write_slave(self, station: int, key: Live, value: int) -> None:
+        """Nothing."""
+
+    def write_master(self, key: Live, data: bytes) -> None:
+        """Nothing."""
+
+
+class FakeGateway:
+    """Answers on UDP and TCP at the same port of 127.0.0.1.
+
+    Attributes:
+        drop: Requests by UDP that are not heard, from now on.
+        has_master: Whether address 0 has a dictionary.
+    """
+
+    def __init__(self) -> None:
+        self.drop = 0
+        self.has_master = True
+        slave = ObjectDictionary(
+            [
+                variable(0x1008, "N", "STRING(500)", RW, "x" * 300),
+                variable(0x2000, "A", "UDINT", RW),
+            ]
+        )
+        servers = {
+            MailboxType.COE: CoeServer(slave, _op, SIZES),
+            MailboxType.FOE: FoeServer(MemoryStore([MemoryFile("f", FILE, max_size=9999)]), SIZES),
+            MailboxType.SOE: SoeServer(
+                {0: [SoeParameter("S-0-0032", "Mode", SoeAttribute(), 7)]}, _op, SIZES
+            ),
+            MailboxType.VOE: VoeServer(),
+        }
+        large = MailboxSizes(1400, 1400)
+        master = CoeServer(MasterDictionary(_OneSlave(), Identity(device_name="M")), _op, large)
+        self._boxes = {
+            1001: MailboxServer(servers, SIZES),
+            0: MailboxServer({MailboxType.COE: master}, large),
+        }
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._udp.bind(("127.0.0.1", 0))
+        self.port = self._udp.getsockname()[1]
+        self._tcp = socket.create_server(("127.0.0.1", self.port))
+        self._threads = [
+            threading.Thread(target=each) for each in (self._serve_udp, self._serve_tcp)
+        ]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *about: object) -> None:
+        self._udp.sendto(b"", self._udp.getsockname())
+        self._tcp.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join()
+        self._udp.close()
+        self._tcp.close()
+
+    def _answers(self, frame: bytes) -> list[bytes]:
+        header, body = decode_message(frame, EtherCatHeader.SIZE)
+        box = self._boxes.get(header.address)
+        if box is None or (header.address == 0 and not self.has_master):
+            detail = MailboxErrorReply(detail=MailboxError.UNSUPPORTED_PROTOCOL).encode()
+            return [_frame(MailboxHeader(4, header.address), detail)]
+        box.receive_message(encode_message(MailboxHeader(0, type=header.type), body), 0)
+        found = []
+        while (message := box.next_message(0)) is not None:
+            box.handle_read()
+            back, data = decode_message(message)
+            counted = MailboxHeader(0, header.address, type=back.type, counter=back.counter)
+            found.append(_frame(counted, data))
+        return found
+
+    def _serve_udp(self) -> None:
+        while True:
+            frame, peer = self._udp.recvfrom(4096)
+            if not frame:
+                return
+            if self.drop:
+                self.drop -= 1
+                continue
+            for answer in self._answers(frame):
+                self._udp.sendto(answer, peer)
+
+    def _serve_tcp(self) -> None:
+        while True:
+            try:
+                connection, _ = self._tcp.accept()
+            except OSError:
+                return
+            with connection, connection.makefile("rwb") as stream:
+                while head := stream.read(2):
+                    frame = head + stream.read(int.from_bytes(head, "little") & 0x7FF)
+                    answers = b"".join(self._answers(frame))
+                    stream.write(answers[:5])  # in two pieces, as a network may
+                    stream.flush()
+                    stream.write(answers[5:])
+                    stream.flush()
+
+
+def _frame(header: MailboxHeader, body: bytes | memoryview) -> bytes:
+    message = encode_message(header, body)
+    return EtherCatHeader(len(message), type=FrameType.MAILBOX).encode() + message
+
+
+def _op() -> OdState:
+    return OdState.OP

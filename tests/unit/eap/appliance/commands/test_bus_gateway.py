@@ -1,0 +1,63 @@
+"""A bus behind a gateway, as commands use it."""
+
+from __future__ import annotations
+
+import pytest
+
+from devicebus.errors import BusError
+from devicebus.mailbox import coe_client
+from devicebus.master.diagnosis import diagnose
+from devicebus.wire.alstatus import AlState
+from eap.appliance.commands.bus_gateway import open_gateway
+from eap.appliance.commands.bus_info import scan_rows
+from eap.appliance.commands.bus_sdo import dump_entries, read_entry, write_entry
+from tests.support.fakegateway import FakeGateway
+
+pytestmark = pytest.mark.net
+
+
+@pytest.fixture
+def gateway():
+    with FakeGateway() as running:
+        yield running
+
+
+@pytest.fixture
+def bus(gateway):
+    with open_gateway("127.0.0.1", gateway.port, tcp=False) as opened:
+        yield opened
+
+
+def test_slaves_and_the_master(bus) -> None:
+    (row,) = scan_rows(bus)
+    assert (row["address"], row["name"], row["state"]) == (1001, "drive", "OP")
+    assert bus.find("drive").station == bus.find("1001").station == 1001
+    assert bus.find("master").station == bus.find("0").station == 0
+    with pytest.raises(BusError, match=r"no slave '7'; there are 1001 \(drive\)"):
+        bus.find("7")
+
+
+def test_objects(bus) -> None:
+    write_entry(bus, "drive", 0x2000, 0, "77", kind=None, complete=False)
+    assert read_entry(bus, "drive", 0x2000, 0, kind=None, complete=False)["value"] == 77
+    rows = list(dump_entries(bus, "0"))
+    assert {row["index"] for row in rows} >= {0x1000, 0x8000, 0xA000, 0xF020}
+    assert not any("error" in row for row in rows), "gaps are left out"
+
+
+def test_a_gateway_whose_master_has_no_dictionary(gateway, bus) -> None:
+    gateway.has_master = False
+    slave = bus.find("1001")
+    assert len(bus.converse(slave, lambda _: coe_client.upload(0x2000, 0), "x")) == 4
+    with pytest.raises(BusError):
+        bus.find("drive")
+
+
+def test_what_is_no_mailbox_message_is_not_passed(bus) -> None:
+    for call in (
+        lambda: bus.run(diagnose([1001]), "registers"),
+        bus.frame_counts,
+        lambda: bus.bring([], AlState.OP),
+    ):
+        with pytest.raises(BusError, match="mailbox messages only"):
+            call()
