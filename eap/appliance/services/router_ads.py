@@ -1,4 +1,4 @@
-"""The ADS services of a station's router: the system service, the I/O server, its dictionary."""
+"""The ADS services of a station's router beside the system service: I/O server and dictionary."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.ads_operation import Operation, OperationOutcome, WriteControl
 from eap.aoe.ads_space import AdsSpace
 from eap.aoe.ads_state import states_of
-from eap.aoe.ads_system import SYSTEM_PORT, SystemSpace
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.services.ads_requests import begin_answer
 from eap.appliance.services.ads_result import ads_result
-from eap.appliance.services.eap_ads import DEVICE_PORT, device_info
+from eap.appliance.services.eap_ads import DEVICE_PORT
 from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.state_control import control_state
 from eap.appliance.services.station_device import StationDevice
-from eap.codec.ads import AdsStates, AdsSystemState
+from eap.codec.ads import AdsDeviceInfo, AdsStates
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.od.model import OdState
@@ -38,7 +37,7 @@ class RouterAds:
         station: Whose router it is.
         device: The EAP device of the station, whose state is that of the whole.
         dictionary: Of the router.
-        release: Of this software.
+        info: What ReadDeviceInfo tells.
     """
 
     def __init__(
@@ -46,13 +45,12 @@ class RouterAds:
         station: StationSpec,
         device: StationDevice,
         dictionary: RouterDictionary,
-        release: str,
+        info: AdsDeviceInfo,
     ) -> None:
         self._device = device
-        self._info = device_info(station.name, release)
+        self._info = info
         objects = ObjectSpace(dictionary, lambda: OdState.OP, ads_result)
         self._devices = {
-            SYSTEM_PORT: self._make(SystemSpace(self._system_state)),
             IO_PORT: self._make(IoSpace(_io_devices(station))),
             DEVICE_PORT: self._make(objects),
         }
@@ -87,16 +85,6 @@ class RouterAds:
 
     def _states(self) -> AdsStates:
         return states_of(self._device.status.state)
-
-    def _system_state(self) -> AdsSystemState:
-        states, info = self._states(), self._info
-        return AdsSystemState(
-            states.ads_state,
-            states.device_state,
-            version=info.major,
-            revision=info.minor,
-            build=info.build,
-        )
 
 
 def _io_devices(station: StationSpec) -> Iterator[IoDevice]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from eap.aoe.ads_system import SYSTEM_PORT
 from eap.appliance.services.eap_ads import DEVICE_PORT, EapAds, device_info
 from eap.appliance.services.image_variables import StationSymbols
 from eap.appliance.services.notification_pump import NotificationPump
@@ -10,6 +11,7 @@ from eap.appliance.services.router_values import LiveRouter
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.appliance.services.station_device import StationDevice
+from eap.appliance.services.system_ads import SystemAds
 from eap.appliance.station_image import StationImage
 from eap.device.eap_content import Identity
 from eap.device.router_dictionary import RouterDictionary
@@ -40,21 +42,28 @@ class StationAds:
         router: StationRouter,
         identity: Identity,
     ) -> None:
-        release = identity.software_version
         symbols = StationSymbols(image)
         self.pump = NotificationPump(symbols, router.send_notification)
         values = LiveRouter(router, device, image, station.ports)
         self.dictionary = RouterDictionary(station, values, identity)
-        own = RouterAds(station, device, self.dictionary, release)
-        router.add_service(router.net_id, Whereabouts(router, own))
+        release = identity.software_version
+        info = device_info(station.name, release)
+        own = RouterAds(station, device, self.dictionary, info)
+        router.add_service(router.net_id, own)
         for ams_port, table in own.notifications.items():
             self.pump.add(table, router.net_id, ams_port)
+        system = SystemAds(device, info)
+        router.add_service(router.net_id, Whereabouts(router, system))
+        self.pump.add(system.notifications, router.net_id, SYSTEM_PORT)
         net_ids = {port.name: NetId.parse(port.net_id) for port in station.ports}
         for port in device.dictionaries:
-            info = device_info(f"{station.name}/{port}", release)
-            service = EapAds(device, port, symbols, info)
-            router.add_service(net_ids[port], service)
-            self.pump.add(service.notifications, net_ids[port], DEVICE_PORT)
+            net_id, name = net_ids[port], f"{station.name}/{port}"
+            of_port = EapAds(device, port, symbols, device_info(name, release))
+            router.add_service(net_id, of_port)
+            self.pump.add(of_port.notifications, net_id, DEVICE_PORT)
+            system = SystemAds(device, info)
+            router.add_service(net_id, system)
+            self.pump.add(system.notifications, net_id, SYSTEM_PORT)
 
     async def serve(self) -> None:
         """Tell whom notifications are for, until cancelled."""

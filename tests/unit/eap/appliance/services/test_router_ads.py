@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
+from eap.appliance.services.eap_ads import device_info
 from eap.appliance.services.router_ads import RouterAds
 from eap.appliance.services.router_values import LiveRouter
 from eap.appliance.services.routing.service import LocalRequest
@@ -26,7 +27,7 @@ from eap.pd.spec import PortKind, PortSpec
 from tests.support import aoe
 from tests.support.stationengine import make_device, while_serving
 
-SYSTEM, IO, DEVICE = 10_000, 300, 0xFFFF
+IO, DEVICE = 300, 0xFFFF
 WAY = Way("ams-tcp", "1")
 CLIENT = NetId.parse("1.2.3.4.1.1")
 OK = bytes(4)
@@ -42,7 +43,7 @@ class Bench:
         router = StationRouter("left", NetId.parse(spec.net_id))
         values = LiveRouter(router, self.device, image, spec.ports)
         dictionary = RouterDictionary(spec, values, Identity())
-        self.ads = RouterAds(spec, self.device, dictionary, "1.2.3")
+        self.ads = RouterAds(spec, self.device, dictionary, device_info("left", "1.2.3"))
 
     def ask(self, port, command, body=b""):
         header = AmsHeader(CLIENT, port, CLIENT, 1, command)
@@ -67,20 +68,15 @@ def bench(stations, images):
 
 
 def test_it_has_the_ports_of_a_router(bench):
-    assert bench.ads.ports == {SYSTEM, IO, DEVICE}
+    assert bench.ads.ports == {IO, DEVICE}
 
 
-@pytest.mark.parametrize("port", [SYSTEM, IO, DEVICE])
+@pytest.mark.parametrize("port", [IO, DEVICE])
 def test_each_says_who_and_how_it_is(bench, port):
     info = bench.ask(port, AmsCommand.READ_DEVICE_INFO).data
     assert info == OK + b"\1\2\3\0" + b"left".ljust(16, b"\0")
     assert bench.ask(port, AmsCommand.READ_STATE).data == OK + b"\5\0\x08\0"
     assert bench.read(port, G.RAW_COMMAND, 0) is AdsError.INDEX_GROUP
-
-
-def test_system_service_tells_its_state(bench):
-    state = struct.unpack("<HHHBBHBBHH", bench.read(SYSTEM, G.SYSTEM_STATE, 0))
-    assert state[:6] == (AdsState.RUN, 8, 0, 1, 2, 3)
 
 
 def test_ports_are_the_devices_of_the_io_server(bench):
@@ -102,9 +98,9 @@ def test_dictionary_is_that_of_a_router(bench):
 
 
 def test_states_are_those_of_the_station(bench):
-    assert bench.control(SYSTEM, AdsState.CONFIG) == 0
+    assert bench.control(DEVICE, AdsState.CONFIG) == 0
     assert bench.engine.state is DeviceState.PREOP
-    assert bench.ask(SYSTEM, AmsCommand.READ_STATE).data == OK + b"\x0f\0\2\0"
+    assert bench.ask(DEVICE, AmsCommand.READ_STATE).data == OK + b"\x0f\0\2\0"
     assert bench.control(DEVICE, AdsState.RUN) == 0
     assert bench.engine.state is DeviceState.OP
     assert bench.control(IO, AdsState.CONFIG) == AdsError.SERVICE
@@ -115,9 +111,9 @@ def test_notifications_end_with_their_connection(bench):
     for port in bench.ads.ports:
         assert bench.ask(port, AmsCommand.ADD_NOTIFICATION, watched).data[:4] == OK
     tables = bench.ads.notifications
-    assert [tables[port].stats().notifications for port in (SYSTEM, IO, DEVICE)] == [1, 1, 1]
+    assert [tables[port].stats().notifications for port in (IO, DEVICE)] == [1, 1]
     bench.ads.client_gone(WAY)
-    assert [tables[port].stats().notifications for port in (SYSTEM, IO, DEVICE)] == [0, 0, 0]
+    assert [tables[port].stats().notifications for port in (IO, DEVICE)] == [0, 0]
 
 
 def test_sum_commands(bench):

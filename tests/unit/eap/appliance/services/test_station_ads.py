@@ -62,6 +62,7 @@ def test_every_net_id_of_its_own_answers(router, carrier, stations):
         (station.net_id, 0xFFFF, b"left"),
         (station.net_id, 10_000, b"left"),
         (station.net_id, 300, b"left"),
+        (station.ports[0].net_id, 10_000, b"left"),
         (station.ports[0].net_id, 0xFFFF, b"left/eap0"),
     ):
         info = ask(router, carrier, net_id, AmsCommand.READ_DEVICE_INFO, port=port)

@@ -13,10 +13,11 @@ from eap.appliance.services.routing.local_client import LocalClient
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.appliance.services.routing.service import Carrier, Service
+from eap.appliance.services.system_ads import SystemAds
 from tests.support.routing import KeepingCarrier, StubService
 
 
-@pytest.mark.parametrize("service", [EapAds, RouterAds, StubService])
+@pytest.mark.parametrize("service", [EapAds, RouterAds, SystemAds, StubService])
 def test_services(service):
     for method in ("answer", "client_gone"):
         asked = [*signature(getattr(Service, method)).parameters]
