@@ -28,9 +28,10 @@ from eap.pd.spec import PortKind
 def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
     """Return by its name what the router of each station is told; files are in *folder*."""
     loose = without_prefix(index)
+    known = {each.name: net_ids_of(each, loose) for each in index.plant.stations}
     return {
         station.name: RoutingSpec(
-            routes=(*_written(index, station, loose), *_derived(index, station, loose)),
+            routes=(*_written(index, station, loose), *_derived(index, station, known)),
             mqtt=tuple(broker_spec(each, folder) for each in brokers_of(station)),
             access=tuple(access_rules(index, station, loose)),
             users=tuple(
@@ -88,20 +89,25 @@ def _written(index: Index, station: Station, loose: set[str]) -> Iterator[RouteS
             )
 
 
-def _derived(index: Index, station: Station, loose: set[str]) -> Iterator[RouteSpec]:
-    """Yield routes to the stations that share an interface or a broker with *station*."""
+def _derived(
+    index: Index, station: Station, known: dict[str, list[tuple[str, int]]]
+) -> Iterator[RouteSpec]:
+    """Yield routes to the stations that share an interface or a broker with *station*.
+
+    *known* has NetIDs and octets to match for each station; its router's come first.
+    """
     written = {route.to for route in station.routes}
     for target in index.plant.stations:
         if target is station or target.name in written:
             continue
-        router = str(NetId.parse(target.net_id))
+        router = known[target.name][0][0]
         hop = find_hop(index, station, target)
         network = "" if hop else shared_network(station, target)
         if network:
             hop = HopSpec(DoorKind.MQTT, network, router)
         if hop is None:
             continue
-        for net_id, octets in net_ids_of(target, loose):
+        for net_id, octets in known[target.name]:
             yield RouteSpec(
                 name=target.name,
                 net_id=net_id,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from ipaddress import IPv4Address
 from typing import NamedTuple
 
@@ -83,12 +84,18 @@ def _hop(
 
 
 def _ip_hop(port: str, uri: InterfaceUri, target: InterfaceUri) -> tuple[HopSpec, int] | None:
-    here, there = IPv4Address(uri.host), IPv4Address(target.host)
+    here, there = _address(uri.host), _address(target.host)
     if there.is_unspecified or (not here.is_unspecified and here.is_loopback != there.is_loopback):
         return None
     kind = DoorKind.UDP if uri.scheme == target.scheme == "udp" else DoorKind.TCP
     hop = HopSpec(kind, port, f"{target.host}:{target.port or EAP_PORT}")
     return hop, (int(here) ^ int(there)).bit_length()
+
+
+@cache
+def _address(host: str) -> IPv4Address:
+    """Read an address that is one of very many pairs in a large plant."""
+    return IPv4Address(host)
 
 
 def _vid(port: Port) -> int:
