@@ -104,7 +104,7 @@ class AmsDiscovery:
         header = DiscoveryHeader(
             0, number, DiscoveryService.SERVER_INFO, self._routers[0].net_id, SYSTEM_PORT
         )
-        target = address or broadcast_of(self._own) or BROADCAST
+        target = address or network_of(self._own)
         try:
             self._sock.sendto(encode_discovery(header), (target, port))
             await asyncio.sleep(wait_s)
@@ -182,6 +182,12 @@ class AmsDiscovery:
             neighbour = Neighbour(name[:_MAX_NAME], net_id, sender, version_text)
             found.setdefault(net_id, neighbour)  # who answers for somebody else comes later
         return True
+
+
+def network_of(address: str) -> str:
+    """Return where all hosts beside *address* of this machine are asked."""
+    is_any = IPv4Address(address).is_unspecified  # whatever network is there then
+    return BROADCAST if is_any else broadcast_of(address) or BROADCAST
 
 
 def _answer(

@@ -97,24 +97,15 @@ class StationRoutes:
         self._spec = spec or self._spec
         self._take_spec()
         for added in self._store.load():
-            try:
-                self._take(added, Origin.ADDED)
-            except ControlError as exc:
-                logger.warning("added route %s is left out: %s", added.name, exc)
+            self._take(added)
             self._added[added] = True  # what cannot be today may be one after the next start
 
     def replace_spec(self, spec: RoutingSpec) -> None:
         """Go on with what another plant file says; added and learned routes stay."""
-        for key in self._written:
-            self.router.remove_route(*key)
-        self._written.clear()
         self._spec = spec
         self._take_spec()
         for each in self._added:  # one of them may have been hidden by a route of the same hop
-            try:
-                self._take(each, Origin.ADDED)
-            except ControlError as exc:
-                logger.warning("added route %s is left out: %s", each.name, exc)
+            self._take(each)
 
     def is_derived(self, route: Route) -> bool:
         """Tell whether a route follows from the ports of the plant."""
@@ -203,18 +194,29 @@ class StationRoutes:
             self._forget(each)
 
     def _take_spec(self) -> None:
+        """Have the routes of the plant file; those that are the same as before are not touched.
+
+        A connection to the next hop is closed when its last route goes.
+        """
+        before, self._written = self._written, {}
         for spec in self._spec.routes:
             try:
-                route = self._take(spec, Origin.STATIC)
+                route = self._route(spec, Origin.STATIC)
             except ControlError as exc:
                 logger.warning("route %s of the plant file is left out: %s", spec.name, exc)
-            else:
-                self._written[route.key] = spec
+                continue
+            self._written[route.key] = spec
+            if before.get(route.key) != spec:
+                self.router.add_route(route)
+        for key in before.keys() - self._written.keys():
+            self.router.remove_route(*key)
 
-    def _take(self, spec: RouteSpec, origin: Origin) -> Route:
-        route = self._route(spec, origin)
-        self.router.add_route(route)
-        return route
+    def _take(self, spec: RouteSpec) -> None:
+        """Have an added route."""
+        try:
+            self.router.add_route(self._route(spec, Origin.ADDED))
+        except ControlError as exc:
+            logger.warning("added route %s is left out: %s", spec.name, exc)
 
     def _route(self, spec: RouteSpec, origin: Origin) -> Route:
         try:

@@ -9,7 +9,8 @@ from importlib.metadata import version
 import pytest
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
+from eap.appliance.services import ams_discovery as module
+from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName, network_of
 from eap.appliance.services.neighbours import Neighbour
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import (
@@ -216,6 +217,13 @@ def test_answers_that_nobody_asked_for_are_not_taken(sock):
     scan = Scan(sock, answers)
     assert asyncio.run(scan.run()) == []
     assert scan.refused == [Refusal.AMS_DISCOVERY] * 3
+
+
+def test_a_network_is_asked_at_its_broadcast_address(monkeypatch):
+    assert network_of("127.9.8.7") == "127.255.255.255"
+    assert network_of("0.0.0.0") == "255.255.255.255"
+    monkeypatch.setattr(module, "broadcast_of", lambda address: "")
+    assert network_of("127.9.8.7") == "255.255.255.255"
 
 
 def test_a_network_that_cannot_be_asked_says_so(sock):

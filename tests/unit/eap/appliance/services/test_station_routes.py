@@ -180,6 +180,19 @@ def test_another_plant_file_takes_over_and_added_routes_stay():
     assert house.names() == {"plc": Origin.ADDED}
 
 
+def test_a_route_that_stays_is_not_touched():
+    """Its connection would be closed and opened again."""
+    saw = replace(STATIC, name="saw", net_id="10.0.0.3.1.1")
+    house = House(RoutingSpec(routes=(STATIC, saw)))
+    touched = []
+    house.router.add_route = lambda route: touched.append(route.name)
+    house.router.remove_route = lambda net_id, hop: touched.append(str(net_id))
+    house.routes.replace_spec(RoutingSpec(routes=(STATIC, replace(saw, timeout_ms=5))))
+    assert touched == ["saw"]
+    house.routes.replace_spec(RoutingSpec(routes=(STATIC,)))
+    assert touched == ["saw", "10.0.0.3.1.1"]
+
+
 def test_what_cannot_be_taken_is_told_and_kept_for_later(caplog):
     House().store.save([replace(PLC, hop=HopSpec(DoorKind.UDP, "gone", "1.1.1.1:1"))])
     house = House(RoutingSpec(routes=(replace(STATIC, hop=HopSpec(DoorKind.UDP, "gone", "x")),)))
