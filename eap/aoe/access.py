@@ -32,7 +32,7 @@ _RAW = frozenset((IndexGroup.RAW_COMMAND, IndexGroup.VOE, *SUM_COMMANDS))
 _FILES = frozenset((IndexGroup.FOE_OPEN_WRITE, IndexGroup.FOE_WRITE))
 _STATES = frozenset((IndexGroup.MASTER_STATE, IndexGroup.SLAVE_STATES))
 _OWN_HANDLES = frozenset((IndexGroup.RELEASE_HANDLE, IndexGroup.FOE_CLOSE))
-_LOOKUPS = frozenset(
+LOOKUPS = frozenset(
     (
         IndexGroup.SYMBOL_HANDLE,
         IndexGroup.VALUE_BY_NAME,
@@ -53,14 +53,14 @@ def service_of(operation: Operation) -> AccessService:
     """Return the kind of access that an operation needs."""
     if isinstance(operation, WriteControl):
         return AccessService.CONTROL
-    group, _ = place_of(operation)
-    if group in _RAW:
-        return AccessService.RAW
     if not isinstance(operation, Write | ReadWrite):
         return AccessService.READ
+    group = operation.group
+    if group in _RAW:
+        return AccessService.RAW
     if group in _FILES:
         return AccessService.FILES
-    if group in (_LOOKUPS if isinstance(operation, ReadWrite) else _OWN_HANDLES):
+    if group in (LOOKUPS if isinstance(operation, ReadWrite) else _OWN_HANDLES):
         return AccessService.READ
     return AccessService.CONTROL if group in _STATES else AccessService.WRITE
 

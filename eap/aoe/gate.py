@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from eap.aoe.access import AccessList, Grants
+from eap.aoe.access import LOOKUPS, AccessList, Grants
 from eap.aoe.action import Outcome, Trace
 from eap.aoe.ads_operation import AdsRefusedError, OperationOutcome
 from eap.aoe.ads_part import has_results
@@ -17,7 +17,7 @@ from eap.aoe.record import Record, describe
 from eap.aoe.refusal import Refusal
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
-from eap.codec.ads import AdsError
+from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand, AmsHeader
 
 MAX_ENTRIES = 4096
@@ -31,6 +31,19 @@ _READS = frozenset(
         AmsCommand.DELETE_NOTIFICATION,
     )
 )
+_READ_GROUPS = frozenset(
+    group.to_bytes(4, "little")
+    for group in (
+        *LOOKUPS,
+        IndexGroup.SUM_READ,
+        IndexGroup.SUM_READ_EX,
+        IndexGroup.SUM_READ_EX_2,
+        IndexGroup.SUM_ADD_NOTIFICATION,
+        IndexGroup.SUM_DELETE_NOTIFICATION,
+    )
+)
+"""Groups of a ReadWrite that only reads, whatever else it holds."""
+_GROUP = slice(AmsHeader.SIZE, AmsHeader.SIZE + 4)
 _LENGTH = 20
 """Where the header says how long the body is."""
 
@@ -86,7 +99,10 @@ class Gate:
         if header.command == AmsCommand.NOTIFICATION:
             return data, None  # nobody gets one who has not asked for it
         grants = self.access.grants(way, header.source, header.target, header.target_port)
-        if grants.may_read and header.command in _READS:
+        if grants.may_read and (
+            header.command in _READS
+            or (header.command == AmsCommand.READ_WRITE and data[_GROUP] in _READ_GROUPS)
+        ):
             return data, None
         try:
             request = parse_request(header.command, data[AmsHeader.SIZE :])
