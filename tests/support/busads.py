@@ -15,6 +15,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
@@ -145,8 +146,9 @@ def play(scene: Callable[[Client, FakeEngine], Awaitable[Any]], name: str = "dri
         link = EngineLink(engine.services, look_s=0.05)
         bus = BusClient(link, [PORT])
         told: list[tuple[Way, bytes]] = []
+        desk = MasterDesk(bus, PORT, "1.2.3")
         service = BusService(
-            bus, PORT, BUS, "1.2.3", lambda way, packet: told.append((way, packet))
+            bus, PORT, BUS, "1.2.3", lambda way, packet: told.append((way, packet)), desk
         )
         try:
             async with asyncio.timeout(20):

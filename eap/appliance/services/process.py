@@ -26,6 +26,7 @@ from eap.appliance.discards import DiscardCounters
 from eap.appliance.handover import (
     NO_DESCRIPTOR,
     Handover,
+    PortName,
     SocketKind,
     tell_ready,
 )
@@ -40,6 +41,7 @@ from eap.appliance.services.device_methods import DeviceMethods
 from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_client import EngineClient
 from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.gateway.opening import open_gateways
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
@@ -90,7 +92,8 @@ class Services:
         self._resources.callback(link.close)
         devices = self._devices(images, link)
         client = BusClient(link, [bus.owner for bus in self._handover.buses])
-        gateways = open_gateways(self._handover, client, RELEASE)
+        desks = {bus.owner: MasterDesk(client, bus.owner, RELEASE) for bus in self._handover.buses}
+        gateways = open_gateways(self._handover, client, desks)
         doors = open_doors(
             self._handover,
             devices.routers,
@@ -102,7 +105,7 @@ class Services:
         )
         brokers = open_mqtt_doors(self._handover.routing, devices.routers)
         audit = self._audit(devices.routers)
-        buses = self._buses(client, devices)
+        buses = self._buses(client, devices, desks)
         methods = self._methods(images, buses, devices)
         server = ControlServer(methods, buses)
         async with asyncio.TaskGroup() as group:
@@ -200,7 +203,9 @@ class Services:
                     found.setdefault(owner.station, shared.address)
         return found
 
-    def _buses(self, client: BusClient, devices: Devices) -> Buses:
+    def _buses(
+        self, client: BusClient, devices: Devices, desks: Mapping[PortName, MasterDesk]
+    ) -> Buses:
         handover = self._handover
         segments = {}
         for bus in handover.buses:
@@ -210,7 +215,9 @@ class Services:
         for bus in handover.buses:
             net_id = NetId.parse(handover.port(bus.owner).net_id)
             router = devices.routers[bus.owner.station]
-            service = BusService(client, bus.owner, net_id, RELEASE, router.send_notification)
+            service = BusService(
+                client, bus.owner, net_id, RELEASE, router.send_notification, desks[bus.owner]
+            )
             router.add_service(net_id, service)
         return Buses(handover.stations, client if handover.buses else None, segments)
 

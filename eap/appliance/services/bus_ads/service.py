@@ -14,9 +14,11 @@ from functools import partial
 from time import monotonic_ns
 from typing import TypeAlias
 
+from eap.aoe.access import place_of
 from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_master import MasterSpace
 from eap.aoe.ads_notifications import Client
+from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.ads_operation import (
     AdsRefusedError,
     Operation,
@@ -30,6 +32,7 @@ from eap.aoe.way import Way
 from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
 from eap.appliance.services.ads_requests import answer_request
+from eap.appliance.services.ads_result import ads_result
 from eap.appliance.services.bus_ads.master_side import MasterSide
 from eap.appliance.services.bus_ads.master_watch import MasterWatch, Send
 from eap.appliance.services.bus_ads.raw_command import RawCommands
@@ -38,10 +41,13 @@ from eap.appliance.services.bus_ads.slave_space import Asked
 from eap.appliance.services.bus_ads.slaves import Slaves
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.eap_ads import device_info
+from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.adsnotification import AddNotification
 from eap.errors import EapError
 from eap.ids import NetId
+from eap.od.model import OdState
 
 MASTER_PORT = 0xFFFF
 ANSWER_S = 4.0
@@ -64,23 +70,35 @@ class BusService:
         net_id: Of the port.
         release: Of this software, such as ``0.1.0``.
         send: Sends a notification to a client.
+        desk: The dictionary of the master.
 
     Attributes:
         ports: AMS ports that it answers for; it knows itself which slaves there are.
     """
 
     def __init__(
-        self, bus: BusClient, port: PortName, net_id: NetId, release: str, send: Send
+        self,
+        bus: BusClient,
+        port: PortName,
+        net_id: NetId,
+        release: str,
+        send: Send,
+        desk: MasterDesk,
     ) -> None:
         self.ports: Container[int] = range(1, MASTER_PORT + 1)
         self._bus = bus
         self._port = port
+        self._desk = desk
+        self._watched: set[int] = set()  # objects that notifications were asked for, ever
         self._master = MasterSide(bus, port)
         self._slaves = Slaves(bus, port, net_id, self._master)
         self._device = AdsDevice(
             device_info(_name(port), release),
             self._master.states,
-            [MasterSpace(self._master)],
+            [
+                MasterSpace(self._master),
+                ObjectSpace(desk.dictionary, lambda: OdState.OP, ads_result),
+            ],
             control=self._master.control,
         )
         notifications = self._device.notifications
@@ -111,10 +129,13 @@ class BusService:
         """End what goes on."""
         self._slaves.close()
         self._watch.close()
+        self._desk.close()
         self._master.close()
 
     async def _look(self) -> None:
         self._master.report = await self._bus.describe(self._port)
+        for index in self._watched:
+            await self._desk.refresh(index)
 
     def _performer(self, ams_port: int, report: BusReport, client: Client) -> Perform:
         """Return who does operations for a port, or raise AdsRefusedError if nobody has it."""
@@ -141,6 +162,11 @@ class BusService:
                 raise AdsRefusedError(AdsError.SIZE)
             return OperationOutcome(data=answer)
         self._master.report = report
+        group, offset = place_of(operation)
+        if group in ObjectSpace.groups:
+            await self._desk.refresh(offset >> 16)
+            if isinstance(operation, AddNotification):
+                self._watched.add(offset >> 16)
         return self._device.perform(operation, client, monotonic_ns())
 
     async def _perform_of_slave(

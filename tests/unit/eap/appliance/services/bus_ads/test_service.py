@@ -66,10 +66,48 @@ def test_master_by_port_0xffff():
         assert await client.good(MASTER, ReadState()) == AdsStates(AdsState.CONFIG, 2).encode()
         found = await client.read(MASTER, IndexGroup.SLAVE_ADDRESSES, 0)
         assert found == b"".join(n.to_bytes(2, "little") for n in (1001, 1002, 1003))
-        # It has no dictionary yet, and says so.
-        assert (await client.do(MASTER, VENDOR)).result == AdsError.INDEX_GROUP
 
     play(scene, "coe")
+
+
+def test_dictionary_of_the_master():
+    async def scene(client, engine):
+        assert (
+            await client.read(MASTER, IndexGroup.SDO, 0x1008 << 16) == b"EtherCAT master left/bus0"
+        )
+        assert await client.read(MASTER, IndexGroup.SDO, 0x8002_0001) == b"\xeb\3"
+        whole = await client.read(MASTER, IndexGroup.SDO, 0xF020_0100)
+        assert whole.hex() == "0300" + "e903ea03eb03"
+        lists = await client.read(MASTER, IndexGroup.OBJECT_LIST, 1 << 16)
+        assert b"\x02\xa0" in lists
+        described = await client.read(MASTER, IndexGroup.OBJECT_DESCRIPTION, 0xA000 << 16)
+        assert described.endswith(b"Diagnosis data slave 0")
+        entry = await client.read(MASTER, IndexGroup.ENTRY_DESCRIPTION, 0xA000_0002)
+        assert entry.endswith(b"AL control")
+        missing = await client.do(MASTER, Read(IndexGroup.SDO, 0x8003_0001, 4))
+        assert missing.result == AdsError.NOT_FOUND
+
+    play(scene, "coe")
+
+
+def test_dictionary_of_the_master_is_live():
+    async def scene(client, engine):
+        await client.good(MASTER, Write(IndexGroup.SDO, 0xA000_0002, b"\1\0"))
+
+        async def is_init():
+            return await client.read(MASTER, IndexGroup.SDO, 0xA000_0001) == b"\1\0"
+
+        await until(is_init)
+        request = Write(IndexGroup.SDO, 0xF002_0001, b"\0\0")
+        await client.good(MASTER, request)
+
+        async def is_found():
+            found = await client.read(MASTER, IndexGroup.SDO, 0xF002_0003)
+            return found == bytes((0, 0, 0, 0, 1, 0))
+
+        await until(is_found)
+
+    play(scene)
 
 
 def test_states_are_requested():

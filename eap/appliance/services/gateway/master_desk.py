@@ -1,0 +1,49 @@
+"""The dictionary of a master, for all ways by which it is asked for: the gateway, and ADS."""
+
+from __future__ import annotations
+
+import platform
+
+from eap.appliance.handover import PortName
+from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.master_values import MasterView
+from eap.device.eap_content import Identity
+from eap.device.master_dictionary import MasterDictionary
+
+_OF_REGISTERS = range(0x9000, 0xB000)
+"""Objects that show registers of slaves."""
+
+
+class MasterDesk:
+    """The dictionary of the master behind one bus port, and the view that it shows.
+
+    Args:
+        client: Asks the engine.
+        port: Which bus.
+        release: Of this software.
+
+    Attributes:
+        dictionary: To be served after :meth:`refresh`.
+    """
+
+    def __init__(self, client: BusClient, port: PortName, release: str) -> None:
+        self._view = MasterView(client, port)
+        identity = Identity(
+            device_name=f"EtherCAT master {port.station}/{port.port}",
+            hardware_version=platform.machine(),
+            software_version=release,
+        )
+        self.dictionary = MasterDictionary(self._view, identity)
+
+    async def refresh(self, index: int) -> None:
+        """See to it that what the object at *index* shows is not old."""
+        await self._view.refresh(with_registers=index in _OF_REGISTERS)
+
+    def open_session(self, room: int) -> MasterSession:
+        """Begin a client's session with the dictionary."""
+        return MasterSession(self.dictionary, room, self.refresh)
+
+    def close(self) -> None:
+        """Wait for nothing any more that was asked for."""
+        self._view.close()
