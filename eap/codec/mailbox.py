@@ -6,6 +6,7 @@ stations and to a mailbox gateway (ETG.8200).
 
 from __future__ import annotations
 
+import struct
 from enum import IntEnum
 from typing import Annotated
 
@@ -148,3 +149,46 @@ def encode_frame(header: MailboxHeader, body: Buffer) -> bytes:
     """
     message = encode_message(header, body)
     return EtherCatHeader(len(message), type=FrameType.MAILBOX).encode() + message
+
+
+def encode_aoe_frame(counter: int, packet: bytes) -> bytes:
+    """Return a whole frame of type 5 to address 0 around an AMS packet.
+
+    These are the frames that stations send each other; this does in one step what
+    :func:`encode_frame` does, and raises the same.
+    """
+    size = len(packet)
+    length = size + MailboxHeader.SIZE
+    if length >> _LENGTH_BITS:
+        header = MailboxHeader(0, type=MailboxType.AOE, counter=counter)
+        return encode_frame(header, packet)
+    word = length | FrameType.MAILBOX << _TYPE_AT
+    return _HEADS.pack(word, size, 0, 0, MailboxType.AOE | counter << _COUNTER_AT) + packet
+
+
+def aoe_packet_in(data: Buffer) -> bytes | None:
+    """Return the AMS packet in a whole frame of type 5 to address 0, None for any other frame.
+
+    What is wrong with a frame, :func:`decode_frame` says.
+    """
+    if len(data) < _HEADS.size:
+        return None
+    word, size, address, _, kind = _HEADS.unpack_from(data)
+    end = _HEADS.size + size
+    if (
+        word >> _TYPE_AT != FrameType.MAILBOX
+        or kind & _TYPE_MASK != MailboxType.AOE
+        or address
+        or end > EtherCatHeader.SIZE + (word & _LENGTH_MASK)
+        or end > len(data)
+    ):
+        return None
+    return bytes(data[_HEADS.size : end])
+
+
+_HEADS = struct.Struct("<HHHBB")
+"""Both headers: Length and Type of the frame; length, address, channel and priority, type and
+counter of the message."""
+_LENGTH_BITS, _TYPE_AT = 11, 12
+_LENGTH_MASK = (1 << _LENGTH_BITS) - 1
+_TYPE_MASK, _COUNTER_AT = 0x0F, 4

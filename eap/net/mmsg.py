@@ -139,7 +139,10 @@ class ReceiveBatch:
 
     def position(self, view: memoryview) -> int | None:
         """Return which message of the batch *view* is, None if it is no view of this batch."""
-        return next((n for n, known in enumerate(self.views) if known is view), None)
+        views = self.views
+        if view is views[0]:  # mostly one comes alone
+            return 0
+        return next((n for n, known in enumerate(views) if known is view), None)
 
     def sender(self, view: memoryview) -> tuple[str, int]:
         """Return IPv4 address and port of who sent *view*, as long as the batch holds it."""

@@ -58,7 +58,7 @@ class FrameIntake:
             reason: Refusal | None = Refusal.STALE
         elif size < EtherCatHeader.SIZE:
             reason = Refusal.TRUNCATED
-        elif EtherCatHeader.decode(data).type == FrameType.MAILBOX:
+        elif data[1] >> 4 == FrameType.MAILBOX:  # the four upper bits of the header
             reason = self.mailbox(data, size, at_ns, origin)
         else:
             reason = Refusal.WRONG_TYPE

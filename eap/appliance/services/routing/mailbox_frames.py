@@ -11,7 +11,7 @@ from devicebus.mailbox.counter import next_counter
 from eap.appliance.discards import Refusal
 from eap.codec.ams import AmsHeader
 from eap.codec.ethercat import EtherCatHeader
-from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame, encode_frame
+from eap.codec.mailbox import MailboxHeader, aoe_packet_in, decode_frame, encode_aoe_frame
 from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
 
@@ -21,15 +21,16 @@ _MAX_PEERS = 1024
 
 def aoe_packet(data: Buffer) -> bytes | Refusal:
     """Return the AMS packet in a frame of type 5, or why there is none for a station."""
+    packet = aoe_packet_in(data)
+    if packet is not None and len(packet) >= AmsHeader.SIZE:
+        return packet
     try:
-        header, body = decode_frame(data)
-        if header.type is not MailboxType.AOE or header.address:
-            return Refusal.MAILBOX
+        decode_frame(data)
     except MalformedError:
         return Refusal.MAILBOX  # of a protocol that nobody knows
     except CodecError:
         return Refusal.TRUNCATED
-    return bytes(body) if len(body) >= AmsHeader.SIZE else Refusal.MAILBOX
+    return Refusal.MAILBOX
 
 
 class MailboxCounters:
@@ -48,4 +49,4 @@ class MailboxCounters:
         self._latest[peer] = counter
         if len(self._latest) > _MAX_PEERS:
             self._latest.popitem(last=False)
-        return encode_frame(MailboxHeader(0, 0, type=MailboxType.AOE, counter=counter), packet)
+        return encode_aoe_frame(counter, packet)

@@ -83,7 +83,8 @@ class ChannelCarrier:
         sent = []
         for frame in frames:
             buffer = bytearray(header + frame)
-            buffer += bytes(max(0, self._channel.minimum_size - len(buffer)))
+            if len(buffer) < self._channel.minimum_size:
+                buffer += bytes(self._channel.minimum_size - len(buffer))
             sent.append(OutFrame(buffer, len(header), connection))
         failed = self._channel.send(sent, monotonic_ns())
         return "the network took no frame" if failed else None

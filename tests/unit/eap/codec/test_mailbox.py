@@ -10,8 +10,10 @@ from eap.codec.mailbox import (
     MailboxErrorReply,
     MailboxHeader,
     MailboxType,
+    aoe_packet_in,
     decode_frame,
     decode_message,
+    encode_aoe_frame,
     encode_frame,
     encode_message,
 )
@@ -90,3 +92,29 @@ def test_error_reply_names_its_reason() -> None:
     assert MailboxError.text_of(reply.detail).startswith("UNSUPPORTED_PROTOCOL, it does not speak")
     assert MailboxError.text_of(0x99) == MailboxError.name_of(0x99) == "0x0099"
     assert MailboxError.name_of(0x1234) == "0x1234"
+
+
+@given(st.integers(0, 7), st.binary(max_size=2100))
+def test_aoe_frame_is_made_in_one_step_as_in_two(counter: int, packet: bytes) -> None:
+    header = MailboxHeader(0, type=MailboxType.AOE, counter=counter)
+    try:
+        frame = encode_frame(header, packet)
+    except CodecError:
+        with pytest.raises(CodecError):
+            encode_aoe_frame(counter, packet)
+        return
+    assert encode_aoe_frame(counter, packet) == frame
+    assert aoe_packet_in(frame + b"padding") == aoe_packet_in(memoryview(frame)) == packet
+
+
+@given(headers, st.binary(max_size=64), st.integers(0, 80), st.binary(max_size=8))
+def test_aoe_packet_is_found_where_a_frame_has_one(
+    header: MailboxHeader, body: bytes, cut: int, damage: bytes
+) -> None:
+    frame = encode_frame(header, body)[:cut] + damage
+    try:
+        found, inside = decode_frame(frame)
+        expected = inside if found.type is MailboxType.AOE and not found.address else None
+    except CodecError:
+        expected = None
+    assert aoe_packet_in(frame) == expected
