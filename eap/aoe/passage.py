@@ -294,6 +294,8 @@ class Passage:
         route = pending.route
         took_ns = now_ns - pending.at_ns
         hop = None
+        if error_code and not why:
+            why = f"{AdsError.words_of(error_code)} from a service of this station"
         text = f"{describe(pending.header, way)}: {why}" if why else ""
         if route is not None:
             hop = route.hop
@@ -305,9 +307,7 @@ class Passage:
             traffic.answer(len(packet), took_ns)
         connection = self._record.connections.of(way, now_ns)
         if error_code:
-            connection.fail(
-                text or f"{AdsError.words_of(error_code)} from a service of this station"
-            )
+            connection.fail(text)
         connection.answer(len(packet), took_ns)
         self._record.enter(
             Trace(now_ns, Outcome.ANSWERED, way, hop, pending.header, error_code, took_ns, text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import re
 
 import pytest
 
@@ -46,20 +47,34 @@ def test_rights_of_the_broker_are_as_the_page_says(farm, tmp_path):
 
 def test_examples_of_the_page(farm, tmp_path):
     settings = (ROOT / "config" / "mosquitto" / "open.conf").read_text().splitlines()
-    assert f"listener 1883 {BROKER}" in settings
-    for line in ("mosquitto -c config/mosquitto/open.conf\n", "eapctl run config/mqtt.yaml\n"):
-        assert line in PAGE.read_text()
     settings.remove(f"listener 1883 {BROKER}")
+    (start, commands) = re.findall(r"```sh\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert start == "mosquitto -c config/mosquitto/open.conf\neapctl run config/mqtt.yaml\n"
     with broker(tmp_path, BROKER, *settings):
-        farm.run(ROOT / "config" / "mqtt.yaml")
+        plant = farm.run(ROOT / "config" / "mqtt.yaml")
         until_read(SOUTH, by=NORTH)
-        test = doctest.DocTestParser().get_doctest(PAGE.read_text(), {}, PAGE.name, PAGE.name, 0)
-        told: list[str] = []
-        result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(
-            test, out=told.append
-        )
-        assert not result.failed, "".join(told)
-        assert result.attempted == 6
+        run_examples()
+        told = [plant.command(*line.split()[1:]) for line in commands.splitlines()]
+    routes, trace, scan = told
+    assert re.search(r"north +south +127.0.5.2.\*.\* +mqtt:works +127.0.5.2.1.1 +up", routes)
+    for line in re.findall(
+        r"^ .*(?:south: mqtt|it is here|RUN).*$", PAGE.read_text(), re.MULTILINE
+    ):
+        assert without_times(line) in without_times(trace)
+    assert 'pyads.Connection("127.0.5.2.3.1", 1001, "127.0.5.1")' in scan
+
+
+def run_examples() -> None:
+    test = doctest.DocTestParser().get_doctest(PAGE.read_text(), {}, PAGE.name, PAGE.name, 0)
+    told: list[str] = []
+    flags = doctest.NORMALIZE_WHITESPACE
+    result = doctest.DocTestRunner(optionflags=flags).run(test, out=told.append)
+    assert not result.failed, "".join(told)
+    assert result.attempted == 6
+
+
+def without_times(text: str) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"[0-9.]+ (?:µs|ms|s)\b", "", text))
 
 
 def test_rights_on_the_page_are_those_of_the_example():

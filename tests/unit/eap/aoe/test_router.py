@@ -72,6 +72,16 @@ def test_what_a_service_says_of_a_refusal_is_kept() -> None:
     assert station.events() == [(Outcome.ANSWERED, f"READ of {DEVICE} for {CLIENT} ({TCP}): {why}")]
 
 
+def test_error_of_a_service_that_gives_no_reason_has_words() -> None:
+    station = Station()
+    delivered = station.delivered(Ams(DEVICE, CLIENT), TCP)
+    station.router.receive_answer(delivered.ticket, AmsAnswer(error_code=4), 5)
+    ((outcome, text),) = station.events()
+    assert outcome is Outcome.ANSWERED
+    assert text.startswith(f"READ of {DEVICE} for {CLIENT} ({TCP}): ")
+    assert text.endswith(" from a service of this station")
+
+
 @pytest.mark.parametrize(
     ("target", "error", "text"),
     [
