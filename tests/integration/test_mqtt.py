@@ -23,6 +23,7 @@ from tests.support.mqtthalls import (
     until_read,
     write_plant,
 )
+from tests.support.namespaces import row
 
 pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 
@@ -112,3 +113,26 @@ def test_client_of_another_make_is_served_and_hostile_ones_are_not(halls):
         assert peer.ask(f"{SOUTH}.1.1", asked).body[:8] == bytes(4) + b"\4\0\0\0"
     until_read(SOUTH, by=NORTH)
     assert north.pid("services") == before
+
+
+@pytest.mark.root
+def test_halls_without_a_way_between_their_networks_meet_at_the_broker(tmp_path):
+    """The broker's host has a leg in both networks and forwards nothing."""
+    with row(3) as (north, middle, south), plants() as farm:
+        middle.ip("addr", "add", "10.88.171.1/24", "dev", "east0")
+        south.ip("addr", "add", "10.88.171.2/24", "dev", "west0")
+        with broker(tmp_path, "0.0.0.0", prefix=middle.prefix) as server:
+            for name, address, own, other in (
+                ("north", "10.88.170.1", north, "10.88.170.2"),
+                ("south", "10.88.171.2", south, "10.88.171.1"),
+            ):
+                plant = write_plant(farm.folder, name, address, f'mqtt: "mqtt://{other}"')
+                farm.run(plant, prefix=own.prefix)
+            until_read("10.88.171.2", by="10.88.170.1", inside=north)
+            until_read("10.88.170.1", by="10.88.171.2", inside=south)
+            with pytest.raises(OSError, match="unreachable"):
+                read("10.88.171.2", by="10.88.171.2", inside=north)
+            server.stop()
+            wait_until(lambda: read("10.88.171.2", "10.88.170.1", inside=north) == -UNREACHABLE)
+            server.start()
+            until_read("10.88.171.2", by="10.88.170.1", inside=north)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
-import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -26,12 +26,15 @@ class Broker:
         folder: For its files.
         address: To listen on.
         settings: Lines of its configuration; without any, it lets everybody in.
+        prefix: Words that start it somewhere else.
     """
 
-    def __init__(self, folder: Path, address: str, *settings: str, port: int = 1883) -> None:
-        self.address = address
-        self.port = port
+    def __init__(
+        self, folder: Path, address: str, *settings: str,
+        port: int = 1883, prefix: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         self.log = folder / "mosquitto.log"
+        self._prefix = prefix
         self._process: subprocess.Popen[bytes] | None = None
         self._config = folder / "mosquitto.conf"
         lines = [f"listener {port} {address}", "persistence false", "user root", "log_type all",
@@ -42,20 +45,15 @@ class Broker:
         """Start it and wait until it listens."""
         program = mosquitto()
         assert program is not None, "mosquitto is not installed"
-        with self.log.open("ab") as log:
+        with self.log.open("wb") as log:
             self._process = subprocess.Popen(
-                [program, "-c", str(self._config)], stdout=log, stderr=log
+                [*self._prefix, program, "-c", str(self._config)], stdout=log, stderr=log
             )
         limit = time.monotonic() + 10
-        while True:
-            assert self._process.poll() is None, self.log.read_text()
-            assert time.monotonic() < limit, self.log.read_text()
-            try:
-                socket.create_connection((self.address, self.port), 1).close()
-            except OSError:
-                time.sleep(0.02)
-            else:
-                return
+        while not re.search("mosquitto version .* running", text := self.log.read_text()):
+            assert self._process.poll() is None, text
+            assert time.monotonic() < limit, text
+            time.sleep(0.02)
 
     def stop(self) -> None:
         """Kill it: what it would still like to say is not said."""
@@ -66,10 +64,12 @@ class Broker:
 
 
 @contextmanager
-def broker(folder: Path, address: str, *settings: str, port: int = 1883) -> Iterator[Broker]:
+def broker(
+    folder: Path, address: str, *settings: str, port: int = 1883, prefix: Sequence[str] = ()
+) -> Iterator[Broker]:
     """Run a broker."""
     folder.mkdir(parents=True, exist_ok=True)
-    made = Broker(folder, address, *settings, port=port)
+    made = Broker(folder, address, *settings, port=port, prefix=prefix)
     made.start()
     try:
         yield made

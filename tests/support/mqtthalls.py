@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tests.support.aoe import packet, read_body
 from tests.support.appliance import wait_until
+from tests.support.namespaces import Namespace
 
 ROOT = Path(__file__).parents[2]
 BROKER = "127.0.5.9"
@@ -41,13 +42,16 @@ def write_plant(folder: Path, name: str, address: str, broker: str = "") -> Path
     return path
 
 
-def read(address: str, by: str, offset: int = VENDOR) -> int:
+def read(address: str, by: str, offset: int = VENDOR, *, inside: Namespace | None = None) -> int:
     """Return an object of the first slave at *address*, asked by a tool at *by*.
 
     What cannot be read is its error code, below zero.
     """
     asked = packet(f"{address}.3.1", READ, read_body(offset, 4), port=1001)
-    with socket.create_connection((by, 48898), 10) as connection:
+    kind = socket.AF_INET, socket.SOCK_STREAM
+    with socket.socket(*kind) if inside is None else inside.socket(*kind) as connection:
+        connection.settimeout(10)
+        connection.connect((by, 48898))
         connection.sendall(struct.pack("<HI", 0, len(asked)) + asked)
         with connection.makefile("rb") as stream:
             _, length = struct.unpack("<HI", stream.read(6))
@@ -59,6 +63,6 @@ def read(address: str, by: str, offset: int = VENDOR) -> int:
     return -result if result else int.from_bytes(body[8 : 8 + size], "little")
 
 
-def until_read(address: str, by: str) -> None:
+def until_read(address: str, by: str, *, inside: Namespace | None = None) -> None:
     """Wait until the drive at *address* answers a tool at *by*."""
-    wait_until(lambda: read(address, by) == VENDOR_OF_DRIVE)
+    wait_until(lambda: read(address, by, inside=inside) == VENDOR_OF_DRIVE)
