@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from enum import StrEnum, auto
 from typing import NamedTuple, TypeAlias
 
 from eap.aoe.answer import AmsAnswer, response_to
@@ -80,23 +81,33 @@ class Closed(NamedTuple):
     connection: str
 
 
+class Drop(StrEnum):
+    """Why a message came to nothing."""
+
+    TOPIC = auto()
+    """Its topic means nothing here, or it has no business there: a request among answers, a packet
+    that the broker had kept."""
+    BROKEN = auto()
+    """Neither a packet, nor what a router tells of itself."""
+    LENGTH = auto()
+    """Longer than any packet may be; a request was answered so."""
+    FULL = auto()
+    """It tells of one router too many."""
+
+
+class Dropped(NamedTuple):
+    """A message came to nothing."""
+
+    reason: Drop
+
+
 class Warn(NamedTuple):
     """Something for people, once for each kind of thing."""
 
     text: str
 
 
-Action: TypeAlias = Publish | Subscribe | Arrived | HopDown | HopUp | Closed | Warn
-
-
-class NetworkStats(NamedTuple):
-    """How things are."""
-
-    is_connected: bool
-    routers: int
-    """That are there, without this one."""
-    dropped: dict[str, int]
-    """Messages that came to nothing, by the reason."""
+Action: TypeAlias = Publish | Subscribe | Arrived | HopDown | HopUp | Closed | Dropped | Warn
 
 
 class _Sender(NamedTuple):
@@ -131,7 +142,6 @@ class MqttNetwork:
         self._told_at_ns = 0
         self._tell_at_ns: int | None = None
         self._refresh_at_ns = 0
-        self._dropped: dict[str, int] = {}
         self._said: set[str] = set()
 
     def will(self) -> Publish:
@@ -162,19 +172,19 @@ class MqttNetwork:
         """
         parsed = self._topics.parse(topic)
         if parsed is None:
-            return self._drop("topic nobody knows", topic[:80])
+            return self._drop(Drop.TOPIC, "topic nobody knows", topic[:80])
         net_id, kind = parsed
         try:
             if kind is TopicKind.INFO:
                 return self._hear_of(net_id, payload, now_ns, is_retained=is_retained)
             if net_id != self._net_id:
-                return self._drop("topic nobody knows", topic[:80])
+                return self._drop(Drop.TOPIC, "topic nobody knows", topic[:80])
             if is_retained:  # it would be done again at each connection
-                return self._drop("retained packet", topic)
+                return self._drop(Drop.TOPIC, "retained packet", topic)
             return self._take(kind, decode_payload(payload), now_ns)
         except CodecError as exc:
             what = "info" if kind is TopicKind.INFO else "packet"
-            return self._drop(f"broken {what}", f"{topic}: {exc}")
+            return self._drop(Drop.BROKEN, f"broken {what}", f"{topic}: {exc}")
 
     def message_for(self, connection: str, packet: bytes) -> Publish:
         """Return the message that brings *packet* to the router with the NetID *connection*."""
@@ -207,11 +217,6 @@ class MqttNetwork:
             actions.append(self._tell(now_ns))
         return actions
 
-    def stats(self) -> NetworkStats:
-        """Return how things are."""
-        is_connected = self._connected_at_ns is not None
-        return NetworkStats(is_connected, self._peers.count_online(), dict(self._dropped))
-
     def _hear_of(
         self, net_id: NetId, payload: bytes, now_ns: int, *, is_retained: bool
     ) -> list[Action]:
@@ -221,7 +226,7 @@ class MqttNetwork:
         address = str(net_id)
         change = self._peers.tell(net_id, info, now_ns)
         if change is Change.IGNORED:
-            return self._drop("one router too many", address)
+            return self._drop(Drop.FULL, "one router too many", address)
         if change is Change.DOWN:
             return [HopDown(address, "it told that it is gone"), Closed(address)]
         actions: list[Action] = [HopUp(address)] if change is Change.UP else []
@@ -243,15 +248,12 @@ class MqttNetwork:
         header = AmsHeader.decode(packet)
         if kind is TopicKind.ANSWERS and not comes_back(packet):
             # Brokers let some write there who may not ask anything.
-            return self._drop("request on the topic for answers", str(header.source))
+            return self._drop(Drop.TOPIC, "request on the topic for answers", str(header.source))
         address = self._peers.address_of(header.source)
         actions = self._hear(address, payload, now_ns)
-        if is_request(packet) and self._spec.is_unidirectional:
-            text = f"{header.source}: nothing may be asked from there, 'unidirectional' says"
-            actions += self._drop("request to who answers nobody", text)
-            return actions + self._refuse(header, address, AdsError.ACCESS_DENIED)
         if len(packet) > MAX_PACKET:
-            actions += self._drop("too long a packet", f"{header.source}: {len(packet)} octets")
+            text = f"{header.source}: {len(packet)} octets"
+            actions += self._drop(Drop.LENGTH, "too long a packet", text)
             return actions + self._refuse(header, address, AdsError.AMS_LENGTH)
         return [*actions, Arrived(self._ports.inward(packet), address)]
 
@@ -298,9 +300,9 @@ class MqttNetwork:
         self._tell_at_ns = max(now_ns, self._told_at_ns + _ANNOUNCE_GAP_NS)
         return [self._tell(now_ns)] if now_ns >= self._tell_at_ns else []
 
-    def _drop(self, reason: str, text: str) -> list[Action]:
-        self._dropped[reason] = self._dropped.get(reason, 0) + 1
-        return self._warn(reason, f"{reason}: {text}; from now on these are only counted")
+    def _drop(self, reason: Drop, kind: str, text: str) -> list[Action]:
+        said = self._warn(kind, f"{kind}: {text}; from now on these are only counted")
+        return [Dropped(reason), *said]
 
     def _warn(self, kind: str, text: str) -> list[Action]:
         if kind in self._said:

@@ -50,6 +50,12 @@ class Refusal(StrEnum):
     """An answer came by AMS/TCP, and nobody had asked."""
     AMS_DISCOVERY = auto()
     """A datagram came to UDP 48899 that asks for nothing that there is."""
+    MQTT_TOPIC = auto()
+    """A message by MQTT on a topic that means nothing here, or that it has no business on."""
+    MQTT_BROKEN = auto()
+    """A message by MQTT that is neither a packet nor what a router tells of itself."""
+    MQTT_FULL = auto()
+    """One router or one message by MQTT more than there is room for."""
 
 
 _REFUSALS = tuple(Refusal)

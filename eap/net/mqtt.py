@@ -50,6 +50,8 @@ class Handlers(NamedTuple):
     """The connection is gone; why, for people."""
     message: Callable[[str, bytes, bool], None]
     """Topic, payload, and whether the broker had kept it."""
+    overrun: Callable[[], None]
+    """A message found no room."""
 
 
 class MqttLink:
@@ -174,12 +176,9 @@ class MqttLink:
             raise first from first.__cause__
 
     async def _read(self, client: Client) -> None:
-        has_said = False
+        client.inbox.overrun = self._handlers.overrun
         async for message in client.messages:
             self._handlers.message(message.topic.value, message.payload, message.retain)
-            if client.inbox.discarded and not has_said:
-                has_said = True
-                logger.warning("%s sends more than can be taken; some is lost", self._name)
 
     async def _write(self, client: Client, group: asyncio.TaskGroup) -> None:
         room = asyncio.Semaphore(_UNCONFIRMED)

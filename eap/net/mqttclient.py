@@ -8,10 +8,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import aiomqtt
 from aiomqtt import Message, MqttError
+from aiomqtt.exceptions import MqttConnectError
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
@@ -39,9 +40,14 @@ _UNSPECIFIED = 0x80
 
 
 class Inbox(asyncio.Queue[Message]):
-    """Messages that wait; what has no room is thrown away and counted."""
+    """Messages that wait; what has no room is thrown away.
 
-    discarded = 0
+    Attributes:
+        overrun: Called for each that is.
+        octets: Of all that wait.
+    """
+
+    overrun: Callable[[], None] | None = None
     octets = 0
 
     def full(self) -> bool:
@@ -50,10 +56,10 @@ class Inbox(asyncio.Queue[Message]):
 
     def put_nowait(self, item: Message) -> None:
         """Take *item* if there is room."""
-        if self.full():
-            self.discarded += 1
-        else:
+        if not self.full():
             super().put_nowait(item)
+        elif self.overrun is not None:
+            self.overrun()
 
     def _put(self, item: Message) -> None:
         self.octets += len(item.payload)
@@ -174,13 +180,14 @@ def make_client(
 
 def is_too_new(error: MqttError) -> bool:
     """Say whether the broker may speak another version; some of them just say nothing."""
-    code = _code(error)
-    return code in _UNSUPPORTED or (code is None and "timed out" in str(error))
+    if isinstance(error, MqttConnectError):
+        return _code(error) in _UNSUPPORTED
+    return "timed out" in str(error)
 
 
 def describe(error: MqttError, client: Client, user: str) -> str:
     """Return in words why there is no connection."""
-    if _code(error) in _LOGIN:
+    if isinstance(error, MqttConnectError) and _code(error) in _LOGIN:
         if not user:
             return "it wants to know who connects: give 'user' and 'password_file', or 'tls'"
         return f"it refuses user {user!r} or the password: look at 'user' and 'password_file'"

@@ -30,7 +30,7 @@ pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
 
 STATUS = 0x60410000
-UNREACHABLE, DENIED = 0x1B, 0x723
+NO_ROUTE, UNREACHABLE, DENIED = 7, 0x1B, 0x723
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +113,18 @@ def test_client_of_another_make_is_served_and_hostile_ones_are_not(halls):
         assert peer.ask(f"{SOUTH}.1.1", asked).body[:8] == bytes(4) + b"\4\0\0\0"
     until_read(SOUTH, by=NORTH)
     assert north.pid("services") == before
+
+
+def test_one_way_hall_asks_and_is_not_asked(server, halls):
+    with plants() as farm:
+        line = f'mqtt: "mqtt://{BROKER}", unidirectional: true'
+        farm.run(write_plant(farm.folder, "office", "127.0.5.3", line))
+        until_read(NORTH, by="127.0.5.3")
+        asked = Ams("127.0.5.3.3.1:1001", "9.9.9.9.1.1:800", body=bytes(12))
+        with PahoPeer(BROKER, "works", "9.9.9.9.1.1") as peer:
+            peer.wait_for_router("127.0.5.3.1.1", "office")
+            assert peer.ask("127.0.5.3.1.1", asked) == asked.answer(b"", DENIED)
+        assert read("127.0.5.3", by=NORTH) == -NO_ROUTE
 
 
 @pytest.mark.root

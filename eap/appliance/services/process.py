@@ -103,7 +103,7 @@ class Services:
             self._link,
             self._resources,
         )
-        brokers = open_mqtt_doors(self._handover.routing, devices.routers)
+        brokers = open_mqtt_doors(self._handover.routing, devices.routers, self._counters)
         audit = self._audit(devices.routers)
         buses = self._buses(client, devices, desks)
         methods = self._methods(images, buses, devices)

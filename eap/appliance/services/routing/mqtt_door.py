@@ -4,38 +4,56 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from time import monotonic_ns
 
 from eap.aoe.mqtt_network import (
     Action,
     Arrived,
     Closed,
+    Drop,
+    Dropped,
     HopDown,
     HopUp,
     MqttNetwork,
-    NetworkStats,
     Publish,
     Subscribe,
 )
-from eap.aoe.spec import DoorKind, MqttSpec, RoutingSpec
+from eap.aoe.spec import MqttSpec, RoutingSpec
 from eap.aoe.way import Door
+from eap.appliance.discards import DiscardCounters, Refusal
+from eap.appliance.services.routing.planned import mqtt_door
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.net.mqtt import Handlers, MqttLink
+
+_REFUSALS = {
+    Drop.TOPIC: Refusal.MQTT_TOPIC,
+    Drop.BROKEN: Refusal.MQTT_BROKEN,
+    Drop.LENGTH: Refusal.AMS_LENGTH,
+    Drop.FULL: Refusal.MQTT_FULL,
+}
 
 logger = logging.getLogger(__name__)
 
 
 def open_mqtt_doors(
-    routing: Mapping[str, RoutingSpec], routers: Mapping[str, StationRouter]
+    routing: Mapping[str, RoutingSpec],
+    routers: Mapping[str, StationRouter],
+    counters: DiscardCounters,
 ) -> list[MqttDoor]:
     """Return the doors of all stations to brokers, to be served.
+
+    Args:
+        routing: What the stations are told, by their names.
+        routers: Of the stations.
+        counters: Of what is not taken.
 
     Raises:
         EnvironmentalError: there are some, and MQTT is not installed.
     """
     return [
-        MqttDoor(spec, routers[station], learns=told.learn)
+        MqttDoor(spec, routers[station], partial(counters.count, station), learns=told.learn)
         for station, told in routing.items()
         for spec in told.mqtt
     ]
@@ -49,15 +67,20 @@ class MqttDoor:
     Args:
         spec: The network and its broker.
         router: Of the station.
+        refuse: Counts a message that comes to nothing.
         learns: Whether routers that tell of themselves become routes.
 
     Raises:
         EnvironmentalError: MQTT is not installed.
     """
 
-    def __init__(self, spec: MqttSpec, router: StationRouter, *, learns: bool = True) -> None:
-        self.name = f"{DoorKind.MQTT}:{spec.network}"
+    def __init__(
+        self, spec: MqttSpec, router: StationRouter, refuse: Callable[[Refusal], None], *,
+        learns: bool = True,
+    ) -> None:  # fmt: skip
+        self.name = mqtt_door(spec)
         self._router = router
+        self._refuse = refuse
         self._network = MqttNetwork(
             spec, router.net_id, router.name, door=self.name, table=router.table, learns=learns
         )
@@ -65,7 +88,7 @@ class MqttDoor:
             spec,
             spec.client_id or f"eap-{router.net_id}-{spec.network}",
             will=self._network.will(),
-            handlers=Handlers(self._connected, self._lost, self._receive),
+            handlers=Handlers(self._connected, self._lost, self._receive, self._overrun),
         )
         self._timer: asyncio.TimerHandle | None = None
         self._due_ns: int | None = None
@@ -87,10 +110,6 @@ class MqttDoor:
                 return why
         return None
 
-    def stats(self) -> NetworkStats:
-        """Return how things are."""
-        return self._network.stats()
-
     def _connected(self) -> None:
         self._router.hop_up(self.name, None)
         self._act(self._network.connected(monotonic_ns()))
@@ -103,6 +122,9 @@ class MqttDoor:
     def _receive(self, topic: str, payload: bytes, is_retained: bool) -> None:
         now_ns = monotonic_ns()
         self._act(self._network.receive_message(topic, payload, now_ns, is_retained=is_retained))
+
+    def _overrun(self) -> None:
+        self._refuse(Refusal.MQTT_FULL)
 
     def _act(self, actions: Iterable[Action]) -> None:
         for action in actions:
@@ -130,8 +152,10 @@ class MqttDoor:
             self._router.hop_up(self.name, action.address)
         elif isinstance(action, Closed):
             self._router.connection_closed(self.name, action.connection)
+        elif isinstance(action, Dropped):
+            self._refuse(_REFUSALS[action.reason])
         else:
-            logger.warning("%s: %s", self.name, action.text)
+            logger.warning("%s: %s: %s", self._router.name, self.name, action.text)
 
     def _time_out(self) -> None:
         self._due_ns = None

@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 
 from eap.aoe.access import AccessList
 from eap.aoe.routes import Origin, Route
-from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.aoe.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ethercat import EAP_PORT
@@ -67,8 +67,18 @@ def to_way(hop: HopSpec) -> Way:
 
 
 def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
-    """Return the access rules of a station."""
-    return AccessList(routing.access, own=tuple(_own_addresses(station)))
+    """Return the access rules of a station; first those of networks that may ask nothing."""
+    closed = tuple(
+        AccessRule(f"unidirectional of {spec.network}", allow=False, doors=(mqtt_door(spec),))
+        for spec in routing.mqtt
+        if spec.is_unidirectional
+    )
+    return AccessList((*closed, *routing.access), own=tuple(_own_addresses(station)))
+
+
+def mqtt_door(spec: MqttSpec) -> str:
+    """Return the name of the door to a network."""
+    return f"{DoorKind.MQTT}:{spec.network}"
 
 
 def _own_addresses(station: StationSpec) -> Iterator[IPv4Address]:

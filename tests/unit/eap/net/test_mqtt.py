@@ -11,6 +11,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import ExitStack, asynccontextmanager
 
 import pytest
+from aiomqtt import Message
 
 from eap.aoe.mqtt_network import Publish, Subscribe
 from eap.aoe.spec import MqttSpec, TlsSpec
@@ -35,14 +36,19 @@ class Peer:
         self.lost: list[str] = []
         self.connections = 0
         spec = MqttSpec(network="hall", **{"host": ADDRESS, **settings})
+        self.overruns = 0
         self.link = MqttLink(
-            spec, name, will=WILL, handlers=Handlers(self._connected, self.lost.append, self._hear)
-        )
+            spec, name, will=WILL,
+            handlers=Handlers(self._connected, self.lost.append, self._hear, self._overrun),
+        )  # fmt: skip
 
     def _connected(self) -> None:
         self.connections += 1
         assert self.link.send(Subscribe(("hall/#",))) is None
         assert self.link.send(HELLO) is None
+
+    def _overrun(self) -> None:
+        self.overruns += 1
 
     def _hear(self, topic: str, payload: bytes, is_retained: bool) -> None:
         self.heard.append((topic, payload, is_retained))
@@ -222,6 +228,24 @@ def test_too_much_at_once_is_not_taken(tmp_path, monkeypatch):
 
     with broker(tmp_path, ADDRESS):
         play(story)
+
+
+def test_message_without_room_is_told_of():
+    class Client:
+        inbox = mqttclient.Inbox(1)
+
+        @property
+        async def messages(self):
+            for _ in range(3):
+                self.inbox.put_nowait(Message("hall/1/ams", b"x", 0, False, 0, None))
+            yield self.inbox.get_nowait()
+
+    async def story():
+        peer = Peer()
+        await peer.link._read(Client())
+        assert (peer.overruns, peer.heard) == (2, [("hall/1/ams", b"x", False)])
+
+    play(story)
 
 
 def test_without_aiomqtt_one_is_told_how_to_get_it(monkeypatch):

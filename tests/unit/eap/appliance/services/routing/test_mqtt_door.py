@@ -11,6 +11,7 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.routes import Origin, Route
 from eap.aoe.spec import MqttSpec, RoutingSpec
 from eap.aoe.way import Door, Way
+from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.services.routing.mqtt_door import MqttDoor, open_mqtt_doors
 from eap.codec.ams import AmsCommand
 from eap.ids import NetId
@@ -36,7 +37,11 @@ class Place:
 
     def __init__(self, net_id: NetId, *specs: MqttSpec, learns: bool = True) -> None:
         self.router = station(str(net_id), name=f"of {net_id[0]}")
-        self.doors = [MqttDoor(each, self.router, learns=learns) for each in specs or (spec(),)]
+        self.refused: list[Refusal] = []
+        self.doors = [
+            MqttDoor(each, self.router, self.refused.append, learns=learns)
+            for each in specs or (spec(),)
+        ]
 
     async def serve(self) -> None:
         async with asyncio.TaskGroup() as group:
@@ -81,7 +86,7 @@ def test_stations_that_know_nothing_of_each_other_meet(tmp_path):
                 assert answers == [AmsAnswer(bytes(4) + b"\2" + (b"%d" % n)[::-1])
                                    for n in range(50)]  # fmt: skip
                 assert (await two.read(ONE)).data == b"\0\0\0\0\2cba"
-                assert one.doors[0].stats() == (True, 1, {})
+                assert not one.refused + two.refused
             await until(lambda: one.router.is_down(route.hop))
             assert (await one.read(TWO)).error_code == 0x1B
 
@@ -186,19 +191,57 @@ def test_nothing_is_learned_that_is_not_to_be(tmp_path):
     async def story():
         one, two = Place(ONE, learns=False), Place(TWO)
         async with running(one, two):
-            await until(lambda: two.knows(ONE) and one.doors[0].stats().routers)
-            assert not one.knows(TWO)
+            await until(lambda: two.knows(ONE))
             assert (await two.read(ONE)).data == b"\0\0\0\0\2cba"
+            assert not one.knows(TWO)
 
     with broker(tmp_path, ADDRESS):
         asyncio.run(story())
 
 
-def test_stations_get_the_doors_of_their_plant_file():
+def test_what_comes_to_nothing_is_counted(tmp_path, caplog):
+    async def story():
+        place = Place(ONE)
+        asked = Ams(f"{ONE}:65535", f"{PEER}:800", body=bytes(300_000))
+        async with running(place):
+            with PahoPeer(ADDRESS, "hall", PEER) as peer:
+                await asyncio.to_thread(peer.wait_for_router, "5.1.1.1.1.1", "of 5")
+                peer.publish("5.1.1.1.1.1", "ams", b"no packet")
+                peer.publish("6.6.6.6.6.6", "info", b"no info")
+                peer.publish("5.1.1.1.1.1", "ams/res", asked.octets())
+                answer = await asyncio.to_thread(peer.ask, "5.1.1.1.1.1", asked)
+                assert answer == asked.answer(b"", 0xE)
+        assert sorted(place.refused) == ["ams_length", "mqtt_broken", "mqtt_broken", "mqtt_topic"]
+
+    with broker(tmp_path, ADDRESS):
+        asyncio.run(story())
+    assert "of 5: mqtt:hall: broken packet: hall/5.1.1.1.1.1/ams: " in caplog.text
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+def test_packets_may_be_sent_with_more_care(tmp_path, qos):
+    async def story():
+        one, two = Place(ONE, spec(qos=qos)), Place(TWO, spec(qos=qos))
+        async with running(one, two):
+            await until(lambda: one.knows(TWO) and two.knows(ONE))
+            answers = await asyncio.gather(*[one.read(TWO, b"%d" % n) for n in range(100)])
+            assert {each.error_code for each in answers} == {0}
+
+    with broker(tmp_path, ADDRESS) as server:
+        asyncio.run(story())
+        assert (
+            f"Received PUBLISH from eap-5.1.1.1.1.1-hall (d0, q{qos}, r0" in server.log.read_text()
+        )
+
+
+def test_stations_get_the_doors_of_their_plant_file(tmp_path):
     async def story():
         routers = {"a": station("5.1.1.1.2.1"), "b": station("6.1.1.1.2.1")}
         routing = {"a": RoutingSpec(mqtt=(spec("x"), spec("y"))), "b": RoutingSpec()}
-        doors = open_mqtt_doors(routing, routers)
+        with DiscardCounters(tmp_path / "counters", [*routers]) as counters:
+            doors = open_mqtt_doors(routing, routers, counters)
+            doors[0]._overrun()
+            assert counters.stats() == {"a": {"mqtt_full": 1}, "b": {}}
         assert [door.name for door in doors] == ["mqtt:x", "mqtt:y"]
         assert doors[0].send("6.1.1.1.1.1", (bytes(32),)).startswith("no connection to MQTT broker")
         assert routers["a"].is_down(Way("mqtt:x", "6.1.1.1.1.1"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from eap.aoe.routes import Origin, Route
-from eap.aoe.spec import AccessRule, DoorKind, HopSpec, RouteSpec, RoutingSpec
+from eap.aoe.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.services.routing import planned
 from eap.appliance.services.routing.planned import access_of, make_router, to_route, to_way
@@ -84,6 +84,17 @@ def test_addresses_of_the_station_are_this_host():
     assert not access.is_this_host(Way("ams-tcp", "10.0.0.2:4711#1"))
     way = Way("ams-tcp", "10.0.0.2:4711#1")
     assert not access.grants(way, THERE, THERE, 1).may_read
+
+
+def test_network_that_may_ask_nothing_is_refused_whatever_the_rules_say():
+    brokers = (
+        MqttSpec(network="hall", host="b", is_unidirectional=True),
+        MqttSpec(network="line", host="b"),
+    )
+    access = access_of(left(), RoutingSpec(mqtt=brokers, access=(AccessRule("all"),)))
+    granted = [access.grants(Way(door, "5.1.2.3.1.1"), THERE, THERE, 1).may_read
+               for door in ("mqtt:hall", "mqtt:line")]  # fmt: skip
+    assert granted == [False, True]
 
 
 def test_router_knows_its_net_ids():
