@@ -41,6 +41,7 @@ from eap.appliance.services.device_methods import DeviceMethods
 from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_client import EngineClient
 from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.gateway.opening import open_gateways
 from eap.appliance.services.methods import Methods
@@ -104,7 +105,7 @@ class Services:
             self._resources,
         )
         brokers = open_mqtt_doors(self._handover.routing, devices.routers, self._counters)
-        audit = self._audit(devices.routers)
+        audit = self._audit(devices.routers, gateways)
         buses = self._buses(client, devices, desks)
         methods = self._methods(images, buses, devices)
         server = ControlServer(methods, buses)
@@ -188,10 +189,13 @@ class Services:
             **AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
         }
 
-    def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:
+    def _audit(
+        self, routers: Mapping[str, StationRouter], gateways: Mapping[str, MailboxGateway]
+    ) -> Audit:
         audit = Audit(Store(self._handover.plant).path / "audit.jsonl", self._directory)
-        for name, router in routers.items():
-            router.on_audit.append(partial(audit.write, name))
+        for told in (routers, gateways):
+            for name, each in told.items():
+                each.on_audit.append(partial(audit.write, name))
         return audit
 
     def _ams_addresses(self) -> dict[str, str]:

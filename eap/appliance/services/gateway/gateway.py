@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 from devicebus.mailbox.counter import next_counter
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation
+from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
 from eap.appliance.services.gateway.dialect_desk import DialectDesk
@@ -28,6 +29,8 @@ from eap.appliance.services.gateway.slave_session import (
     find_refusal,
 )
 from eap.appliance.services.gateway.tally import Tally
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
 from eap.gateway import dialect
 from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, Slave
@@ -87,6 +90,7 @@ class MailboxGateway:
 
     Attributes:
         tally: What it did.
+        on_audit: Called with each change that begins, and with each refusal.
     """
 
     def __init__(
@@ -98,6 +102,7 @@ class MailboxGateway:
         addresses: AddressMap | None = None,
     ) -> None:
         self.tally = Tally()
+        self.on_audit: list[Callable[[AuditEntry], None]] = []
         self.ledger = Ledger(settings.limits)
         self._bus = bus
         self._open_master = open_master
@@ -252,7 +257,14 @@ class MailboxGateway:
         grants = self._access.grants(way, NOBODY, self._settings.net_id, port)
         verdict = grants.judge(operation)
         if by_rule and verdict.service is not AccessService.READ and not verdict.is_by_rule:
-            return False
+            why = "only a rule allows it for all slaves at once"
+            verdict = verdict._replace(is_allowed=False, why=why)
+        result = None if verdict.is_allowed else AdsError.ACCESS_DENIED
+        audited = AuditedOperation(operation, verdict, result)
+        if audited.is_told:
+            header = AmsHeader(self._settings.net_id, port, NOBODY, 0, 0)
+            for write in self.on_audit:
+                write(AuditEntry(way, header, "", (audited,)))
         return verdict.is_allowed
 
     async def _serve_dialect(self, request: _Request, kind: MailboxType) -> None:

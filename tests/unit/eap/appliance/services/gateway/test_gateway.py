@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from eap.aoe.access import AccessList
+from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, AccessService, ObjectRange
 from eap.aoe.way import Way
 from eap.appliance.services.bus_client import BusClient
@@ -358,6 +359,24 @@ def test_a_rule_opens_one_object() -> None:
         assert (await desk.one(COE, 1001, other, ELSEWHERE)).startswith("00 20 80")
 
     play(scene, rule)
+
+
+def test_changes_and_refusals_are_audited() -> None:
+    async def scene(desk: Desk) -> None:
+        entries: list[AuditEntry] = []
+        desk.gateway.on_audit.append(entries.append)
+        await desk.one(COE, 1001, VENDOR, ELSEWHERE)
+        assert not entries
+        await desk.one(COE, 1001, WRITE, ELSEWHERE)
+        await desk.one(COE, 1001, WRITE)
+        await desk.ask(COE, 0xFFFF, WRITE)
+        told = [(each.way, each.header.target_port, each.operations[0].result) for each in entries]
+        assert told == [(ELSEWHERE, 1001, 0x723), (HERE, 1001, None), (HERE, 1001, 0x723)]
+        assert entries[2].operations[0].verdict.why == (
+            "only a rule allows it for all slaves at once"
+        )
+
+    play(scene)
 
 
 def test_the_same_request_is_answered_once_until_then() -> None:
