@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eap.aoe import mqtt_network
 from eap.aoe.mqtt_info import Info, encode_info
@@ -21,7 +22,7 @@ from eap.aoe.mqtt_network import (
     Subscribe,
     Warn,
 )
-from eap.aoe.mqtt_peers import REFRESH_NS
+from eap.aoe.mqtt_peers import EXPIRY_NS, REFRESH_NS
 from eap.aoe.mqtt_ports import FIRST_PORT
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.spec import MqttSpec
@@ -305,3 +306,65 @@ def test_sender_that_nobody_told_of_is_forgotten_when_silent_for_an_hour() -> No
 def test_no_message_raises(topic: str, payload: bytes, is_retained: bool) -> None:
     place = Place()
     place.hear(topic, payload, is_retained=is_retained)
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """Whatever is told in whatever order, hops and routes are those of who is there."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.place = Place()
+        self.told_at: dict[str, int] = {}
+        self.down: set[str] = set()
+        self.is_connected = True
+
+    def do(self, actions: list[Action]) -> None:
+        for action in actions:
+            if isinstance(action, HopDown):
+                self.down.add(action.address)
+            elif isinstance(action, HopUp):
+                self.down.discard(action.address)
+            elif isinstance(action, Publish):
+                assert self.is_connected
+
+    @rule(number=st.integers(1, 4), is_online=st.booleans(), is_retained=st.booleans())
+    def tell(self, number: int, is_online: bool, is_retained: bool) -> None:
+        if not self.is_connected:
+            return
+        net_id = f"6.1.1.1.{number}.1"
+        self.do(self.place.hear_of(net_id, Info("x", is_online), is_retained=is_retained))
+        self.told_at.pop(net_id, None)
+        if is_online:
+            self.told_at[net_id] = self.place.now_ns
+        assert (net_id in self.down) == (not is_online)
+
+    @rule()
+    def lose(self) -> None:
+        self.place.network.disconnected()
+        self.is_connected = False
+
+    @rule()
+    def connect(self) -> None:
+        self.is_connected = True
+        self.do(self.place.network.connected(self.place.now_ns))
+
+    @rule(seconds=st.sampled_from([1, 31, 121, 301]))
+    def elapse(self, seconds: int) -> None:
+        self.do(self.place.wait(seconds))
+        self.place.table.expire(self.place.now_ns)
+
+    @invariant()
+    def time_goes_on(self) -> None:
+        due_ns = self.place.network.next_timeout()
+        assert (due_ns is not None) == self.is_connected
+
+    @invariant()
+    def routes_are_of_who_was_there(self) -> None:
+        oldest = self.place.now_ns - EXPIRY_NS
+        for route in self.place.table:
+            address = route.hop.connection
+            known = self.told_at.get(address, -1) > oldest
+            assert known or address in self.down
+
+
+TestAnyOrder = AnyOrder.TestCase

@@ -73,9 +73,10 @@ async def until(done) -> None:
             await asyncio.sleep(0.01)
 
 
-def test_stations_that_know_nothing_of_each_other_meet(tmp_path):
+@pytest.mark.parametrize("no_retain", [False, True])
+def test_stations_that_know_nothing_of_each_other_meet(tmp_path, no_retain):
     async def story():
-        one, two = Place(ONE), Place(TWO)
+        one, two = Place(ONE, spec(no_retain=no_retain)), Place(TWO, spec(no_retain=no_retain))
         async with running(one):
             assert (await one.read(TWO)).error_code == 7
             async with running(two):
