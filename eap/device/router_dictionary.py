@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from heapq import merge
 from ipaddress import IPv4Address
+from itertools import starmap
 from typing import Any, Protocol
 
 from eap.codec import datatypes
@@ -85,8 +87,9 @@ class RouterDictionary(ObjectDictionary):
 
     def __iter__(self) -> Iterator[OdObject]:
         """Yield the objects in the order of their indexes."""
-        indexes = sorted({*self._objects, *self._route_indexes()})
-        return (self[index] for index in indexes)
+        routes = zip(self._route_indexes(), self._values.routes(), strict=False)
+        objects = super().__iter__()
+        return merge(objects, starmap(self._make_route, routes), key=lambda item: item.index)
 
     def __len__(self) -> int:
         return super().__len__() + len(self._route_indexes())

@@ -74,8 +74,7 @@ class StationSymbols(AdsSpace):
     """The symbols of one station, as its newest image has them.
 
     Attributes:
-        store: The values in the image that was the newest when somebody looked last.
-        image: That image.
+        store: The values in :attr:`image`.
     """
 
     groups = SymbolSpace.groups
@@ -87,7 +86,8 @@ class StationSymbols(AdsSpace):
         self._space = SymbolSpace(self._table(), self.store)
 
     @property
-    def image(self) -> Image:  # noqa: D102  the class says it
+    def image(self) -> Image:
+        """The image that was the newest when somebody looked last."""
         return self._file.image
 
     def look(self) -> SymbolSpace:

@@ -61,6 +61,8 @@ class LiveRouter:
         self._device = device
         self._image = image
         self._ports: Mapping[str, PortSpec] = {port.name: port for port in ports}
+        self._routes: tuple[Route, ...] = ()
+        self._version = -1
 
     def number(self, key: Live) -> int:
         """Return what *key* stands for, of the router as a whole."""
@@ -92,7 +94,11 @@ class LiveRouter:
 
     def routes(self) -> Sequence[Route]:
         """Return all routes in their order."""
-        return tuple(self._router.table)
+        table = self._router.table
+        if table.version != self._version:
+            self._version = table.version
+            self._routes = tuple(table)
+        return self._routes
 
     def of_route(self, key: Live, route: object) -> Any:
         """Return what *key* stands for, of one of the routes."""

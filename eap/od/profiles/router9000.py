@@ -70,7 +70,7 @@ DEVICE = ObjectRange(
     "A port of the station, in the order of the plant file.",
 )  # fmt: skip
 ROUTE = ObjectRange(
-    0x9000, 0x9FFF, "Route {n}", _RECORD,
+    0x9000, 0x93FF, "Route {n}", _RECORD,
     (
         live(1, "NetID", "BLOCK(6)", Live.ROUTE_NET_ID, "Whoever has it, or one that begins alike, "
              "is reached by this route.", form=Form.NET_ID),
@@ -88,7 +88,7 @@ ROUTE = ObjectRange(
         live(10, "Errors", "ULINT", Live.ROUTE_ERRORS, "Of those, that did not get there."),
         live(11, "Last error", TEXT, Live.ROUTE_LAST_ERROR, "In words."),
     ),
-    "A route, in the order in which eapctl routes lists them: objects come and go with the routes.",
+    "A route, of the first 1024 in the order of the table: objects come and go with the routes.",
 )  # fmt: skip
 
 

@@ -96,8 +96,11 @@ def test_routes_are_told_as_they_do(router, values):
         Live.ROUTE_ERRORS: 0,
         Live.ROUTE_LAST_ERROR: "",
     }
+    assert values.routes() is values.routes()
     traffic = router.record.routes.of(route.key, monotonic_ns())
     traffic.ask(40)
     traffic.answer(40, 2_000_000)
     keys = (Live.ROUTE_STATE, Live.ROUTE_ROUND_TRIP, Live.ROUTE_REQUESTS)
     assert [values.of_route(key, route) for key in keys] == [1, 2000, 1]
+    router.remove_route(ROUTE.net_id, ROUTE.hop)
+    assert values.routes() == ()
