@@ -9,7 +9,7 @@ from eap.aoe.routes import Route
 from eap.aoe.way import Door, Way
 from eap.appliance.services.routing.entrance import Entrance
 from eap.ids import NetId
-from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
+from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams
 from tests.support.routing import KeepingCarrier, entrance, station
 
 CLIENT = "192.168.9.9.1.1:33000"
@@ -77,7 +77,8 @@ def test_answers_and_notifications_go_to_who_asked(stations, carrier):
         ("peer", NOTIFICATION),
     ]
     back.receive(notice.replace(b"\7\0\0\0", b"\6\0\0\0"), "hop")
-    assert len(carrier.sent) == 3
+    (ended,) = carrier.sent[3:]
+    assert (ended[0], ended[1].command) == ("hop", DELETE_NOTIFICATION)
 
 
 def test_fragments_are_put_together_before_anybody_is_asked(stations, carrier):
