@@ -10,13 +10,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from tools.bench import machine
 from tools.bench.appliance import running, status
-from tools.bench.figures import Figure, at_least, at_most, median_ratio, skipped
+from tools.bench.figures import Figure, at_least, at_most, median_ratio, report, skipped
 from tools.bench.network import Worker
 from tools.bench.settings import Settings
 
@@ -35,7 +35,7 @@ def run(settings: Settings) -> list[Figure]:
         folder = Path(name)
         return [
             _reads(settings, folder),
-            *(_hop(settings, folder, how) for how in HOPS),
+            *(figure for how in HOPS for figure in _hop(settings, folder, how)),
             _crowd(settings, folder),
         ]
 
@@ -48,12 +48,30 @@ def reads_figure(pairs: Sequence[tuple[float, float]]) -> Figure:
     return at_least(name, median_ratio(pairs), 0.8, detail)
 
 
-def hop_figure(how: str, rounds: Sequence[tuple[float, float, float]]) -> Figure:
-    """Say what a hop adds: of each round, medians with it, without it and of an echo, in ns."""
-    added = median((hop - direct) / echo for hop, direct, echo in rounds)
-    hop, direct, echo = (median(column) / 1000 for column in zip(*rounds, strict=True))
-    detail = f"{direct:.0f} to {hop:.0f} µs, an echo {echo:.0f} µs"
-    return at_most(f"a hop by {how} adds, in raw echo round trips", added, 2, "", detail)
+class Trips(NamedTuple):
+    """Medians of one round in nanoseconds."""
+
+    hop: float
+    """Of reads through a station."""
+    direct: float
+    """Of reads from that station itself."""
+    raw: float
+    """Of as many octets to an echo, a loop over a blocking socket."""
+    looped: float
+    """The same to the smallest echo that asyncio makes."""
+
+
+def hop_figures(how: str, rounds: Sequence[Trips]) -> list[Figure]:
+    """Say what a hop adds."""
+    hop, direct, raw, looped = (median(column) / 1000 for column in zip(*rounds, strict=True))
+    added = median((each.hop - each.direct) / each.raw for each in rounds)
+    in_loops = median((each.hop - each.direct) / each.looped for each in rounds)
+    detail = f"{direct:.0f} to {hop:.0f} µs, an echo {raw:.0f} µs"
+    name = f"a hop by {how} adds, in round trips of"
+    return [
+        at_most(f"{name} a raw echo", added, 2, "", detail),
+        report(f"{name} the smallest asyncio echo", f"{in_loops:.2f} ({looped:.0f} µs)", in_loops),
+    ]
 
 
 def crowd_figure(counts: Sequence[int], seconds: float) -> Figure:
@@ -84,28 +102,33 @@ def _reads(settings: Settings, folder: Path) -> Figure:
     return reads_figure(pairs)
 
 
-def _hop(settings: Settings, folder: Path, how: str) -> Figure:
+def _hop(settings: Settings, folder: Path, how: str) -> list[Figure]:
     near, far = machine.cores()
     rounds = []
     count = {"count": 400 * settings.rounds}
     with ExitStack() as stack:
         stack.enter_context(_appliance(folder, "near", far, HOPS[how]))
         stack.enter_context(_appliance(folder, "far", near))
-        echo = stack.enter_context(_worker("ads_roles.echo", {"address": SERVER}, far))
-        port = echo.answer()["port"]
+        echoes = [
+            {
+                "address": SERVER,
+                **stack.enter_context(_worker(role, {"address": SERVER}, far)).answer(),
+            }
+            for role in ("ads_roles.echo", "ads_roles.asyncio_echo")
+        ]
         for number in range(settings.rounds):
             settings.tell(f"a hop by {how}, round {number + 1} of {settings.rounds}")
             jobs = [
                 ("reads", {"address": NEAR, "net_id": f"{FAR}.2.1"}),
                 ("reads", {"address": NEAR, "net_id": f"{NEAR}.2.1"}),
-                ("echoes", {"address": SERVER, "port": port}),
+                *(("echoes", echo) for echo in echoes),
             ]
             found = []
             for role, job in jobs:
                 with _worker(f"ads_roles.{role}", job | count, near) as client:
                     found.append(median(client.answer()["trips"]))
-            rounds.append((found[0], found[1], found[2]))
-    return hop_figure(how, rounds)
+            rounds.append(Trips(*found))
+    return hop_figures(how, rounds)
 
 
 def _crowd(settings: Settings, folder: Path) -> Figure:

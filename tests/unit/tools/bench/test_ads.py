@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from eap.config.load import load
-from tools.bench.ads import HOPS, crowd_figure, hop_figure, plant, reads_figure
+from tools.bench.ads import HOPS, Trips, crowd_figure, hop_figures, plant, reads_figure
 from tools.bench.figures import Verdict
 
 
@@ -16,9 +16,10 @@ def test_reads_are_compared_by_round() -> None:
 
 
 def test_hop_is_what_it_adds() -> None:
-    figure = hop_figure("mail", [(200_000.0, 100_000.0, 40_000.0)] * 3)
-    assert (figure.value, figure.verdict) == (2.5, Verdict.MISSED)
-    assert figure.measured == "2.50 (100 to 200 µs, an echo 40 µs)"
+    raw, looped = hop_figures("mail", [Trips(200_000.0, 100_000.0, 40_000.0, 50_000.0)] * 3)
+    assert (raw.value, raw.verdict) == (2.5, Verdict.MISSED)
+    assert raw.measured == "2.50 (100 to 200 µs, an echo 40 µs)"
+    assert (looped.value, looped.measured) == (2.0, "2.00 (50 µs)")
 
 
 def test_slowest_client_is_compared_with_the_median() -> None:
