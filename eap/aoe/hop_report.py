@@ -99,8 +99,16 @@ def decode_report(data: bytes) -> HopReport:
     """Read the data of an answer; raise MalformedError if it is none."""
     try:
         report = _DECODER.decode(data)
-        for text in (report.net_id, report.next_net_id, report.target):
-            NetId.parse(text or report.net_id)
+        for net_id in (report.net_id, report.next_net_id, report.target):
+            NetId.parse(net_id or report.net_id)
+        _require_printable(report)
     except (msgspec.DecodeError, UnicodeDecodeError, ValueError) as exc:
         raise MalformedError(f"not a report of a hop: {exc}", layout="HopReport") from None
     return report
+
+
+def _require_printable(report: HopReport) -> None:
+    """Raise ValueError for a text that would do something to a terminal."""
+    for text in (report.station, report.route, report.door, report.address, report.why):
+        if not text.isprintable():
+            raise ValueError(f"{text!r} cannot be printed")

@@ -24,6 +24,8 @@ Row: TypeAlias = dict[str, Any]
 
 PATIENCE_S = 3.0
 """For one answer."""
+STATION_S = 20.0
+"""For all answers of a station."""
 _AT_A_TIME = 8
 """Stations that are asked."""
 _MAX_PORTS = 64
@@ -95,12 +97,14 @@ class _Look:
         """Return all there is of it."""
         row: Row = {"name": self._known.name, "net_id": str(self._known.net_id)}
         try:
-            ids = await self._read_io(0, "ids")
-            numbers = _numbers(ids)[1 : _MAX_PORTS + 1]
-            ports = [await self._port(place, number) for place, number in enumerate(numbers)]
-        except _FailedError as exc:
+            async with asyncio.timeout(STATION_S):
+                ids = await self._read_io(0, "ids")
+                numbers = _numbers(ids)[1 : _MAX_PORTS + 1]
+                ports = [await self._port(place, number) for place, number in enumerate(numbers)]
+        except (_FailedError, TimeoutError) as exc:
+            reason = str(exc) or f"not all was said within {STATION_S:g} s"
             planned = [_planned_row(port) for port in self._planned.values()]
-            return row | {"ports": planned, "error": str(exc)}
+            return row | {"ports": planned, "error": reason}
         ports.sort(key=lambda port: port["kind"] != "eap")
         return row | {"ports": ports, "error": ""}
 
@@ -195,7 +199,8 @@ def _state(octet: bytes) -> str | None:
 
 
 def _text(octets: bytes) -> str:
-    return octets.partition(b"\0")[0].decode("utf-8", "replace")
+    text = octets.partition(b"\0")[0].decode("utf-8", "replace")
+    return "".join(each if each.isprintable() else "?" for each in text)  # it goes to terminals
 
 
 def _numbers(octets: bytes) -> list[int]:

@@ -71,7 +71,15 @@ def test_reports_survive_the_wire() -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"\xff", b"[]", b'{"station": "x", "net_id": "1.2"}', b'{"station": 5}']
+    "data",
+    [
+        b"",
+        b"\xff",
+        b"[]",
+        b'{"station": "x", "net_id": "1.2"}',
+        b'{"station": 5}',
+        b'{"station": "\\u001b[2J", "net_id": "1.2.3.4.5.6"}',
+    ],
 )
 def test_what_is_no_report(data: bytes) -> None:
     with pytest.raises(CodecError):

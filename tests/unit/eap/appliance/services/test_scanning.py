@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
+import pytest
+
 from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_io import IO_PORT, IoDevice, IoDeviceType, IoSpace
 from eap.aoe.ads_master import MasterSpace, SlaveState
@@ -13,6 +15,7 @@ from eap.aoe.directory import Directory
 from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryPort, DirectoryStation
 from eap.aoe.way import Way
+from eap.appliance.services import scanning
 from eap.appliance.services.scanning import scan, stations_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_name
 from eap.ids import NetId
@@ -54,6 +57,9 @@ class Devices:
         states = [SlaveState(1001, 8, 0), SlaveState(1002, 0x14, 0)]
         self._master = self._device("master", MasterSpace(Master(states)))
         self._slave = self._device("coupler 7")
+
+    def name_slaves(self, name: str) -> None:
+        self._slave = self._device(name)
 
     def __call__(self, port: int, command: int, body: bytes) -> AmsAnswer:
         if port == IO_PORT:
@@ -162,3 +168,27 @@ def test_stations_that_only_routes_tell_of() -> None:
 def test_default_routes_are_no_stations() -> None:
     everything = Route(NetId(bytes(6)), "default", Way("link", "x"), octets=0)
     assert [each.name for each in stations_of(Directory([]), [everything, to(3)])] == ["island-03"]
+
+
+def test_a_station_that_takes_its_time_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scanning, "STATION_S", 0.05)
+
+    class Slow(Station):
+        async def ask(self, *args: Any, **more: Any) -> AmsAnswer:
+            await asyncio.sleep(0.02)
+            return await super().ask(*args, **more)
+
+    line = Line()
+    slow = Slow(line, 1, [], Devices(1))
+    (row, _) = look(slow)
+    assert row["error"] == "not all was said within 0.05 s"
+    assert [port["name"] for port in row["ports"]] == ["eap0", "bus0"]
+
+
+def test_names_that_cannot_be_printed() -> None:
+    line, first = plant()
+    devices = line.stations["island-02"].serve
+    assert isinstance(devices, Devices)
+    devices.name_slaves("\x1b[2Jx")
+    _, far = look(first)
+    assert far["ports"][1]["slaves"][1]["name"] == "?[2Jx"
