@@ -64,10 +64,6 @@ class Peers:
     def __len__(self) -> int:
         return len(self._peers)
 
-    def count_online(self) -> int:
-        """Return how many are there."""
-        return sum(map(len, self._online.values()))
-
     def tell(self, net_id: NetId, info: Info, now_ns: int) -> Change:
         """Note what *net_id* told; learn a route to it, if routes are learned."""
         before = self._peers.get(net_id)

@@ -137,7 +137,7 @@ class MqttLink:
         finally:
             client.close()
         if self._is_connected:
-            self._is_connected = False
+            self._is_connected = self._is_old = False  # by next time it may be a newer one
             self._handlers.lost(f"no connection to {self._name}: {why}")
         return why
 

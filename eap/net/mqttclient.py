@@ -182,7 +182,7 @@ def is_too_new(error: MqttError) -> bool:
     """Say whether the broker may speak another version; some of them just say nothing."""
     if isinstance(error, MqttConnectError):
         return _code(error) in _UNSUPPORTED
-    return "timed out" in str(error)
+    return str(error) == "Operation timed out"  # connected, but not answered
 
 
 def describe(error: MqttError, client: Client, user: str) -> str:

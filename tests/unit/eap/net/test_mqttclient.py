@@ -100,6 +100,7 @@ def test_broker_of_before_is_recognised():
     assert is_too_new(MqttError("Operation timed out"))
     assert not is_too_new(MqttConnectError(REFUSED))
     assert not is_too_new(MqttError("[Errno 111] Connection refused"))
+    assert not is_too_new(MqttError("timed out"))
 
 
 def test_client_speaks_the_version_that_it_should():
