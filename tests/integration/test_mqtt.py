@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import time
@@ -113,6 +114,34 @@ def test_client_of_another_make_is_served_and_hostile_ones_are_not(halls):
         assert peer.ask(f"{SOUTH}.1.1", asked).body[:8] == bytes(4) + b"\4\0\0\0"
     until_read(SOUTH, by=NORTH)
     assert north.pid("services") == before
+
+
+def test_flood_leaves_memory_and_engine_alone(halls):
+    """Messages of all kinds as fast as paho sends, to one hall; tools at it are answered."""
+    north, _ = halls
+    wait_until(lambda: read(NORTH, NORTH) == VENDOR_OF_DRIVE)
+    before = north.status()["processes"]
+    packet = Ams(f"{NORTH}.3.1:1001", "9.9.9.9.1.1:800", body=bytes(12)).octets()
+    told = b"<info><online name='x'>true</online></info>"
+    with PahoPeer(BROKER, "works", "9.9.9.9.1.1") as peer:
+        end = time.monotonic() + 2
+        for number in itertools.count():
+            asked = packet[:28] + number.to_bytes(4, "little") + packet[32:]
+            peer.publish(f"{NORTH}.1.1", "ams", asked)
+            peer.publish(f"{NORTH}.1.1", "ams/res", packet)
+            peer.publish(f"{NORTH}.1.1", "ams", bytes(20_000))
+            peer.publish(f"9.9.{number >> 8 & 0xFF}.{number & 0xFF}.1.1", "info", told)
+            if number % 100 == 0:
+                assert read(NORTH, NORTH) == VENDOR_OF_DRIVE
+                if time.monotonic() > end:
+                    break
+    after = north.status()["processes"]
+    assert after["services"]["rss"] - before["services"]["rss"] < 48 << 20
+    assert [after[each]["restarts"] for each in ("engine", "services")] == [
+        before[each]["restarts"] for each in ("engine", "services")
+    ]
+    assert north.station("north")["discarded"]["mqtt_topic"] > 100
+    until_read(SOUTH, by=NORTH)
 
 
 def test_one_way_hall_asks_and_is_not_asked(server, halls):
