@@ -115,6 +115,20 @@ class RoutesScanParameters(Parameters, frozen=True, kw_only=True):
     wait_ms: Annotated[int, Meta(ge=10, le=60_000)] = 1_000
 
 
+class RoutesIntroduceParameters(Parameters, frozen=True, kw_only=True):
+    """``routes_introduce``: asks the router at *address* for a route to that of *station*.
+
+    User and password are those of the other system; they are sent in clear.
+    """
+
+    station: str
+    address: Text
+    name: Text = ""
+    user: Text = ""
+    password: Text = ""
+    wait_ms: Annotated[int, Meta(ge=10, le=60_000)] = 5_000
+
+
 class Document(msgspec.Struct, frozen=True, kw_only=True):
     """Base of what is told; a field that somebody newer tells is not looked at."""
 
@@ -291,6 +305,20 @@ class NeighbourRow(Document, frozen=True, kw_only=True):
     version: str
     route: str
     is_learned: bool
+
+
+class IntroducedRow(Document, frozen=True, kw_only=True):
+    """What another router said when it was asked for a route.
+
+    Attributes:
+        ok: Whether it has it now.
+        result: An ADS result; None if it said nothing.
+        text: That in words.
+    """
+
+    ok: bool
+    result: int | None
+    text: str
 
 
 class ImportRow(Document, frozen=True, kw_only=True):

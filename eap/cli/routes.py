@@ -25,6 +25,7 @@ _MARGIN_S = 5.0
         "add": "eap.cli.routes:add",
         "export": "eap.cli.routes_file:export",
         "import": "eap.cli.routes_file:import_routes",
+        "introduce": "eap.cli.routes_introduce:introduce",
         "list": "eap.cli.routes:list_all",
         "remove": "eap.cli.routes:remove",
         "scan": "eap.cli.routes_scan:scan",

@@ -85,8 +85,9 @@ def test_routers_of_a_network_find_each_other(appliance):
         tool.bind(("127.0.0.1", 0))
         tool.settimeout(5)
         tool.sendto(SERVER_INFO, ("127.255.255.255", 48899))
-        senders = {tool.recvfrom(400)[1] for _ in range(2)}
-    assert senders == {(OPEN, 48899), (CLOSED, 48899)}
+        missing = {(OPEN, 48899), (CLOSED, 48899)}
+        while missing:  # whatever else runs on this machine answers too
+            missing.discard(tool.recvfrom(400)[1])
 
 
 def test_a_scan_tells_who_is_there(appliance):

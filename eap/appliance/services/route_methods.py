@@ -16,22 +16,30 @@ from eap.appliance.control import ErrorCode, near, parameters
 from eap.appliance.control_routes import (
     Export,
     ImportRow,
+    IntroducedRow,
     NeighbourRow,
     RouteRow,
     RouterRow,
     RoutesAddParameters,
     RoutesExportParameters,
     RoutesImportParameters,
+    RoutesIntroduceParameters,
     RoutesListParameters,
     RoutesRemoveParameters,
     RoutesScanParameters,
     RoutesTestParameters,
     TestResult,
 )
-from eap.appliance.services.neighbours import Found, find_neighbours
+from eap.appliance.services.neighbours import (
+    Found,
+    Introduction,
+    find_neighbours,
+    introduce,
+)
 from eap.appliance.services.route_probe import find_target, probe_target
 from eap.appliance.services.route_rows import RouterView, route_row
 from eap.codec import staticroutes
+from eap.codec.ads import AdsError
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.staticroutes import TCP_IP, StaticRoute
 from eap.errors import ControlError, EnvironmentalError
@@ -61,6 +69,7 @@ class RouteMethods:
             "routes_list": self._list,
             "routes_add": self._add,
             "routes_remove": self._remove,
+            "routes_introduce": self._introduce,
             "routes_scan": self._scan,
             "routes_test": self._test,
             "routes_import": self._import,
@@ -95,12 +104,26 @@ class RouteMethods:
     async def _scan(self, params: dict[str, Any]) -> list[NeighbourRow]:
         wanted = parameters(params, RoutesScanParameters)
         if wanted.address:
-            _check_address(wanted.address)
+            _address(wanted.address)
         if wanted.station:
             return await self._scan_from(self._view(wanted.station), wanted)
         views = [view for view in self._views.values() if view.routes.scanners]
         rows = await asyncio.gather(*(self._scan_from(view, wanted) for view in views))
         return [row for each in rows for row in each]
+
+    async def _introduce(self, params: dict[str, Any]) -> IntroducedRow:
+        wanted = parameters(params, RoutesIntroduceParameters)
+        view, address = self._view(wanted.station), _address(wanted.address)
+        name = wanted.name or view.router.name
+        if "\0" in name + wanted.user + wanted.password:
+            raise ControlError("a NUL in a text", code=ErrorCode.VALUE)
+        route = Introduction(name, view.router.net_id, wanted.user, wanted.password)
+        with _kept():
+            result = await introduce(view.routes, route, address, wanted.wait_ms / 1000)
+        if result is None:
+            return IntroducedRow(ok=False, result=None, text=f"{address} says nothing (UDP 48899)")
+        text = "added" if result == AdsError.NONE else AdsError.words_of(result)
+        return IntroducedRow(ok=result == AdsError.NONE, result=result, text=text)
 
     async def _scan_from(
         self, view: RouterView, wanted: RoutesScanParameters
@@ -221,9 +244,9 @@ def _neighbour_row(view: RouterView, found: Found) -> NeighbourRow:
     )
 
 
-def _check_address(text: str) -> None:
+def _address(text: str) -> IPv4Address:
     try:
-        IPv4Address(text)
+        return IPv4Address(text)
     except ValueError as exc:
         raise ControlError(f"address: {exc}", code=ErrorCode.VALUE) from None
 
@@ -248,7 +271,7 @@ def _removed(spec: RouteSpec) -> RouteRow:
 
 @contextmanager
 def _kept() -> Iterator[None]:
-    """Refuse what this machine cannot do: keep a route over a restart, ask a network."""
+    """Refuse what this machine cannot do: keep a route over a restart, ask another host."""
     try:
         yield
     except EnvironmentalError as exc:

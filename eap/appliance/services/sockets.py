@@ -13,6 +13,7 @@ from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
 from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.ams_door import AmsClients, AmsDoor
+from eap.appliance.services.ams_questions import AmsQuestions
 from eap.appliance.services.ams_uplinks import AmsUplinks
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway
@@ -196,14 +197,16 @@ class _Sockets:
             if station.name in names
         ]
         desk = RouteDesk([self._routes[name] for name in names])
-        discovery = AmsDiscovery(self._socket(shared), routers, desk, self._refuser(names))
+        sock = self._socket(shared)
+        questions = AmsQuestions(sock, [router.net_id for router in routers])
+        discovery = AmsDiscovery(sock, routers, desk, questions, self._refuser(names))
         discovery.watch()
         for other in self._handover.sockets:
             is_for_it = other.kind is SocketKind.AMS_BROADCAST and other.address == shared.address
             if is_for_it and other.services_fd != NO_DESCRIPTOR:
                 discovery.watch(self._socket(other))
         for name in names:
-            self._routes[name].scanners.append(discovery)
+            self._routes[name].scanners.append(questions)
 
     def _ams_door(self, shared: SharedSocket) -> AmsDoor:
         """Return the listener of an address; a station with several has one door for all."""

@@ -13,6 +13,7 @@ from eap.aoe.way import Way
 from eap.appliance.discards import Refusal
 from eap.appliance.route_store import RouteStore
 from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
+from eap.appliance.services.ams_questions import AmsQuestions
 from eap.appliance.services.route_desk import RouteDesk
 from eap.appliance.services.station_routes import StationRoutes
 from eap.codec.amsdiscovery import (
@@ -81,7 +82,11 @@ def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     refused: list[Refusal] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         desk = RouteDesk([routes])
-        discovery = AmsDiscovery(sock, [RouterName("left", OWN)], desk, refused.append)
+        questions = AmsQuestions(sock, [OWN])
+        if questions.take(data, "127.0.0.1"):
+            raise AssertionError("the answer to a question that was not asked")
+        routers = [RouterName("left", OWN)]
+        discovery = AmsDiscovery(sock, routers, desk, questions, refused.append)
         answers = discovery.answers_to(data, "127.0.0.1")
         added = routes.added
         if discovery.answers_to(data, "127.0.0.1") != answers or routes.added != added:

@@ -9,9 +9,8 @@ from importlib.metadata import version
 import pytest
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services import ams_discovery as module
-from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName, network_of
-from eap.appliance.services.neighbours import Neighbour
+from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
+from eap.appliance.services.ams_questions import AmsQuestions
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import (
     DiscoveryHeader,
@@ -20,7 +19,6 @@ from eap.codec.amsdiscovery import (
     encode_discovery,
     encode_version,
 )
-from eap.errors import EnvironmentalError
 from eap.ids import NetId
 from tests.support.vectors import load
 
@@ -53,7 +51,8 @@ class Desk:
 
 def discovery(sock, *routers, desk=None, refused=None):
     refuse = [].append if refused is None else refused.append
-    return AmsDiscovery(sock, routers or [LEFT], desk or Desk(), refuse)
+    questions = AmsQuestions(sock, [LEFT.net_id])
+    return AmsDiscovery(sock, routers or [LEFT], desk or Desk(), questions, refuse)
 
 
 def test_every_router_of_the_address_names_itself(sock):
@@ -152,80 +151,27 @@ def test_what_comes_to_a_network_is_answered_from_the_address(sock):
     asyncio.run(run())
 
 
-def answer(number, net_id, *tags, service=0x8000_0001):
-    header = DiscoveryHeader(0, number, service, net_id, 10_000)
-    return encode_discovery(header, tags)
+def test_answers_to_own_questions_are_none_of_tools(sock):
+    refused = []
 
-
-class Scan:
-    """A question to one other socket, which sends what *answers* makes of its number."""
-
-    def __init__(self, sock, answers):
-        self.sock = sock
-        self.answers = answers
-        self.refused = []
-        self.question = None
-
-    async def run(self):
-        found = discovery(self.sock, refused=self.refused)
-        found.watch()
+    async def run():
         loop = asyncio.get_running_loop()
+        questions = AmsQuestions(sock, [LEFT.net_id])
+        AmsDiscovery(sock, [LEFT], Desk(), questions, refused.append).watch()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             other.bind(("127.0.0.2", 0))
             other.setblocking(False)
             scan = asyncio.create_task(
-                found.scan("127.0.0.2", wait_s=0.2, port=other.getsockname()[1])
+                questions.scan("127.0.0.2", wait_s=0.2, port=other.getsockname()[1])
             )
             data = await asyncio.wait_for(loop.sock_recv(other, 100), 5)
-            self.question = decode_discovery(data).header
-            for each in self.answers(self.question.invoke_id):
-                other.sendto(each, self.sock.getsockname())
-            neighbours = await scan
-        loop.remove_reader(self.sock.fileno())
-        return neighbours
+            number = decode_discovery(data).header.invoke_id
+            header = DiscoveryHeader(0, number, 0x8000_0001, NetId(b"222211"), 10_000)
+            other.sendto(encode_discovery(header), sock.getsockname())
+            other.sendto(b"?", sock.getsockname())
+            found = await scan
+        loop.remove_reader(sock.fileno())
+        return found
 
-
-def test_who_answers_a_question_is_found(sock):
-    mill = NetId.parse("2.2.2.2.1.1")
-
-    def answers(number):
-        version = (Tag.VERSION, b"\3\1\xb8\x0f")
-        yield answer(number, mill, (Tag.HOST, b"mi\x1bll\0"), version)
-        yield answer(number, mill, (Tag.HOST, b"again\0"))
-        yield answer(number, LEFT.net_id)  # itself
-        yield answer(number, NOTHING)
-        yield answer(number, NetId.parse("3.3.3.3.1.1"))
-
-    scan = Scan(sock, answers)
-    assert asyncio.run(scan.run()) == [
-        Neighbour("mill", mill, "127.0.0.2", "3.1.4024"),
-        Neighbour("", NetId.parse("3.3.3.3.1.1"), "127.0.0.2", ""),
-    ]
-    assert scan.question.service == 1
-    assert scan.question.net_id == LEFT.net_id
-    assert scan.refused == []
-
-
-def test_answers_that_nobody_asked_for_are_not_taken(sock):
-    mill = NetId.parse("2.2.2.2.1.1")
-
-    def answers(number):
-        yield answer(number + 1, mill)
-        yield answer(number, mill, service=0x8000_0006)
-        yield b"?"
-
-    scan = Scan(sock, answers)
-    assert asyncio.run(scan.run()) == []
-    assert scan.refused == [Refusal.AMS_DISCOVERY] * 3
-
-
-def test_a_network_is_asked_at_its_broadcast_address(monkeypatch):
-    assert network_of("127.9.8.7") == "127.255.255.255"
-    assert network_of("0.0.0.0") == "255.255.255.255"
-    monkeypatch.setattr(module, "broadcast_of", lambda address: "")
-    assert network_of("127.9.8.7") == "255.255.255.255"
-
-
-def test_a_network_that_cannot_be_asked_says_so(sock):
-    with pytest.raises(EnvironmentalError, match=r"203\.0\.113\.1 cannot be asked from 127\.0\.0"):
-        asyncio.run(discovery(sock).scan("203.0.113.1", wait_s=0))
+    assert len(asyncio.run(run())) == 1
+    assert refused == [Refusal.AMS_DISCOVERY]

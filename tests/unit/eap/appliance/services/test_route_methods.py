@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+from ipaddress import IPv4Address
 from typing import Any
 
 import pytest
@@ -209,3 +210,47 @@ def test_scan_that_cannot_be(ask):
         with pytest.raises(ControlError, match=text) as caught:
             asyncio.run(ask("scan", **params))
         assert caught.value.code == code
+
+
+class Introducer:
+    """Stands for another router that is asked for a route."""
+
+    address = IPv4Address("127.0.9.1")
+
+    def __init__(self, result):
+        self.result = result
+        self.asked = []
+
+    async def introduce(self, wanted, address, *, wait_s):
+        self.asked.append((*wanted, address, wait_s))
+        return self.result
+
+
+@pytest.mark.parametrize(
+    ("result", "ok", "text"),
+    [
+        (0, True, "added"),
+        (0x704, False, "error 0x704 (user or password is wrong)"),
+        (None, False, "10.0.0.5 says nothing (UDP 48899)"),
+    ],
+)
+def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
+    left.routes.scanners.append(other := Introducer(result))
+    login = {"user": "Administrator", "password": "1"}
+    row = asyncio.run(ask("introduce", station="left", address="10.0.0.5", **login, wait_ms=20))
+    assert (row.ok, row.result, row.text) == (ok, result, text)
+    net_id = NetId.parse("127.0.9.1.1.1")
+    assert other.asked == [("left", net_id, "Administrator", "1", "10.0.0.5", 0.02)]
+
+
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ({"address": "plc"}, "address: Expected 4 octets in 'plc'"),
+        ({"address": "10.0.0.5", "user": "a\0"}, "a NUL in a text"),
+        ({"address": "10.0.0.5"}, "no IP address at which it serves AMS"),
+    ],
+)
+def test_introduction_that_cannot_be(ask, params, text):
+    with pytest.raises(ControlError, match=text):
+        asyncio.run(ask("introduce", station="left", **params))

@@ -1,0 +1,54 @@
+"""``eapctl routes introduce``."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+
+import pytest
+from click.testing import CliRunner
+
+from eap.cli import main
+from tests.support.controlstub import ControlStub
+
+ADDED = {"ok": True, "result": 0, "text": "added"}
+WRONG = {"ok": False, "result": 0x704, "text": "user or password is wrong"}
+
+
+@pytest.fixture
+def run(runtime):
+    """Run the command against a station whose peer takes the password ``1``."""
+    with ExitStack() as stack:
+        methods = {"routes_introduce": lambda params: ADDED if params["password"] == "1" else WRONG}
+        stub = ControlStub("line", ["left"], methods, stack)
+
+        def run_command(*words, typed=None):
+            result = CliRunner().invoke(main, ["routes", "introduce", *words], input=typed)
+            asked = [params for method, params in stub.requests if method == "routes_introduce"]
+            return result, asked
+
+        yield run_command
+
+
+def test_a_password_is_asked_for(run):
+    result, (asked,) = run("left", "10.0.0.5", "--user", "Administrator", typed="1\n")
+    assert result.exit_code == 0
+    assert result.output.endswith("10.0.0.5: added\n")
+    assert asked == {
+        "station": "left", "address": "10.0.0.5", "name": "", "user": "Administrator",
+        "password": "1", "wait_ms": 5000,
+    }  # fmt: skip
+
+
+def test_a_password_comes_from_a_file(run, tmp_path):
+    (tmp_path / "pw").write_text("1\r\nmore\n")
+    words = ["--user", "x", "--password-file", str(tmp_path / "pw"), "--name", "ours"]
+    result, (asked,) = run("left", "10.0.0.5", *words, "--json")
+    assert json.loads(result.output) == ADDED
+    assert (asked["password"], asked["name"]) == ("1", "ours")
+
+
+def test_a_refusal_fails(run):
+    result, _ = run("left", "10.0.0.5")
+    assert result.exit_code == 1
+    assert result.output == "10.0.0.5: user or password is wrong\n"
