@@ -118,8 +118,13 @@ class AmsDoor:
             sock.close()
             return
         name = connection_name(sock)
-        set_options(sock)
-        await loop.connect_accepted_socket(lambda: AmsConnection(name, host, self), sock)
+        try:
+            set_options(sock)
+            await loop.connect_accepted_socket(lambda: AmsConnection(name, host, self), sock)
+        except OSError as exc:  # it has gone again already
+            logger.debug("AMS/TCP connection %s: %s", name, exc.strerror)
+            self._shares.give_back(host)
+            sock.close()
 
     async def _watch_slow(self) -> None:
         loop = asyncio.get_running_loop()

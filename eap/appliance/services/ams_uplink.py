@@ -8,6 +8,7 @@ Rule 2: the peer may ask on it too, and is answered on it.
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple, Protocol
@@ -29,8 +30,15 @@ _STABLE_S = 10.0
 """A connection that lasted so long was a good one: the next is tried soon."""
 
 
+logger = logging.getLogger(__name__)
+
+
 class Hops(Protocol):
     """What a connection to a peer needs of the router of its station."""
+
+    @property
+    def name(self) -> str:
+        """Name of the station."""
 
     def receive(self, data: bytes, door: str, connection: str) -> None:
         """Act on a packet; what has to be said goes to ``AmsUplink.send``."""
@@ -92,6 +100,7 @@ class AmsUplink:
         self._connection: AmsConnection | None = None
         self._closed: asyncio.Future[str]
         self._early: list[bytes] | None = []
+        self._said = ""
 
     async def serve(self) -> None:
         """Keep the connection until cancelled."""
@@ -104,6 +113,9 @@ class AmsUplink:
                 backoff.reset()
             self._early = None
             self._router.hop_down(*self._way, why)
+            if why != self._said:  # it is tried again and again
+                self._said = why
+                logger.warning("%s: %s", self._router.name, why)
             await asyncio.sleep(backoff.next_s())
 
     def send(self, connection: str, packets: Iterable[bytes]) -> str | None:
@@ -190,6 +202,9 @@ class AmsUplink:
         try:
             while not (await asyncio.wait([self._closed], timeout=self._patience_s / 4))[0]:
                 connection.find_slow(loop.time(), self._patience_s)
+                if self._said:
+                    self._said = ""
+                    logger.info("%s: connected to %s", self._router.name, self.peer)
         finally:
             connection.close("the appliance ends")
         why = self._closed.result()

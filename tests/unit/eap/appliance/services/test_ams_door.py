@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import pytest
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services import ams_shares
+from eap.appliance.services import ams_door, ams_shares
 from eap.appliance.services.ams_door import AmsClients, AmsDoor
 from eap.appliance.services.routing.entrance import Entrance
 from tests.support import aoe
@@ -222,6 +222,25 @@ def test_connection_that_is_reset_before_it_is_accepted_is_no_matter():
         writer.close()
 
     assert play(script)[0] == []
+
+
+def test_connection_that_cannot_be_served_gives_its_place_back(monkeypatch):
+    def refuse(sock):
+        raise OSError(22, "Invalid argument")
+
+    async def script(connect, door):
+        with monkeypatch.context() as patch:
+            patch.setattr(ams_door, "set_options", refuse)
+            reader, writer = await connect()
+            assert await reader.read() == b""
+            writer.close()
+        assert door._shares._total == 0
+        reader, writer = await connect()
+        writer.write(question(b"x"))
+        assert await hear(reader) == b"x"
+        writer.close()
+
+    play(script)
 
 
 def test_connections_are_closed_when_the_door_is():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import struct
 from contextlib import asynccontextmanager
@@ -26,6 +27,8 @@ def packet(body: bytes = b"", flags: int = 4) -> bytes:
 
 class Router:
     """Notes what an uplink tells it."""
+
+    name = "left"
 
     def __init__(self) -> None:
         self.seen: list[str | bytes] = []
@@ -186,6 +189,25 @@ def test_peer_that_refuses_is_tried_again_until_it_is_there():
                 writer.close()
 
     asyncio.run(run())
+
+
+def test_log_says_once_why_there_is_no_connection_and_when_there_is(caplog):
+    async def run():
+        port = free_port()
+        async with serving(port, patience_s=0.2) as (_, router, _):
+            await eventually(lambda: len(router.seen) == 3)
+            async with listening(port) as (plc, _):
+                _, writer = await plc.take()
+                await eventually(lambda: len(caplog.messages) == 2)
+                writer.close()
+                await eventually(lambda: len(caplog.messages) == 3)
+            refuses, connected, closed = caplog.messages
+            assert refuses == f"left: 127.0.0.1:{port} refuses connections: no router runs there"
+            assert connected == f"left: connected to 127.0.0.1:{port}"
+            assert "closes connections at once" in closed
+
+    with caplog.at_level(logging.INFO):
+        asyncio.run(run())
 
 
 def test_connection_that_is_lost_is_opened_again():

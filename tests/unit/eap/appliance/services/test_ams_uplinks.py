@@ -22,6 +22,8 @@ pytestmark = pytest.mark.net
 class Router:
     """Has doors and routes; knows which hops are up."""
 
+    name = "left"
+
     def __init__(self, *routes: Route) -> None:
         self.table: list[Route] = list(routes)
         self.doors: dict[str, Door] = {}
