@@ -160,4 +160,15 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
     pid: int
 
 
-FromEngine: TypeAlias = Answer | Hello
+class Heard(msgspec.Struct, frozen=True, tag="heard"):
+    """What a slave sent unasked: an Ethernet frame, an emergency, a notification."""
+
+    bus: int
+    station: int
+    type: int
+    """Mailbox type of the message."""
+    data: bytes
+    """What stands behind its mailbox header."""
+
+
+FromEngine: TypeAlias = Answer | Hello | Heard

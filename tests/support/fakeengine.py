@@ -30,6 +30,7 @@ from eap.appliance.bus_request import (
     Cancel,
     Describe,
     Failure,
+    Heard,
     Hello,
     Outcome,
     Ping,
@@ -192,6 +193,10 @@ class FakeEngine:
     def say_hello(self) -> None:
         """Be a new engine."""
         self._send(Hello(1))
+
+    def tell(self, message: Heard) -> None:
+        """Pass on what a slave sent unasked."""
+        self._send(message)
 
     def release(self) -> None:
         """Do what was held back, and nothing is any more."""

@@ -18,6 +18,7 @@ import msgspec
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Message
 from devicebus.master.access import Reply
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_failure import to_failure
@@ -30,6 +31,7 @@ from eap.appliance.bus_request import (
     Cancel,
     Describe,
     Failure,
+    Heard,
     Hello,
     Outcome,
     Ping,
@@ -98,6 +100,10 @@ class BusDesk:
     def greet(self) -> None:
         """Say that a new engine is here."""
         self._send(Hello(os.getpid()))
+
+    def tell(self, bus: int, message: Unsolicited) -> None:
+        """Pass on what a slave of the bus numbered *bus* sent unasked."""
+        self._send(Heard(bus, message.station, message.type, message.data))
 
     def serve(self, now_ns: int) -> None:
         """Take a few of the requests that wait."""
@@ -227,7 +233,7 @@ class BusDesk:
             del self._places[errand.place]
         return True
 
-    def _send(self, message: Answer | Hello) -> None:
+    def _send(self, message: Answer | Hello | Heard) -> None:
         try:
             self._sock.send(msgspec.msgpack.encode(message))
         except OSError:

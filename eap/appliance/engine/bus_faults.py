@@ -1,16 +1,24 @@
-"""What the master told last about each slave that is not where it belongs."""
+"""What the master told last about each slave that is not where it belongs, and what they sent."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from devicebus.master.event import SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import name_of, state_name
 
 
 class SlaveFaults:
-    """Texts by station address; :meth:`of` returns one."""
+    """Texts by station address; :meth:`of` returns one.
+
+    Attributes:
+        on_unsolicited: Called with each message that a slave sent unasked.
+    """
 
     def __init__(self) -> None:
+        self.on_unsolicited: list[Callable[[Unsolicited], None]] = []
         self._texts: dict[int, str] = {}
 
     def of(self, station: int) -> str:
@@ -31,3 +39,6 @@ class SlaveFaults:
                 )
             elif isinstance(event, SlaveBack):
                 self._texts.pop(event.station, None)
+            elif isinstance(event, Unsolicited):
+                for call in self.on_unsolicited:
+                    call(event)

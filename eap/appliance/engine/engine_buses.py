@@ -6,6 +6,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 
 from eap.appliance.engine.bus_desk import BusDesk, ServeStation
 from eap.appliance.engine.bus_settings import master_settings
@@ -44,6 +45,8 @@ class EngineBuses:
         if handover.bus_fd != NO_DESCRIPTOR:
             self.desk = BusDesk(socket.socket(fileno=handover.bus_fd), self.buses, serve_station)
             self.arrivals[self.desk.fileno()] = self.desk.serve
+            for number, bus in enumerate(self.buses):
+                bus.faults.on_unsolicited.append(partial(self.desk.tell, number))
 
     def start(self, now_ns: int) -> None:
         """Begin to bring all buses up."""

@@ -7,7 +7,7 @@ handled here, so that the engine never waits for a file or for a client.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from time import monotonic_ns
 from typing import TypeVar
 
@@ -21,6 +21,7 @@ from eap.appliance.bus_request import (
     BusReport,
     Datagram,
     Describe,
+    Heard,
     Transfer,
 )
 from eap.appliance.control_bus import BRING_S, PATIENCE_S, TRANSFER_S
@@ -53,6 +54,16 @@ class BusClient:
         self._turns = Turns()
         self._up: set[PortName] = set()
         link.on_restart.append(self._up.clear)
+
+    def listen(self, port: PortName, heard: Callable[[Heard], None]) -> None:
+        """Call *heard* with each message that a slave of a bus sends unasked."""
+        number = self._numbers[port]
+
+        def take(message: Heard) -> None:
+            if message.bus == number:
+                heard(message)
+
+        self._link.on_heard.append(take)
 
     async def describe(self, port: PortName, timeout_s: float = DESCRIBE_S) -> BusReport:
         """Return how a bus is now; raises EngineGoneError."""

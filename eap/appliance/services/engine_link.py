@@ -16,7 +16,7 @@ from time import monotonic_ns
 import msgspec
 
 from eap.appliance.bus_failure import to_error
-from eap.appliance.bus_request import Answer, Cancel, FromEngine, Hello, Ping, Request
+from eap.appliance.bus_request import Answer, Cancel, FromEngine, Heard, Hello, Ping, Request
 from eap.errors import EngineGoneError
 
 LOOK_S = 1.0
@@ -37,6 +37,7 @@ class EngineLink:
 
     Attributes:
         on_restart: Called when another engine has taken its end of the pair.
+        on_heard: Called with each message that a slave sent unasked.
     """
 
     def __init__(self, sock: socket.socket, *, look_s: float = LOOK_S) -> None:
@@ -52,6 +53,7 @@ class EngineLink:
         self._last_id = monotonic_ns()
         self._heard_s = 0.0
         self.on_restart: list[Callable[[], None]] = []
+        self.on_heard: list[Callable[[Heard], None]] = []
 
     async def ask(self, make: Callable[[int], Request], timeout_s: float) -> Answer:
         """Send the request that *make* returns for its number, and wait for the answer.
@@ -136,6 +138,9 @@ class EngineLink:
         self._heard_s = self._loop.time()
         if isinstance(message, Hello):
             self._restarted()
+        elif isinstance(message, Heard):
+            for call in self.on_heard:
+                call(message)
         elif (future := self._waiting.get(message.id)) is not None and not future.done():
             future.set_result(message)
 

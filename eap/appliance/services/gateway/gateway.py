@@ -19,7 +19,9 @@ from eap.aoe.ads_operation import Operation
 from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
+from eap.appliance.bus_request import Heard
 from eap.appliance.services.gateway.dialect_desk import DialectDesk
+from eap.appliance.services.gateway.eoe_listeners import EoeListeners
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.slave_book import SlaveBook
 from eap.appliance.services.gateway.slave_link import SlaveLink
@@ -116,7 +118,9 @@ class MailboxGateway:
         self._slaves: Sessions[SlaveSession] = {}
         self._masters: Sessions[MasterSession] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._listeners = EoeListeners()
         self._counter = 0
+        bus.listen(self._take_unasked)
 
     def receive(
         self, header: MailboxHeader, body: bytes, way: Way, send: Send
@@ -145,6 +149,7 @@ class MailboxGateway:
     def connection_closed(self, way: Way) -> None:
         """Forget a client, and end what it had under way."""
         self.ledger.forget(way)
+        self._listeners.forget(way)
         for key in [key for key in self._slaves if key[0] == way]:
             self._slaves.pop(key).close()
         for key in [key for key in self._masters if key[0] == way]:
@@ -231,12 +236,26 @@ class MailboxGateway:
         if reason is not None:
             return [Reply(*refuse(kind, body, reason), reason=reason)]
 
+        if kind is MailboxType.EOE:
+            address, now_ns = request.header.address, monotonic_ns()
+            self._listeners.note(station, request.way, address, request.send, now_ns)
+
         def begin() -> SlaveSession:
             talk = partial(self._bus.open_talk, station, kind, request.way)
             return SlaveSession(kind, slave, talk, answer_s=self._settings.answer_s)
 
         session = self._session(self._slaves, (request.way, station, kind), begin)
         return await session.ask(body, is_step=is_step)
+
+    def _take_unasked(self, message: Heard) -> None:
+        """Hand an Ethernet frame of a slave to the clients that talk EoE to it."""
+        if message.type != MailboxType.EOE:
+            return
+        for listener in self._listeners.of(message.station, monotonic_ns()):
+            header = MailboxHeader(
+                0, listener.address, type=MailboxType.EOE, counter=self._next_counter()
+            )
+            listener.send(encode_frame(header, message.data))
 
     def _session(self, sessions: Sessions[S], key: _Key, begin: Callable[[], S]) -> S:
         session = sessions.pop(key, None)

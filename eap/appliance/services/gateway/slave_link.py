@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import Protocol, TypeVar
 
 from devicebus.mailbox.conversation import Conversation
-from eap.appliance.bus_request import BusReport
+from eap.appliance.bus_request import BusReport, Heard
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.bus_talk import Talk
@@ -27,6 +27,9 @@ class SlaveLink(Protocol):
     async def converse(self, station: int, conversation: Conversation[T], requester: Hashable) -> T:
         """Lead a conversation with a slave."""
 
+    def listen(self, heard: Callable[[Heard], None]) -> None:
+        """Call *heard* with each message that a slave sends unasked."""
+
 
 class PortLink:
     """The bus of one port."""
@@ -34,6 +37,10 @@ class PortLink:
     def __init__(self, client: BusClient, port: PortName) -> None:
         self._client = client
         self._port = port
+
+    def listen(self, heard: Callable[[Heard], None]) -> None:
+        """Call *heard* with each message that a slave sends unasked."""
+        self._client.listen(self._port, heard)
 
     async def describe(self) -> BusReport:
         """Return how the bus is."""

@@ -8,6 +8,7 @@ import socket
 import msgspec
 import pytest
 
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command
 from devicebus.wire.register import Register
@@ -20,6 +21,7 @@ from eap.appliance.bus_request import (
     Describe,
     Failure,
     FromEngine,
+    Heard,
     Hello,
     Ping,
     Transfer,
@@ -125,6 +127,12 @@ def test_a_mailbox_answers(office):
 def test_what_needs_no_reply_is_answered_when_it_is_sent(office):
     abort = bytes.fromhex("0020 80 1810 01 00000008")
     assert office.ask(ask(1, request=abort, expects_reply=False)) == Answer(id=1)
+
+
+def test_what_a_slave_sent_unasked_is_told(office):
+    office.desk.tell(0, Unsolicited(1001, MailboxType.EOE, b"frame"))
+    message = msgspec.msgpack.decode(office.services.recv(100), type=FromEngine)
+    assert message == Heard(0, 1001, MailboxType.EOE, b"frame")
 
 
 def test_who_listens_gets_what_comes(office):

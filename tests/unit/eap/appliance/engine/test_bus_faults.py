@@ -3,7 +3,9 @@ from __future__ import annotations
 import pytest
 
 from devicebus.master.event import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
+from devicebus.master.mailboxes import Unsolicited
 from eap.appliance.engine.bus_faults import SlaveFaults
+from eap.codec.mailbox import MailboxType
 
 
 class Master:
@@ -40,3 +42,12 @@ def test_the_last_counts_until_the_slave_is_back():
     assert (faults.of(1001), faults.of(1002)) == ("x", "it does not answer")
     faults.take_events(Master(SlaveBack(1001, 1, 3)))
     assert (faults.of(1001), faults.of(1002)) == ("", "it does not answer")
+
+
+def test_what_slaves_send_unasked_is_told_on():
+    faults, heard = SlaveFaults(), []
+    faults.on_unsolicited.append(heard.append)
+    message = Unsolicited(1001, MailboxType.EOE, b"frame")
+    faults.take_events(Master(message, SlaveLost(1001, 1)))
+    assert heard == [message]
+    assert faults.of(1001) == "it does not answer"

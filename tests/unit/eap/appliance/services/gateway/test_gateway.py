@@ -11,6 +11,7 @@ from eap.aoe.access import AccessList
 from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, AccessService, ObjectRange
 from eap.aoe.way import Way
+from eap.appliance.bus_request import Heard
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
@@ -412,6 +413,28 @@ def test_a_mailbox_error_is_no_request() -> None:
         frame = encode_frame(MailboxHeader(0, 1001, counter=1), bytes.fromhex("0100 0200"))
         ((header, body),) = [decoded(each) for each in await desk.ask_frame(frame)]
         assert (header.type, body) == (MailboxType.ERR, bytes.fromhex("0100 0400"))
+
+    play(scene)
+
+
+def test_ethernet_frames_of_a_slave_go_to_who_talks_to_it() -> None:
+    async def scene(desk: Desk) -> None:
+        heard: list[bytes] = []
+        frame = encode_frame(
+            MailboxHeader(0, 1001, type=EOE), bytes.fromhex("00010000") + bytes(60)
+        )
+        header, body = decode_frame(frame)
+        task = desk.gateway.receive(header, bytes(body), HERE, heard.append)
+        assert task is not None
+        await task
+        desk.engine.tell(Heard(0, 1001, EOE, b"an Ethernet frame"))
+        desk.engine.tell(Heard(0, 1001, COE, b"an emergency"))
+        desk.engine.tell(Heard(0, 1002, EOE, b"of another slave"))
+        desk.engine.tell(Heard(1, 1001, EOE, b"of another bus"))
+        await desk.ask(COE, 1001, VENDOR)
+        (back,) = heard
+        header, body = decode_frame(back)
+        assert (header.type, header.address, bytes(body)) == (EOE, 1001, b"an Ethernet frame")
 
     play(scene)
 
