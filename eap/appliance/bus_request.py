@@ -165,7 +165,7 @@ class Heard(msgspec.Struct, frozen=True, tag="heard"):
 
     bus: int
     station: int
-    type: int
+    kind: int
     """Mailbox type of the message."""
     data: bytes
     """What stands behind its mailbox header."""

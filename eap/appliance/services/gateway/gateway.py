@@ -249,7 +249,7 @@ class MailboxGateway:
 
     def _take_unasked(self, message: Heard) -> None:
         """Hand an Ethernet frame of a slave to the clients that talk EoE to it."""
-        if message.type != MailboxType.EOE:
+        if message.kind != MailboxType.EOE:
             return
         for listener in self._listeners.of(message.station, monotonic_ns()):
             header = MailboxHeader(
