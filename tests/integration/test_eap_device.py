@@ -138,11 +138,12 @@ def test_aoe_refusals(appliance: Appliance, left: UdpClient) -> None:
     assert left.write(0xD000, Tx.PD_ID, b"\2").result == 0x705
     assert left.ask(aoe.READ, aoe.read_body(0x1000 << 16, 3)).result == 0x705
     assert left.ask(aoe.READ, aoe.read_body(0, group=0x4020)).result == 0x702
-    assert left.ask(6, bytes(40)).result == 0x701
+    assert left.ask(6, bytes(40)).result == 0x702
     assert left.ask(77, b"").error == 8
     assert left.ask(aoe.READ, aoe.read_body(0), port=1001).error == 6
     left.target = f"{LEFT}.1.1"
-    assert left.read(0x1000).error == 6
+    assert left.read(0x1000).data == (9000 << 16 | 5001).to_bytes(4, "little")
+    assert left.ask(aoe.READ, aoe.read_body(0), port=851).error == 6
     left.target = "9.9.9.9.2.1"
     assert left.read(0x1000).error == 7
     left.target = f"{RIGHT}.2.1"
