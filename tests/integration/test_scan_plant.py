@@ -74,6 +74,7 @@ def row(farm: Plants) -> Row:
     return Row(farm.run(plant, "--station", name(1)), others)
 
 
+@pytest.mark.timeout(400)  # 14 buses and their slaves, beside whatever else a machine does
 def test_one_connection_lists_every_port_and_slave(row: Row) -> None:
     wait_until(row.is_whole, 60)
     found = row.scan()
