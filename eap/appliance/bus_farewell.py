@@ -11,13 +11,20 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import encode_abort
 from eap.od.abort import AbortCode
 
+_TIMEOUT_NS = 50_000_000
+"""A slave that does not take messages shall not keep others waiting for this one."""
+
 FAREWELLS = {
     MailboxType.COE: Ask(
-        MailboxType.COE, encode_abort(0, 0, AbortCode.GENERAL), expects_reply=False
+        MailboxType.COE,
+        encode_abort(0, 0, AbortCode.GENERAL),
+        timeout_ns=_TIMEOUT_NS,
+        expects_reply=False,
     ),
     MailboxType.FOE: Ask(
         MailboxType.FOE,
         foe.encode_message(foe.FoeOpcode.ERROR, foe.FoeErrorCode.NOT_DEFINED),
+        timeout_ns=_TIMEOUT_NS,
         expects_reply=False,
     ),
 }

@@ -37,6 +37,8 @@ _NAMED = {
     MailboxType.SOE: 2,
 }
 """Octets of a request that fragments of its answer repeat."""
+_GRACE_S = 0.03
+"""For the engine, which answers at the deadline itself."""
 _S = 1_000_000_000
 
 
@@ -96,23 +98,34 @@ class SlaveSession:
             body: What stands behind the mailbox header.
             is_step: Whether it only makes sense within a transfer.
         """
-        async with self._turn:
-            if self._transfer.is_repeated(body):
-                return self._last
-            if is_step and not self.is_running:
-                return self._refuse(body, Reason.SERVICE, "no transfer is under way")
-            self._stop_timer()
-            try:
-                self._last = await self._exchange(body)
-            except BaseException:
-                self.close()
-                raise
-            if self.is_running:
-                loop = asyncio.get_running_loop()
-                self._timer = loop.call_later(self._idle_s, self.close)
-            else:
-                self._let_go()
+        deadline_s = asyncio.get_running_loop().time() + self._answer_s
+        try:
+            async with asyncio.timeout_at(deadline_s):
+                await self._turn.acquire()
+        except TimeoutError:
+            return self._refuse(body, Reason.TIMEOUT)
+        try:
+            return await self._ask(body, deadline_s, is_step=is_step)
+        finally:
+            self._turn.release()
+
+    async def _ask(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[Reply]:
+        if self._transfer.is_repeated(body):
             return self._last
+        if is_step and not self.is_running:
+            return self._refuse(body, Reason.SERVICE, "no transfer is under way")
+        self._stop_timer()
+        try:
+            self._last = await self._exchange(body, deadline_s)
+        except BaseException:
+            self.close()
+            raise
+        if self.is_running:
+            loop = asyncio.get_running_loop()
+            self._timer = loop.call_later(self._idle_s, self.close)
+        else:
+            self._let_go()
+        return self._last
 
     def close(self) -> None:
         """End what is under way: the slave is told that it will not go on."""
@@ -122,8 +135,7 @@ class SlaveSession:
             talk.abandon()
         self._transfer.end()
 
-    async def _exchange(self, body: bytes) -> list[Reply]:
-        deadline_s = asyncio.get_running_loop().time() + self._answer_s
+    async def _exchange(self, body: bytes, deadline_s: float) -> list[Reply]:
         try:
             talk = await self._take_turn(deadline_s)
             return await self._pass_on(talk, body, deadline_s)
@@ -160,7 +172,13 @@ class SlaveSession:
 
     async def _step(self, talk: Talk, ask: Ask, deadline_s: float) -> Message:
         rest_s = deadline_s - asyncio.get_running_loop().time()
-        return await talk.ask(ask._replace(timeout_ns=max(1, int(rest_s * _S))))
+        asked = ask._replace(timeout_ns=max(1, int(rest_s * _S)))
+        try:
+            # The engine's time counts from when the mailbox is free.
+            async with asyncio.timeout_at(deadline_s + _GRACE_S):
+                return await talk.ask(asked)
+        except TimeoutError:
+            raise MailboxTimeoutError("its mailbox was not free in time") from None
 
     def _note(self, message: Message) -> Reply:
         self._transfer.answer(message.data)
