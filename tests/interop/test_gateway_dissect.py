@@ -151,7 +151,7 @@ def _check_info(reply: Reply) -> None:
         assert reply.field("coe.sdoinfoindex") == told.index
         assert reply.field("coe.sdoinfodatatype") == told.data_type
         assert reply.field("coe.sdoinfomaxsub") == told.max_subindex
-        assert reply.field("coe.sdoinfoobjcode") == told.object_code
+        assert reply.field("coe.sdoinfoobjcode") == told.code
     elif opcode == sdoinfo.SdoInfoOpcode.ENTRY_RESPONSE:
         index, subindex, info = reply.body[6] | reply.body[7] << 8, reply.body[8], reply.body[9]
         assert reply.field("coe.sdoinfoindex") == index
