@@ -10,13 +10,15 @@ import signal
 import socket
 import struct
 import time
+from contextlib import ExitStack
 
 import pytest
 
+from eap.appliance.services.ams_shares import MAX_OF_HOST
 from tests.support import aoe
 from tests.support.amsclient import AmsClient
 from tests.support.appliance import Appliance, Plants, wait_until
-from tests.support.namespaces import cable
+from tests.support.namespaces import Namespace, cable
 from tests.support.vectors import load
 
 pytestmark = pytest.mark.net
@@ -194,3 +196,30 @@ def test_other_hosts_read_and_do_not_write(farm: Plants) -> None:
         with AmsClient(address, here.socket(socket.AF_INET, socket.SOCK_STREAM)) as client:
             assert client.ask(target, aoe.WRITE, write) == (0, bytes(4))
         assert appliance.station("left")["state"] == "PREOP"
+
+
+@pytest.mark.root
+def test_other_host_does_not_take_all_places(farm: Plants) -> None:
+    with cable(addresses=True) as (here, there), ExitStack() as stack:
+        address = "10.88.164.1"
+        appliance = farm.run(farm.write(ALONE.replace(LEFT, address)), prefix=here.prefix)
+        target = f"{address}.2.1"
+
+        def connect(host: Namespace) -> AmsClient:
+            sock = host.socket(socket.AF_INET, socket.SOCK_STREAM)
+            return stack.enter_context(AmsClient(address, sock))
+
+        greedy = [connect(there) for _ in range(MAX_OF_HOST + 3)]
+        wait_until(lambda: appliance.station("left")["discarded"] == {"ams_full": 3})
+        assert [each.net_id(target) for each in greedy[:MAX_OF_HOST]] == [target] * MAX_OF_HOST
+        assert all(each.socket.recv(1) == b"" for each in greedy[MAX_OF_HOST:])
+        assert connect(here).net_id(target) == target
+        greedy[0].socket.close()
+        wait_until(lambda: _is_served(connect(there), target))
+
+
+def _is_served(client: AmsClient, target: str) -> bool:
+    try:
+        return client.net_id(target) == target
+    except (AssertionError, OSError):
+        return False
