@@ -191,6 +191,14 @@ def address_of(way: Way) -> IPv4Address | None:
         return None
 
 
+def host_of(way: Way) -> str:
+    """Return who came by *way*, whichever of his connections it is."""
+    kind = _kind(way)
+    if kind in _IP_DOORS:
+        return way.connection.partition(":")[0]
+    return "" if kind == LOCAL else way.connection
+
+
 def _kind(way: Way) -> str:
     return way.door.partition(":")[0]
 

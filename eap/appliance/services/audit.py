@@ -21,11 +21,12 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from eap.aoe.access import place_of
+from eap.aoe.access import host_of, place_of
 from eap.aoe.ads_operation import Operation, WriteControl
 from eap.aoe.directory import Directory
 from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.way import Way
+from eap.appliance.services.allowance import Allowance
 from eap.codec.ads import AdsError, IndexGroup
 from eap.od.abort import entry_name
 
@@ -33,9 +34,9 @@ MAX_OCTETS = 8 << 20
 """Of the file before it is put aside."""
 KEPT = 4
 """Older files."""
-BURST = 500
-"""Lines that a client may cause at once, and a tenth of it in each second for long."""
-DOOR_BURST = 5000
+BURST, PER_S = 500, 50
+"""Lines that a client may cause at once, and in each second for long."""
+DOOR_BURST, DOOR_PER_S = 5000, 500
 """Likewise, of all clients of a door, whose addresses may be made up."""
 _MAX_CLIENTS = 1024
 _PLAIN = 8
@@ -47,29 +48,6 @@ _Client: TypeAlias = tuple[str, str, str]
 """Station, door, and address without its TCP port."""
 
 logger = logging.getLogger(__name__)
-
-
-class Allowance:
-    """How many lines somebody may still cause; *burst* at once.
-
-    Attributes:
-        skipped: Lines that were left out.
-    """
-
-    def __init__(self, burst: int, now: float) -> None:
-        self.skipped = 0
-        self._burst = burst
-        self._left = float(burst)
-        self._at = now
-
-    def take(self, now: float) -> bool:
-        """Say whether there is one more."""
-        self._left = min(self._burst, self._left + (now - self._at) * self._burst / 10)
-        self._at = now
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
 
 
 class Audit:
@@ -131,8 +109,8 @@ class Audit:
             self._append(lines)
 
     def _client(self, station: str, way: Way) -> Allowance:
-        key = station, way.door, way.connection.partition(":")[0]
-        client = self._clients.pop(key, None) or Allowance(BURST, self._clock())
+        key = station, way.door, host_of(way)
+        client = self._clients.pop(key, None) or Allowance(BURST, PER_S, self._clock())
         if len(self._clients) >= _MAX_CLIENTS:
             self.tell_skipped()
             self._clients.popitem(last=False)
@@ -141,7 +119,7 @@ class Audit:
 
     def _door(self, station: str, name: str) -> Allowance:
         if (station, name) not in self._doors:
-            self._doors[station, name] = Allowance(DOOR_BURST, self._clock())
+            self._doors[station, name] = Allowance(DOOR_BURST, DOOR_PER_S, self._clock())
         return self._doors[station, name]
 
     def _head(self, station: str, entry: AuditEntry) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from eap.aoe.routes import Origin, RouteTable
 from eap.aoe.spec import AmsUser, DoorKind, HopSpec, RouteSpec
-from eap.appliance.services.audit import Allowance
+from eap.appliance.services.allowance import Allowance
 from eap.appliance.services.station_routes import StationRoutes
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
@@ -54,7 +54,7 @@ class RouteDesk:
     ) -> None:
         self._stations = stations
         self._clock = clock
-        self._allowance = Allowance(BURST, clock())
+        self._allowance = Allowance(BURST, BURST / 10, clock())
 
     def take(self, question: Discovery, sender: str, *, is_this_host: bool) -> AdsError | None:
         """Add the route that *question* asks for, and return the result for its sender.

@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 from collections import OrderedDict
 
+from eap.aoe.access import host_of
 from eap.aoe.action import Outcome, Trace
+from eap.appliance.services.allowance import Allowance
 
 LINES_PER_S = 5
 """On the average; what is more is only counted."""
@@ -25,26 +27,6 @@ _LEVELS = {
 logger = logging.getLogger(__name__)
 
 
-class _Allowance:
-    """How many lines somebody may still cause."""
-
-    def __init__(self) -> None:
-        self.missed = 0
-        self._left = float(BURST)
-        self._at_ns = 0
-
-    def take(self, at_ns: int) -> bool:
-        """Say whether there is one more."""
-        passed_s = max(0, at_ns - self._at_ns) / 1e9
-        self._at_ns = at_ns
-        self._left = min(BURST, self._left + passed_s * LINES_PER_S)
-        if self._left < 1:
-            self.missed += 1
-            return False
-        self._left -= 1
-        return True
-
-
 class TraceLog:
     """The lines of one *station*.
 
@@ -54,7 +36,7 @@ class TraceLog:
 
     def __init__(self, station: str) -> None:
         self._station = station
-        self._allowances: OrderedDict[tuple[str, str], _Allowance] = OrderedDict()
+        self._allowances: OrderedDict[tuple[str, str], Allowance] = OrderedDict()
 
     def write(self, trace: Trace) -> None:
         """Say what became of a packet, unless too much was said just now."""
@@ -62,19 +44,21 @@ class TraceLog:
         if not logger.isEnabledFor(level):
             return
         allowance = self._allowance(trace)
-        if not allowance.take(trace.at_ns):
+        if not allowance.take(trace.at_ns / 1e9):
+            allowance.skipped += 1
             return
-        if allowance.missed:
+        if allowance.skipped:
             text = "%s: %d more packets met errors"
-            logger.warning(text, self._station, allowance.missed)
-            allowance.missed = 0
+            logger.warning(text, self._station, allowance.skipped)
+            allowance.skipped = 0
         logger.log(level, "%s: %s (0x%x)", self._station, trace.text, trace.error_code)
 
-    def _allowance(self, trace: Trace) -> _Allowance:
+    def _allowance(self, trace: Trace) -> Allowance:
         whose = "", ""
         if trace.outcome is Outcome.DENIED and trace.came_by is not None:
-            whose = trace.came_by.door, trace.came_by.connection.partition(":")[0]
-        allowance = self._allowances.pop(whose, None) or _Allowance()
+            whose = trace.came_by.door, host_of(trace.came_by)
+        allowance = self._allowances.pop(whose, None)
+        allowance = allowance or Allowance(BURST, LINES_PER_S, trace.at_ns / 1e9)
         if len(self._allowances) >= MAX_CLIENTS:
             self._allowances.popitem(last=False)
         self._allowances[whose] = allowance

@@ -4,7 +4,7 @@ from ipaddress import IPv4Address
 
 import pytest
 
-from eap.aoe.access import AccessList, Grants, address_of, objects_of, service_of
+from eap.aoe.access import AccessList, Grants, address_of, host_of, objects_of, service_of
 from eap.aoe.ads_operation import (
     DeleteNotification,
     Operation,
@@ -82,6 +82,13 @@ def test_objects_of_operations() -> None:
     )
     assert objects_of(Read(G.OBJECT_LIST, 0x0001_0000, 64)) is None
     assert objects_of(CONTROL) is None
+
+
+def test_host_of_a_way() -> None:
+    assert host_of(Way("ams-tcp", "10.0.0.2:40000#7")) == "10.0.0.2"
+    assert host_of(Way("ethernet:eap0", "02:00:00:00:00:01")) == "02:00:00:00:00:01"
+    assert host_of(Way("mqtt:line", "5.1.1.1.1.1")) == "5.1.1.1.1.1"
+    assert not host_of(Way("local", "17"))
 
 
 def test_without_rules_this_host_does_everything_and_others_read() -> None:
