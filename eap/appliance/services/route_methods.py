@@ -121,7 +121,7 @@ class RouteMethods:
         with _kept():
             result = await introduce(view.routes, route, address, wanted.wait_ms / 1000)
         if result is None:
-            return IntroducedRow(ok=False, result=None, text=f"{address} says nothing (UDP 48899)")
+            return IntroducedRow(ok=False, result=None, text="no answer by UDP 48899")
         text = "added" if result == AdsError.NONE else AdsError.words_of(result)
         return IntroducedRow(ok=result == AdsError.NONE, result=result, text=text)
 
