@@ -51,9 +51,7 @@ class StationRouting:
         self._store = store
         self._set_access = set_access
         self._base = digest_of(routes.spec)
-        kept = store.read()
-        is_usable = kept is not None and kept.base == self._base
-        self._applied = kept if is_usable else None
+        self._applied = self._usable(store.read())
 
     @property
     def applied(self) -> AppliedRouting | None:
@@ -109,6 +107,19 @@ class StationRouting:
         changes = describe_routing(now.spec, now.previous)
         self._change(replace(now, spec=now.previous, previous=now.spec, undone=not now.undone))
         return changes
+
+    def _usable(self, kept: AppliedRouting | None) -> AppliedRouting | None:
+        """Return what was applied, unless the plant file was edited since."""
+        if kept is None or kept.base == self._base:
+            return kept
+        if kept.spec != self.routes.spec:
+            logger.warning(
+                "station %s: the plant file was edited since routes or access rules were changed;"
+                " the file counts",
+                self._name,
+            )
+        self._store.set_aside()
+        return None
 
     def _change(self, applied: AppliedRouting) -> None:
         self._store.save(applied)

@@ -49,11 +49,21 @@ def test_what_is_applied_is_in_force_at_once_and_after_a_new_start(caplog):
     assert "station left: routes and access rules are as applied last" in caplog.text
 
 
-def test_who_edits_the_plant_file_has_the_last_word():
+def test_who_edits_the_plant_file_has_the_last_word(caplog):
     House().routing.apply(OTHER, "1")
     edited = House(RoutingSpec())
     assert edited.names() == []
     assert edited.routing.applied is None
+    assert "the plant file was edited since routes or access rules were changed" in caplog.text
+    caplog.clear()
+    assert House().names() == ["mill"]  # nor does it come back with the file as it was
+    assert caplog.text == ""
+
+
+def test_a_file_that_says_what_was_applied_is_nothing_to_speak_of(caplog):
+    House().routing.apply(OTHER, "1")
+    assert House(OTHER).names() == ["saw"]
+    assert caplog.text == ""
 
 
 def test_a_change_is_taken_back_and_made_again():
