@@ -18,10 +18,19 @@ _DENIED = OperationOutcome(AdsError.ACCESS_DENIED)
 _RESULT = 4
 
 
+class AddRoute(NamedTuple):
+    """A route that somebody asked for by UDP 48899; *user* is who he says he is."""
+
+    name: str
+    net_id: str
+    address: str
+    user: str
+
+
 class AuditedOperation(NamedTuple):
     """One operation, what was decided on it, and how it came out."""
 
-    operation: Operation
+    operation: Operation | AddRoute
     verdict: Verdict
     result: int | None
     """None if nobody knows: there was no answer, or none that can be read."""

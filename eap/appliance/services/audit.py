@@ -24,7 +24,7 @@ import msgspec
 from eap.aoe.access import host_of, place_of
 from eap.aoe.ads_operation import Operation, WriteControl
 from eap.aoe.directory import Directory
-from eap.aoe.judged import AuditedOperation, AuditEntry
+from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.aoe.way import Way
 from eap.appliance.services.allowance import Allowance
 from eap.codec.ads import AdsError, IndexGroup
@@ -188,9 +188,12 @@ def _words(each: AuditedOperation) -> dict[str, Any]:
     }
 
 
-def _what(operation: Operation) -> Iterator[tuple[str, Any]]:
+def _what(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]]:
     """Yield what was to be done."""
     yield "operation", type(operation).__name__
+    if isinstance(operation, AddRoute):
+        yield "adds", operation._asdict()
+        return
     group, offset = place_of(operation)
     if group is not None:
         yield "group", f"0x{group:X}"

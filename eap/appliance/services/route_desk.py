@@ -13,11 +13,16 @@ from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
+from eap.aoe.access import Verdict
+from eap.aoe.ads_system import SYSTEM_PORT
+from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.aoe.routes import Origin, RouteTable
-from eap.aoe.spec import AmsUser, DoorKind, HopSpec, RouteSpec
+from eap.aoe.spec import AccessService, AmsUser, DoorKind, HopSpec, RouteSpec
+from eap.aoe.way import Way
 from eap.appliance.services.allowance import Allowance
 from eap.appliance.services.station_routes import StationRoutes
 from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
 from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.config.hosts import parse_host
@@ -74,8 +79,28 @@ class RouteDesk:
             result, why = _decide(station, question, sender, is_this_host=is_this_host)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
             logger.log(level, "route %r asked for by %s: %s", name, sender, why)
+            entry = _audited(station.router.net_id, question, sender, result, why)
+            for write in station.router.on_audit:
+                write(entry)
             results.append(result)
         return next((each for each in results if each != AdsError.NONE), AdsError.NONE)
+
+
+def _audited(
+    router: NetId, question: Discovery, sender: str, result: AdsError, why: str
+) -> AuditEntry:
+    """Return what the audit says of a request."""
+    octets = (question.find(Tag.NET_ID) or b"")[:6].ljust(6, b"\0")
+    wanted = AddRoute(
+        decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN],
+        str(NetId(octets)),
+        decode_text(question.find(Tag.HOST) or b"")[:_SHOWN],
+        decode_text(question.find(Tag.USER) or b"")[:_SHOWN],
+    )
+    verdict = Verdict(AccessService.CONTROL, result != AdsError.ACCESS, why)
+    header = AmsHeader(router, SYSTEM_PORT, NetId(octets), 0, 0)
+    done = AuditedOperation(wanted, verdict, result)
+    return AuditEntry(Way("ams-udp", sender), header, "", (done,))
 
 
 def _decide(

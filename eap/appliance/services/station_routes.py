@@ -12,6 +12,7 @@ from typing import Protocol
 
 from msgspec.structs import replace
 
+from eap.aoe.judged import AuditEntry
 from eap.aoe.routes import Origin, Route, RouteTable
 from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
@@ -36,9 +37,16 @@ logger = logging.getLogger(__name__)
 class RoutedStation(Protocol):
     """What is needed of the router of a station."""
 
+    on_audit: list[Callable[[AuditEntry], None]]
+    """Called with what was changed, or refused."""
+
     @property
     def table(self) -> RouteTable:
         """Its routes, to be read."""
+
+    @property
+    def net_id(self) -> NetId:
+        """Of the router itself."""
 
     @property
     def net_ids(self) -> Collection[NetId]:

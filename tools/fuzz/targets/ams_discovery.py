@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import socket
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+from eap.aoe.judged import AuditEntry
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.spec import AmsUser, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
@@ -49,7 +50,9 @@ class _Store(RouteStore):
 class _Router:
     def __init__(self) -> None:
         self.table = RouteTable()
+        self.net_id = OWN
         self.net_ids: Collection[NetId] = (OWN,)
+        self.on_audit: list[Callable[[AuditEntry], None]] = []
 
     def add_route(self, route: Route) -> bool:
         return self.table.add(route)

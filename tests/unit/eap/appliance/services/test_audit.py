@@ -10,7 +10,7 @@ import pytest
 from eap.aoe.access import Verdict
 from eap.aoe.ads_operation import Operation, ReadWrite, Write, WriteControl
 from eap.aoe.directory import Directory
-from eap.aoe.judged import AuditedOperation, AuditEntry
+from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService, DirectoryPort, DirectoryStation
 from eap.aoe.way import Way
 from eap.appliance.services import audit as module
@@ -56,7 +56,7 @@ def audit(tmp_path: Path, clock: Clock) -> Audit:
 
 
 def entry(
-    operation: Operation = WRITE,
+    operation: Operation | AddRoute = WRITE,
     result: int | None = 0,
     *,
     verdict: Verdict = ALLOWED,
@@ -105,10 +105,24 @@ def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
             Write(IndexGroup.SDO, 0x8000_0100, bytes(9)),
             {"object": "0x8000:00 (complete access)", "length": 9, "sha256": "3e7077fd2f66d689"},
         ),
+        (
+            AddRoute("tool", "10.0.0.5.1.1", "10.0.0.5", "maria"),
+            {
+                "operation": "AddRoute",
+                "adds": {
+                    "name": "tool",
+                    "net_id": "10.0.0.5.1.1",
+                    "address": "10.0.0.5",
+                    "user": "maria",
+                },
+            },
+        ),
         (ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 4, b"a.bin\0"), {"file": "a.bin", "length": 6}),
     ],
 )
-def test_what_was_to_be_done(audit: Audit, operation: Operation, said: dict[str, Any]) -> None:
+def test_what_was_to_be_done(
+    audit: Audit, operation: Operation | AddRoute, said: dict[str, Any]
+) -> None:
     audit.write("island-01", entry(operation))
     (line,) = lines(audit)
     assert line | said == line

@@ -179,6 +179,19 @@ def test_all_stations_of_an_address_get_the_route():
     assert [each.added for each in both] == [(ADDED,), (ADDED,)]
 
 
+def test_who_asked_is_audited():
+    found, entries = routes(), []
+    found.router.on_audit.append(entries.append)
+    ask(found, asked(user=b"maria\0"))
+    ask(found, is_this_host=True)
+    refused = entries[0]
+    assert (refused.way, str(refused.header.target)) == (("ams-udp", "10.0.0.5"), "10.0.0.1.1.1")
+    assert refused.operations[0].operation == ("myroute", str(TOOL), "myhost", "maria")
+    assert refused.operations[0].verdict.why.startswith("refused: the station has no users")
+    assert [each.operations[0].result for each in entries] == [AdsError.ACCESS, AdsError.NONE]
+    assert [each.operations[0].verdict.is_allowed for each in entries] == [False, True]
+
+
 def test_passwords_are_not_tried_faster_than_they_may():
     now = 0.0
     desk = RouteDesk([routes()], clock=lambda: now)
