@@ -36,6 +36,8 @@ from eap.errors import TruncatedError
 
 MAX_ANSWER = 1 << 20
 """Octets of the longest answer; a sum command that asks for more is refused as a whole."""
+MAX_ITEMS = 10_000
+"""Of a sum command; Beckhoff advises 500.  Others wait while a request is taken apart."""
 _HEAD_SIZE = 8
 """Octets of a result and of what stands beside it in the answer of a sum command."""
 _REASONS = 3
@@ -191,6 +193,8 @@ def _parse_sum(request: ReadWrite) -> AdsRequest:
         count = len(request.data) // kind.item_size
     if count * kind.item_size > len(request.data):
         raise AdsRefusedError(AdsError.SIZE)
+    if count > MAX_ITEMS:
+        raise AdsRefusedError(AdsError.NO_MEMORY)
     operations = kind.split(count, request.data)
     padding = sum(map(asked_length, operations)) if kind.is_padded else 0
     if len(operations) * _HEAD_SIZE + padding > MAX_ANSWER:

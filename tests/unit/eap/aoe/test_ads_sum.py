@@ -16,7 +16,7 @@ from eap.aoe.ads_operation import (
     ReadWrite,
     Write,
 )
-from eap.aoe.ads_request import MAX_ANSWER, Outcomes, encode_refusal, parse_request
+from eap.aoe.ads_request import MAX_ANSWER, MAX_ITEMS, Outcomes, encode_refusal, parse_request
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand
@@ -123,6 +123,13 @@ def test_answer_must_fit_where_the_client_has_room() -> None:
     request = parse_sum(G.SUM_READ, reads(4), room=7)
     answer = request.encode_answer([OperationOutcome(data=b"abcd")])
     assert answer == struct.pack("<II", AdsError.SIZE, 0)
+
+
+@pytest.mark.parametrize("group", [G.SUM_READ, G.SUM_WRITE, G.SUM_READ_EX_2])
+def test_nobody_has_others_wait_for_too_many_items(group: int) -> None:
+    with pytest.raises(AdsRefusedError, match="NO_MEMORY"):
+        parse_sum(group, reads(*[0] * (MAX_ITEMS + 1)))
+    assert len(parse_sum(group, reads(*[0] * MAX_ITEMS)).operations) == MAX_ITEMS
 
 
 @pytest.mark.parametrize("group", [G.SUM_READ, G.SUM_READ_EX])
