@@ -15,6 +15,7 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 
+_SDO = IndexGroup.SDO.value  # a plain number: members of enums are slow
 _COMPLETE = 0x100
 _RESULTS: dict[int, AdsError] = {
     AbortCode.NO_OBJECT: AdsError.NOT_FOUND,
@@ -101,7 +102,7 @@ class ObjectSpace(AdsSpace):
     def _read(self, group: int, offset: int) -> bytes:
         index, low = offset >> 16, offset & 0xFFFF
         subindex = low & 0xFF
-        if group == IndexGroup.SDO:
+        if group == _SDO:
             if _is_complete(low):
                 return self._dictionary.upload_complete(index, 0, self._state())
             return self._dictionary.upload(index, subindex, self._state())

@@ -22,6 +22,8 @@ from eap.codec.ams import AmsCommand, AmsHeader
 
 MAX_ENTRIES = 4096
 """Entries of the audit that wait for somebody who writes them down; the oldest makes room."""
+_NOTIFICATION = AmsCommand.NOTIFICATION.value  # plain numbers: members of enums are slow
+_READ_WRITE = AmsCommand.READ_WRITE.value
 _READS = frozenset(
     (
         AmsCommand.READ_DEVICE_INFO,
@@ -96,12 +98,12 @@ class Gate:
             now_ns: The time on the monotonic clock.
             route: Name of the route that it would go on by.
         """
-        if header.command == AmsCommand.NOTIFICATION:
+        if header.command == _NOTIFICATION:
             return data, None  # nobody gets one who has not asked for it
         grants = self.access.grants(way, header.source, header.target, header.target_port)
         if grants.may_read and (
             header.command in _READS
-            or (header.command == AmsCommand.READ_WRITE and data[_GROUP] in _READ_GROUPS)
+            or (header.command == _READ_WRITE and data[_GROUP] in _READ_GROUPS)
         ):
             return data, None
         try:

@@ -19,6 +19,10 @@ from eap.ids import NetId
 _ADDRESSES = struct.Struct("<6sH6sH")
 _GRANTED = struct.Struct("<II")  # result, handle
 _HANDLE = 4
+_OF_NOTIFICATIONS = frozenset(
+    (AmsCommand.ADD_NOTIFICATION, AmsCommand.DELETE_NOTIFICATION, AmsCommand.READ_WRITE)
+)
+"""Commands that may be about some."""
 _SUM_HEAD = 8
 """Octets of result and length before the answers to the items of a sum command."""
 
@@ -37,6 +41,8 @@ class Notifier:
     def follow_request(self, pending: Pending, body: bytes, way: Way) -> None:
         """Note how many notifications a client asks for, or which it wants no more."""
         command, group, count = pending.header.command, 0, 0
+        if command not in _OF_NOTIFICATIONS:
+            return
         if command == AmsCommand.READ_WRITE and len(body) >= AdsReadWrite.SIZE:
             head = AdsReadWrite.decode(body)
             group, count = head.group, min(head.offset, MAX_PER_WAY)

@@ -29,6 +29,8 @@ from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
 from eap.ids import NetId
 
+_NOTIFICATION = AmsCommand.NOTIFICATION.value  # taken once: members of enums are slow
+_ANSWERED = Outcome.ANSWERED
 _ADDRESSES = struct.Struct("<6sH6sH")
 _HALF = _ADDRESSES.size // 2
 _INVOKE_ID = 28
@@ -75,7 +77,7 @@ class Passage:
         Raises:
             CodecError: it is a notification shorter or longer than it says.
         """
-        if header.command == AmsCommand.NOTIFICATION:
+        if header.command == _NOTIFICATION:
             body = data[AmsHeader.SIZE :]
             replies = self.notifier.hand_on(
                 header, body, lambda hop: self._outlet.is_from(hop, way)
@@ -84,7 +86,7 @@ class Passage:
                 return list(replies)
         found = self._let_on(header, data, way, now_ns)
         if isinstance(found, Refusal):
-            if header.command == AmsCommand.NOTIFICATION and found.error == AdsError.TARGET_MACHINE:
+            if header.command == _NOTIFICATION and found.error == AdsError.TARGET_MACHINE:
                 return self._end_unwanted(header, data, way, now_ns)
             return self._refuser.refuse(header, way, found, now_ns)
         route, data, judged = found
@@ -145,7 +147,7 @@ class Passage:
         """Send back what a service had at hand for a request that never waited."""
         packet = response_to(header, answer)
         self._record.connections.of(way, now_ns).answer(len(packet), took_ns)
-        self._record.enter(Trace(now_ns, Outcome.ANSWERED, way, None, header, 0, took_ns, ""))
+        self._record.enter(Trace(now_ns, _ANSWERED, way, None, header, 0, took_ns, ""))
         return [self._outlet.reply(way, packet)]
 
     def answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
@@ -310,7 +312,7 @@ class Passage:
             connection.fail(text)
         connection.answer(len(packet), took_ns)
         self._record.enter(
-            Trace(now_ns, Outcome.ANSWERED, way, hop, pending.header, error_code, took_ns, text)
+            Trace(now_ns, _ANSWERED, way, hop, pending.header, error_code, took_ns, text)
         )
         return [self._outlet.reply(way, packet)]
 

@@ -13,6 +13,7 @@ from eap.aoe.traffic import TrafficTable
 from eap.aoe.way import Way
 from eap.codec.ams import AmsCommand, AmsHeader
 
+_ANSWERED = Outcome.ANSWERED  # looked up once: members of enums are slow
 MAX_EVENTS = 1024
 """Traces that wait for somebody who reads them; the oldest makes room."""
 MAX_LATEST = 256
@@ -53,7 +54,7 @@ class Record:
         if _is_life(trace):
             return
         self.latest.append(trace)
-        if trace.outcome is Outcome.ANSWERED and not trace.error_code and not trace.text:
+        if trace.outcome is _ANSWERED and not trace.error_code and not trace.text:
             return
         if len(self._events) >= MAX_EVENTS:
             self._events.popleft()
@@ -88,7 +89,7 @@ def _is_life(trace: Trace) -> bool:
         header is not None
         and header.source_port == PROBE_PORT
         and header.target_port == SYSTEM_PORT
-        and trace.outcome is Outcome.ANSWERED
+        and trace.outcome is _ANSWERED
         and not trace.error_code
     )
 

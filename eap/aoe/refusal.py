@@ -13,7 +13,8 @@ from eap.aoe.way import Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 
-_NO_RETURN = StateFlags.NO_RETURN.value  # a plain number: operators of flags are slow
+_NO_RETURN = StateFlags.NO_RETURN.value  # plain numbers: enums and operators of flags are slow
+_NOTIFICATION = AmsCommand.NOTIFICATION.value
 
 
 class Refusal(NamedTuple):
@@ -30,7 +31,7 @@ class Refusal(NamedTuple):
 
 def wants_answer(header: AmsHeader) -> bool:
     """Say whether the sender of a request waits for an answer."""
-    return not (header.state_flags & _NO_RETURN or header.command == AmsCommand.NOTIFICATION)
+    return not (header.state_flags & _NO_RETURN or header.command == _NOTIFICATION)
 
 
 class Refuser:

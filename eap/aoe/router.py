@@ -28,7 +28,8 @@ from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError, MalformedError
 from eap.ids import NetId
 
-_RESPONSE = StateFlags.RESPONSE.value  # a plain number: operators of flags are slow
+_RESPONSE = StateFlags.RESPONSE.value  # plain numbers: enums and operators of flags are slow
+_FRAGMENT = AmsCommand.FRAGMENT.value
 _NOBODY = 0
 """Ticket of a request that has no answer."""
 
@@ -142,9 +143,9 @@ class Router:
         try:
             header = AmsHeader.decode(data)
             end = AmsHeader.SIZE + header.length
-            if header.command == AmsCommand.FRAGMENT or len(data) != end:
+            if header.command == _FRAGMENT or len(data) != end:
                 _, body = decode_packet(data)
-                if header.command == AmsCommand.FRAGMENT:
+                if header.command == _FRAGMENT:
                     return self._receive_fragment(header, bytes(body), way, now_ns, for_all=for_all)
                 data = data[:end]
             return self._receive_whole(header, data, way, now_ns, for_all=for_all)
@@ -273,7 +274,7 @@ class Router:
         if packet is None:
             return [] if acknowledgement is None or for_all else [Reply(way, (acknowledgement,))]
         whole, _ = decode_packet(packet)
-        if whole.command == AmsCommand.FRAGMENT:
+        if whole.command == _FRAGMENT:
             raise MalformedError("a fragment in fragments", layout="AmsHeader")
         return self._receive_whole(whole, packet, way, now_ns, for_all=for_all)
 

@@ -162,8 +162,8 @@ def encode_aoe_frame(counter: int, packet: bytes) -> bytes:
     if length >> _LENGTH_BITS:
         header = MailboxHeader(0, type=MailboxType.AOE, counter=counter)
         return encode_frame(header, packet)
-    word = length | FrameType.MAILBOX << _TYPE_AT
-    return _HEADS.pack(word, size, 0, 0, MailboxType.AOE | counter << _COUNTER_AT) + packet
+    word = length | _MAILBOX << _TYPE_AT
+    return _HEADS.pack(word, size, 0, 0, _AOE | counter << _COUNTER_AT) + packet
 
 
 def aoe_packet_in(data: Buffer) -> bytes | None:
@@ -176,8 +176,8 @@ def aoe_packet_in(data: Buffer) -> bytes | None:
     word, size, address, _, kind = _HEADS.unpack_from(data)
     end = _HEADS.size + size
     if (
-        word >> _TYPE_AT != FrameType.MAILBOX
-        or kind & _TYPE_MASK != MailboxType.AOE
+        word >> _TYPE_AT != _MAILBOX
+        or kind & _TYPE_MASK != _AOE
         or address
         or end > EtherCatHeader.SIZE + (word & _LENGTH_MASK)
         or end > len(data)
@@ -189,6 +189,7 @@ def aoe_packet_in(data: Buffer) -> bytes | None:
 _HEADS = struct.Struct("<HHHBB")
 """Both headers: Length and Type of the frame; length, address, channel and priority, type and
 counter of the message."""
+_MAILBOX, _AOE = FrameType.MAILBOX.value, MailboxType.AOE.value  # members of enums are slow
 _LENGTH_BITS, _TYPE_AT = 11, 12
 _LENGTH_MASK = (1 << _LENGTH_BITS) - 1
 _TYPE_MASK, _COUNTER_AT = 0x0F, 4

@@ -47,6 +47,7 @@ from eap.od.abort import SdoAbortError
 
 DEVICE_PORT = 0xFFFF
 """AMS port of an EAP device."""
+_READ, _DONE = AmsCommand.READ.value, AdsError.NONE.value  # members of enums are slow
 _BUSY_PAUSE_S = 0.005
 _BUSY_PAUSES = 20
 """Before a client is told that a writer has stopped in the middle of writing."""
@@ -88,14 +89,14 @@ class EapAds:
 
         Most requests are such.
         """
-        if header.command != AmsCommand.READ or len(body) != AdsRange.SIZE:
+        if header.command != _READ or len(body) != AdsRange.SIZE:
             return None
         asked = AdsRange.decode(body)
         try:
             data = self._ads.read(asked.group, asked.offset, asked.length)
         except AdsRefusedError:
             return None
-        return AmsAnswer(encode_result(AdsError.NONE, data))
+        return AmsAnswer(encode_result(_DONE, data))
 
     def client_gone(self, way: Way) -> None:
         """End the notifications of a connection."""
