@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import pytest
 
@@ -111,3 +112,12 @@ def test_every_request_has_an_answer() -> None:
         assert answer.body
         assert reason.text
         assert isinstance(reason.value.mailbox, MailboxError)
+
+
+def test_the_page_of_the_gateway_has_each_code() -> None:
+    page = (Path(__file__).parents[4] / "docs" / "gateway.md").read_text()
+    for reason in Reason:
+        codes = reason.value
+        numbers = f"`0x{codes.sdo:08X}` | `0x{codes.soe:04X}` | `0x{codes.foe:04X}`"
+        row = f"| {codes.text} | {int(codes.mailbox)} | {numbers} | `0x{int(codes.ads):X}` |"
+        assert row in page
