@@ -46,18 +46,17 @@ def test_every_hop_is_named_and_the_one_that_fails(line: Row) -> None:
     code, found = trace(line)
     assert (code, hops(found), found["why"]) == (0, WHOLE, "")
     assert found["answer"]["ads_state"] == 5
-    times = [each["took_us"] for each in found["hops"]]
-    assert times == sorted(times)
+    assert all(each["took_us"] > 0 for each in found["hops"])
     rules = [each["may"]["write"] for each in found["hops"]]
     assert rules == [True, False, False], "b and c know the tool, and not the station a"
 
     line.appliances["c"].close()
-    wait_until(lambda: trace(line)[0] == 1)
+    gone = "b: c (", "c: it does not answer b at "
+    wait_until(lambda: trace(line)[1]["why"].startswith(gone))
     code, found = trace(line)
     assert (code, found["answer"]) == (1, None)
     assert hops(found)[:2] == WHOLE[:2]
-    assert "c" in found["why"]
-    assert found["why"].startswith(("b: c (", "c: it does not answer b at "))
+    assert found["why"].startswith(gone)
 
     line.places[1].ip("link", "set", "west0", "down")
     wait_until(lambda: trace(line)[1]["why"].startswith(("a: ", "b: it does not answer a")))
