@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from eap.appliance.runtime import VARIABLE
+from eap.appliance.store import VARIABLE as STATE_VARIABLE
 from tools.bench.machine import ProcessSample, memory_folder
 from tools.bench.network import ROOT, Cable
 from tools.bench.pacing import wait
@@ -63,7 +64,9 @@ def running(plant: Path, link: Cable | None, *arguments: str) -> Iterator[dict[s
         RuntimeError: it does not get ready.
     """
     with TemporaryDirectory(dir=memory_folder()) as folder:
-        environment = os.environ | {VARIABLE: folder}
+        runtime = Path(folder, "run")
+        runtime.mkdir()
+        environment = os.environ | {VARIABLE: str(runtime), STATE_VARIABLE: f"{folder}/state"}
         process = subprocess.Popen(
             _command(link, "run", str(plant), *arguments),
             stdout=subprocess.PIPE,
