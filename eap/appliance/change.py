@@ -10,6 +10,8 @@ from eap.pd.spec import PortSpec, StationSpec
 
 _IN_FRAMES = {"net_id", "eap_sm"}
 """Fields of a port that only say what its frames carry."""
+_WHOLE = {"bus", "gateway"}
+"""Fields that are too much for a line."""
 
 
 def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
@@ -32,5 +34,5 @@ def _differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
     for field, value in asdict(new).items():
         if field not in _IN_FRAMES and value != was[field]:
             yield (
-                f"{field} is another one" if field == "bus" else f"{field} {was[field]} -> {value}"
+                f"{field} is another one" if field in _WHOLE else f"{field} {was[field]} -> {value}"
             )

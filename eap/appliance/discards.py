@@ -17,7 +17,7 @@ class Refusal(StrEnum):
     """Why a frame or a connection went no further."""
 
     MAILBOX = auto()
-    """Type 5 that is no AoE request to this station: nothing in this release answers it."""
+    """Type 5 that is no AoE request, to a station without a bus or to many."""
     STALE = auto()
     """It had waited in its socket since before services started."""
     WRONG_TYPE = auto()
@@ -50,6 +50,8 @@ class Refusal(StrEnum):
     """An answer came by AMS/TCP, and nobody had asked."""
     AMS_DISCOVERY = auto()
     """A datagram came to UDP 48899 that asks for nothing that there is."""
+    GATEWAY_OFF = auto()
+    """A mailbox message, while the gateway that it was for is stopped."""
     MQTT_TOPIC = auto()
     """A message by MQTT on a topic that means nothing here, or that it has no business on."""
     MQTT_BROKEN = auto()

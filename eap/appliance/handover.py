@@ -39,6 +39,10 @@ class SocketKind(StrEnum):
     AMS_BROADCAST = "ams_broadcast"
     """One socket for services, on which they ask all hosts of the address's network; none where
     that does not work.  Without a group it is the broadcast address of the network."""
+    GATEWAY_UDP = "gateway_udp"
+    """One socket for services, for the mailbox gateway of one bus port."""
+    GATEWAY_TCP = "gateway_tcp"
+    """One listener for services, likewise."""
 
 
 class PortName(Record, frozen=True, order=True):

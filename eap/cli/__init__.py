@@ -19,6 +19,7 @@ from eap.cli.group import LazyGroup
         "bus": "eap.cli.bus:bus",
         "check": "eap.cli.check:check",
         "decode": "eap.cli.decode:decode",
+        "gateway": "eap.cli.gateway:gateway",
         "gw": "eap.cli.gw:gw",
         "new": "eap.cli.new:new",
         "od": "eap.cli.od:od",

@@ -15,6 +15,7 @@ import msgspec
 from eap.codec import datatypes
 from eap.config.check_buses import bus_file
 from eap.config.destination import IP_BROADCAST, find_net_id, group_of, resolve
+from eap.config.gateways import gateway_spec
 from eap.config.index import Index, SentPd
 from eap.config.links import ends, in_order, is_bitwise
 from eap.config.structs import Frame, From, Port, Publish, Station, Subscribe, Variable
@@ -268,6 +269,7 @@ def _bus_port(index: Index, station: Station, port: Port, folder: Path) -> PortS
         interface=str(InterfaceUri("sim", path) if uri.scheme == "sim" else uri),
         net_id=str(NetId.parse(port.net_id)),
         bus=BusPortSpec(path, slaves, port.target, port.clocks),
+        gateway=gateway_spec(index, station, port),
     )
 
 

@@ -11,6 +11,7 @@ from eap.aoe.spec import DirectoryStation, RoutingSpec
 from eap.config.bus import DescribeBus
 from eap.config.check_access import check_access
 from eap.config.check_buses import describe_buses
+from eap.config.check_gateways import check_gateways
 from eap.config.check_links import check_links
 from eap.config.check_polls import check_polls
 from eap.config.check_ports import check_ports
@@ -62,6 +63,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
         return LoadResult(None, report.findings())
     index = Index(plant_file, describe_buses(plant_file, path.parent, describe_bus, report))
     check_ports(index, report)
+    check_gateways(index, report)
     check_variables(index, report, path.parent)
     check_publish(index, report)
     check_subscribe(index, report)

@@ -42,6 +42,29 @@ class Vlan(Section, frozen=True):
     priority: Annotated[int, Meta(ge=0, le=7)] = 0
 
 
+class GatewayLimits(Section, frozen=True):
+    """How much a mailbox gateway takes on."""
+
+    in_flight: Annotated[int, Meta(ge=1, le=1024)] = 32
+    rate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
+    clients: Annotated[int, Meta(ge=1, le=0xFFFF)] = 256
+
+
+class Gateway(Section, frozen=True):
+    """The mailbox gateway of a bus port; the short form just says whether it answers."""
+
+    enabled: bool = True
+    port: Annotated[int, Meta(ge=1, le=0xFFFF)] | None = None
+    answer_ms: Annotated[int, Meta(ge=10, le=MAX_PATIENCE_MS)] = 900
+    silent: bool = False
+    full: bool = False
+    padded: bool = False
+    addresses: dict[str, Plain] = {}
+    limits: GatewayLimits = GatewayLimits()
+
+    SHORT: ClassVar[str] = "enabled"
+
+
 class Port(Section, frozen=True):
     """A port; the NetID of an EAP port is the publisher ID of its frames.
 
@@ -64,6 +87,7 @@ class Port(Section, frozen=True):
     bus: str = ""
     target: BusTarget = BusTarget.OP
     clocks: bool = False
+    gateway: Gateway = Gateway()
 
     EAP_KEYS: ClassVar[tuple[str, ...]] = (
         "vlan",
@@ -76,7 +100,7 @@ class Port(Section, frozen=True):
         "ams",
         "mac",
     )
-    BUS_KEYS: ClassVar[tuple[str, ...]] = ("bus", "target", "clocks")
+    BUS_KEYS: ClassVar[tuple[str, ...]] = ("bus", "target", "clocks", "gateway")
 
 
 class Variable(Section, frozen=True):

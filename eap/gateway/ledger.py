@@ -92,7 +92,6 @@ class Ledger:
         limits = self._limits
         is_full = len(client.waiting) >= limits.in_flight
         if is_full or self._in_flight >= limits.in_flight_in_all or not self._pay(client, now_ns):
-            client.counts.errors += 1
             return Admission.CROWDED
         client.waiting.add(frame)
         client.counts.requests += 1

@@ -66,9 +66,17 @@ def _of_coe(body: bytes) -> Operation | None:
     if specifier == SdoRequest.UPLOAD:
         return sdo(index, subindex, complete=complete)
     if specifier == SdoRequest.DOWNLOAD:
-        data = body[CoeHeader.SIZE + SdoHeader.SIZE :]
-        return sdo(index, subindex, complete=complete, data=data)
+        return sdo(index, subindex, complete=complete, data=_written(body))
     return None
+
+
+def _written(body: bytes) -> bytes:
+    """Return what a download writes, as far as its first message has it."""
+    start = CoeHeader.SIZE + SdoHeader.SIZE
+    if len(body) < start:
+        return b""
+    head = SdoHeader.decode(body, CoeHeader.SIZE)
+    return head.data if head.expedited else body[start:]
 
 
 def _of_info(body: bytes) -> Operation:

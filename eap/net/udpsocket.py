@@ -55,6 +55,22 @@ def open_udp_pair(address: str, port: int = EAP_PORT) -> tuple[socket.socket, so
     return pair
 
 
+def open_udp_receiver(address: str, port: int) -> socket.socket:
+    """Return a socket that is bound to *address*, for one process alone.
+
+    Raises:
+        EnvironmentalError: the port is taken, and by whom, or the address is not this machine's.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        prepare_receiver(sock)
+        _bind(sock, address, port)
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
 def open_udp_group_pair(
     group: str, interface_address: str, port: int = EAP_PORT
 ) -> tuple[socket.socket, socket.socket]:

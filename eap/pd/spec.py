@@ -11,6 +11,8 @@ from enum import StrEnum
 
 import msgspec
 
+from eap.pd.gateway import GatewaySpec
+
 
 class Writer(StrEnum):
     """Who may write a variable; each has a region of the process image to itself."""
@@ -350,7 +352,8 @@ class PortSpec(Record, frozen=True):
     ams: bool = True
     """Whether AMS/TCP and UDP 48899 are served at the port's IP address, if it has one."""
     bus: BusPortSpec | None = None
-    """Bus ports only."""
+    """Bus ports only, as the next one."""
+    gateway: GatewaySpec | None = None
 
 
 class StationSpec(Record, frozen=True):

@@ -42,8 +42,9 @@ from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_client import EngineClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway
+from eap.appliance.services.gateway.gateway_methods import GatewayMethods
 from eap.appliance.services.gateway.master_desk import MasterDesk
-from eap.appliance.services.gateway.opening import open_gateways
+from eap.appliance.services.gateway.opening import open_desks, open_gateways
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
@@ -93,8 +94,8 @@ class Services:
         self._resources.callback(link.close)
         devices = self._devices(images, link)
         client = BusClient(link, [bus.owner for bus in self._handover.buses])
-        desks = {bus.owner: MasterDesk(client, bus.owner, RELEASE) for bus in self._handover.buses}
-        gateways = open_gateways(self._handover, client, desks)
+        desks = open_desks(self._handover, client, RELEASE)
+        gateways = open_gateways(self._handover, client, desks, devices.routers)
         doors = open_doors(
             self._handover,
             devices.routers,
@@ -107,7 +108,7 @@ class Services:
         brokers = open_mqtt_doors(self._handover.routing, devices.routers, self._counters)
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(client, devices, desks)
-        methods = self._methods(images, buses, devices)
+        methods = self._methods(images, buses, devices, gateways)
         server = ControlServer(methods, buses)
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(server.serve(self._listener))]
@@ -151,7 +152,13 @@ class Services:
         gc.freeze()  # what a collection would go through again and again, while clients wait
         return devices
 
-    def _methods(self, images: dict[str, StationImage], buses: Buses, devices: Devices) -> Methods:
+    def _methods(
+        self,
+        images: dict[str, StationImage],
+        buses: Buses,
+        devices: Devices,
+        gateways: Mapping[PortName, MailboxGateway],
+    ) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
             DiscardCounters(self._folder.discards("engine"), self._names)
@@ -172,7 +179,7 @@ class Services:
             images,
             status=status,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
-            more=self._more_methods(devices),
+            more=self._more_methods(devices) | GatewayMethods(self._handover, gateways).table(),
         )
 
     def _more_methods(self, devices: Devices) -> dict[str, Callable[[dict[str, Any]], Any]]:
@@ -190,12 +197,13 @@ class Services:
         }
 
     def _audit(
-        self, routers: Mapping[str, StationRouter], gateways: Mapping[str, MailboxGateway]
+        self, routers: Mapping[str, StationRouter], gateways: Mapping[PortName, MailboxGateway]
     ) -> Audit:
         audit = Audit(Store(self._handover.plant).path / "audit.jsonl", self._directory)
-        for told in (routers, gateways):
-            for name, each in told.items():
-                each.on_audit.append(partial(audit.write, name))
+        for name, router in routers.items():
+            router.on_audit.append(partial(audit.write, name))
+        for owner, gateway in gateways.items():
+            gateway.guard.on_audit.append(partial(audit.write, owner.station))
         return audit
 
     def _ams_addresses(self) -> dict[str, str]:

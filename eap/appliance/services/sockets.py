@@ -45,7 +45,7 @@ def open_doors(
     handover: Handover,
     routers: Mapping[str, StationRouter],
     routes: Mapping[str, StationRoutes],
-    gateways: Mapping[str, MailboxGateway],
+    gateways: Mapping[PortName, MailboxGateway],
     counters: DiscardCounters,
     link: socket.socket,
     resources: ExitStack,
@@ -56,7 +56,7 @@ def open_doors(
         handover: What the supervisor opened.
         routers: Of the stations, by name; they get their doors.
         routes: Of these routers; tools may add some.
-        gateways: To the first bus of each station that has one.
+        gateways: To the buses, in their order.
         counters: Of what is not taken.
         link: To the engine, for connections that belong there.
         resources: Closes what is opened here.
@@ -73,7 +73,7 @@ class _Sockets:
         handover: Handover,
         routers: Mapping[str, StationRouter],
         routes: Mapping[str, StationRoutes],
-        gateways: Mapping[str, MailboxGateway],
+        gateways: Mapping[PortName, MailboxGateway],
         counters: DiscardCounters,
         resources: ExitStack,
     ) -> None:
@@ -81,6 +81,9 @@ class _Sockets:
         self._routers = routers
         self._routes = routes
         self._gateways = gateways
+        self._first_gateways: dict[str, MailboxGateway] = {}
+        for owner, gateway in gateways.items():
+            self._first_gateways.setdefault(owner.station, gateway)
         self._counters = counters
         self._resources = resources
         self._batch = ReceiveBatch()
@@ -101,8 +104,11 @@ class _Sockets:
             self._watch_interface(shared)
         for shared in by_kind[SocketKind.AMS_UDP]:
             self._watch_discovery(shared)
+        for shared in by_kind[SocketKind.GATEWAY_UDP]:
+            self._watch_gateway(shared)
         doors: list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch] = []
         doors += [self._door(shared, link) for shared in by_kind[SocketKind.TCP]]
+        doors += [self._gateway_door(shared, link) for shared in by_kind[SocketKind.GATEWAY_TCP]]
         doors += [self._ams_door(shared) for shared in by_kind[SocketKind.AMS_TCP]]
         doors += [self._uplinks(station) for station in self._handover.stations]
         doors.append(LinkWatch(self._links))
@@ -119,12 +125,44 @@ class _Sockets:
         return Entrance([(self._routers[station], door) for station, door in doors.items()])
 
     def _gateway(self, kind: str, owners: Sequence[PortName]) -> GatewayDoor:
-        """Return the way in to their gateways."""
+        """Return the way in to the gateways of their stations' first buses."""
         doors = _doors(kind, owners)
-        gateways = self._gateways
+        gateways = self._first_gateways
         return GatewayDoor(
             [(gateways[station], door) for station, door in doors.items() if station in gateways]
         )
+
+    def _own_gateway(self, kind: str, shared: SharedSocket) -> GatewayDoor:
+        """Return the way in to the gateway that has a port number to itself."""
+        (owner,) = shared.owners
+        spec = next(each for each in self._handover.stations if each.name == owner.station)
+        at = next(
+            port.name
+            for port in spec.ports
+            if InterfaceUri.parse(port.interface).host == shared.address
+        )
+        return GatewayDoor([(self._gateways[owner], f"{kind}:{at}")])
+
+    def _watch_gateway(self, shared: SharedSocket) -> None:
+        channel = self._channel(shared)
+        mailbox = MailboxIntake(
+            Entrance([]),
+            self._own_gateway("udp", shared),
+            ChannelCarrier(channel),
+            lambda data: False,
+            is_aoe_here=False,
+        )
+        stations = _stations_of(shared)
+        channel.takers.append(
+            FrameIntake(stations, self._counters, self._now_ns, mailbox.take).take
+        )
+        watch_channel(channel)
+
+    def _gateway_door(self, shared: SharedSocket, link: socket.socket) -> TcpDoor:
+        refuse = self._refuser(_stations_of(shared))
+        gateway = self._own_gateway("tcp", shared)
+        streams = MailboxStreams(Entrance([]), gateway, refuse, is_aoe_here=False)
+        return TcpDoor(self._socket(shared), (), link, refuse, streams)
 
     def _watch_unicast(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)

@@ -24,7 +24,7 @@ from eap.ids import InterfaceUri
 from eap.net.amssocket import open_ams_broadcast, open_ams_listener, open_ams_socket
 from eap.net.packetsocket import open_arp, open_packet_pair
 from eap.net.tcp import open_tcp_listener
-from eap.net.udpsocket import open_udp_group_pair, open_udp_pair
+from eap.net.udpsocket import open_udp_group_pair, open_udp_pair, open_udp_receiver
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 BROADCAST = "255.255.255.255"
@@ -38,6 +38,9 @@ def plan_sockets(stations: Sequence[StationSpec]) -> tuple[SharedSocket, ...]:
     owners: dict[SharedSocket, list[PortName]] = {}
     ports = [(station.name, port) for station in stations for port in station.ports]
     ports = [(station, port) for station, port in ports if port.kind is PortKind.EAP]
+    for each in stations:
+        for name, wanted in _gateway_sockets(each):
+            owners.setdefault(wanted, []).append(name)
     for station, port in ports:
         for wanted in _sockets_of(port):
             owners.setdefault(wanted, []).append(PortName(station, port.name))
@@ -75,6 +78,18 @@ def _ams_sockets(address: str) -> Iterator[SharedSocket]:
     if address != EVERY_ADDRESS:  # which broadcasts arrive at too
         yield SharedSocket(SocketKind.AMS_BROADCAST, address)
         yield SharedSocket(SocketKind.AMS_BROADCAST, address, group=BROADCAST)
+
+
+def _gateway_sockets(station: StationSpec) -> Iterator[tuple[PortName, SharedSocket]]:
+    """Yield what gateways have to themselves, at each address of their station."""
+    uris = [InterfaceUri.parse(port.interface) for port in station.ports if port.bus is None]
+    hosts = dict.fromkeys(uri.host for uri in uris if uri.scheme in {"udp", "tcp"})
+    for port in station.ports:
+        if port.gateway is not None and port.gateway.port:
+            name = PortName(station.name, port.name)
+            for host in hosts:
+                yield name, SharedSocket(SocketKind.GATEWAY_UDP, host, port.gateway.port)
+                yield name, SharedSocket(SocketKind.GATEWAY_TCP, host, port.gateway.port)
 
 
 def _ams_address(port: PortSpec) -> str:
@@ -160,7 +175,9 @@ def _open(planned: SharedSocket, opened: ExitStack) -> SharedSocket:
 
 def _open_single(planned: SharedSocket) -> socket.socket | None:
     """Open what services alone gets; return None for a pair."""
-    if planned.kind is SocketKind.TCP:
+    if planned.kind is SocketKind.GATEWAY_UDP:
+        return open_udp_receiver(planned.address, planned.port)
+    if planned.kind in {SocketKind.TCP, SocketKind.GATEWAY_TCP}:
         return open_tcp_listener(planned.address, planned.port)
     if planned.kind is SocketKind.ARP:
         return open_arp(planned.address)

@@ -9,11 +9,12 @@ from devicebus.errors import BusError
 from eap.aoe.ads_operation import Operation, ReadWrite
 from eap.aoe.way import Way
 from eap.appliance.services.gateway.dialect_task import FAILURES, DialectError, perform
+from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Target
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.slave_book import SlaveBook
 from eap.appliance.services.gateway.slave_link import SlaveLink
 from eap.appliance.services.gateway.slave_session import find_refusal, reason_of
-from eap.codec.ads import IndexGroup
+from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.errors import EngineGoneError, MalformedError
 from eap.gateway.address import MASTER_ADDRESS, VIRTUAL_BIT
@@ -31,6 +32,7 @@ from eap.gateway.dialect import (
 )
 from eap.gateway.refusal import Reason
 from eap.gateway.rights import idn, sdo
+from eap.ids import NetId
 
 
 class DialectDesk:
@@ -39,8 +41,9 @@ class DialectDesk:
     Args:
         bus: The slaves.
         book: What is known of them.
-        may: Says whether a client may have something done at a station address.
+        guard: Says whether a client may have something done.
         open_master: Begins a session with the master's dictionary.
+        net_id: Of the bus, for rules.
         room: Octets of the longest answer.
         answer_s: How long an answer may take.
     """
@@ -49,15 +52,17 @@ class DialectDesk:
         self,
         bus: SlaveLink,
         book: SlaveBook,
-        may: Callable[[Way, int, Operation], bool],
+        guard: Guard,
         open_master: Callable[[], MasterSession],
+        net_id: NetId,
         room: int,
         answer_s: float,
     ) -> None:
         self._bus = bus
         self._book = book
-        self._may = may
+        self._guard = guard
         self._open_master = open_master
+        self._net_id = net_id
         self._room = room
         self._answer_s = answer_s
 
@@ -67,20 +72,35 @@ class DialectDesk:
         """Return what answers a request, and why it is an error if it is one."""
         code: int | None = None
         try:
-            return await self._perform(kind, address & ~VIRTUAL_BIT, body, way), None
+            task = decode(kind, body)
+            return await self._judge(kind, task, address & ~VIRTUAL_BIT, body, way), None
         except MalformedError as exc:
             failure, reason, text = Failure.COMMAND, Reason.SERVICE, str(exc)
         except DialectError as exc:
-            failure, reason, text, code = exc.failure, Reason.SERVICE, str(exc), exc.code
+            failure, reason, text, code = exc.failure, exc.reason, str(exc), exc.code
         except (BusError, EngineGoneError) as exc:
             reason, text = reason_of(exc), str(exc)
             failure = FAILURES.get(reason, Failure.GENERAL)
         return encode_failure(kind, body, failure, code=code, text=text), reason
 
-    async def _perform(self, kind: MailboxType, station: int, body: bytes, way: Way) -> bytes:
-        task = decode(kind, body)
-        if not self._may(way, station, operation_of(task)):
-            raise _refusal(Reason.DENIED)
+    async def _judge(
+        self, kind: MailboxType, task: Task, station: int, body: bytes, way: Way
+    ) -> bytes:
+        operation, target = operation_of(task), Target(self._net_id, station or MASTER_PORT)
+        verdict = self._guard.judge(way, target, operation)
+        result: int | None = AdsError.GENERAL
+        try:
+            if not verdict.is_allowed:
+                raise _refusal(Reason.DENIED)
+            answer = await self._perform(kind, task, station, body, way)
+            result = 0
+        finally:
+            self._guard.tell(way, target, operation, verdict, result)
+        return answer
+
+    async def _perform(
+        self, kind: MailboxType, task: Task, station: int, body: bytes, way: Way
+    ) -> bytes:
         if station == MASTER_ADDRESS:
             return encode_done(body, task, await self._open_master().perform(task))
         slave = await self._book.find(station)
@@ -94,7 +114,7 @@ class DialectDesk:
 
 
 def _refusal(reason: Reason) -> DialectError:
-    return DialectError(FAILURES.get(reason, Failure.GENERAL), reason.text)
+    return DialectError(FAILURES.get(reason, Failure.GENERAL), reason.text, reason=reason)
 
 
 def operation_of(task: Task) -> Operation:

@@ -43,12 +43,22 @@ Converse: TypeAlias = Callable[[Conversation[Any]], Awaitable[Any]]
 
 
 class DialectError(EapError):
-    """A task was not done; *code* is the slave's own where the protocol has one."""
+    """A task was not done; *code* is the slave's own where the protocol has one.
 
-    def __init__(self, failure: Failure, text: str, code: int | None = None) -> None:
+    For statistics *reason* says why.
+    """
+
+    def __init__(
+        self,
+        failure: Failure,
+        text: str,
+        code: int | None = None,
+        reason: Reason = Reason.SERVICE,
+    ) -> None:
         super().__init__(text)
         self.failure = failure
         self.code = code
+        self.reason = reason
 
 
 FAILURES = {

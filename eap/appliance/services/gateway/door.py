@@ -41,6 +41,9 @@ class GatewayDoor:
         """
         if self._gateway is None:
             return Refusal.MAILBOX
+        if not self._gateway.is_open:
+            self._gateway.turned_away += 1
+            return Refusal.GATEWAY_OFF
 
         def answer(frame: bytes) -> None:
             send(connection, frame)

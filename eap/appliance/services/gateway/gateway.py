@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from time import monotonic_ns
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias
 
 from devicebus.mailbox.counter import next_counter
 from eap.aoe.access import AccessList
-from eap.aoe.ads_operation import Operation
-from eap.aoe.judged import AuditedOperation, AuditEntry
-from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
 from eap.appliance.services.gateway.dialect_desk import DialectDesk
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
+from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Target, result_of
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.sessions import SessionKey, Sessions
 from eap.appliance.services.gateway.slave_book import SlaveBook
 from eap.appliance.services.gateway.slave_link import SlaveLink
 from eap.appliance.services.gateway.slave_session import (
@@ -31,8 +30,6 @@ from eap.appliance.services.gateway.slave_session import (
     find_refusal,
 )
 from eap.appliance.services.gateway.tally import Tally
-from eap.codec.ads import AdsError
-from eap.codec.ams import AmsHeader
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
 from eap.gateway import dialect
 from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, Slave
@@ -43,11 +40,6 @@ from eap.ids import NetId
 
 ANSWER_S = 0.9
 """How long an answer may take: before a usual client gives up."""
-MAX_SESSIONS = 512
-MASTER_PORT = 0xFFFF
-"""AMS port by which rules name the master itself."""
-NOBODY = NetId(bytes(6))
-"""Source NetID of who has none."""
 
 Send: TypeAlias = Callable[[bytes], None]
 """Sends a frame back to who sent a request, now or later."""
@@ -75,52 +67,66 @@ class _Request(NamedTuple):
     send: Send
 
 
-_Key: TypeAlias = tuple[Way, int, MailboxType]
-S = TypeVar("S", SlaveSession, MasterSession)
-Sessions: TypeAlias = dict[_Key, S]
-
-
 class MailboxGateway:
     """A gateway.
 
     Args:
         bus: Its slaves.
         open_master: Begins a session with the master's dictionary.
-        access: Who may do what.
+        access: Returns the rules by which is judged who may do what.
         settings: How it behaves.
         addresses: Beside those of the standard.
 
     Attributes:
-        tally: What it did.
-        on_audit: Called with each change that begins, and with each refusal.
+        tally: What it did, by slave and protocol.
+        ledger: What it did, by client.
+        guard: Judges requests, and has the audit written.
+        settings: As given.
+        is_open: Whether it takes requests.
+        turned_away: Frames that came while it did not.
     """
 
     def __init__(
         self,
         bus: SlaveLink,
         open_master: Callable[[], MasterSession],
-        access: AccessList,
+        access: Callable[[], AccessList],
         settings: Settings,
         addresses: AddressMap | None = None,
     ) -> None:
         self.tally = Tally()
-        self.on_audit: list[Callable[[AuditEntry], None]] = []
         self.ledger = Ledger(settings.limits)
+        self.guard = Guard(access)
+        self.settings = settings
+        self.is_open = True
+        self.turned_away = 0
         self._bus = bus
         self._open_master = open_master
-        self._access = access
-        self._settings = settings
         self._addresses = addresses or AddressMap()
         self._book = SlaveBook(bus.describe)
         self._dialect = DialectDesk(
-            bus, self._book, self._may, open_master, settings.room, settings.answer_s
-        )
-        self._slaves: Sessions[SlaveSession] = {}
-        self._masters: Sessions[MasterSession] = {}
+            bus, self._book, self.guard, open_master, settings.net_id, settings.room,
+            settings.answer_s,
+        )  # fmt: skip
+        self._slaves: Sessions[SlaveSession] = Sessions()
+        self._masters: Sessions[MasterSession] = Sessions()
         self._tasks: set[asyncio.Task[None]] = set()
         self._listeners = EoeListeners()
         self._counter = 0
         bus.listen(self._take_unasked)
+
+    def start(self) -> None:
+        """Take requests, again."""
+        self.is_open = True
+
+    async def stop(self) -> None:
+        """Take no requests; what is under way is ended, at the slaves too."""
+        self.is_open = False
+        await self.close()
+
+    def transfers(self) -> list[SessionKey]:
+        """Return the transfers that are under way."""
+        return [*self._slaves.running(), *self._masters.running()]
 
     def receive(
         self, header: MailboxHeader, body: bytes, way: Way, send: Send
@@ -150,10 +156,8 @@ class MailboxGateway:
         """Forget a client, and end what it had under way."""
         self.ledger.forget(way)
         self._listeners.forget(way)
-        for key in [key for key in self._slaves if key[0] == way]:
-            self._slaves.pop(key).close()
-        for key in [key for key in self._masters if key[0] == way]:
-            self._masters.pop(key).close()
+        self._slaves.close_of(way)
+        self._masters.close_of(way)
 
     async def wait_below(self, way: Way, count: int) -> None:
         """Wait until fewer than *count* requests of a client wait."""
@@ -170,8 +174,11 @@ class MailboxGateway:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for way in {key[0] for key in (*self._slaves, *self._masters)}:
-            self.connection_closed(way)
+        for way in self.ledger.table():
+            self.ledger.forget(way)
+            self._listeners.forget(way)
+        self._slaves.close()
+        self._masters.close()
 
     def _done(self, way: Way, frame: bytes, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
@@ -209,22 +216,27 @@ class MailboxGateway:
         self, request: _Request, found: object, address: int, *, is_group: bool = False
     ) -> None:
         """Ask the master or one slave, and answer from *address*."""
-        kind, body = request.header.type, request.body
+        kind, body, way = request.header.type, request.body, request.way
         start_ns = monotonic_ns()
         operation = operation_of(kind, body)
         station = found.station if isinstance(found, Slave) else MASTER_ADDRESS
-        if not self._may(request.way, station, operation, by_rule=is_group):
+        target = Target(self.settings.net_id, station or MASTER_PORT)
+        verdict = None  # a step of what was judged when it began
+        if operation is not None:
+            verdict = self.guard.judge(way, target, operation, by_rule=is_group)
+        if verdict is not None and not verdict.is_allowed:
             replies = [Reply(*refuse(kind, body, Reason.DENIED), reason=Reason.DENIED)]
         elif isinstance(found, Slave):
             replies = await self._ask_slave(request, station, is_step=operation is None)
         elif isinstance(found, Master):
-            key = request.way, station, kind
-            master = self._session(self._masters, key, self._open_master)
+            master = self._masters.take(SessionKey(way, station, kind), self._open_master)
             replies = await master.ask(kind, body)
         else:
             text = "the slave of another station is reached by AoE"
             replies = [Reply(*refuse(kind, body, Reason.NO_SLAVE, text), reason=Reason.NO_SLAVE)]
-        self.tally.note(station, kind, [each.reason for each in replies], monotonic_ns() - start_ns)
+        if operation is not None and verdict is not None:
+            self.guard.tell(way, target, operation, verdict, result_of(replies))
+        self._note(request, station, replies, monotonic_ns() - start_ns)
         self._answer(request, address, replies)
 
     async def _ask_slave(self, request: _Request, station: int, *, is_step: bool) -> list[Reply]:
@@ -242,9 +254,9 @@ class MailboxGateway:
 
         def begin() -> SlaveSession:
             talk = partial(self._bus.open_talk, station, kind, request.way)
-            return SlaveSession(kind, slave, talk, answer_s=self._settings.answer_s)
+            return SlaveSession(kind, slave, talk, answer_s=self.settings.answer_s)
 
-        session = self._session(self._slaves, (request.way, station, kind), begin)
+        session = self._slaves.take(SessionKey(request.way, station, kind), begin)
         return await session.ask(body, is_step=is_step)
 
     def _take_unasked(self, message: Heard) -> None:
@@ -257,51 +269,35 @@ class MailboxGateway:
             )
             listener.send(encode_frame(header, message.data))
 
-    def _session(self, sessions: Sessions[S], key: _Key, begin: Callable[[], S]) -> S:
-        session = sessions.pop(key, None)
-        if session is None:
-            if len(sessions) >= MAX_SESSIONS:
-                _drop_oldest(sessions)
-            session = begin()
-        sessions[key] = session  # at the end: at the front is who has asked nothing for longest
-        return session
-
-    def _may(
-        self, way: Way, station: int, operation: Operation | None, *, by_rule: bool = False
-    ) -> bool:
-        """Say whether a client may have it done; *by_rule*: a change only if a rule says so."""
-        if operation is None:
-            return True  # a step of what was judged when it began
-        port = station or MASTER_PORT
-        grants = self._access.grants(way, NOBODY, self._settings.net_id, port)
-        verdict = grants.judge(operation)
-        if by_rule and verdict.service is not AccessService.READ and not verdict.is_by_rule:
-            why = "only a rule allows it for all slaves at once"
-            verdict = verdict._replace(is_allowed=False, why=why)
-        result = None if verdict.is_allowed else AdsError.ACCESS_DENIED
-        audited = AuditedOperation(operation, verdict, result)
-        if audited.is_told:
-            header = AmsHeader(self._settings.net_id, port, NOBODY, 0, 0)
-            for write in self.on_audit:
-                write(AuditEntry(way, header, "", (audited,)))
-        return verdict.is_allowed
-
     async def _serve_dialect(self, request: _Request, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()
         answer, reason = await self._dialect.answer(kind, address, request.body, request.way)
         self.tally.note(address, kind, [reason], monotonic_ns() - start_ns)
-        if not (self._settings.is_silent and reason is not None):
+        self._count_errors(request.way, [reason])
+        if not (self.settings.is_silent and reason is not None):
             request.send(encode_frame(dialect.encode_header(kind, address), answer))
 
     def _refuse(self, request: _Request, reason: Reason) -> None:
         kind = request.header.type
         replies = [Reply(*refuse(kind, request.body, reason), reason=reason)]
-        self.tally.note(request.header.address, kind, [reason], 0)
+        self._note(request, request.header.address, replies, 0)
         self._answer(request, request.header.address, replies)
+
+    def _note(
+        self, request: _Request, station: int, replies: Sequence[Reply], took_ns: int
+    ) -> None:
+        reasons = [each.reason for each in replies]
+        self.tally.note(station, request.header.type, reasons, took_ns)
+        self._count_errors(request.way, reasons)
+
+    def _count_errors(self, way: Way, reasons: Iterable[Reason | None]) -> None:
+        counts = self.ledger.counts_of(way)
+        if counts is not None and any(reason is not None for reason in reasons):
+            counts.errors += 1
 
     def _answer(self, request: _Request, address: int, replies: Iterable[Reply]) -> None:
         for reply in replies:
-            if reply.reason is not None and self._settings.is_silent:
+            if reply.reason is not None and self.settings.is_silent:
                 continue
             counter = reply.counter or self._next_counter()
             header = MailboxHeader(0, address, type=reply.type, counter=counter)
@@ -310,8 +306,3 @@ class MailboxGateway:
     def _next_counter(self) -> int:
         self._counter = next_counter(self._counter)
         return self._counter
-
-
-def _drop_oldest(sessions: Sessions[S]) -> None:
-    idle = (key for key, each in sessions.items() if not each.is_running)
-    sessions.pop(next(idle, next(iter(sessions)))).close()

@@ -22,19 +22,29 @@ class MasterDesk:
         client: Asks the engine.
         port: Which bus.
         release: Of this software.
+        full: As the dictionary has it.
+        padded: Likewise.
 
     Attributes:
         dictionary: To be served after :meth:`refresh`.
     """
 
-    def __init__(self, client: BusClient, port: PortName, release: str) -> None:
+    def __init__(
+        self,
+        client: BusClient,
+        port: PortName,
+        release: str,
+        *,
+        full: bool = False,
+        padded: bool = False,
+    ) -> None:
         self._view = MasterView(client, port)
         identity = Identity(
             device_name=f"EtherCAT master {port.station}/{port.port}",
             hardware_version=platform.machine(),
             software_version=release,
         )
-        self.dictionary = MasterDictionary(self._view, identity)
+        self.dictionary = MasterDictionary(self._view, identity, full=full, padded=padded)
 
     async def refresh(self, index: int) -> None:
         """See to it that what the object at *index* shows is not old."""

@@ -5,37 +5,84 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 
-from eap.aoe.spec import RoutingSpec
+from eap.aoe.access import AccessList
 from eap.appliance.handover import Handover, PortName
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.gateway.slave_link import PortLink
-from eap.appliance.services.routing.planned import access_of
+from eap.appliance.services.routing.station_router import StationRouter
+from eap.gateway.address import AddressMap, Group, RemoteSlave, Slave
+from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
+from eap.pd.gateway import GatewayAddress, GatewaySpec
+
+_MS = 1000
+
+
+def open_desks(handover: Handover, client: BusClient, release: str) -> dict[PortName, MasterDesk]:
+    """Return the dictionary of the master behind each bus port.
+
+    Args:
+        handover: The buses.
+        client: Asks the engine for something on them.
+        release: Of this software.
+    """
+    desks = {}
+    for bus in handover.buses:
+        told = _told(handover, bus.owner)
+        desks[bus.owner] = MasterDesk(
+            client, bus.owner, release, full=told.full, padded=told.padded
+        )
+    return desks
 
 
 def open_gateways(
-    handover: Handover, client: BusClient, desks: Mapping[PortName, MasterDesk]
-) -> dict[str, MailboxGateway]:
-    """Return the gateway to the first bus of each station that has one, by station.
+    handover: Handover,
+    client: BusClient,
+    desks: Mapping[PortName, MasterDesk],
+    routers: Mapping[str, StationRouter],
+) -> dict[PortName, MailboxGateway]:
+    """Return the gateway to each bus, in their order.
 
     Args:
         handover: The stations and their buses.
         client: Asks the engine for something on them.
         desks: Dictionaries of the masters, one for each bus.
+        routers: Of the stations: they know the access rules, and the way to other buses.
     """
-    gateways: dict[str, MailboxGateway] = {}
-    stations = {station.name: station for station in handover.stations}
+    gateways = {}
     for bus in handover.buses:
-        name = bus.owner.station
-        if name not in gateways:
-            settings = Settings(NetId.parse(handover.port(bus.owner).net_id))
-            routing = handover.routing.get(name, RoutingSpec())
-            gateways[name] = MailboxGateway(
-                PortLink(client, bus.owner),
-                partial(desks[bus.owner].open_session, settings.room),
-                access_of(stations[name], routing),
-                settings,
-            )
+        told, router = _told(handover, bus.owner), routers[bus.owner.station]
+        settings = Settings(
+            NetId.parse(handover.port(bus.owner).net_id),
+            answer_s=told.answer_ms / _MS,
+            is_silent=told.silent,
+            limits=ClientLimits(told.in_flight, told.rate, told.clients),
+        )
+        gateway = MailboxGateway(
+            PortLink(client, bus.owner),
+            partial(desks[bus.owner].open_session, settings.room),
+            partial(_access_of, router),
+            settings,
+            AddressMap({each.address: _whom(each) for each in told.addresses}),
+        )
+        gateway.is_open = told.enabled
+        gateways[bus.owner] = gateway
     return gateways
+
+
+def _told(handover: Handover, owner: PortName) -> GatewaySpec:
+    return handover.port(owner).gateway or GatewaySpec()
+
+
+def _access_of(router: StationRouter) -> AccessList:
+    return router.access
+
+
+def _whom(told: GatewayAddress) -> Slave | RemoteSlave | Group:
+    if told.members:
+        return Group(told.members)
+    if told.net_id:
+        return RemoteSlave(NetId.parse(told.net_id), told.port)
+    return Slave(told.station)

@@ -27,6 +27,7 @@ class MailboxIntake:
         gateway: For what is no AoE to a station; a frame for many is for no gateway.
         carrier: Sends what the gateway answers.
         is_for_many: Tells of a frame whether it was meant for many.
+        is_aoe_here: Whether AoE is for the stations; otherwise that is for the gateway too.
     """
 
     def __init__(
@@ -35,11 +36,14 @@ class MailboxIntake:
         gateway: GatewayDoor,
         carrier: ChannelCarrier,
         is_for_many: Callable[[memoryview], bool],
+        *,
+        is_aoe_here: bool = True,
     ) -> None:
         self._entrance = entrance
         self._gateway = gateway
         self._carrier = carrier
         self._is_for_many = is_for_many
+        self._is_aoe_here = is_aoe_here
 
     def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
         """Act on a frame; return why not if it is not taken."""
@@ -48,6 +52,8 @@ class MailboxIntake:
         packet = aoe_packet(data[:size])
         if not sender:
             return Refusal.MAILBOX
+        if not isinstance(packet, Refusal) and not self._is_aoe_here:
+            packet = Refusal.MAILBOX
         if isinstance(packet, Refusal):
             if packet is not Refusal.MAILBOX or self._is_for_many(data):
                 return packet

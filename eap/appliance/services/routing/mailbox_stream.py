@@ -35,6 +35,7 @@ class MailboxStreams:
         gateway: For what is no AoE to a station.
         refuse: Counts a frame that is not taken.
         source: Own address to connect from; empty for any.
+        is_aoe_here: Whether AoE is for the stations; otherwise that is for the gateway too.
     """
 
     def __init__(
@@ -43,10 +44,13 @@ class MailboxStreams:
         gateway: GatewayDoor,
         refuse: Callable[[Refusal], None],
         source: str = "",
+        *,
+        is_aoe_here: bool = True,
     ) -> None:
         self._entrance = entrance
         self._gateway = gateway
         self._refuse = refuse
+        self._is_aoe_here = is_aoe_here
         self._uplinks = Uplinks(entrance, self._serve_uplink, source)
         self._counters = MailboxCounters()
         self._writers: dict[str, asyncio.StreamWriter] = {}
@@ -120,6 +124,8 @@ class MailboxStreams:
             except asyncio.IncompleteReadError:
                 return
             packet = aoe_packet(frame)
+            if not isinstance(packet, Refusal) and not self._is_aoe_here:
+                packet = Refusal.MAILBOX
             if packet is Refusal.MAILBOX:
                 refusal = self._gateway.receive(frame, name, self.send_frame)
                 if refusal is not None:

@@ -120,6 +120,11 @@ class StationRouter:
         """Return who asks, or asked and is still connected."""
         return self._router.connections()
 
+    @property
+    def access(self) -> AccessList:
+        """The access rules that are in force."""
+        return self._router.gate.access
+
     def set_access(self, access: AccessList) -> None:
         """Judge requests by other rules from now on."""
         self._router.gate.access = access

@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from eap.errors import EnvironmentalError
-from eap.net.udpsocket import open_udp_group_pair, open_udp_pair
+from eap.net.udpsocket import open_udp_group_pair, open_udp_pair, open_udp_receiver
 
 pytestmark = pytest.mark.net
 
@@ -61,6 +61,17 @@ def test_each_process_gets_its_types_of_a_group(group):
         assert received(sender[0]) == set()
     finally:
         close(sender, *pairs)
+
+
+def test_a_receiver_gets_all_types_and_shares_with_nobody():
+    receiver, other = open_udp_receiver("127.0.3.14", PORT), open_udp_pair("127.0.3.15")
+    try:
+        send_all_types(other[0], "127.0.3.14")
+        assert received(receiver) == {*range(16), 0xEE}
+        with pytest.raises(EnvironmentalError, match=r"127\.0\.3\.14"):
+            open_udp_receiver("127.0.3.14", PORT)
+    finally:
+        close((receiver,), other)
 
 
 def test_second_appliance_is_refused_though_the_port_could_be_shared():

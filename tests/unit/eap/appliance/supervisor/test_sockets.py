@@ -13,6 +13,7 @@ import pytest
 from eap.appliance.handover import NO_DESCRIPTOR, PortName, SocketKind
 from eap.appliance.supervisor.sockets import SharedSockets, plan_sockets
 from eap.errors import EnvironmentalError
+from eap.pd.gateway import GatewaySpec
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec, StationSpec
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
@@ -65,6 +66,21 @@ def test_who_listens_at_every_address_shares_it_with_all():
 def test_no_ams_without_an_ip_address():
     without = (eap_port(1, ams=False), eap_port(1, "loop://line"), eap_port(1, "ethernet://eth0"))
     assert [ams_of(left(port)) for port in without] == [[], [], []]
+
+
+def test_gateways_have_their_own_at_each_address():
+    def bus(number: int, own: int) -> PortSpec:
+        return PortSpec(
+            f"bus{number}", PortKind.BUS, "sim://bus.yaml", f"5.1.1.1.{number}.1",
+            bus=BusPortSpec(), gateway=GatewaySpec(port=own),
+        )  # fmt: skip
+
+    station = msgspec.structs.replace(left(), ports=(eap_port(1), bus(0, 0), bus(1, 34981)))
+    kinds = (SocketKind.GATEWAY_UDP, SocketKind.GATEWAY_TCP)
+    owners = (PortName("left", "bus1"),)
+    assert [
+        (s.kind, s.address, s.port, s.owners) for s in plan_sockets([station]) if s.kind in kinds
+    ] == [(kind, "127.9.2.1", 34981, owners) for kind in kinds]
 
 
 def test_groups_and_broadcasts_have_their_own():

@@ -14,6 +14,8 @@ UPLOAD = bytes.fromhex("10 50 0a 00 e9 03 00 23 00 20 41 18 10 02 00 00 00 00")
 
 class Gateway:
     def __init__(self) -> None:
+        self.is_open = True
+        self.turned_away = 0
         self.heard: list[Any] = []
 
     def receive(self, header, body, way, send) -> None:
@@ -53,6 +55,15 @@ def test_a_protocol_that_nobody_knows_is_refused_by_a_mailbox_error() -> None:
     frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
     assert door.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
     assert sent == [("me", bytes.fromhex("0a50 0400 e903 00 00 0100 0200"))]
+
+
+def test_a_gateway_that_is_stopped_turns_frames_away() -> None:
+    gateway = Gateway()
+    gateway.is_open = False
+    door = GatewayDoor([(gateway, "udp:a")])
+    assert door.receive(UPLOAD, "me", lambda *each: None) is Refusal.GATEWAY_OFF
+    assert gateway.turned_away == 1
+    assert not gateway.heard
 
 
 def test_a_frame_that_is_cut_is_counted() -> None:

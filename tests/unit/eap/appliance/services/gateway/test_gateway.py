@@ -62,7 +62,7 @@ class Desk:
         self.gateway = MailboxGateway(
             PortLink(BusClient(self._link, [PORT]), PORT),
             lambda: MasterSession(MASTER, settings.room, nothing),
-            AccessList(rules),
+            lambda: AccessList(rules),
             settings,
         )
 
@@ -365,17 +365,58 @@ def test_a_rule_opens_one_object() -> None:
 def test_changes_and_refusals_are_audited() -> None:
     async def scene(desk: Desk) -> None:
         entries: list[AuditEntry] = []
-        desk.gateway.on_audit.append(entries.append)
+        desk.gateway.guard.on_audit.append(entries.append)
         await desk.one(COE, 1001, VENDOR, ELSEWHERE)
         assert not entries
         await desk.one(COE, 1001, WRITE, ELSEWHERE)
         await desk.one(COE, 1001, WRITE)
         await desk.ask(COE, 0xFFFF, WRITE)
         told = [(each.way, each.header.target_port, each.operations[0].result) for each in entries]
-        assert told == [(ELSEWHERE, 1001, 0x723), (HERE, 1001, None), (HERE, 1001, 0x723)]
+        assert told == [(ELSEWHERE, 1001, 0x723), (HERE, 1001, 0), (HERE, 1001, 0x723)]
         assert entries[2].operations[0].verdict.why == (
-            "only a rule allows it for all slaves at once"
+            "only a rule allows it for several slaves at once"
         )
+
+    play(scene)
+
+
+def test_the_audit_tells_how_a_change_came_out() -> None:
+    async def scene(desk: Desk) -> None:
+        entries: list[AuditEntry] = []
+        desk.gateway.guard.on_audit.append(entries.append)
+        await desk.one(COE, 1001, "0020 2b 5555 00 06000000")
+        await desk.ask(COE, 1009, WRITE)
+        await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 4060 00 0600"))
+        await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 5555 00 0600"))
+        operations = [each.operations[0] for each in entries]
+        assert [each.result for each in operations] == [0x70C, 6, 0, 0x700]
+        assert [each.operation.data for each in operations[:2]] == [b"\6\0", b"\6\0"]
+
+    play(scene)
+
+
+def test_who_is_stopped_lets_go_of_everything() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.one(FOE, 1001, "01 00 00000000" + FILE)
+        (running,) = desk.gateway.transfers()
+        assert (running.way, running.address, running.kind) == (HERE, 1001, FOE)
+        await desk.gateway.stop()
+        assert not desk.gateway.is_open
+        assert not desk.gateway.transfers()
+        assert not desk.gateway.ledger.table()
+        desk.gateway.start()
+        assert desk.gateway.is_open
+        assert (await desk.one(FOE, 1001, "01 00 00000000" + FILE)).startswith("03")
+
+    play(scene)
+
+
+def test_errors_are_counted_for_their_client() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.ask(COE, 1009, VENDOR)
+        await desk.one(COE, 1001, VENDOR)
+        counts = desk.gateway.ledger.counts_of(HERE)
+        assert (counts.requests, counts.errors) == (2, 1)
 
     play(scene)
 

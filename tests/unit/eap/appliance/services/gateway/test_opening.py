@@ -4,32 +4,54 @@ from __future__ import annotations
 
 import asyncio
 
+from msgspec.structs import replace
+
 from eap.appliance.handover import BusSocket, Handover, PortName
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.gateway.master_desk import MasterDesk
-from eap.appliance.services.gateway.opening import open_gateways
+from eap.appliance.services.gateway.opening import open_desks, open_gateways
+from eap.od.model import OdState
+from eap.pd.gateway import GatewayAddress, GatewaySpec
 from tests.support.cyclic import bus_port, eap_port, station
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
+from tests.support.routing import station as router
+
+NAMES = [PortName("left", "bus0"), PortName("left", "bus1")]
+TOLD = GatewaySpec(
+    enabled=False,
+    answer_ms=250,
+    silent=True,
+    full=True,
+    addresses=(GatewayAddress(0x9000, station=1001), GatewayAddress(0x9001, members=(1001,))),
+    in_flight=3,
+)
 
 
-def test_each_station_has_one_to_its_first_bus() -> None:
+def test_each_bus_has_one_as_the_plant_file_says() -> None:
     async def run() -> None:
-        engine = FakeEngine(FakeBus(LoopBus("drive")))
+        engine = FakeEngine(FakeBus(LoopBus("drive")), FakeBus(LoopBus("drive")))
         link = EngineLink(engine.services)
-        ports = (eap_port(), bus_port("bus0"), bus_port("bus1"))
-        names = [PortName("left", "bus0"), PortName("left", "bus1")]
+        ports = (eap_port(), replace(bus_port("bus0"), gateway=TOLD), bus_port(name="bus1"))
         handover = Handover(
             supervisor=1, folder="", plant="p", plant_file="",
             stations=(station(name="left", ports=ports), station(name="right")),
-            sockets=(), buses=tuple(BusSocket(owner=name) for name in names),
+            sockets=(), buses=tuple(BusSocket(owner=name) for name in NAMES),
         )  # fmt: skip
         try:
-            client = BusClient(link, names)
-            desks = {name: MasterDesk(client, name, "1.0") for name in names}
-            gateways = open_gateways(handover, client, desks)
-            assert list(gateways) == ["left"]
+            client = BusClient(link, NAMES)
+            desks = open_desks(handover, client, "1.0")
+            gateways = open_gateways(handover, client, desks, {"left": router("5.1.1.1.1.1")})
+            assert list(gateways) == NAMES
+            first, second = gateways.values()
+            assert (first.is_open, second.is_open) == (False, True)
+            assert (first.settings.answer_s, first.settings.is_silent) == (0.25, True)
+            assert first.settings.limits.in_flight == 3
+            extents = []
+            for desk in desks.values():
+                await desk.refresh(0xA000)
+                extents.append(desk.dictionary.upload(0xA000, 0, OdState.OP)[0])
+            assert extents == [19, 17]
         finally:
             link.close()
             engine.close()

@@ -1,0 +1,129 @@
+"""The methods of the control protocol about mailbox gateways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from eap.appliance.control import ErrorCode, near, parameters
+from eap.appliance.control_gateway import GatewayParameters
+from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.appliance.services.gateway.gateway import MailboxGateway
+from eap.errors import ControlError
+
+_OWN = {SocketKind.GATEWAY_UDP: "udp", SocketKind.GATEWAY_TCP: "tcp"}
+_SHARED = {SocketKind.UDP: "udp", SocketKind.TCP: "tcp", SocketKind.PACKET: "ethernet"}
+
+
+class GatewayMethods:
+    """Starts and stops gateways, and tells what they do.
+
+    Args:
+        handover: Where they are served.
+        gateways: All of them, in the order of the buses.
+    """
+
+    def __init__(self, handover: Handover, gateways: Mapping[PortName, MailboxGateway]) -> None:
+        self._handover = handover
+        self._gateways = gateways
+
+    def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the methods by name."""
+        return {
+            "gateway_start": self._start,
+            "gateway_stop": self._stop,
+            "gateway_status": self._status,
+        }
+
+    def _start(self, params: dict[str, Any]) -> list[dict[str, Any]]:
+        found = self._find(params)
+        for owner in found:
+            self._gateways[owner].start()
+        return self._rows(found)
+
+    async def _stop(self, params: dict[str, Any]) -> list[dict[str, Any]]:
+        found = self._find(params)
+        for owner in found:
+            await self._gateways[owner].stop()
+        return self._rows(found)
+
+    def _status(self, params: dict[str, Any]) -> list[dict[str, Any]]:
+        return self._rows(self._find(params))
+
+    def _find(self, params: dict[str, Any]) -> list[PortName]:
+        wanted = parameters(params, GatewayParameters)
+        names = [station.name for station in self._handover.stations]
+        if wanted.station not in names:
+            reason = f"no station {wanted.station!r} here{near(wanted.station, names)}"
+            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+        buses = [owner for owner in self._gateways if owner.station == wanted.station]
+        found = [owner for owner in buses if wanted.port in {"", owner.port}]
+        if not found:
+            known = [owner.port for owner in buses]
+            ports = f"its bus ports are {', '.join(known)}" if known else "it has no bus ports"
+            which = f"no bus port {wanted.port!r}" if wanted.port else "no gateway"
+            reason = f"station {wanted.station} has {which}; {ports}{near(wanted.port, known)}"
+            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
+        return found
+
+    def _rows(self, owners: list[PortName]) -> list[dict[str, Any]]:
+        return [
+            {"station": owner.station, "port": owner.port}
+            | {"served": self._served(owner)}
+            | gateway_row(self._gateways[owner])
+            for owner in owners
+        ]
+
+    def _served(self, owner: PortName) -> list[str]:
+        """Return the sockets behind which a gateway is."""
+        first = next(each for each in self._gateways if each.station == owner.station)
+        found = []
+        for shared in self._handover.sockets:
+            if shared.kind in _OWN and owner in shared.owners:
+                found.append(_place(_OWN[shared.kind], shared))
+            elif shared.kind in _SHARED and first == owner:
+                # Of several stations at a socket, the first that has a gateway.
+                stations = [each.station for each in shared.owners]
+                known = {each.station for each in self._gateways}
+                if next((name for name in stations if name in known), "") == owner.station:
+                    found.append(_place(_SHARED[shared.kind], shared))
+        return found
+
+
+def gateway_row(gateway: MailboxGateway) -> dict[str, Any]:
+    """Return how a gateway behaves and what it did, as plain values."""
+    settings = gateway.settings
+    transfers = gateway.transfers()
+    return {
+        "state": "running" if gateway.is_open else "stopped",
+        "turned_away": gateway.turned_away,
+        "settings": {
+            "answer_ms": round(settings.answer_s * 1000),
+            "silent": settings.is_silent,
+            "in_flight": settings.limits.in_flight,
+            "rate": settings.limits.rate,
+            "clients": settings.limits.clients,
+        },
+        "clients": [
+            {
+                "door": way.door,
+                "address": way.connection,
+                "requests": counts.requests,
+                "repeated": counts.repeated,
+                "errors": counts.errors,
+                "waiting": gateway.ledger.waiting(way),
+                "transfers": [
+                    {"address": key.address, "protocol": key.kind.name}
+                    for key in transfers
+                    if key.way == way
+                ],
+            }
+            for way, counts in gateway.ledger.table().items()
+        ],
+        "slaves": gateway.tally.report(),
+    }
+
+
+def _place(scheme: str, shared: SharedSocket) -> str:
+    number = f":{shared.port}" if shared.port else ""
+    return f"{scheme}://{shared.address}{number}"

@@ -1,0 +1,111 @@
+"""Who may do what at a gateway: the rules of the plant file, and what the audit is told.
+
+One line of the audit is written for each change, when it is known how it came out and before its
+client has the answer, and one for each refusal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from eap.aoe.access import AccessList, Verdict
+from eap.aoe.ads_operation import Operation
+from eap.aoe.judged import AuditedOperation, AuditEntry
+from eap.aoe.spec import AccessService
+from eap.aoe.way import Way
+from eap.appliance.services.ads_result import ads_result
+from eap.appliance.services.gateway.slave_session import Reply
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsHeader
+from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.foe import FoeOpcode
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoHeader, SdoRequest
+from eap.codec.soe import SoeHeader
+from eap.ids import NetId
+from eap.od.abort import SdoAbortError
+
+NOBODY = NetId(bytes(6))
+"""Source NetID of who has none."""
+MASTER_PORT = 0xFFFF
+"""AMS port by which rules name the master itself."""
+_SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
+"""Services of CoE whose messages may be aborts."""
+_SOE_ERROR = 0x10
+
+
+class Target(NamedTuple):
+    """Whom rules name: a NetID and an AMS port, which is 0xFFFF for a master."""
+
+    net_id: NetId
+    port: int
+
+
+class Guard:
+    """Judges requests.
+
+    Args:
+        access: Returns the rules that are in force.
+
+    Attributes:
+        on_audit: Called with what was changed, and what was refused.
+    """
+
+    def __init__(self, access: Callable[[], AccessList]) -> None:
+        self.on_audit: list[Callable[[AuditEntry], None]] = []
+        self._access = access
+
+    def judge(
+        self, way: Way, target: Target, operation: Operation, *, by_rule: bool = False
+    ) -> Verdict:
+        """Decide on an operation; *by_rule*: a change only if a rule says so."""
+        verdict = self._access().grants(way, NOBODY, *target).judge(operation)
+        if by_rule and verdict.service is not AccessService.READ and not verdict.is_by_rule:
+            why = "only a rule allows it for several slaves at once"
+            return verdict._replace(is_allowed=False, why=why)
+        return verdict
+
+    def tell(
+        self, way: Way, target: Target, operation: Operation, verdict: Verdict, result: int | None
+    ) -> None:
+        """Have the audit written of what was decided and how it came out.
+
+        Args:
+            way: Connection, or address, of the client.
+            target: Whom it was for.
+            operation: What was to be done.
+            verdict: Whether it may be.
+            result: An error of ADS, 0 for none, None if nobody knows.
+        """
+        if not verdict.is_allowed:
+            result = AdsError.ACCESS_DENIED
+        audited = AuditedOperation(operation, verdict, result)
+        if audited.is_told:
+            entry = AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
+            for write in self.on_audit:
+                write(entry)
+
+
+def result_of(replies: Sequence[Reply]) -> int | None:
+    """Return what an audit says of the answers to a request, as an error of ADS."""
+    if not replies:
+        return None
+    reply = replies[-1]
+    return _result(reply) if reply.reason is None else reply.reason.value.ads
+
+
+def _result(reply: Reply) -> int:
+    body = reply.body
+    match reply.type:
+        case MailboxType.ERR:
+            return AdsError.SERVICE
+        case MailboxType.COE if len(body) >= CoeHeader.SIZE + SdoHeader.SIZE:
+            head = SdoHeader.decode(body, CoeHeader.SIZE)
+            if body[1] >> 4 in _SDO and head.specifier == SdoRequest.ABORT:
+                return ads_result(SdoAbortError(head.value, head.index, head.subindex))
+        case MailboxType.SOE if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR:
+            return AdsError.GENERAL
+        case MailboxType.FOE if body[:1] == bytes((FoeOpcode.ERROR,)):
+            return AdsError.GENERAL
+    return 0

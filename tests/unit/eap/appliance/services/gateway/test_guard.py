@@ -1,0 +1,68 @@
+"""Who may do what, and what the audit is told of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from eap.aoe.access import AccessList
+from eap.aoe.ads_operation import Read, Write
+from eap.aoe.judged import AuditEntry
+from eap.aoe.spec import AccessRule, AccessService
+from eap.aoe.way import Way
+from eap.appliance.services.gateway.guard import Guard, Target, result_of
+from eap.appliance.services.gateway.slave_session import Reply
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.mailbox import MailboxType
+from eap.gateway.refusal import Reason, refuse
+from eap.ids import NetId
+
+TARGET = Target(NetId.parse("5.1.1.1.3.1"), 1001)
+HERE, ELSEWHERE = Way("udp:eap0", "127.0.0.1:1"), Way("udp:eap0", "10.0.0.9:1")
+READ, WRITE = Read(IndexGroup.SDO, 0x1018_0001, 4), Write(IndexGroup.SDO, 0x6040_0000, b"1")
+
+
+def test_rules_that_change_count_at_once() -> None:
+    rules: list[AccessRule] = []
+    guard = Guard(lambda: AccessList(tuple(rules)))
+    assert guard.judge(HERE, TARGET, WRITE).is_allowed
+    assert not guard.judge(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert guard.judge(HERE, TARGET, READ, by_rule=True).is_allowed
+    assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+    rules.append(AccessRule("all", services=(AccessService.WRITE,)))
+    assert guard.judge(HERE, TARGET, WRITE, by_rule=True).is_allowed
+    assert guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+
+
+def test_the_audit_is_told_of_changes_and_refusals() -> None:
+    guard = Guard(AccessList)
+    told: list[AuditEntry] = []
+    guard.on_audit.append(told.append)
+    for way, operation in ((HERE, READ), (HERE, WRITE), (ELSEWHERE, WRITE)):
+        guard.tell(way, TARGET, operation, guard.judge(way, TARGET, operation), 0)
+    assert [(each.way, each.header.target_port, each.operations[0].result) for each in told] == [
+        (HERE, 1001, 0),
+        (ELSEWHERE, 1001, AdsError.ACCESS_DENIED),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "result"),
+    [
+        (MailboxType.COE, "0030 60 4060 00 00000000", 0),
+        (MailboxType.COE, "0020 80 4060 00 00000206", AdsError.NOT_FOUND),
+        (MailboxType.COE, "0080 81 00 0000 00000000", 0),
+        (MailboxType.SOE, "04 40 2000", 0),
+        (MailboxType.SOE, "14 40 2000 0110", AdsError.GENERAL),
+        (MailboxType.FOE, "04 00 00000000", 0),
+        (MailboxType.FOE, "05 00 01800000", AdsError.GENERAL),
+        (MailboxType.ERR, "0100 0200", AdsError.SERVICE),
+    ],
+)
+def test_how_a_request_came_out(kind: MailboxType, body: str, result: int) -> None:
+    assert result_of([Reply(kind, bytes.fromhex(body))]) == result
+
+
+def test_how_a_request_came_out_that_the_gateway_answers() -> None:
+    refusal = refuse(MailboxType.COE, bytes(10), Reason.TIMEOUT)
+    assert result_of([Reply(*refusal, reason=Reason.TIMEOUT)]) == AdsError.TIMEOUT
+    assert result_of([]) is None

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from rich.console import Console
+
+from eap.cli.gateway_view import gateway_tables
+
+ROW = {
+    "station": "mixer",
+    "port": "bus0",
+    "served": ["udp://10.0.0.1:34980", "tcp://10.0.0.1:34980"],
+    "state": "running",
+    "turned_away": 0,
+    "settings": {
+        "answer_ms": 900, "silent": False, "in_flight": 32, "rate": 0, "clients": 256,
+    },
+    "clients": [
+        {
+            "door": "udp:eap0", "address": "10.0.0.9:5000", "requests": 7, "repeated": 1,
+            "errors": 2, "waiting": 0, "transfers": [{"address": 1001, "protocol": "FOE"}],
+        }
+    ],
+    "slaves": [
+        {
+            "address": 0, "protocol": "COE", "requests": 5, "replies": 5, "errors": {},
+            "last_error": "", "mean_us": 1200.0, "slowest_us": 3000.0,
+        },
+        {
+            "address": 1009, "protocol": "SOE", "requests": 2, "replies": 0,
+            "errors": {"no_slave": 2}, "last_error": "there is no such slave", "mean_us": None,
+            "slowest_us": 0.0,
+        },
+    ],
+}  # fmt: skip
+
+
+def shown(row):
+    console = Console(width=120)
+    with console.capture() as captured:
+        for each in gateway_tables(row):
+            console.print(each)
+    return captured.get()
+
+
+def test_what_a_gateway_does():
+    text = shown(ROW)
+    first, *lines = text.splitlines()
+    assert first == (
+        "mixer/bus0: running at udp://10.0.0.1:34980, tcp://10.0.0.1:34980; answers within 900 ms"
+    )
+    assert any(
+        s.split() == ["10.0.0.9:5000", "udp:eap0", "7", "1", "2", "FOE", "1001"] for s in lines
+    )
+    assert any("master" in each and "1.2 ms" in each for each in lines)
+    assert "there is no such slave" in text
+
+
+def test_one_that_is_stopped_and_silent():
+    quiet = ROW | {"state": "stopped", "turned_away": 3, "served": [], "clients": [], "slaves": []}
+    quiet["settings"] = ROW["settings"] | {"silent": True}
+    assert shown(quiet) == (
+        "mixer/bus0: stopped at nowhere; answers within 900 ms, silent, 3 frames turned away\n"
+    )
