@@ -190,8 +190,11 @@ def _decode_coe(body: bytes) -> Task:
         raise MalformedError(f"SDO command 0x{command:02x}", layout="dialect")
     data = body[_SDO_BODY:]
     if command & 0x0F:  # as the standard writes it: expedited, or with its size in front
+        least = CoeHeader.SIZE + SdoHeader.SIZE
+        if len(body) < least:
+            raise _short("CoE", body, least)
         head = SdoHeader.decode(body, CoeHeader.SIZE)
-        data = head.data if head.expedited else body[CoeHeader.SIZE + SdoHeader.SIZE :]
+        data = head.data if head.expedited else body[least:]
     if not data:
         raise MalformedError("a download without data", layout="dialect")
     return WriteSdo(index, subindex, data)

@@ -97,6 +97,7 @@ def test_what_else_is_understood(kind, octets, task) -> None:
         (FOE, "01 0000", "FoE request of 3 octets"),
         (FOE, "02 00000000 66", "FoE opcode 2: only whole files are read"),
         (VOE, "641100000100"[:-2], "VoE request of 5 octets"),
+        (COE, "0020 23 0020 00", "6 octets, expected at least 10"),
     ],
 )
 def test_what_is_not_understood_says_what_was_expected(kind, octets, why) -> None:
