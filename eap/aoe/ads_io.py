@@ -16,7 +16,6 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adssymbol import encode_text
 from eap.ids import NetId
 
-IO_PORT = 300
 _MAX_ID = 0xFFF
 
 

@@ -12,8 +12,6 @@ from eap.aoe.ads_operation import AdsRefusedError
 from eap.aoe.ads_space import AdsSpace
 from eap.codec.ads import AdsError, AdsSystemState, IndexGroup
 
-SYSTEM_PORT = 10_000
-
 
 class SystemSpace(AdsSpace):
     """The state of the whole station; *state* is called whenever somebody asks."""

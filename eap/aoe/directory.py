@@ -6,13 +6,11 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import NamedTuple
 
-from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.spec import DirectoryPort, DirectoryStation
+from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
 from eap.ids import NetId
 from eap.od.profiles.router9000 import ROUTER
 
-DEVICE_PORT = 0xFFFF
-"""AMS port of an EAP device, of a master, and of the dictionary of a router."""
 _MAX_PORT = 0xFFFF
 
 

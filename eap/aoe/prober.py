@@ -13,13 +13,11 @@ from typing import NamedTuple
 
 from eap.aoe.routes import RouteTable
 from eap.aoe.way import Way
-from eap.codec.ams import AmsCommand, AmsHeader
+from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId
 
 PROBE_PORT = 1
 """AMS port of this router that answers to probes go to."""
-SYSTEM_PORT = 10000
-"""AMS port of the system service, which routers have."""
 MISSES = 2
 """Questions without an answer that make a hop a dead one."""
 _BUSY = 5

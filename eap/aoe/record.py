@@ -7,11 +7,11 @@ from collections import deque
 import msgspec
 
 from eap.aoe.action import Outcome, Trace
-from eap.aoe.prober import PROBE_PORT, SYSTEM_PORT
+from eap.aoe.prober import PROBE_PORT
 from eap.aoe.routes import RouteKey
 from eap.aoe.traffic import TrafficTable
 from eap.aoe.way import Way
-from eap.codec.ams import AmsCommand, AmsHeader
+from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 
 _ANSWERED = Outcome.ANSWERED  # looked up once: members of enums are slow
 MAX_EVENTS = 1024

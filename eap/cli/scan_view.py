@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple, TypeAlias
 
-Row: TypeAlias = dict[str, Any]
+from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
 
-_ROUTER_PORT = 10_000
-_DEVICE_PORT = 65_535
+Row: TypeAlias = dict[str, Any]
 
 
 class _Line(NamedTuple):
@@ -52,11 +51,11 @@ def _lines(station: Row, via: Row) -> Iterator[_Line]:
         return client_line(net_id, port, via["address"])
 
     name = station["name"]
-    yield _Line(name, "router", _state(station), client(station["net_id"], _ROUTER_PORT))
+    yield _Line(name, "router", _state(station), client(station["net_id"], SYSTEM_PORT))
     for port in station["ports"]:
         place = f"{name}/{port['name']}"
         what = f"  {port['kind']} {port['interface']}".rstrip()
-        yield _Line(place, what, _state(port), client(port["net_id"], _DEVICE_PORT))
+        yield _Line(place, what, _state(port), client(port["net_id"], DEVICE_PORT))
         for slave in port["slaves"]:
             number = slave["address"]
             yield _Line(

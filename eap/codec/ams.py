@@ -11,6 +11,13 @@ from enum import IntEnum, IntFlag
 from eap.codec.wire import Buffer, WireStruct, net_id, u16, u32
 from eap.errors import TruncatedError
 
+SYSTEM_PORT = 10_000
+"""AMS port of the system service, which routers have."""
+IO_PORT = 300
+"""AMS port of the I/O server, which knows the masters of a station."""
+DEVICE_PORT = 0xFFFF
+"""AMS port of an EAP device, of a master, and of the dictionary of a router."""
+
 
 class AmsCommand(IntEnum):
     """The ADS services, and the fragment of a packet too long for a mailbox."""

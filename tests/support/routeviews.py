@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.directory import Directory
 from eap.aoe.spec import (
@@ -19,6 +18,7 @@ from eap.appliance.services.route_rows import RouterView
 from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.station_routes import StationRoutes
+from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
 from tests.support.routing import KeepingCarrier, StubService
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import ReadWrite
 from eap.aoe.ads_request import parse_request
-from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.hop_report import HopQuestion, encode_report
 from eap.aoe.report import Location
@@ -17,7 +16,7 @@ from eap.aoe.spec import AccessRule
 from eap.aoe.way import Door, Way
 from eap.appliance.services.tracing import answer_question
 from eap.codec.ads import AdsError, IndexGroup, encode_result
-from eap.codec.ams import AmsCommand, AmsHeader
+from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId
 
 Serve = Callable[[int, int, bytes], AmsAnswer]

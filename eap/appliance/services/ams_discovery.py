@@ -16,8 +16,9 @@ from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.ams_questions import SYSTEM_PORT, AmsQuestions
+from eap.appliance.services.ams_questions import AmsQuestions
 from eap.appliance.services.route_desk import RouteDesk
+from eap.codec.ams import SYSTEM_PORT
 from eap.codec.amsdiscovery import (
     RESPONSE,
     Discovery,

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Sequence
 from ipaddress import IPv4Address
 
 from eap.appliance.services.neighbours import Introduction, Neighbour
+from eap.codec.ams import SYSTEM_PORT
 from eap.codec.amsdiscovery import (
     AMS_UDP_PORT,
     RESPONSE,
@@ -30,8 +31,6 @@ from eap.errors import CodecError, EnvironmentalError
 from eap.ids import NetId
 from eap.net.interface import broadcast_of
 
-SYSTEM_PORT = 10000
-"""AMS port of the system service, in whose name routers ask and answer."""
 MAX_NEIGHBOURS = 1024
 """Answers to one question that are taken."""
 BROADCAST = "255.255.255.255"

@@ -41,12 +41,10 @@ from eap.codec.ads import (
     device_name,
     encode_result,
 )
-from eap.codec.ams import AmsCommand, AmsHeader
+from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
 from eap.errors import ControlError
 from eap.od.abort import SdoAbortError
 
-DEVICE_PORT = 0xFFFF
-"""AMS port of an EAP device."""
 _READ, _DONE = AmsCommand.READ.value, AdsError.NONE.value  # members of enums are slow
 _BUSY_PAUSE_S = 0.005
 _BUSY_PAUSES = 20

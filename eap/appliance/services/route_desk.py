@@ -14,7 +14,6 @@ from time import monotonic
 from typing import NamedTuple
 
 from eap.aoe.access import Verdict
-from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.aoe.routes import Origin, RouteTable
 from eap.aoe.spec import AccessService, AmsUser, DoorKind, HopSpec, RouteSpec
@@ -22,7 +21,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.allowance import Allowance
 from eap.appliance.services.station_routes import StationRoutes
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsHeader
+from eap.codec.ams import SYSTEM_PORT, AmsHeader
 from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.config.hosts import parse_host

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from time import monotonic_ns
 
-from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.advice import advise
 from eap.aoe.directory import AmsAddress, Directory
 from eap.appliance.control import ErrorCode
 from eap.appliance.control_routes import TestResult
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ads import AdsState, AdsStates
-from eap.codec.ams import AmsCommand
+from eap.codec.ams import SYSTEM_PORT, AmsCommand
 from eap.errors import CodecError, ControlError
 from eap.ids import NetId
 

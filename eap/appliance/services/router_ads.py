@@ -7,7 +7,7 @@ from functools import partial
 from time import monotonic_ns
 
 from eap.aoe.ads_device import AdsDevice
-from eap.aoe.ads_io import IO_PORT, IoDevice, IoDeviceType, IoSpace
+from eap.aoe.ads_io import IoDevice, IoDeviceType, IoSpace
 from eap.aoe.ads_notifications import Client, NotificationTable
 from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.ads_operation import Operation, OperationOutcome, WriteControl
@@ -17,11 +17,11 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.services.ads_requests import begin_answer
 from eap.appliance.services.ads_result import ads_result
-from eap.appliance.services.eap_ads import DEVICE_PORT
 from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.state_control import control_state
 from eap.appliance.services.station_device import StationDevice
 from eap.codec.ads import AdsDeviceInfo, AdsStates
+from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.od.model import OdState

@@ -11,13 +11,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 from devicebus.wire.alstatus import state_name
-from eap.aoe.ads_io import IO_PORT, IoDeviceType
+from eap.aoe.ads_io import IoDeviceType
 from eap.aoe.ads_operation import OperationOutcome, Read, ReadDeviceInfo
-from eap.aoe.directory import DEVICE_PORT, AmsAddress, Directory
+from eap.aoe.directory import AmsAddress, Directory
 from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryPort, DirectoryStation
 from eap.appliance.services.tracing import Station, ask_one
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.ids import NetId
 
 Row: TypeAlias = dict[str, Any]

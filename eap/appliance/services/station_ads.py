@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from eap.aoe.ads_system import SYSTEM_PORT
-from eap.appliance.services.eap_ads import DEVICE_PORT, EapAds, device_info
+from eap.appliance.services.eap_ads import EapAds, device_info
 from eap.appliance.services.image_variables import StationSymbols
 from eap.appliance.services.notification_pump import NotificationPump
 from eap.appliance.services.router_ads import RouterAds
@@ -13,6 +12,7 @@ from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.appliance.services.station_device import StationDevice
 from eap.appliance.services.system_ads import SystemAds
 from eap.appliance.station_image import StationImage
+from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
 from eap.device.eap_content import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId

@@ -14,7 +14,7 @@ from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_notifications import Client, NotificationTable
 from eap.aoe.ads_operation import Operation, OperationOutcome, WriteControl
 from eap.aoe.ads_state import states_of
-from eap.aoe.ads_system import SYSTEM_PORT, SystemSpace
+from eap.aoe.ads_system import SystemSpace
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.services.ads_requests import begin_answer
@@ -22,6 +22,7 @@ from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.state_control import control_state
 from eap.appliance.services.station_device import StationDevice
 from eap.codec.ads import AdsDeviceInfo, AdsStates, AdsSystemState
+from eap.codec.ams import SYSTEM_PORT
 
 
 class SystemAds:

@@ -15,7 +15,6 @@ from msgspec.structs import replace
 from eap.aoe.access import LOCAL
 from eap.aoe.ads_operation import Operation, OperationOutcome, ReadState, ReadWrite
 from eap.aoe.ads_query import decode_outcome, encode_query
-from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.hop_report import (
     MAX_FURTHER,
@@ -28,7 +27,7 @@ from eap.aoe.hop_report import (
 from eap.aoe.report import Location
 from eap.aoe.way import Way
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
-from eap.codec.ams import AmsHeader
+from eap.codec.ams import SYSTEM_PORT, AmsHeader
 from eap.errors import CodecError
 from eap.ids import NetId
 

@@ -45,11 +45,11 @@ from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification
+from eap.codec.ams import DEVICE_PORT
 from eap.errors import EapError
 from eap.ids import NetId
 from eap.od.model import OdState
 
-MASTER_PORT = 0xFFFF
 ANSWER_S = 4.0
 """How long a request may take; routers give up after 4.5 s, clients after 5 s."""
 _IN_HEADER = frozenset((AdsError.HOST_UNREACHABLE, AdsError.TARGET_PORT))
@@ -85,7 +85,7 @@ class BusService:
         send: Send,
         desk: MasterDesk,
     ) -> None:
-        self.ports: Container[int] = range(1, MASTER_PORT + 1)
+        self.ports: Container[int] = range(1, DEVICE_PORT + 1)
         self._bus = bus
         self._port = port
         self._desk = desk
@@ -102,7 +102,7 @@ class BusService:
             control=self._master.control,
         )
         notifications = self._device.notifications
-        self._watch = MasterWatch(notifications, self._look, send, net_id, MASTER_PORT)
+        self._watch = MasterWatch(notifications, self._look, send, net_id, DEVICE_PORT)
 
     async def answer(self, request: LocalRequest) -> AmsAnswer:
         """Do what a request asks for."""
@@ -139,7 +139,7 @@ class BusService:
 
     def _performer(self, ams_port: int, report: BusReport, client: Client) -> Perform:
         """Return who does operations for a port, or raise AdsRefusedError if nobody has it."""
-        if ams_port == MASTER_PORT:
+        if ams_port == DEVICE_PORT:
             return lambda operation: self._perform_of_master(operation, report, client)
         slave = next((each for each in report.slaves if each.station == ams_port), None)
         if slave is None:

@@ -16,12 +16,11 @@ from typing import NamedTuple
 from eap.aoe.prober import PROBE_PORT
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
+from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
 from eap.errors import CodecError
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
 from eap.pd.link import Channel
 
-DEVICE_PORT = 0xFFFF
 ASK_NS = 1_000_000_000
 """Between two questions for a NetID that nobody answered."""
 ASK_AGAIN_NS = 30_000_000_000

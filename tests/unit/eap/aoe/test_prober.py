@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 from eap.aoe.action import Forward, Outcome
-from eap.aoe.prober import PROBE_PORT, SYSTEM_PORT, Prober
+from eap.aoe.prober import PROBE_PORT, Prober
 from eap.aoe.routes import RouteTable
 from eap.aoe.way import Way
-from eap.codec.ams import AmsCommand
+from eap.codec.ams import SYSTEM_PORT, AmsCommand
 from eap.ids import NetId
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import (

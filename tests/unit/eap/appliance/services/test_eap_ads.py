@@ -10,14 +10,14 @@ import pytest
 from eap.aoe.ads_notifications import Client
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
-from eap.appliance.services.eap_ads import DEVICE_PORT, EapAds, device_info
+from eap.appliance.services.eap_ads import EapAds, device_info
 from eap.appliance.services.image_variables import StationSymbols
 from eap.appliance.services.jobs import MAX_WAITING
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode
-from eap.codec.ams import AmsCommand, AmsHeader
+from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
 from eap.device.fault import FaultCode
 from eap.errors import EngineRefusedError
 from eap.ids import NetId

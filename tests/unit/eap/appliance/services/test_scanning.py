@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from eap.aoe.ads_device import AdsDevice
-from eap.aoe.ads_io import IO_PORT, IoDevice, IoDeviceType, IoSpace
+from eap.aoe.ads_io import IoDevice, IoDeviceType, IoSpace
 from eap.aoe.ads_master import MasterSpace, SlaveState
 from eap.aoe.ads_notifications import Client
 from eap.aoe.answer import AmsAnswer
@@ -18,6 +18,7 @@ from eap.aoe.way import Way
 from eap.appliance.services import scanning
 from eap.appliance.services.scanning import scan, stations_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_name
+from eap.codec.ams import IO_PORT
 from eap.ids import NetId
 from tests.support.tracedplant import Line, Station, to
 

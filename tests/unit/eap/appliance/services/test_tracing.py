@@ -3,12 +3,12 @@ from __future__ import annotations
 import asyncio
 from itertools import count
 
-from eap.aoe.ads_system import SYSTEM_PORT
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule
 from eap.aoe.spec import AccessService as Service
 from eap.appliance.services.tracing import Traced, trace
 from eap.codec.ads import AdsError, AdsStates
+from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
 from tests.support.tracedplant import Line, Station, run_state, to
 
