@@ -1,0 +1,178 @@
+"""A gateway given any frames by two clients; its slave and its master are in memory."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Hashable, Iterator
+from itertools import cycle
+from typing import TypeVar, cast
+
+from devicebus.errors import BusError, MailboxTimeoutError
+from devicebus.mailbox.coe_server import CoeServer
+from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.foe_server import FoeServer
+from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.server import MailboxServer
+from devicebus.mailbox.voe_server import VoeServer
+from eap.aoe.access import AccessList
+from eap.aoe.spec import AccessRule, AccessService
+from eap.appliance.bus_request import BusReport, Heard, SlaveReport
+from eap.appliance.services.bus_talk import Talk
+from eap.appliance.services.gateway.door import GatewayDoor
+from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
+from eap.appliance.services.gateway.master_session import MasterSession
+from eap.codec.mailbox import (
+    MailboxHeader,
+    MailboxType,
+    decode_frame,
+    decode_message,
+    encode_frame,
+    encode_message,
+)
+from eap.gateway.ledger import ClientLimits
+from eap.ids import NetId
+from eap.od.dictionary import ObjectDictionary
+from eap.od.model import RW, OdState, variable
+from tools.fuzz.messages import cut
+
+T = TypeVar("T")
+
+_SIZES = MailboxSizes(40, 40)
+_STATION = 1001
+_ADDRESSES = (_STATION, 0, 0xFFFF, _STATION | 0x8000, 7)
+_SETTINGS = Settings(NetId(b"\1\2\3\4\5\6"), room=60, limits=ClientLimits(4, clients=1))
+_EVERYTHING = (AccessRule("all", allow=True, services=(AccessService.READ, AccessService.WRITE)),)
+
+
+class _Failures(logging.Handler):
+    """Keeps the last exception that the gateway logged: it raises none."""
+
+    found: BaseException | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.exc_info:
+            self.found = record.exc_info[1]
+
+
+def _op() -> OdState:
+    return OdState.OP
+
+
+class _Talk:
+    """One slave's mailbox, without a bus."""
+
+    def __init__(self, box: MailboxServer) -> None:
+        self._box = box
+
+    async def ask(self, ask: Ask) -> Message:
+        if not ask.listen:
+            octets = encode_message(MailboxHeader(0, 0, type=ask.type), ask.request)
+            self._box.receive_message(octets, 0)
+        if not ask.expects_reply:
+            return Message(ask.type, b"")
+        reply = self._box.next_message(0)
+        if reply is None:
+            raise MailboxTimeoutError("nothing comes")
+        self._box.handle_read()
+        header, body = decode_message(reply)
+        return Message(header.type, bytes(body), counter=header.counter)
+
+    def abandon(self) -> None:
+        """Nobody is told."""
+
+    def close(self) -> None:
+        """There is always a turn."""
+
+
+class _Link:
+    """A bus of one slave."""
+
+    def __init__(self, dictionary: ObjectDictionary) -> None:
+        store = MemoryStore([MemoryFile("", bytes(90), max_size=200)], creates=True)
+        self._box = MailboxServer(
+            {
+                MailboxType.COE: CoeServer(dictionary, _op, _SIZES),
+                MailboxType.FOE: FoeServer(store, _SIZES),
+                MailboxType.VOE: VoeServer(),
+            },
+            _SIZES,
+        )
+
+    async def describe(self) -> BusReport:
+        slave = SlaveReport(
+            station=_STATION, name="", vendor=0, product=0, revision=0, serial=0, alias=0, state=8,
+            target=8, to_slave=_SIZES.to_slave, to_master=_SIZES.to_master, protocols=0x2C,
+        )  # fmt: skip
+        return BusReport(is_up=True, slaves=(slave,))
+
+    async def open_talk(self, station: int, kind: MailboxType, requester: Hashable) -> Talk:
+        return cast("Talk", _Talk(self._box))
+
+    async def converse(self, station: int, conversation: Conversation[T], requester: Hashable) -> T:
+        talk = _Talk(self._box)
+        try:
+            ask = next(conversation)
+            while True:
+                try:
+                    message = await talk.ask(ask)
+                except BusError as exc:
+                    ask = conversation.throw(exc)
+                else:
+                    ask = conversation.send(message)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+    def listen(self, heard: Callable[[Heard], None]) -> None:
+        """It says nothing unasked."""
+
+
+async def _nothing(index: int) -> None:
+    """What the master shows is never old."""
+
+
+def _frames(data: bytes) -> Iterator[bytes]:
+    """Yield the octets as they are, then messages to each address in each protocol."""
+    yield data
+    kinds = cycle((*MailboxType,))
+    for number, body in enumerate(cut(data)):
+        address, counter = _ADDRESSES[len(body) % len(_ADDRESSES)], number % 8
+        header = MailboxHeader(0, address, type=next(kinds), counter=counter)
+        yield encode_frame(header, body)
+
+
+async def _serve(data: bytes) -> None:
+    dictionary = ObjectDictionary(
+        [variable(0x1000, "A", "UDINT"), variable(0, "B", "BLOCK(90)", RW)]
+    )
+    gateway = MailboxGateway(
+        _Link(dictionary),
+        lambda: MasterSession(dictionary, _SETTINGS.room, _nothing),
+        lambda: AccessList(_EVERYTHING),
+        _SETTINGS,
+    )
+    door = GatewayDoor([(gateway, "udp:eap0")])
+    answered: list[bytes] = []
+    for frame, client in zip(_frames(data), cycle("ab"), strict=False):
+        door.receive(frame, client, lambda to, octets: answered.append(octets))
+        await gateway.wait_idle()
+    for octets in answered:
+        decode_frame(octets)
+    await gateway.close()
+    if gateway.transfers() or gateway.ledger.table():
+        raise AssertionError("transfers or clients are left over")
+
+
+def fuzz_one(data: bytes) -> None:
+    """Have all frames taken; nothing is raised, every answer is a frame, nothing stays."""
+    failures = _Failures()
+    logger = logging.getLogger("eap.appliance.services.gateway")
+    logger.addHandler(failures)
+    try:
+        asyncio.run(_serve(data))
+    finally:
+        logger.removeHandler(failures)
+    if failures.found is not None:
+        raise failures.found
