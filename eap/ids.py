@@ -8,6 +8,9 @@ from ipaddress import IPv4Address
 from typing import NamedTuple, Self
 from urllib.parse import parse_qsl, urlencode
 
+STATION_OCTETS = 4
+"""Octets that all NetIDs of a station usually have in common."""
+
 
 class NetId(bytes):
     """An AMS NetID: six octets, written ``5.23.91.23.1.1``.  Not an IP address."""
@@ -25,11 +28,21 @@ class NetId(bytes):
             raise ValueError(f"{text!r} has an octet above 255")
         return cls(numbers)
 
+    @property
+    def station(self) -> bytes:
+        """The octets that it has in common with all others of its station, usually."""
+        return self[:STATION_OCTETS]
+
     def __str__(self) -> str:
         return ".".join(map(str, self))
 
     def __repr__(self) -> str:
         return f"NetId.parse({str(self)!r})"
+
+
+def prefix_text(prefix: bytes) -> str:
+    """Return what all NetIDs that begin with *prefix* look like: ``5.23.91.23.x.x``."""
+    return ".".join([*map(str, prefix), *["x"] * (6 - len(prefix))])
 
 
 _MAC = re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}")

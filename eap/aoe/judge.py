@@ -17,10 +17,7 @@ from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
-from eap.ids import NetId
-
-_PREFIX = 4
-"""Octets that all NetIDs of a station have in common."""
+from eap.ids import STATION_OCTETS, NetId
 
 
 class Limits(NamedTuple):
@@ -101,7 +98,7 @@ class Judge:
         if found is None:
             return Refusal(AdsError.TARGET_MACHINE, f"no route to {header.target}")
         route, octets = found
-        if octets < _PREFIX and header.target[:_PREFIX] == self._net_id[:_PREFIX]:
+        if octets < STATION_OCTETS and header.target.station == self._net_id.station:
             # Whoever has a route for the station's NetIDs would send it back here.
             text = f"this station has no NetID {header.target}"
             return Refusal(AdsError.TARGET_MACHINE, text)
@@ -138,7 +135,7 @@ class Judge:
 
     def _find_obstacle(self, header: AmsHeader, way: Way, route: Route) -> Refusal | None:
         back = self._table.find(header.source)
-        if back is not None and back[1] >= _PREFIX and back[0].is_unidirectional:
+        if back is not None and back[1] >= STATION_OCTETS and back[0].is_unidirectional:
             text = f"route {back[0].name} is unidirectional: nothing may be asked from there"
             return Refusal(AdsError.ACCESS_DENIED, text, back[0])
         hop = route.hop

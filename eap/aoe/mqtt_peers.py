@@ -14,7 +14,7 @@ import msgspec
 from eap.aoe.mqtt_info import Info
 from eap.aoe.routes import Origin, Route, RouteTable
 from eap.aoe.way import Way
-from eap.ids import NetId
+from eap.ids import STATION_OCTETS, NetId
 
 MAX_PEERS = 2000
 """Routers that are remembered; who comes later is not."""
@@ -22,8 +22,6 @@ EXPIRY_NS = 300_000_000_000
 """How long what a router told counts."""
 REFRESH_NS = 120_000_000_000
 """Between two times that all are asked for."""
-_STATION = 4
-"""Octets that all NetIDs of a station have in common."""
 
 
 class Change(Enum):
@@ -110,8 +108,9 @@ class Peers:
         """Return the NetID of the router that *source* is behind; its own if none is known."""
         if source in self._peers:
             return str(source)
-        near = self._online.get(source[:_STATION], ())
-        return str(max(near, key=lambda each: each[_STATION] == source[_STATION], default=source))
+        near = self._online.get(source.station, ())
+        fifth = source[STATION_OCTETS]
+        return str(max(near, key=lambda each: each[STATION_OCTETS] == fifth, default=source))
 
     def _learn(self, net_id: NetId, name: str, known: Route | None, now_ns: int) -> Route | None:
         """Return the route, new or with more time; None if there cannot be one."""
@@ -128,17 +127,17 @@ class Peers:
             Way(self._door, str(net_id)),
             Origin.LEARNED,
             # Another router on this computer; this station's own NetIDs stay its own.
-            octets=6 if net_id[:_STATION] == self._net_id[:_STATION] else _STATION,
+            octets=6 if net_id.station == self._net_id.station else STATION_OCTETS,
             expires_at_ns=expires_at_ns,
             is_probed=False,  # the broker tells who is gone
         )
         return route if self._table.add(route) else None
 
     def _list(self, net_id: NetId, *, is_online: bool) -> None:
-        near = self._online.setdefault(net_id[:_STATION], [])
+        near = self._online.setdefault(net_id.station, [])
         if is_online:
             near.append(net_id)
         else:
             near.remove(net_id)
         if not near:
-            del self._online[net_id[:_STATION]]
+            del self._online[net_id.station]

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import msgspec
 
 from eap.aoe.way import Way
-from eap.ids import NetId
+from eap.ids import NetId, prefix_text
 
 MAX_LEARNED = 10_000
 """Routes that others may make known; who comes later is not taken."""
@@ -257,7 +257,7 @@ def _prefixes(route: Route) -> list[bytes]:
 def _text(prefix: bytes) -> str:
     if not prefix:
         return "NetIDs without a route"
-    octets = ".".join([*map(str, prefix), *["x"] * (6 - len(prefix))])
+    octets = prefix_text(prefix)
     return octets if len(prefix) == 6 else f"NetIDs {octets} without a route of their own"
 
 

@@ -8,10 +8,10 @@ from eap.aoe.spec import DEFAULT_TARGET
 from eap.config.check_brokers import check_brokers
 from eap.config.finding import Report, near, one_of
 from eap.config.index import Index
-from eap.config.reach import COMMON, WHOLE, prefixes, reach, without_prefix
+from eap.config.reach import reach, without_prefix
 from eap.config.routes import MQTT, MisfitError, next_hop, target_of
 from eap.config.structs import Route, Station
-from eap.ids import NetId
+from eap.ids import NetId, prefix_text
 
 _OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four numbers"
 
@@ -20,7 +20,7 @@ def check_routes(index: Index, report: Report, folder: Path) -> None:
     """Report every route and broker that cannot be as it is; files are in *folder*."""
     loose = without_prefix(index)
     for station in index.plant.stations:
-        claimed: dict[tuple[bytes, int], Route] = {}
+        claimed: dict[bytes, Route] = {}
         for route in station.routes:
             _check_keys(route, report)
             if not route.mqtt:
@@ -95,7 +95,7 @@ def _is_usable(text: str) -> bool:
 def _check_claims(
     index: Index,
     sent: tuple[Station, Route],
-    claimed: dict[tuple[bytes, int], Route],
+    claimed: dict[bytes, Route],
     loose: set[str],
     report: Report,
 ) -> None:
@@ -105,7 +105,7 @@ def _check_claims(
         claims = reach(index, route, loose)
         if route.virtual and route.to != DEFAULT_TARGET:
             claims = [(route.virtual, octets) for _, octets in claims]
-        keys = [(NetId.parse(net_id)[:octets], octets) for net_id, octets in claims]
+        keys = [NetId.parse(net_id)[:octets] for net_id, octets in claims]
     except ValueError:
         return  # a finding of its own
     for key in keys:
@@ -129,16 +129,14 @@ def _report_doubled(first: Route, route: Route, report: Report) -> None:
 
 
 def _check_owners(
-    index: Index, station: Station, path: str, keys: list[tuple[bytes, int]], report: Report
+    index: Index, station: Station, path: str, keys: list[bytes], report: Report
 ) -> None:
-    for prefix, octets in keys:
+    for prefix in keys:
         for owner in index.plant.stations:
             texts = [owner.net_id, *(port.net_id for port in owner.ports)]
-            is_taken = any(_begins(text, prefix) for text in texts)
-            if is_taken or (octets == COMMON and prefix in prefixes(owner)):
+            if any(_begins(text, prefix) for text in texts):
                 whose = "this station" if owner is station else f"station {owner.name}"
-                shown = ".".join(map(str, prefix)) + ".x" * (WHOLE - octets)
-                report.add(path, f"NetID {shown} is one of {whose}", _OTHER_NET_ID)
+                report.add(path, f"NetID {prefix_text(prefix)} is one of {whose}", _OTHER_NET_ID)
                 return
 
 

@@ -6,10 +6,8 @@ from eap.aoe.spec import DEFAULT_TARGET
 from eap.config.index import Index
 from eap.config.routes import target_of
 from eap.config.structs import Route, Station
-from eap.ids import NetId
+from eap.ids import STATION_OCTETS, NetId
 
-COMMON = 4
-"""Octets that all NetIDs of a station usually have in common."""
 WHOLE = 6
 NOBODY = NetId(bytes(WHOLE))
 
@@ -23,7 +21,7 @@ def reach(index: Index, route: Route, loose: set[str]) -> list[tuple[str, int]]:
         return [(str(NOBODY), 0)]
     target = target_of(index, route)
     if target is None:
-        return [(str(NetId.parse(route.net_id)), route.octets or COMMON)]
+        return [(str(NetId.parse(route.net_id)), route.octets or STATION_OCTETS)]
     # One NetID only can stand for another, so a virtual one is for all that begin alike.
     return net_ids_of(target, set() if route.virtual else loose)
 
@@ -32,7 +30,7 @@ def net_ids_of(station: Station, loose: set[str]) -> list[tuple[str, int]]:
     """Return by which NetIDs, and octets of them, everything at *station* is reached."""
     router = str(NetId.parse(station.net_id))
     if station.name not in loose:
-        return [(router, COMMON)]
+        return [(router, STATION_OCTETS)]
     return [(router, WHOLE), *((str(NetId.parse(port.net_id)), WHOLE) for port in station.ports)]
 
 
@@ -51,7 +49,7 @@ def prefixes(station: Station) -> set[bytes]:
     found = set()
     for text in [station.net_id, *(port.net_id for port in station.ports)]:
         try:
-            found.add(NetId.parse(text)[:COMMON])
+            found.add(NetId.parse(text).station)
         except ValueError:
             continue  # a finding of its own
     return found

@@ -9,10 +9,10 @@ from ipaddress import IPv4Network
 from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
 from eap.config.finding import near, one_of
 from eap.config.index import Index
-from eap.config.reach import COMMON, WHOLE, net_ids_of
+from eap.config.reach import WHOLE, net_ids_of
 from eap.config.routes import MisfitError
 from eap.config.structs import Access, Port, Station
-from eap.ids import MacAddr, NetId
+from eap.ids import STATION_OCTETS, MacAddr, NetId
 from eap.pd.spec import PortKind
 
 ALL = "all"
@@ -172,7 +172,7 @@ def _beginnings(station: Station, loose: set[str]) -> list[str]:
 
 def _net_id(text: str) -> str:
     numbers = text.split(".")
-    if COMMON <= len(numbers) <= WHOLE and all(
+    if STATION_OCTETS <= len(numbers) <= WHOLE and all(
         each.isascii() and each.isdigit() and int(each) < 256 for each in numbers
     ):
         return ".".join(str(int(each)) for each in numbers)

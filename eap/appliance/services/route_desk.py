@@ -26,13 +26,12 @@ from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.config.hosts import parse_host
 from eap.errors import ControlError, EnvironmentalError
-from eap.ids import NetId
+from eap.ids import STATION_OCTETS, NetId
 
 BURST = 10
 """Requests that are looked at, at once; one a second for long.  Passwords take time to guess."""
 _MAX_PASSWORD = 4096
 _SHOWN = 80
-_COMMON = 4
 
 logger = logging.getLogger(__name__)
 
@@ -175,13 +174,12 @@ def _written(table: RouteTable, net_id: NetId) -> str:
 def _add(station: StationRoutes, wanted: _Request) -> None:
     """Add a route for all NetIDs that begin as the wanted one, or for that alone."""
     hop = HopSpec(DoorKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
-    prefix = wanted.net_id[:_COMMON]
-    is_here = any(own.startswith(prefix) for own in station.router.net_ids)
+    is_here = station.has(wanted.net_id.station)
     spec = RouteSpec(
         name=wanted.name,
         net_id=str(wanted.net_id),
         hop=hop,
-        octets=len(wanted.net_id) if is_here else _COMMON,
+        octets=len(wanted.net_id) if is_here else STATION_OCTETS,
         is_probed=False,  # most tools answer nobody
     )
     station.add(spec, is_kept=wanted.is_kept)

@@ -19,7 +19,7 @@ from eap.aoe.spec import DirectoryPort, DirectoryStation
 from eap.appliance.services.tracing import Station, ask_one
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, IO_PORT
-from eap.ids import NetId
+from eap.ids import STATION_OCTETS, NetId
 
 Row: TypeAlias = dict[str, Any]
 
@@ -31,7 +31,6 @@ _AT_A_TIME = 8
 """Stations that are asked."""
 _MAX_PORTS = 64
 _ROOM = 4096
-_LEVEL = 4
 _NAME = 0x1008_0000
 _INTERFACE = 0x8000_0003
 _INTERFACE_STEP = 0x1_0000
@@ -62,7 +61,7 @@ def stations_of(directory: Directory, routes: Iterable[Route]) -> list[Known]:
     }
     for route in routes:
         is_known = route.net_id in found or directory.station_of(route.net_id)
-        if route.octets >= _LEVEL and not is_known:
+        if route.octets >= STATION_OCTETS and not is_known:
             found[route.net_id] = Known(route.name, route.net_id, None)
     return [*found.values()]
 

@@ -21,15 +21,13 @@ from eap.appliance.services.neighbours import Scanner
 from eap.appliance.services.routing.planned import to_route, to_way
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.errors import ControlError
-from eap.ids import NetId
+from eap.ids import STATION_OCTETS, NetId, prefix_text
 
 MAX_ADDED = 1000
 """Routes that can be added to one station."""
 MAX_NAME = 80
 LEARNED_NS = 600_000_000_000
 """After which a learned route is forgotten, unless its router answers again."""
-_COMMON = 4
-_WHOLE = 6
 
 logger = logging.getLogger(__name__)
 
@@ -120,6 +118,10 @@ class StationRoutes:
         spec = self._written.get(route.key)
         return spec is not None and spec.is_derived
 
+    def has(self, prefix: bytes) -> bool:
+        """Say whether a NetID of the station itself begins with *prefix*."""
+        return any(own.startswith(prefix) for own in self.router.net_ids)
+
     def check(self, spec: RouteSpec) -> None:
         """Say whether a route could be added; raise ControlError with the reason if not."""
         self._checked(spec, "")
@@ -150,12 +152,13 @@ class StationRoutes:
 
         It is gone after ten minutes, and never before a route that somebody wrote or added.
         """
-        prefix = net_id[:_COMMON]
         found = self.router.table.find(net_id)
-        if not self._spec.learn or any(own.startswith(prefix) for own in self.router.net_ids):
+        if not self._spec.learn or self.has(net_id.station):
             return False
-        if found is not None and found[1] >= _COMMON and found[0].origin is not Origin.LEARNED:
-            return False
+        if found is not None:
+            known, octets = found
+            if octets >= STATION_OCTETS and known.origin is not Origin.LEARNED:
+                return False
         hop = to_way(HopSpec(DoorKind.AMS_TCP, "", f"{address}:{AMS_TCP_PORT}"))
         route = Route(
             net_id,
@@ -251,9 +254,8 @@ class StationRoutes:
         if not any(net_id) and spec.octets:
             raise ControlError(f"NetID {net_id} stands for any; a default route matches 0 octets")
         prefix = net_id[: spec.octets]
-        if spec.octets and any(own.startswith(prefix) for own in self.router.net_ids):
-            shown = ".".join(map(str, prefix)) + ".x" * (_WHOLE - spec.octets)
-            raise ControlError(f"NetID {shown} is one of this station itself")
+        if spec.octets and self.has(prefix):
+            raise ControlError(f"NetID {prefix_text(prefix)} is one of this station itself")
         for route in self.router.table:
             if route.origin is Origin.STATIC and _takes(route, net_id, spec.octets):
                 raise ControlError(_hidden_by(route.name))

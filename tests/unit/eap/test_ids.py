@@ -12,6 +12,7 @@ from eap.ids import (
     InterfaceUri,
     MacAddr,
     NetId,
+    prefix_text,
 )
 
 six_octets = st.binary(min_size=6, max_size=6)
@@ -98,6 +99,13 @@ def test_destination_round_trip(address: str, port: int, tcp: bool) -> None:
     assert destination.kind is (DestinationKind.TCP if tcp else DestinationKind.IP)
     assert (destination.host, destination.port) == (address, port)
     assert str(destination) == text
+
+
+def test_net_ids_of_a_station_have_a_beginning_in_common() -> None:
+    station = NetId.parse("5.23.91.23.1.1").station
+    assert station == NetId.parse("5.23.91.23.2.1").station
+    assert prefix_text(station) == "5.23.91.23.x.x"
+    assert prefix_text(NetId.parse("5.23.91.23.1.1")) == "5.23.91.23.1.1"
 
 
 @pytest.mark.parametrize(
