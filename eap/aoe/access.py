@@ -15,15 +15,12 @@ from typing import NamedTuple
 
 from eap.aoe.ads_operation import Operation, Read, ReadWrite, Write, WriteControl
 from eap.aoe.ads_sum import SUM_COMMANDS
-from eap.aoe.spec import AccessRule, AccessService, DoorKind, ObjectRange
+from eap.aoe.spec import IP_DOORS, AccessRule, AccessService, DoorKind, ObjectRange
 from eap.aoe.way import Way
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.ids import MacAddr, NetId
 
-LOCAL = "local"
-"""Door of those who ask inside this process."""
-_IP_DOORS = frozenset(("ams-tcp", "udp", "tcp"))
 _MAX_KNOWN = 4096
 """Pairs of a client and a target whose rules are remembered."""
 
@@ -165,9 +162,9 @@ class AccessList:
 
     def is_this_host(self, way: Way) -> bool:
         """Say whether only a program of this host can have come by *way*."""
-        kind = _kind(way)
-        if kind not in _IP_DOORS:
-            return kind == LOCAL
+        kind = way.kind
+        if kind not in IP_DOORS:
+            return kind == DoorKind.LOCAL
         address = address_of(way)
         return address is not None and (address.is_loopback or address in self._own)
 
@@ -183,7 +180,7 @@ class AccessList:
 
 def address_of(way: Way) -> IPv4Address | None:
     """Return the IPv4 address that somebody came from, None where there is none."""
-    if _kind(way) not in _IP_DOORS:
+    if way.kind not in IP_DOORS:
         return None
     try:
         return IPv4Address(way.connection.partition(":")[0])
@@ -193,14 +190,10 @@ def address_of(way: Way) -> IPv4Address | None:
 
 def host_of(way: Way) -> str:
     """Return who came by *way*, whichever of his connections it is."""
-    kind = _kind(way)
-    if kind in _IP_DOORS:
+    kind = way.kind
+    if kind in IP_DOORS:
         return way.connection.partition(":")[0]
-    return "" if kind == LOCAL else way.connection
-
-
-def _kind(way: Way) -> str:
-    return way.door.partition(":")[0]
+    return "" if kind == DoorKind.LOCAL else way.connection
 
 
 class _Matcher:
@@ -215,13 +208,13 @@ class _Matcher:
 
     def is_from(self, way: Way, address: IPv4Address | None, source: NetId) -> bool:
         doors = self.rule.doors
-        if doors and way.door not in doors and _kind(way) not in doors:
+        if doors and way.door not in doors and way.kind not in doors:
             return False
         if self._net_ids and not source.startswith(self._net_ids):
             return False
         if not (self._networks or self._macs):
             return True
-        if _kind(way) == DoorKind.ETHERNET:
+        if way.kind == DoorKind.ETHERNET:
             return way.connection in self._macs
         return address is not None and any(address in each for each in self._networks)
 
@@ -238,23 +231,5 @@ def _prefix(text: str) -> bytes:
 def _is_about(rule: AccessRule, touched: ObjectRange) -> bool:
     """Say whether a rule grants all of *touched*, or refuses any of it."""
     if rule.allow:
-        return any(_contains(each, touched) for each in rule.objects)
-    return any(_overlaps(each, touched) for each in rule.objects)
-
-
-def _contains(outer: ObjectRange, inner: ObjectRange) -> bool:
-    return (
-        outer.first <= inner.first
-        and inner.last <= outer.last
-        and outer.low <= inner.low
-        and inner.high <= outer.high
-    )
-
-
-def _overlaps(one: ObjectRange, other: ObjectRange) -> bool:
-    return (
-        one.first <= other.last
-        and other.first <= one.last
-        and one.low <= other.high
-        and other.low <= one.high
-    )
+        return any(each.contains(touched) for each in rule.objects)
+    return any(each.overlaps(touched) for each in rule.objects)

@@ -5,17 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from eap.aoe.report import RouteReport, RouteState
+from eap.aoe.spec import DoorKind
 from eap.codec.ads import AdsError
 from eap.ids import NetId
 
 _ALIVE = frozenset({AdsError.TARGET_PORT})
 """Errors of the AMS header that only who has the NetID answers with."""
-_UNREACHED = {
-    "ams-tcp": "see whether it is switched on, and listens on that TCP port (a firewall?)",
-    "udp": "see whether it is switched on and in the same network, and whether its station runs",
-    "tcp": "see whether its station runs, and takes connections on that port",
-    "ethernet": "see to the cable and the MAC address, and whether its station runs",
-    "mqtt": "see whether both stations are connected to the broker, under the same network",
+_UNREACHED: dict[str, str] = {
+    DoorKind.AMS_TCP: "see whether it is switched on, and listens on that TCP port (a firewall?)",
+    DoorKind.UDP: "see whether it is switched on, in the same network, and its station runs",
+    DoorKind.TCP: "see whether its station runs, and takes connections on that port",
+    DoorKind.ETHERNET: "see to the cable and the MAC address, and whether its station runs",
+    DoorKind.MQTT: "see whether both stations are connected to the broker, under the same network",
 }
 """What to do about a hop that is down, by the kind of the door."""
 
@@ -61,7 +62,7 @@ def _behind(error: int, words: str, target: NetId, report: RouteReport, own: Net
     name, hop = report.route.name, report.route.hop
     where = f"{name} ({hop})"
     if report.state is RouteState.DOWN:
-        hint = _UNREACHED.get(hop.door.partition(":")[0], "")
+        hint = _UNREACHED.get(hop.kind, "")
         return Advice(is_reached=False, text=f"{where} is down: {report.why}", hint=hint)
     if error == AdsError.TIMEOUT:
         hint = (

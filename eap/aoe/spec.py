@@ -33,6 +33,10 @@ class DoorKind(StrEnum):
     """Programs of this appliance."""
 
 
+IP_DOORS = frozenset((DoorKind.AMS_TCP, DoorKind.UDP, DoorKind.TCP))
+"""Kinds of doors whose connections begin with an IPv4 address."""
+
+
 class HopSpec(Record, frozen=True):
     """Where packets go from here.
 
@@ -102,6 +106,24 @@ class ObjectRange(Record, frozen=True):
     last: int
     low: int = 0
     high: int = 0xFF
+
+    def contains(self, other: ObjectRange) -> bool:
+        """Say whether all of *other* is in it."""
+        return (
+            self.first <= other.first
+            and other.last <= self.last
+            and self.low <= other.low
+            and other.high <= self.high
+        )
+
+    def overlaps(self, other: ObjectRange) -> bool:
+        """Say whether some of *other* is in it."""
+        return (
+            self.first <= other.last
+            and other.first <= self.last
+            and self.low <= other.high
+            and other.low <= self.high
+        )
 
 
 class AccessTarget(Record, frozen=True):

@@ -17,6 +17,11 @@ class Way(NamedTuple):
     door: str
     connection: str
 
+    @property
+    def kind(self) -> str:
+        """Kind of the door, a :class:`~eap.aoe.spec.DoorKind`."""
+        return self.door.partition(":")[0]
+
     def __str__(self) -> str:
         # A door to one address only is named after it, which need not be said twice.
         return f"{self.connection} by {self.door.removesuffix(f':{self.connection}')}"

@@ -7,7 +7,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import TypeVar
 
-from eap.aoe.spec import AccessRule, AccessService, DoorKind, ObjectRange
+from eap.aoe.spec import IP_DOORS, AccessRule, AccessService, DoorKind, ObjectRange
 from eap.config.brokers import brokers_of
 from eap.config.check_brokers import check_file
 from eap.config.check_ports import check_names
@@ -28,7 +28,6 @@ from eap.pd.spec import PortKind
 
 T = TypeVar("T")
 
-_IP_DOORS = (DoorKind.UDP, DoorKind.TCP, DoorKind.AMS_TCP)
 _OBJECT_SERVICES = {AccessService.READ, AccessService.WRITE}
 
 
@@ -115,7 +114,7 @@ def _check_order(index: Index, station: Station, loose: set[str], report: Report
 
 def _why_never(rule: AccessRule) -> str:
     kinds = {_kind(door) for door in rule.doors}
-    is_known = kinds.isdisjoint(_IP_DOORS) if rule.networks else bool(rule.macs)
+    is_known = kinds.isdisjoint(IP_DOORS) if rule.networks else bool(rule.macs)
     if kinds and is_known and not (rule.macs and DoorKind.ETHERNET in kinds):
         return f"who comes by {', '.join(rule.doors)} has no such address"
     if rule.objects and rule.services and _OBJECT_SERVICES.isdisjoint(rule.services):
@@ -137,7 +136,7 @@ def _covers(one: AccessRule, other: AccessRule) -> bool:
             ),
         )
         and _all_in(one.services, other.services, lambda outer, inner: outer == inner)
-        and _all_in(one.objects, other.objects, _contains)
+        and _all_in(one.objects, other.objects, ObjectRange.contains)
     )
 
 
@@ -166,15 +165,6 @@ def _in_network(outer: str, inner: str) -> bool:
 
 def _begins(outer: str, inner: str) -> bool:
     return f"{inner}.".startswith(f"{outer}.")
-
-
-def _contains(outer: ObjectRange, inner: ObjectRange) -> bool:
-    return (
-        outer.first <= inner.first
-        and inner.last <= outer.last
-        and outer.low <= inner.low
-        and inner.high <= outer.high
-    )
 
 
 def _kind(door: str) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
 from eap.aoe.routes import Route
+from eap.aoe.spec import DoorKind
 from eap.aoe.way import Door, Way
 from eap.appliance.discards import Refusal
 from eap.appliance.services.ams_uplink import AmsUplink, Hops, Peer
@@ -16,8 +17,7 @@ from eap.codec.amstcp import AMS_TCP_PORT
 
 logger = logging.getLogger(__name__)
 
-
-DOOR = "ams-tcp:"
+DOOR = f"{DoorKind.AMS_TCP}:"
 """Begin of the names of doors to peers; the address of the peer follows."""
 
 

@@ -10,7 +10,7 @@ from time import monotonic_ns
 from typing import Any
 
 from eap.aoe.directory import Directory
-from eap.aoe.spec import RouteSpec
+from eap.aoe.spec import DoorKind, RouteSpec
 from eap.aoe.via import parse_via
 from eap.appliance.control import ErrorCode, near, parameters
 from eap.appliance.control_routes import (
@@ -47,7 +47,6 @@ from eap.ids import NetId
 
 _ANY = NetId(bytes(6))
 """Stands in a default route."""
-_AMS_TCP = "ams-tcp"
 _USUAL_PORT = f":{AMS_TCP_PORT}"
 
 
@@ -150,7 +149,7 @@ class RouteMethods:
         routes, left_out = [], []
         for route in view.router.table:
             is_plain = route.octets and route.real is None
-            if is_plain and route.hop.door.partition(":")[0] == _AMS_TCP:
+            if is_plain and route.hop.kind == DoorKind.AMS_TCP:
                 address = route.hop.connection.removesuffix(_USUAL_PORT)
                 routes.append(StaticRoute(route.name, str(route.net_id), address))
             else:
@@ -160,7 +159,7 @@ class RouteMethods:
         return Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
 
     def _import_one(self, view: RouterView, route: StaticRoute, *, dry_run: bool) -> ImportRow:
-        via, reason = f"{_AMS_TCP}:{route.address}", ""
+        via, reason = f"{DoorKind.AMS_TCP}:{route.address}", ""
         wanted = RoutesAddParameters(
             station=view.router.name, name=route.name, net_id=route.net_id, via=via
         )

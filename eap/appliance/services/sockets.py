@@ -8,6 +8,7 @@ from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address
 from time import monotonic_ns
 
+from eap.aoe.spec import DoorKind
 from eap.aoe.way import Door
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
@@ -37,7 +38,7 @@ from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.pd.spec import StationSpec
 
-AMS_DOOR = "ams-tcp"
+AMS_DOOR = DoorKind.AMS_TCP
 """By which clients come in that connect to AMS/TCP."""
 
 

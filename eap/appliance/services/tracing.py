@@ -12,7 +12,6 @@ from typing import NamedTuple, Protocol
 
 from msgspec.structs import replace
 
-from eap.aoe.access import LOCAL
 from eap.aoe.ads_operation import Operation, OperationOutcome, ReadState, ReadWrite
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer
@@ -25,13 +24,14 @@ from eap.aoe.hop_report import (
     report_of,
 )
 from eap.aoe.report import Location
+from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.ams import SYSTEM_PORT, AmsHeader
 from eap.errors import CodecError
 from eap.ids import NetId
 
-HERE = Way(LOCAL, "trace")
+HERE = Way(DoorKind.LOCAL, "trace")
 TARGET_PATIENCE_S = 5.0
 """For the target itself: a router gives up before."""
 SUSPECT_PATIENCE_S = 2.0

@@ -6,14 +6,14 @@ import asyncio
 from itertools import count
 from typing import Protocol
 
-from eap.aoe.access import LOCAL
 from eap.aoe.answer import AmsAnswer
+from eap.aoe.spec import DoorKind
 from eap.aoe.way import Door
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.ids import NetId
 
-LOCAL_DOOR = Door(LOCAL, is_stream=True, is_hub=True)
+LOCAL_DOOR = Door(DoorKind.LOCAL, is_stream=True, is_hub=True)
 """By which a station's own requests come into its router."""
 _FIRST_PORT = 0x8000
 """As clients of AMS routers have them."""
