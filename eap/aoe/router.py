@@ -88,10 +88,6 @@ class Router:
         """Let services answer for *net_id*; *ports* says at any time which AMS ports it has."""
         self._devices[net_id] = ports
 
-    def remove_device(self, net_id: NetId) -> None:
-        """Answer for *net_id* no more."""
-        self._devices.pop(net_id, None)
-
     def add_door(self, door: Door) -> None:
         """Let packets come and go by *door*; raises ValueError as :meth:`Outlet.add`."""
         self._outlet.add(door)

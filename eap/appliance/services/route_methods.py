@@ -170,7 +170,7 @@ class RouteMethods:
         else:
             try:
                 if dry_run:
-                    view.routes.check(self._spec(view, wanted))
+                    view.routes.check(self._spec(wanted))
                 else:
                     self._take(view, wanted)
             except ControlError as exc:
@@ -178,12 +178,12 @@ class RouteMethods:
         return ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
 
     def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
-        spec = self._spec(view, wanted)
+        spec = self._spec(wanted)
         with _kept():
             route = view.routes.add(spec, replaces=wanted.replaces)
         return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
 
-    def _spec(self, view: RouterView, wanted: RoutesAddParameters) -> RouteSpec:
+    def _spec(self, wanted: RoutesAddParameters) -> RouteSpec:
         """Return the route that is wanted; raise ControlError if there cannot be one."""
         try:
             net_id = self._net_id(wanted)

@@ -163,10 +163,6 @@ class StationRouter:
         """
         self._services[net_id].append(service)
 
-    def remove_service(self, net_id: NetId, service: Service) -> None:
-        """Ask *service* no more."""
-        self._services[net_id].remove(service)
-
     def add_route(self, route: Route) -> bool:
         """Take *route* into the table; return whether it was taken."""
         is_taken = self.table.add(route)

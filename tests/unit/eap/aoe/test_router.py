@@ -178,12 +178,6 @@ def test_hop_that_is_down_is_known() -> None:
     assert not station.router.is_down(LINK)
 
 
-def test_removed_device_is_unknown() -> None:
-    station = Station()
-    station.router.remove_device(NetId.parse("5.1.1.1.2.1"))
-    assert station.replied(Ams(DEVICE, CLIENT), TCP)[1].error == 7
-
-
 def test_broken_packets_are_named_and_answered_by_nobody() -> None:
     station = Station()
     octets = Ams(DEVICE, CLIENT, body=b"abc").octets()

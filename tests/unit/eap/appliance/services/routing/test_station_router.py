@@ -74,7 +74,7 @@ def test_first_service_that_has_the_port_answers(scene):
     scene.ask(f"{DEVICE}:1002")
     slave.ports.add(1002)
     scene.ask(f"{DEVICE}:1002")
-    scene.station.remove_service(DEVICE, slave)
+    slave.ports.remove(1001)
     scene.ask(f"{DEVICE}:1001")
     assert [(each.error, each.body) for each in scene.sent] == [
         (0, b"1001"),
@@ -94,7 +94,7 @@ class PromptService(StubService):
 
 
 def test_what_a_service_has_at_hand_is_answered_without_its_lane(scene):
-    scene.station.remove_service(DEVICE, scene.service)
+    scene.service.ports.clear()
     scene.station.add_service(DEVICE, PromptService())
     for number, body in enumerate((b"fast", b"slow", b"fail")):
         scene.ask(body=body, invoke_id=number)
