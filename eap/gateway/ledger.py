@@ -110,6 +110,11 @@ class Ledger:
         client = self._clients.get(way)
         return len(client.waiting) if client else 0
 
+    def counts_of(self, way: Way) -> Counts | None:
+        """Return what was done for a client that is known."""
+        client = self._clients.get(way)
+        return client.counts if client else None
+
     def forget(self, way: Way) -> None:
         """Forget a client whose connection is closed."""
         client = self._clients.pop(way, None)

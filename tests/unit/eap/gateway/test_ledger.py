@@ -17,10 +17,10 @@ def test_the_same_octets_are_one_request_until_they_are_answered() -> None:
     assert ledger.admit(B, b"x", 1) is Admission.TAKEN
     ledger.answered(A, b"x")
     assert ledger.admit(A, b"x", 2) is Admission.TAKEN
-    counts = ledger.table()[A]
+    counts = ledger.counts_of(A)
     assert counts is not None
     assert (counts.requests, counts.repeated, counts.errors) == (3, 1, 0)
-    assert C not in ledger.table()
+    assert ledger.counts_of(C) is None
 
 
 def test_each_client_and_all_together_have_limits() -> None:
