@@ -148,6 +148,30 @@ def test_virtual_addresses(plant: Appliance, client: Client) -> None:
     assert found[1001][:6] == GIVEN
 
 
+def test_a_slave_of_another_station(plant: Appliance, client: Client) -> None:
+    there = Client("127.9.88.2")
+    try:
+        write = bytes.fromhex("0020 2b 4060 00 0f000000")
+        assert client.ask(0x9001, write).hex() == "0030" + "60" + "4060" + "00" + "00000000"
+        read = bytes.fromhex("0020 40 4060 00 00000000")
+        assert client.ask(0x9001, read) == there.ask(1001, read)
+        idn = bytes.fromhex("01 42 2000")  # name and value of S-0-0032
+        assert client.ask(0x9001, idn, SOE) == there.ask(1001, idn, SOE)
+        for request in (
+            "0080 01 00 0000 0100",
+            "0080 05 00 0000 1810 01 00",
+            "0080 03 00 0000 5555",
+        ):
+            octets = bytes.fromhex(request)
+            assert client.ask(0x9001, octets)[:6] == there.ask(1001, octets)[:6]
+        missing = bytes.fromhex("0020 40 5555 00 00000000")
+        assert client.ask(0x9001, missing) == there.ask(1001, missing)
+        count = bytes.fromhex("0020 40 20f0 00 00000000")
+        assert client.ask(0x9002, count) == there.ask(0, count)
+    finally:
+        there.close()
+
+
 def test_stop_and_start(plant: Appliance, client: Client) -> None:
     (before,) = plant.request("gateway_status", station="mill", port="bus0")
     assert before["state"] == "running"

@@ -21,6 +21,7 @@ from eap.appliance.services.gateway.dialect_desk import DialectDesk
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
 from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Target, result_of
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.sessions import SessionKey, Sessions
 from eap.appliance.services.gateway.slave_book import SlaveBook
 from eap.appliance.services.gateway.slave_link import SlaveLink
@@ -32,7 +33,7 @@ from eap.appliance.services.gateway.slave_session import (
 from eap.appliance.services.gateway.tally import Tally
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
 from eap.gateway import dialect
-from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, Slave
+from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, RemoteSlave, Slave
 from eap.gateway.ledger import Admission, ClientLimits, Ledger
 from eap.gateway.refusal import Reason, refuse
 from eap.gateway.rights import operation_of
@@ -43,6 +44,8 @@ ANSWER_S = 0.9
 
 Send: TypeAlias = Callable[[bytes], None]
 """Sends a frame back to who sent a request, now or later."""
+
+OpenRemote: TypeAlias = Callable[[RemoteSlave, MailboxType], RemoteSession]
 
 logger = logging.getLogger(__name__)
 
@@ -76,6 +79,7 @@ class MailboxGateway:
         access: Returns the rules by which is judged who may do what.
         settings: How it behaves.
         addresses: Beside those of the standard.
+        open_remote: Begins a session with a slave of another station, in one protocol.
 
     Attributes:
         tally: What it did, by slave and protocol.
@@ -92,7 +96,8 @@ class MailboxGateway:
         open_master: Callable[[], MasterSession],
         access: Callable[[], AccessList],
         settings: Settings,
-        addresses: AddressMap | None = None,
+        addresses: AddressMap,
+        open_remote: OpenRemote,
     ) -> None:
         self.tally = Tally()
         self.ledger = Ledger(settings.limits)
@@ -102,7 +107,8 @@ class MailboxGateway:
         self.turned_away = 0
         self._bus = bus
         self._open_master = open_master
-        self._addresses = addresses or AddressMap()
+        self._addresses = addresses
+        self._open_remote = open_remote
         self._book = SlaveBook(bus.describe)
         self._dialect = DialectDesk(
             bus, self._book, self.guard, open_master, settings.net_id, settings.room,
@@ -110,6 +116,7 @@ class MailboxGateway:
         )  # fmt: skip
         self._slaves: Sessions[SlaveSession] = Sessions()
         self._masters: Sessions[MasterSession] = Sessions()
+        self._remotes: Sessions[RemoteSession] = Sessions()
         self._tasks: set[asyncio.Task[None]] = set()
         self._listeners = EoeListeners()
         self._counter = 0
@@ -126,7 +133,7 @@ class MailboxGateway:
 
     def transfers(self) -> list[SessionKey]:
         """Return the transfers that are under way."""
-        return [*self._slaves.running(), *self._masters.running()]
+        return [*self._slaves.running(), *self._remotes.running()]
 
     def receive(
         self, header: MailboxHeader, body: bytes, way: Way, send: Send
@@ -158,6 +165,7 @@ class MailboxGateway:
         self._listeners.forget(way)
         self._slaves.close_of(way)
         self._masters.close_of(way)
+        self._remotes.close_of(way)
 
     async def wait_below(self, way: Way, count: int) -> None:
         """Wait until fewer than *count* requests of a client wait."""
@@ -179,6 +187,7 @@ class MailboxGateway:
             self._listeners.forget(way)
         self._slaves.close()
         self._masters.close()
+        self._remotes.close()
 
     def _done(self, way: Way, frame: bytes, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
@@ -219,8 +228,8 @@ class MailboxGateway:
         kind, body, way = request.header.type, request.body, request.way
         start_ns = monotonic_ns()
         operation = operation_of(kind, body)
-        station = found.station if isinstance(found, Slave) else MASTER_ADDRESS
-        target = Target(self.settings.net_id, station or MASTER_PORT)
+        station = found.station if isinstance(found, Slave) else address
+        target = self._target(found)
         verdict = None  # a step of what was judged when it began
         if operation is not None:
             verdict = self.guard.judge(way, target, operation, by_rule=is_group)
@@ -231,13 +240,22 @@ class MailboxGateway:
         elif isinstance(found, Master):
             master = self._masters.take(SessionKey(way, station, kind), self._open_master)
             replies = await master.ask(kind, body)
-        else:
-            text = "the slave of another station is reached by AoE"
-            replies = [Reply(*refuse(kind, body, Reason.NO_SLAVE, text), reason=Reason.NO_SLAVE)]
+        elif isinstance(found, RemoteSlave):
+            begin = partial(self._open_remote, found, kind)
+            replies = await self._remotes.take(SessionKey(way, station, kind), begin).ask(body)
+        else:  # a group within a group
+            replies = [Reply(*refuse(kind, body, Reason.NO_SLAVE), reason=Reason.NO_SLAVE)]
         if operation is not None and verdict is not None:
             self.guard.tell(way, target, operation, verdict, result_of(replies))
         self._note(request, station, replies, monotonic_ns() - start_ns)
         self._answer(request, address, replies)
+
+    def _target(self, found: object) -> Target:
+        """Return by what rules name somebody."""
+        if isinstance(found, RemoteSlave):
+            return Target(found.net_id, found.port)
+        port = found.station if isinstance(found, Slave) else MASTER_PORT
+        return Target(self.settings.net_id, port)
 
     async def _ask_slave(self, request: _Request, station: int, *, is_step: bool) -> list[Reply]:
         kind, body = request.header.type, request.body
@@ -271,7 +289,9 @@ class MailboxGateway:
 
     async def _serve_dialect(self, request: _Request, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()
-        answer, reason = await self._dialect.answer(kind, address, request.body, request.way)
+        found = self._addresses.resolve(address, ())
+        station = found.station if isinstance(found, Slave) else address
+        answer, reason = await self._dialect.answer(kind, station, request.body, request.way)
         self.tally.note(address, kind, [reason], monotonic_ns() - start_ns)
         self._count_errors(request.way, [reason])
         if not (self.settings.is_silent and reason is not None):

@@ -6,12 +6,16 @@ from collections.abc import Mapping
 from functools import partial
 
 from eap.aoe.access import AccessList
+from eap.aoe.ads_operation import Operation, OperationOutcome
+from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.appliance.handover import Handover, PortName
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_desk import MasterDesk
+from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.slave_link import PortLink
 from eap.appliance.services.routing.station_router import StationRouter
+from eap.codec.mailbox import MailboxType
 from eap.gateway.address import AddressMap, Group, RemoteSlave, Slave
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
@@ -66,6 +70,7 @@ def open_gateways(
             partial(_access_of, router),
             settings,
             AddressMap({each.address: _whom(each) for each in told.addresses}),
+            partial(_open_remote, router, settings),
         )
         gateway.is_open = told.enabled
         gateways[bus.owner] = gateway
@@ -78,6 +83,19 @@ def _told(handover: Handover, owner: PortName) -> GatewaySpec:
 
 def _access_of(router: StationRouter) -> AccessList:
     return router.access
+
+
+def _open_remote(
+    router: StationRouter, settings: Settings, slave: RemoteSlave, kind: MailboxType
+) -> RemoteSession:
+    async def perform(operation: Operation) -> OperationOutcome:
+        command, body = encode_query(operation)
+        answer = await router.ask(
+            slave.net_id, slave.port, command, body, timeout_s=settings.answer_s
+        )
+        return decode_outcome(command, answer.error_code, answer.data)
+
+    return RemoteSession(kind, perform, room=settings.room, answer_s=settings.answer_s)
 
 
 def _whom(told: GatewayAddress) -> Slave | RemoteSlave | Group:

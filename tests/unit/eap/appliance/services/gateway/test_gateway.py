@@ -8,17 +8,22 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from eap.aoe.access import AccessList
+from eap.aoe.ads_operation import Operation, OperationOutcome, Read
 from eap.aoe.judged import AuditEntry
-from eap.aoe.spec import AccessRule, AccessService, ObjectRange
+from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
 from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.slave_link import PortLink
+from eap.codec.ads import IndexGroup
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame, encode_frame
+from eap.gateway.address import AddressMap, RemoteSlave, Slave
+from eap.gateway.elsewhere import ROOM
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
@@ -30,6 +35,7 @@ from tests.support.vectors import load
 COE, FOE, SOE, VOE, AOE, EOE = (
     MailboxType[name] for name in ("COE", "FOE", "SOE", "VOE", "AOE", "EOE")
 )
+ELSEWHERE_BUS = NetId.parse("127.0.1.2.3.1")
 NET_ID = NetId.parse("127.0.1.1.3.1")
 HERE, ALSO_HERE = Way("udp:eap0", "127.0.0.1:1"), Way("udp:eap0", "127.0.0.1:2")
 ELSEWHERE = Way("udp:eap0", "10.0.0.9:1")
@@ -57,6 +63,7 @@ class Desk:
     """
 
     def __init__(self, bus: str, rules: tuple[AccessRule, ...], settings: Settings) -> None:
+        self.asked: list[tuple[RemoteSlave, Operation]] = []
         self.engine = FakeEngine(FakeBus(LoopBus(bus)))
         self._link = EngineLink(self.engine.services)
         self.gateway = MailboxGateway(
@@ -64,7 +71,16 @@ class Desk:
             lambda: MasterSession(MASTER, settings.room, nothing),
             lambda: AccessList(rules),
             settings,
+            AddressMap({0x9000: Slave(1001), 0x9001: RemoteSlave(ELSEWHERE_BUS, 1003)}),
+            self._open_remote,
         )
+
+    def _open_remote(self, slave: RemoteSlave, kind: MailboxType) -> RemoteSession:
+        async def perform(operation: Operation) -> OperationOutcome:
+            self.asked.append((slave, operation))
+            return OperationOutcome(data=b"\7\0\0\0")
+
+        return RemoteSession(kind, perform, room=1000, answer_s=1)
 
     async def ask(
         self, kind: MailboxType, address: int, octets: str | bytes, way: Way = HERE
@@ -378,6 +394,24 @@ def test_changes_and_refusals_are_audited() -> None:
         )
 
     play(scene)
+
+
+def test_virtual_addresses_stand_for_slaves_here_and_elsewhere() -> None:
+    async def scene(desk: Desk) -> None:
+        assert await desk.one(COE, 0x9000, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
+        assert await desk.one(COE, 0x9001, VENDOR) == "00 30 43 18 10 01 07 00 00 00"
+        ((slave, operation),) = desk.asked
+        assert slave == RemoteSlave(ELSEWHERE_BUS, 1003)
+        assert operation == Read(IndexGroup.SDO, 0x1018_0001, ROOM)
+
+    rule = AccessRule("no", targets=(AccessTarget(str(ELSEWHERE_BUS), 1003),), allow=False)
+    play(scene)
+
+    async def refused(desk: Desk) -> None:
+        assert await desk.one(COE, 0x9001, VENDOR) == "00 20 80 18 10 01 00 00 01 06"
+        assert not desk.asked
+
+    play(refused, rule)
 
 
 def test_the_audit_tells_how_a_change_came_out() -> None:

@@ -1,0 +1,99 @@
+"""Slaves of other stations: mailbox requests as operations of ADS, and refusals the other way.
+
+On the way to another station a whole transfer is one request by AoE (ETG.1020); what comes back of
+a refusal is an error of ADS, which is told in the code of the protocol that comes nearest.
+"""
+
+from __future__ import annotations
+
+from eap.aoe.ads_operation import Read, ReadWrite, Write
+from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoHeader, SdoInfoOpcode
+from eap.codec.soe import SoeHeader
+from eap.codec.soeerror import SoeErrorCode
+from eap.gateway.refusal import Reason
+from eap.od.abort import AbortCode
+
+ROOM = 0x20002
+"""Octets of the longest answer: a list of all indexes there can be."""
+_COMPLETE = 0x100
+_REASONS: dict[int, Reason] = {
+    AdsError.TARGET_PORT: Reason.NO_SLAVE,
+    AdsError.TARGET_MACHINE: Reason.NO_SLAVE,
+    AdsError.HOST_UNREACHABLE: Reason.BUS_DOWN,
+    AdsError.TIMEOUT: Reason.TIMEOUT,
+    AdsError.BUSY: Reason.BUSY,
+    AdsError.ACCESS_DENIED: Reason.DENIED,
+}
+_ABORTS: dict[int, AbortCode] = {
+    AdsError.NOT_FOUND: AbortCode.NO_OBJECT,
+    AdsError.SERVICE: AbortCode.UNSUPPORTED_ACCESS,
+    AdsError.ACCESS: AbortCode.READ_ONLY,
+    AdsError.SIZE: AbortCode.LENGTH,
+    AdsError.VALUE: AbortCode.VALUE,
+    AdsError.STATE: AbortCode.DEVICE_STATE,
+}
+_SOE: dict[int, SoeErrorCode] = {
+    AdsError.NOT_FOUND: SoeErrorCode.NO_IDN,
+    AdsError.SIZE: SoeErrorCode.VALUE_TOO_LONG,
+    AdsError.ACCESS: SoeErrorCode.VALUE_READ_ONLY,
+    AdsError.VALUE: SoeErrorCode.INVALID_VALUE,
+    AdsError.STATE: SoeErrorCode.COMMAND_NOT_NOW,
+}
+
+
+def reason_for(result: int) -> Reason | None:
+    """Return why nobody answered, None if it was the slave that refused."""
+    return _REASONS.get(result)
+
+
+def abort_for(result: int) -> AbortCode:
+    """Return the SDO abort code that comes nearest to a refusal by ADS."""
+    return _ABORTS.get(result, AbortCode.GENERAL)
+
+
+def soe_error_for(result: int) -> SoeErrorCode:
+    """Return the error of SoE that comes nearest to a refusal by ADS."""
+    return _SOE.get(result, SoeErrorCode.GENERAL)
+
+
+def sdo_offset(index: int, subindex: int, *, complete: bool) -> int:
+    """Return the offset that names an entry, or with *complete* an object from subindex 0 on."""
+    return index << 16 | (_COMPLETE if complete else subindex)
+
+
+def info_query(body: bytes) -> tuple[SdoInfoOpcode, Read] | None:
+    """Return what asks for SDO information, and the opcode of the answer; None for no request.
+
+    Args:
+        body: Of the message, behind its CoE header.
+
+    Raises:
+        CodecError: it is cut, or of no known kind.
+    """
+    asked = body[SdoInfoHeader.SIZE :]
+    match SdoInfoHeader.decode(body).opcode:
+        case SdoInfoOpcode.LIST_REQUEST:
+            offset = ListRequest.decode(asked).list_type << 16
+            return SdoInfoOpcode.LIST_RESPONSE, Read(IndexGroup.OBJECT_LIST, offset, ROOM)
+        case SdoInfoOpcode.OBJECT_REQUEST:
+            offset = ObjectRequest.decode(asked).index << 16
+            return SdoInfoOpcode.OBJECT_RESPONSE, Read(IndexGroup.OBJECT_DESCRIPTION, offset, ROOM)
+        case SdoInfoOpcode.ENTRY_REQUEST:
+            entry = EntryRequest.decode(asked)
+            offset = entry.index << 16 | entry.value_info << 8 | entry.subindex
+            return SdoInfoOpcode.ENTRY_RESPONSE, Read(IndexGroup.ENTRY_DESCRIPTION, offset, ROOM)
+    return None
+
+
+def idn_query(head: SoeHeader, data: bytes | None = None) -> Read | Write:
+    """Return what reads the elements that *head* names, or with *data* writes them."""
+    offset = head.drive << 24 | head.elements << 16 | head.idn
+    if data is None:
+        return Read(IndexGroup.SOE, offset, ROOM)
+    return Write(IndexGroup.SOE, offset, data)
+
+
+def vendor_query(body: bytes) -> ReadWrite:
+    """Return what brings a message of VoE, and its answer."""
+    return ReadWrite(IndexGroup.VOE, 0, ROOM, body)
