@@ -17,12 +17,14 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.voe_server import VoeServer
 from eap.aoe.access import AccessList
+from eap.aoe.ads_operation import Operation, OperationOutcome, Read
 from eap.aoe.spec import AccessRule, AccessService
 from eap.appliance.bus_request import BusReport, Heard, SlaveReport
 from eap.appliance.services.bus_talk import Talk
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.codec.mailbox import (
     MailboxHeader,
     MailboxType,
@@ -31,6 +33,7 @@ from eap.codec.mailbox import (
     encode_frame,
     encode_message,
 )
+from eap.gateway.address import AddressMap, RemoteSlave
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
@@ -41,7 +44,9 @@ T = TypeVar("T")
 
 _SIZES = MailboxSizes(40, 40)
 _STATION = 1001
-_ADDRESSES = (_STATION, 0, 0xFFFF, _STATION | 0x8000, 7)
+_VIRTUAL = 0x9001
+"""A slave of another station."""
+_ADDRESSES = (_STATION, 0, 0xFFFF, _STATION | 0x8000, 7, _VIRTUAL)
 _SETTINGS = Settings(NetId(b"\1\2\3\4\5\6"), room=60, limits=ClientLimits(4, clients=1))
 _EVERYTHING = (AccessRule("all", allow=True, services=(AccessService.READ, AccessService.WRITE)),)
 
@@ -133,6 +138,11 @@ async def _nothing(index: int) -> None:
     """What the master shows is never old."""
 
 
+async def _perform(operation: Operation) -> OperationOutcome:
+    """Read long values from another station, and take what is written there."""
+    return OperationOutcome(data=bytes(3000) if isinstance(operation, Read) else b"")
+
+
 def _frames(data: bytes) -> Iterator[bytes]:
     """Yield the octets as they are, then messages to each address in each protocol."""
     yield data
@@ -152,6 +162,8 @@ async def _serve(data: bytes) -> None:
         lambda: MasterSession(dictionary, _SETTINGS.room, _nothing),
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,
+        AddressMap({_VIRTUAL: RemoteSlave(_SETTINGS.net_id, 1001)}),
+        lambda slave, kind: RemoteSession(kind, _perform, room=_SETTINGS.room, answer_s=1),
     )
     door = GatewayDoor([(gateway, "udp:eap0")])
     answered: list[bytes] = []

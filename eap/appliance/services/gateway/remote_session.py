@@ -169,7 +169,7 @@ class RemoteSession:
             opcode = SdoInfoOpcode.ERROR
             answer = InfoError(elsewhere.abort_for(exc.result)).encode()
         room = (self._room - CoeHeader.SIZE - SdoInfoHeader.SIZE) & ~1  # no index is cut in two
-        pieces = [answer[at : at + room] for at in range(0, len(answer), room)]
+        pieces = [answer[at : at + room] for at in range(0, len(answer), room)] or [answer]
         return [
             encode_coe(
                 CoeService.SDO_INFORMATION,
