@@ -151,9 +151,9 @@ def test_virtual_addresses(plant: Appliance, client: Client) -> None:
 def test_a_slave_of_another_station(plant: Appliance, client: Client) -> None:
     there = Client("127.9.88.2")
     try:
-        write = bytes.fromhex("0020 2b 4060 00 0f000000")
-        assert client.ask(0x9001, write).hex() == "0030" + "60" + "4060" + "00" + "00000000"
-        read = bytes.fromhex("0020 40 4060 00 00000000")
+        write = bytes.fromhex("0020 23 0080 01 0f000000")
+        assert client.ask(0x9001, write).hex() == "0030" + "60" + "0080" + "01" + "00000000"
+        read = bytes.fromhex("0020 40 0080 01 00000000")
         assert client.ask(0x9001, read) == there.ask(1001, read)
         idn = bytes.fromhex("01 42 2000")  # name and value of S-0-0032
         assert client.ask(0x9001, idn, SOE) == there.ask(1001, idn, SOE)
