@@ -6,14 +6,15 @@ records, so that they cannot disagree about a name.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 from enum import StrEnum, auto
 from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from eap.errors import ControlError
+from eap.errors import ControlError, EnvironmentalError
 
 VERSION = 1
 MAX_LINE = 1 << 23
@@ -130,6 +131,7 @@ class UnsubscribeParameters(Parameters, frozen=True):
 
 
 ParametersT = TypeVar("ParametersT", bound=Parameters)
+ItemT = TypeVar("ItemT")
 
 _REQUEST = msgspec.json.Decoder(Request)
 _REPLY = msgspec.json.Decoder(Reply)
@@ -161,6 +163,24 @@ def near(name: str, known: Iterable[str]) -> str:
     """Return ``, did you mean …?``, or nothing if no known name comes near."""
     found = get_close_matches(name, list(known), n=1)
     return f", did you mean {found[0]}?" if found else ""
+
+
+def of_station(name: str, known: Mapping[str, ItemT]) -> ItemT:
+    """Return what *known* has for a station; raise ControlError that says which comes near."""
+    try:
+        return known[name]
+    except KeyError:
+        reason = f"no station {name!r} here{near(name, known)}"
+        raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
+
+
+@contextmanager
+def unless_unavailable() -> Iterator[None]:
+    """Refuse what this machine cannot do: keep something over a restart, ask another host."""
+    try:
+        yield
+    except EnvironmentalError as exc:
+        raise ControlError(str(exc), code=ErrorCode.UNAVAILABLE) from None
 
 
 def request_id(line: bytes) -> int | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from eap.aoe.directory import AmsAddress, Directory
 from eap.appliance import control_ams as words
-from eap.appliance.control import ErrorCode, near, parameters
+from eap.appliance.control import ErrorCode, of_station, parameters
 from eap.appliance.control_bus import to_octets
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.scanning import scan, stations_of
@@ -75,12 +75,7 @@ class AmsMethods:
         return {"error": answer.error_code, "data": answer.data.hex()}
 
     def _router(self, via: str) -> StationRouter:
-        name = via or next(iter(self._routers))
-        try:
-            return self._routers[name]
-        except KeyError:
-            hint = near(via, self._routers)
-            raise _unknown(f"no station {via!r} runs here{hint}") from None
+        return of_station(via or next(iter(self._routers)), self._routers)
 
 
 def _found(find: Callable[[str], AmsAddress], target: str) -> AmsAddress:

@@ -16,7 +16,7 @@ from devicebus.sim.spec import FaultKind
 from devicebus.wire.alstatus import AlState
 from eap.appliance import control_bus
 from eap.appliance.bus_request import BusReport
-from eap.appliance.control import ErrorCode, near, parameters
+from eap.appliance.control import ErrorCode, near, of_station, parameters
 from eap.appliance.control_bus import BusParameters, kind_of, reply_row, to_access, to_ask
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus_client import BusClient
@@ -64,10 +64,7 @@ class Buses:
 
     def find(self, wanted: BusParameters) -> tuple[BusClient, PortName]:
         """Return the bus that is meant, and who asks it; raise ControlError that says which are."""
-        station = self._stations.get(wanted.station)
-        if station is None:
-            hint = near(wanted.station, self._stations)
-            raise _unknown(f"no station {wanted.station!r} here{hint}")
+        station = of_station(wanted.station, self._stations)
         buses = [port.name for port in station.ports if port.kind is PortKind.BUS]
         if wanted.port in buses and self._client is not None:
             return self._client, PortName(station.name, wanted.port)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from eap.appliance import control_device as words
-from eap.appliance.control import ErrorCode, near, parameters
+from eap.appliance.control import ErrorCode, near, of_station, parameters
 from eap.appliance.control_bus import to_octets
 from eap.appliance.services.station_device import StationDevice
 from eap.device.eap_dictionary import EapDictionary
@@ -147,11 +147,7 @@ class DeviceMethods:
         return words.outcome_document(*await self._device(wanted.station).roll_back(wanted.spec))
 
     def _device(self, station: str) -> StationDevice:
-        try:
-            return self._devices[station]
-        except KeyError:
-            hint = near(station, self._devices)
-            raise _unknown(f"no station {station!r} here{hint}") from None
+        return of_station(station, self._devices)
 
     def _find(self, target: str) -> _Target:
         """Return who is meant by a target; raise ControlError that says which there are."""

@@ -12,7 +12,7 @@ from inspect import isawaitable
 from typing import Any
 
 from eap.appliance import control
-from eap.appliance.control import VERSION, ErrorCode, near, parameters
+from eap.appliance.control import VERSION, ErrorCode, near, of_station, parameters
 from eap.appliance.control_bus import BUS_METHODS
 from eap.appliance.station_image import StationImage
 from eap.codec import datatypes
@@ -139,13 +139,7 @@ class Methods:
         return self._station(station).image
 
     def _station(self, station: str) -> StationImage:
-        try:
-            return self._images[station]
-        except KeyError:
-            raise ControlError(
-                f"no station {station!r} here{near(station, self._images)}",
-                code=ErrorCode.UNKNOWN_NAME,
-            ) from None
+        return of_station(station, self._images)
 
 
 class Watch:

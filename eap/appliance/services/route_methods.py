@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 from eap.aoe.directory import Directory
 from eap.aoe.spec import DoorKind, RouteSpec
 from eap.aoe.via import parse_via
-from eap.appliance.control import ErrorCode, near, parameters
+from eap.appliance.control import ErrorCode, near, of_station, parameters, unless_unavailable
 from eap.appliance.control_routes import (
     Export,
     ImportRow,
@@ -42,7 +41,7 @@ from eap.codec import staticroutes
 from eap.codec.ads import AdsError
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.staticroutes import TCP_IP, StaticRoute
-from eap.errors import ControlError, EnvironmentalError
+from eap.errors import ControlError
 from eap.ids import NetId
 
 _ANY = NetId(bytes(6))
@@ -90,7 +89,7 @@ class RouteMethods:
     def _remove(self, params: dict[str, Any]) -> dict[str, RouteRow]:
         wanted = parameters(params, RoutesRemoveParameters)
         routes = self._view(wanted.station).routes
-        with _kept():
+        with unless_unavailable():
             spec = routes.remove(wanted.route, door=wanted.door, address=wanted.address)
         return {"route": _removed(spec)}
 
@@ -117,7 +116,7 @@ class RouteMethods:
         if "\0" in name + wanted.user + wanted.password:
             raise ControlError("a NUL in a text", code=ErrorCode.VALUE)
         route = Introduction(name, view.router.net_id, wanted.user, wanted.password)
-        with _kept():
+        with unless_unavailable():
             result = await introduce(view.routes, route, address, wanted.wait_ms / 1000)
         if result is None:
             return IntroducedRow(ok=False, result=None, text="no answer by UDP 48899")
@@ -127,7 +126,7 @@ class RouteMethods:
     async def _scan_from(
         self, view: RouterView, wanted: RoutesScanParameters
     ) -> list[NeighbourRow]:
-        with _kept():
+        with unless_unavailable():
             found = await find_neighbours(view.routes, wanted.address, wanted.wait_ms / 1000)
         return [_neighbour_row(view, each) for each in found]
 
@@ -179,7 +178,7 @@ class RouteMethods:
 
     def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
         spec = self._spec(wanted)
-        with _kept():
+        with unless_unavailable():
             route = view.routes.add(spec, replaces=wanted.replaces)
         return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
 
@@ -221,11 +220,7 @@ class RouteMethods:
         )
 
     def _view(self, station: str) -> RouterView:
-        try:
-            return self._views[station]
-        except KeyError:
-            reason = f"no station {station!r} here{near(station, self._views)}"
-            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
+        return of_station(station, self._views)
 
 
 def _neighbour_row(view: RouterView, found: Found) -> NeighbourRow:
@@ -266,12 +261,3 @@ def _removed(spec: RouteSpec) -> RouteRow:
         timeout_ms=spec.timeout_ms,
         probed=spec.is_probed,
     )
-
-
-@contextmanager
-def _kept() -> Iterator[None]:
-    """Refuse what this machine cannot do: keep a route over a restart, ask another host."""
-    try:
-        yield
-    except EnvironmentalError as exc:
-        raise ControlError(str(exc), code=ErrorCode.UNAVAILABLE) from None

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from eap.appliance.control import ErrorCode, near, parameters
+from eap.appliance.control import of_station, parameters, unless_unavailable
 from eap.appliance.control_routing import (
     RoutingApplyParameters,
     RoutingDifference,
@@ -15,7 +14,6 @@ from eap.appliance.control_routing import (
     RunningRouting,
 )
 from eap.appliance.services.station_routing import StationRouting
-from eap.errors import ControlError, EnvironmentalError
 
 
 class RoutingMethods:
@@ -53,28 +51,15 @@ class RoutingMethods:
         plan = station.plan(wanted.routing)
         if plan.refused:
             return RoutingDifference(changes=[], refused=plan.refused)
-        with _kept():
+        with unless_unavailable():
             return RoutingDifference(
                 changes=station.apply(wanted.routing, wanted.cause), refused=[]
             )
 
     def _roll_back(self, params: dict[str, Any]) -> RoutingDifference:
         station = self._station(parameters(params, RoutingExportParameters).station)
-        with _kept():
+        with unless_unavailable():
             return RoutingDifference(changes=station.roll_back(), refused=[])
 
     def _station(self, name: str) -> StationRouting:
-        try:
-            return self._stations[name]
-        except KeyError:
-            reason = f"no station {name!r} here{near(name, self._stations)}"
-            raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME) from None
-
-
-@contextmanager
-def _kept() -> Iterator[None]:
-    """Refuse what cannot be kept over a restart."""
-    try:
-        yield
-    except EnvironmentalError as exc:
-        raise ControlError(str(exc), code=ErrorCode.UNAVAILABLE) from None
+        return of_station(name, self._stations)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.appliance import control
-from eap.appliance.control import ErrorCode, Failure, Reply, Request
-from eap.errors import ControlError
+from eap.appliance.control import ErrorCode, Failure, Reply, Request, of_station, unless_unavailable
+from eap.errors import ControlError, EnvironmentalError
 
 
 def test_a_request_crosses():
@@ -71,3 +71,16 @@ def test_an_answer_too_long_becomes_an_error():
 def test_unknown_parameters_are_refused():
     with pytest.raises(msgspec.ValidationError, match="nmaes"):
         msgspec.convert({"station": "a", "nmaes": []}, control.ReadParameters)
+
+
+def test_a_station_that_is_not_here_is_refused_with_the_nearest_name():
+    assert of_station("left", {"left": 1}) == 1
+    with pytest.raises(ControlError, match="no station 'lefd' here, did you mean left") as caught:
+        of_station("lefd", {"left": 1})
+    assert caught.value.code is ErrorCode.UNKNOWN_NAME
+
+
+def test_what_this_machine_cannot_do_is_unavailable():
+    with pytest.raises(ControlError, match="disk full") as caught, unless_unavailable():
+        raise EnvironmentalError("disk full")
+    assert caught.value.code is ErrorCode.UNAVAILABLE
