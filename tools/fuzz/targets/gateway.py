@@ -159,7 +159,7 @@ async def _serve(data: bytes) -> None:
     )
     gateway = MailboxGateway(
         _Link(dictionary),
-        lambda: MasterSession(dictionary, _SETTINGS.room, _nothing),
+        lambda: MasterSession(dictionary, _SETTINGS.room, _nothing, lambda index: bool(index & 1)),
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,
         AddressMap({_VIRTUAL: RemoteSlave(_SETTINGS.net_id, 1001)}),

@@ -14,7 +14,8 @@ from time import monotonic_ns
 from typing import NamedTuple, TypeAlias
 
 from devicebus.mailbox.counter import next_counter
-from eap.aoe.access import AccessList
+from eap.aoe.access import AccessList, Verdict
+from eap.aoe.ads_operation import Operation
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
 from eap.appliance.services.gateway.dialect_desk import DialectDesk
@@ -68,6 +69,19 @@ class _Request(NamedTuple):
     body: bytes
     way: Way
     send: Send
+
+
+class _Judged(NamedTuple):
+    """What a request does, to whom, and whether it may."""
+
+    station: int
+    target: Target
+    operation: Operation | None
+    verdict: Verdict | None
+
+    @property
+    def is_allowed(self) -> bool:
+        return self.verdict is None or self.verdict.is_allowed
 
 
 class MailboxGateway:
@@ -154,6 +168,9 @@ class MailboxGateway:
         if admission is Admission.CROWDED:
             self._refuse(request, Reason.CROWDED)
             return None
+        if self._answer_at_once(request):
+            self.ledger.answered(way, frame)
+            return None
         task = asyncio.get_running_loop().create_task(self._serve(request))
         self._tasks.add(task)
         task.add_done_callback(partial(self._done, way, frame))
@@ -215,6 +232,24 @@ class MailboxGateway:
                 *(self._ask(request, one, address, is_group=True) for one, address in members)
             )
 
+    def _answer_at_once(self, request: _Request) -> bool:
+        """Answer from the master's dictionary; return whether nothing had to be waited for."""
+        header, body, way, _ = request
+        start_ns = monotonic_ns()
+        if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
+            return False
+        if self.ledger.waiting(way) > 1:
+            return False  # what came first is answered first
+        operation = operation_of(MailboxType.COE, body)
+        key = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
+        master = self._masters.take(key, self._open_master)
+        if not master.is_ready(operation):
+            return False
+        judged = self._judge(way, MASTER_ADDRESS, self._target(Master()), operation)
+        replies = master.ask_now(body) if judged.is_allowed else _denied(MailboxType.COE, body)
+        self._finish(request, judged, MASTER_ADDRESS, replies, start_ns)
+        return True
+
     async def _stations(self, address: int) -> tuple[int, ...]:
         """Return the slaves there are, as far as that matters for *address*."""
         if address == MASTER_ADDRESS:
@@ -229,12 +264,9 @@ class MailboxGateway:
         start_ns = monotonic_ns()
         operation = operation_of(kind, body)
         station = found.station if isinstance(found, Slave) else address
-        target = self._target(found)
-        verdict = None  # a step of what was judged when it began
-        if operation is not None:
-            verdict = self.guard.judge(way, target, operation, by_rule=is_group)
-        if verdict is not None and not verdict.is_allowed:
-            replies = [Reply(*refuse(kind, body, Reason.DENIED), reason=Reason.DENIED)]
+        judged = self._judge(way, station, self._target(found), operation, by_rule=is_group)
+        if not judged.is_allowed:
+            replies = _denied(kind, body)
         elif isinstance(found, Slave):
             replies = await self._ask_slave(request, station, is_step=operation is None)
         elif isinstance(found, Master):
@@ -245,8 +277,34 @@ class MailboxGateway:
             replies = await self._remotes.take(SessionKey(way, station, kind), begin).ask(body)
         else:  # a group within a group
             replies = [Reply(*refuse(kind, body, Reason.NO_SLAVE), reason=Reason.NO_SLAVE)]
+        self._finish(request, judged, address, replies, start_ns)
+
+    def _judge(
+        self,
+        way: Way,
+        station: int,
+        target: Target,
+        operation: Operation | None,
+        *,
+        by_rule: bool = False,
+    ) -> _Judged:
+        if operation is None:  # a step of what was judged when it began
+            return _Judged(station, target, None, None)
+        verdict = self.guard.judge(way, target, operation, by_rule=by_rule)
+        return _Judged(station, target, operation, verdict)
+
+    def _finish(
+        self,
+        request: _Request,
+        judged: _Judged,
+        address: int,
+        replies: Sequence[Reply],
+        start_ns: int,
+    ) -> None:
+        """Tell the audit, count, and answer from *address*."""
+        station, target, operation, verdict = judged
         if operation is not None and verdict is not None:
-            self.guard.tell(way, target, operation, verdict, result_of(replies))
+            self.guard.tell(request.way, target, operation, verdict, result_of(replies))
         self._note(request, station, replies, monotonic_ns() - start_ns)
         self._answer(request, address, replies)
 
@@ -326,3 +384,7 @@ class MailboxGateway:
     def _next_counter(self) -> int:
         self._counter = next_counter(self._counter)
         return self._counter
+
+
+def _denied(kind: MailboxType, body: bytes) -> list[Reply]:
+    return [Reply(*refuse(kind, body, Reason.DENIED), reason=Reason.DENIED)]

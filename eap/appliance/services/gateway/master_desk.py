@@ -50,9 +50,13 @@ class MasterDesk:
         """See to it that what the object at *index* shows is not old."""
         await self._view.refresh(with_registers=index in _OF_REGISTERS)
 
+    def is_fresh(self, index: int) -> bool:
+        """Say whether what the object at *index* shows may be read at once."""
+        return self._view.is_fresh(with_registers=index in _OF_REGISTERS)
+
     def open_session(self, room: int) -> MasterSession:
         """Begin a client's session with the dictionary."""
-        return MasterSession(self.dictionary, room, self.refresh)
+        return MasterSession(self.dictionary, room, self.refresh, self.is_fresh)
 
     def close(self) -> None:
         """Wait for nothing any more that was asked for."""

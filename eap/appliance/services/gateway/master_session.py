@@ -8,6 +8,7 @@ from devicebus.errors import MailboxRefusedError
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.access import place_of
+from eap.aoe.ads_operation import Operation
 from eap.appliance.services.gateway.dialect_task import DialectError
 from eap.appliance.services.gateway.slave_session import Reply
 from eap.codec.mailbox import MailboxHeader, MailboxType
@@ -26,6 +27,7 @@ class MasterSession:
         dictionary: Of the master.
         room: Octets of the longest answer behind its mailbox header.
         refresh: Sees to it that what an object shows is not old; it gets the object's index.
+        is_fresh: Says whether that is so already.
     """
 
     is_running = False
@@ -35,9 +37,11 @@ class MasterSession:
         dictionary: ObjectDictionary,
         room: int,
         refresh: Callable[[int], Awaitable[None]],
+        is_fresh: Callable[[int], bool],
     ) -> None:
         self._dictionary = dictionary
         self._refresh = refresh
+        self._is_fresh = is_fresh
         size = room + MailboxHeader.SIZE
         self._server = CoeServer(dictionary, _op, MailboxSizes(size, size))
 
@@ -46,8 +50,15 @@ class MasterSession:
         if kind is not MailboxType.COE:
             reason = Reason.NO_PROTOCOL
             return [Reply(*refuse(kind, body, reason), reason=reason)]
-        touched = operation_of(kind, body)
-        await self._refresh(place_of(touched)[1] >> 16 if touched else 0)
+        await self._refresh(_index_of(operation_of(kind, body)))
+        return self.ask_now(body)
+
+    def is_ready(self, operation: Operation | None) -> bool:
+        """Say whether the answer to a request by CoE, which does *operation*, need not wait."""
+        return self._is_fresh(_index_of(operation))
+
+    def ask_now(self, body: bytes) -> list[Reply]:
+        """Return the answers to a request by CoE that is ready."""
         try:
             answers = self._server.receive_message(body, 0)
         except MailboxRefusedError as exc:
@@ -76,6 +87,10 @@ class MasterSession:
     def close(self) -> None:
         """Forget what is under way."""
         self._server.reset()
+
+
+def _index_of(operation: Operation | None) -> int:
+    return place_of(operation)[1] >> 16 if operation else 0
 
 
 def _op() -> OdState:

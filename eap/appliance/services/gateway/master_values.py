@@ -70,9 +70,9 @@ class MasterView:
 
     async def refresh(self, *, with_registers: bool) -> None:
         """See to it that what is shown is not old; a bus that is down shows no slaves."""
-        loop = asyncio.get_running_loop()
-        if loop.time() < (self._registers_until_s if with_registers else self._until_s):
+        if self.is_fresh(with_registers=with_registers):
             return
+        loop = asyncio.get_running_loop()
         async with self._turn:
             if loop.time() >= self._until_s:
                 await self._look()
@@ -80,6 +80,11 @@ class MasterView:
             if with_registers and loop.time() >= self._registers_until_s:
                 await self._look_closely()
                 self._registers_until_s = loop.time() + FRESH_S
+
+    def is_fresh(self, *, with_registers: bool) -> bool:
+        """Say whether :meth:`refresh` has nothing to do."""
+        until_s = self._registers_until_s if with_registers else self._until_s
+        return asyncio.get_running_loop().time() < until_s
 
     def configured(self) -> Sequence[int]:
         """Return the station addresses of the configuration."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -66,9 +67,10 @@ class Desk:
         self.asked: list[tuple[RemoteSlave, Operation]] = []
         self.engine = FakeEngine(FakeBus(LoopBus(bus)))
         self._link = EngineLink(self.engine.services)
+        turns = itertools.cycle((False, True))  # has to be waited for, and has not
         self.gateway = MailboxGateway(
             PortLink(BusClient(self._link, [PORT]), PORT),
-            lambda: MasterSession(MASTER, settings.room, nothing),
+            lambda: MasterSession(MASTER, settings.room, nothing, lambda index: next(turns)),
             lambda: AccessList(rules),
             settings,
             AddressMap({0x9000: Slave(1001), 0x9001: RemoteSlave(ELSEWHERE_BUS, 1003)}),

@@ -22,12 +22,14 @@ async def nothing(index: int) -> None:
 
 
 def session(room: int = 100) -> MasterSession:
-    return MasterSession(ObjectDictionary([variable(0x2000, "A", "UDINT", RW)]), room, nothing)
+    return MasterSession(
+        ObjectDictionary([variable(0x2000, "A", "UDINT", RW)]), room, nothing, lambda index: True
+    )
 
 
 def test_segments_of_two_clients_do_not_meet() -> None:
     objects = ObjectDictionary([variable(0x1008, "N", "STRING(200)", value="n" * 200)])
-    first, second = (MasterSession(objects, 100, nothing) for _ in range(2))
+    first, second = (MasterSession(objects, 100, nothing, lambda index: True) for _ in range(2))
     upload = bytes.fromhex("0020 40 0810 00 00000000")
     ((_, head, _, _),) = asyncio.run(first.ask(COE, upload))
     assert head[2] == 0x41
