@@ -23,7 +23,7 @@ from eap.appliance.services.route_desk import RouteDesk
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.link_watch import LinkWatch
 from eap.appliance.services.routing.mailbox_frames import FRAME_OVERHEAD
-from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake, judge
+from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake
 from eap.appliance.services.routing.mailbox_stream import LARGEST_FRAME, MailboxStreams
 from eap.appliance.services.routing.segment import Segment, SegmentCarrier
 from eap.appliance.services.routing.station_router import StationRouter
@@ -36,6 +36,7 @@ from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
 from eap.net.interface import interface_of
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
+from eap.pd.link import Origin
 from eap.pd.spec import StationSpec
 
 AMS_DOOR = DoorKind.AMS_TCP
@@ -202,25 +203,27 @@ class _Sockets:
         """
         interface = EthernetInterface(socket.socket(fileno=shared.services_fd), packet_batch())
         self._resources.callback(interface.close)
-        intakes: dict[int, FrameIntake] = {}
+        intakes: dict[int, list[FrameIntake]] = {}
         ports: dict[int, dict[PortName, EthernetPort]] = {}
         for owner in shared.owners:
             spec = self._handover.port(owner)
-            intake = FrameIntake([owner.station], self._counters, self._now_ns, judge)
+            intake = FrameIntake([owner.station], self._counters, self._now_ns, _not_yet)
             port = interface.port(
                 intake.take, vlan_id=spec.vlan_id, priority=spec.vlan_priority, join=spec.join
             )
-            intakes.setdefault(spec.vlan_id, intake)
+            intakes.setdefault(spec.vlan_id, []).append(intake)
             in_vlan = ports.setdefault(spec.vlan_id, {})
             if owner.station not in {each.station for each in in_vlan}:
                 in_vlan[owner] = port
-        for vlan_id, intake in intakes.items():
+        for vlan_id, (first, *others) in intakes.items():
             there = [*ports[vlan_id]]
             segment = Segment(self._entrance("ethernet", there), interface.address)
             carrier = ChannelCarrier(ports[vlan_id][there[0]])
             gateway = self._gateway("ethernet", there)
             mailbox = MailboxIntake(segment, gateway, carrier, interface.is_for_many)
-            intake.mailbox = mailbox.take
+            first.mailbox = mailbox.take
+            for each in others:
+                each.mailbox = mailbox.judge
             for owner, port in ports[vlan_id].items():
                 router = self._routers[owner.station]
                 door = Door(f"ethernet:{owner.port}", MAX_ETHERNET_FRAME - FRAME_OVERHEAD)
@@ -320,3 +323,9 @@ def _doors(kind: str, owners: Sequence[PortName]) -> dict[str, str]:
 
 def _stations_of(shared: SharedSocket) -> list[str]:
     return list(dict.fromkeys(owner.station for owner in shared.owners))
+
+
+def _not_yet(data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
+    """Take nothing of an interface whose ports are not all known."""
+    del data, size, at_ns, origin
+    return Refusal.MAILBOX

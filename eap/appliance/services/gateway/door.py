@@ -29,6 +29,11 @@ class GatewayDoor:
         if behind:
             self._gateway, self._name = behind[0]
 
+    @property
+    def is_there(self) -> bool:
+        """Whether there is any gateway behind."""
+        return self._gateway is not None
+
     def receive(
         self, frame: Buffer, connection: str, send: Callable[[str, bytes], object]
     ) -> Refusal | None:

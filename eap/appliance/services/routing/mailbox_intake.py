@@ -61,12 +61,13 @@ class MailboxIntake:
         self._entrance.receive(packet, sender, for_all=self._is_for_many(data))
         return None
 
-
-def judge(data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
-    """Leave a frame to another intake that gets it too; return why that does not take it."""
-    del at_ns, origin
-    packet = aoe_packet(data[:size])
-    return packet if packet is Refusal.TRUNCATED else None
+    def judge(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
+        """Return why a frame is not taken that this intake gets too, without acting on it."""
+        del at_ns, origin
+        packet = aoe_packet(data[:size])
+        if packet is Refusal.MAILBOX and self._gateway.is_there and not self._is_for_many(data):
+            return None
+        return packet if isinstance(packet, Refusal) else None
 
 
 class ChannelCarrier:

@@ -7,7 +7,7 @@ import pytest
 from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
 from eap.appliance.services.gateway.door import GatewayDoor
-from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake, judge
+from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake
 from tests.support import aoe
 from tests.support.routing import entrance, station
 
@@ -95,8 +95,17 @@ def test_what_is_not_taken_has_a_reason():
 
 
 @pytest.mark.parametrize(
-    ("frame", "reason"),
-    [(ask(), None), (ask(kind=3), None), (ask()[:-1], Refusal.TRUNCATED)],
+    ("frame", "behind", "for_many", "reason"),
+    [
+        (ask(), [], False, None),
+        (ask()[:-1], [], False, Refusal.TRUNCATED),
+        (ask(kind=3), [], False, Refusal.MAILBOX),
+        (ask(kind=3), ["a gateway"], False, None),
+        (ask(kind=3), ["a gateway"], True, Refusal.MAILBOX),
+    ],
 )
-def test_frame_that_another_intake_takes_is_only_judged(frame, reason):
-    assert judge(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason
+def test_frame_that_another_intake_takes_is_only_judged(frame, behind, for_many, reason):
+    gateway = GatewayDoor([(object(), name) for name in behind])
+    carrier = ChannelCarrier(Wire())
+    intake = MailboxIntake(entrance(station(TARGET)), gateway, carrier, lambda data: for_many)
+    assert intake.judge(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason
