@@ -22,6 +22,7 @@ from eap.appliance.services.gateway.dialect_desk import DialectDesk
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
 from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Target, result_of
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.refusal_log import RefusalLog
 from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.sessions import SessionKey, Sessions
 from eap.appliance.services.gateway.slave_book import SlaveBook
@@ -62,6 +63,8 @@ class Settings(NamedTuple):
     room: int = 1486
     """Octets of the longest answer behind its headers: one datagram takes it."""
     limits: ClientLimits = ClientLimits()
+    name: str = ""
+    """Of the bus port, for log lines."""
 
 
 class _Request(NamedTuple):
@@ -133,6 +136,7 @@ class MailboxGateway:
         self._remotes: Sessions[RemoteSession] = Sessions()
         self._tasks: set[asyncio.Task[None]] = set()
         self._listeners = EoeListeners()
+        self._log = RefusalLog(settings.name)
         self._counter = 0
         bus.listen(self._take_unasked)
 
@@ -351,7 +355,7 @@ class MailboxGateway:
         station = found.station if isinstance(found, Slave) else address
         answer, reason = await self._dialect.answer(kind, station, request.body, request.way)
         self.tally.note(address, kind, [reason], monotonic_ns() - start_ns)
-        self._count_errors(request.way, [reason])
+        self._tell_refusals(request, kind, [reason])
         if not (self.settings.is_silent and reason is not None):
             request.send(encode_frame(dialect.encode_header(kind, address), answer))
 
@@ -366,12 +370,19 @@ class MailboxGateway:
     ) -> None:
         reasons = [each.reason for each in replies]
         self.tally.note(station, request.header.type, reasons, took_ns)
-        self._count_errors(request.way, reasons)
+        self._tell_refusals(request, request.header.type, reasons)
 
-    def _count_errors(self, way: Way, reasons: Iterable[Reason | None]) -> None:
-        counts = self.ledger.counts_of(way)
-        if counts is not None and any(reason is not None for reason in reasons):
+    def _tell_refusals(
+        self, request: _Request, kind: MailboxType, reasons: Iterable[Reason | None]
+    ) -> None:
+        """Count what the gateway answers itself, and log it."""
+        reason = next((each for each in reasons if each is not None), None)
+        if reason is None:
+            return
+        counts = self.ledger.counts_of(request.way)
+        if counts is not None:
             counts.errors += 1
+        self._log.write(request.way, request.header.address, kind, reason)
 
     def _answer(self, request: _Request, address: int, replies: Iterable[Reply]) -> None:
         for reply in replies:

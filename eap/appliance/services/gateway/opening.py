@@ -63,6 +63,7 @@ def open_gateways(
             answer_s=told.answer_ms / _MS,
             is_silent=told.silent,
             limits=ClientLimits(told.in_flight, told.rate, told.clients),
+            name=f"{bus.owner.station}/{bus.owner.port}",
         )
         gateway = MailboxGateway(
             PortLink(client, bus.owner),
