@@ -102,6 +102,8 @@ class TcpDoor:
         self._streams += 1
         try:
             await self._mailboxes.serve(connection)
+        except Exception:  # one connection is no reason to end all of them
+            logger.exception("TCP connection from %s", peer)
         finally:
             self._streams -= 1
 

@@ -89,7 +89,7 @@ class BusService:
         self._bus = bus
         self._port = port
         self._desk = desk
-        self._watched: set[int] = set()  # objects that notifications were asked for, ever
+        self._watched: set[int] = set()  # objects that somebody was ever told of
         self._master = MasterSide(bus, port)
         self._slaves = Slaves(bus, port, net_id, self._master)
         self._device = AdsDevice(
@@ -163,11 +163,13 @@ class BusService:
             return OperationOutcome(data=answer)
         self._master.report = report
         group, offset = place_of(operation)
-        if group in ObjectSpace.groups:
+        is_object = group in ObjectSpace.groups
+        if is_object:
             await self._desk.refresh(offset >> 16)
-            if isinstance(operation, AddNotification):
-                self._watched.add(offset >> 16)
-        return self._device.perform(operation, client, monotonic_ns())
+        outcome = self._device.perform(operation, client, monotonic_ns())
+        if is_object and isinstance(operation, AddNotification) and not outcome.result:
+            self._watched.add(offset >> 16)
+        return outcome
 
     async def _perform_of_slave(
         self, operation: Operation, report: BusReport, asked: Asked

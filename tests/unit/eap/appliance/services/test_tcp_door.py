@@ -125,6 +125,20 @@ def test_type_5_is_answered_here():
     assert play(script) == []
 
 
+def test_a_fault_ends_one_connection_only(monkeypatch, caplog):
+    async def fail(streams, connection):
+        connection.close()
+        raise RuntimeError("a fault")
+
+    async def script(scene):
+        for _ in range(2):
+            assert await scene.send(frame(5)) == b""
+
+    monkeypatch.setattr(MailboxStreams, "serve", fail)
+    assert play(script) == []
+    assert ["a fault" in record.exc_text for record in caplog.records] == [True, True]
+
+
 def test_there_is_a_limit_to_those_who_talk(monkeypatch):
     monkeypatch.setattr(tcp_door, "MAX_STREAMS", 1)
     question = aoe.frame(aoe.packet(TARGET, 4, b""))

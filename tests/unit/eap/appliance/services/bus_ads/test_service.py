@@ -18,6 +18,7 @@ from eap.aoe.ads_operation import (
 )
 from eap.appliance.bus_request import AskMailbox
 from eap.appliance.services.bus_ads import files, idns, service
+from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,
@@ -28,6 +29,7 @@ from eap.codec.ads import (
     IndexGroup,
     device_name,
 )
+from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand
 from eap.codec.mailbox import MailboxType
 from tests.support.busads import DRIVE, MASTER, play, until
@@ -108,6 +110,33 @@ def test_dictionary_of_the_master_is_live():
         await until(is_found)
 
     play(scene)
+
+
+def test_only_what_somebody_is_told_of_is_looked_at_again(monkeypatch):
+    looked_at = []
+    refresh = MasterDesk.refresh
+
+    async def note(desk, index):
+        looked_at.append(index)
+        await refresh(desk, index)
+
+    async def scene(client, engine):
+        there, missing = (
+            AddNotification(IndexGroup.SDO, offset, 2, TransMode.SERVER_CYCLE, 0, 0)
+            for offset in (0x8002_0001, 0x8003_0001)
+        )
+        assert (await client.do(MASTER, missing)).result == AdsError.NOT_FOUND
+        await client.good(MASTER, there)
+        looked_at.clear()
+
+        async def is_looked_at():
+            return len(looked_at) > 1
+
+        await until(is_looked_at)
+        assert set(looked_at) == {0x8002}
+
+    monkeypatch.setattr(MasterDesk, "refresh", note)
+    play(scene, "coe")
 
 
 def test_states_are_requested():
