@@ -17,6 +17,7 @@ from eap.aoe.ads_types import SymbolType, symbol_type
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsdatatype import encode_data_type
 from eap.codec.adssymbol import (
+    AdsType,
     HandleInfo,
     SymbolEntry,
     SymbolFlag,
@@ -28,6 +29,8 @@ from eap.codec.adssymbol import (
 from eap.codec.values import DataType
 
 _INDEX_BITS = 24
+_UTF_8 = (("TcEncoding", "UTF-8"),)
+"""Attribute of texts; clients take those without for texts in the code page of TwinCAT."""
 _ALIGNMENT = 8
 """Octets: no value of a client's lies across what its processor reads at once."""
 
@@ -60,6 +63,7 @@ class Symbol(NamedTuple):
                 self.variable.name,
                 self.type.name,
                 self.variable.comment,
+                _UTF_8 if self.type.id == AdsType.STRING else (),
             )
         )
 

@@ -69,7 +69,7 @@ class SymbolSpace(AdsSpace):
         if group == IndexGroup.SYMBOL_UPLOAD_INFO:
             return self._table.info.encode()[: min(length, 8)]
         if group == IndexGroup.SYMBOL_UPLOAD_INFO_2:
-            return self._table.info.encode()[:length]
+            return self._table.info.encode_for(length)
         if group == IndexGroup.SYMBOL_UPLOAD:
             return _whole(self._table.upload, length)
         if group == IndexGroup.DATA_TYPE_UPLOAD:

@@ -160,9 +160,8 @@ class Passage:
             body = self._gate.take_answer(pending.judged, answer.error_code, answer.data)
             answer = answer._replace(data=body)
         packet = response_to(pending.header, answer)
-        return self._send_back(
-            pending, pending.came_by, packet, answer.error_code, now_ns, answer.why
-        )
+        why = _with_result(answer)
+        return self._send_back(pending, pending.came_by, packet, answer.error_code, now_ns, why)
 
     def send_failed(self, ticket: int, text: str, now_ns: int) -> list[Action]:
         """Answer a request that its door could not send."""
@@ -368,6 +367,12 @@ class Passage:
         pending = Pending(invoke_id, header, None, route, subscription.onward, now_ns, deadline_ns)
         self.in_flight.add(pending)
         return [self._forward(invoke_id, encode_packet(header, body), subscription.onward, route)]
+
+
+def _with_result(answer: AmsAnswer) -> str:
+    """Return why a service refused something, with the result of the whole if it has one."""
+    result = int.from_bytes(answer.data[:4], "little")
+    return f"{answer.why} (0x{result:x})" if answer.why and result else answer.why
 
 
 def _unasked(answer: AmsHeader) -> str:

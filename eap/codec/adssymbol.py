@@ -8,7 +8,8 @@ from typing import NamedTuple
 from eap.codec.wire import Buffer, WireStruct, u16, u32
 from eap.errors import MalformedError, TruncatedError
 
-_ENCODING = "cp1252"
+CODE_PAGE = 1252
+_ENCODING = f"cp{CODE_PAGE}"
 """TwinCAT's, for names, types and comments."""
 MAX_TEXT = 255
 """Octets of a name, type or comment: clients have room for 256 with the NUL."""
@@ -41,6 +42,7 @@ class SymbolFlag(IntFlag):
     PERSISTENT = 0x0001
     BIT_VALUE = 0x0002
     READ_ONLY = 0x0020
+    ATTRIBUTES = 0x1000
 
 
 class SymbolPlace(WireStruct, frozen=True):
@@ -52,7 +54,12 @@ class SymbolPlace(WireStruct, frozen=True):
 
 
 class UploadInfo(WireStruct, frozen=True):
-    """What SYM_UPLOADINFO2 tells; the first two fields are SYM_UPLOADINFO.  Sizes in octets."""
+    """What SYM_UPLOADINFO2 tells; the first two fields are SYM_UPLOADINFO.  Sizes in octets.
+
+    Clients that know of its third version ask for 64 octets: there *invalid_dynamic*,
+    *code_page* of names and comments, *upload_flags* and seven reserved numbers follow, as the
+    open client ads-client reads them.
+    """
 
     symbols: u32
     symbol_size: u32
@@ -60,6 +67,22 @@ class UploadInfo(WireStruct, frozen=True):
     type_size: u32 = 0
     max_dynamic: u32 = 0
     used_dynamic: u32 = 0
+
+    def encode_for(self, length: int) -> bytes:
+        """Return the newest version that a client has room for in *length* octets."""
+        octets = self.encode()
+        if length >= _INFO_3_SIZE:
+            return (octets + _InfoTail(0, CODE_PAGE).encode()).ljust(_INFO_3_SIZE, b"\0")
+        return octets[:length]
+
+
+class _InfoTail(WireStruct, frozen=True):
+    invalid_dynamic: u32
+    code_page: u32
+    upload_flags: u32 = 0
+
+
+_INFO_3_SIZE = 64
 
 
 class _EntryHead(WireStruct, frozen=True):
@@ -98,6 +121,8 @@ class SymbolEntry(NamedTuple):
     name: str
     type_name: str
     comment: str = ""
+    attributes: tuple[tuple[str, str], ...] = ()
+    """Names and values."""
 
 
 def encode_entry(entry: SymbolEntry) -> bytes:
@@ -105,20 +130,32 @@ def encode_entry(entry: SymbolEntry) -> bytes:
     texts = [encode_text(text) for text in (entry.name, entry.type_name, entry.comment)]
     lengths = [len(text) for text in texts]
     place = entry.place
+    attributes = _encode_attributes(entry.attributes)
     head = _EntryHead(
-        _EntryHead.SIZE + sum(lengths) + len(texts),
+        _EntryHead.SIZE + sum(lengths) + len(texts) + len(attributes),
         place.group,
         place.offset,
         place.size,
         entry.type,
-        entry.flags,
+        entry.flags | (SymbolFlag.ATTRIBUTES if attributes else 0),
         *lengths,
     )
-    return head.encode() + b"".join(text + b"\0" for text in texts)
+    return head.encode() + b"".join(text + b"\0" for text in texts) + attributes
+
+
+def _encode_attributes(attributes: tuple[tuple[str, str], ...]) -> bytes:
+    """Return what stands behind the texts, as the open client ads-client reads it."""
+    if not attributes:
+        return b""
+    octets = bytearray(len(attributes).to_bytes(2, "little"))
+    for attribute in attributes:
+        name, value = map(encode_text, attribute)
+        octets += bytes((len(name), len(value))) + name + b"\0" + value + b"\0"
+    return bytes(octets)
 
 
 def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
-    """Return the entry at *offset*, and where the next one begins.
+    """Return the entry at *offset* without its attributes, and where the next one begins.
 
     Raises:
         TruncatedError: the data ends before the entry does.
@@ -145,7 +182,8 @@ def decode_entry(data: Buffer, offset: int = 0) -> tuple[SymbolEntry, int]:
         texts.append(bytes(data[at : at + length]).decode(_ENCODING, "replace"))
         at += length + 1
     place = SymbolPlace(head.group, head.offset, head.size)
-    return SymbolEntry(place, head.type, head.flags, *texts), end
+    name, type_name, comment = texts
+    return SymbolEntry(place, head.type, head.flags, name, type_name, comment), end
 
 
 def encode_text(text: str) -> bytes:

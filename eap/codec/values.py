@@ -219,7 +219,9 @@ class String(DataType, frozen=True):
     """
 
     def encode(self, value: Any) -> bytes:
-        """Return the padded octets of a text that fits and holds no NUL."""
+        """Return the padded octets of a text that fits and has no NUL; take octets as they are."""
+        if isinstance(value, bytes) and len(value) == self.size:
+            return value
         if not isinstance(value, str):
             raise self._refuse(value, "a text")
         try:

@@ -16,6 +16,7 @@ from eap.aoe.ads_symbols import SymbolSpace
 from eap.appliance.station_image import StationImage
 from eap.codec import datatypes
 from eap.codec.ads import AdsError
+from eap.codec.values import String
 from eap.errors import ImageError, TornReadError, WriterConflictError
 from eap.pd.image import Image, take
 from eap.pd.layout import VariablePlace
@@ -60,8 +61,10 @@ class ImageVariables:
     def write(self, name: str, octets: bytes) -> None:
         """Store a value; refuse with BUSY while another program writes, with VALUE what is none."""
         kind = datatypes.parse(self._image.places[name].type)
+        # A text of a client with another encoding than ours: its octets go on as they are.
+        value = bytes(octets) if isinstance(kind, String) else kind.decode(octets, 0)
         try:
-            self._station.write_once(Writer.APPLICATION, {name: kind.decode(octets, 0)})
+            self._station.write_once(Writer.APPLICATION, {name: value})
         except WriterConflictError as exc:
             raise AdsRefusedError(AdsError.BUSY, str(exc)) from None
         except ValueError as exc:

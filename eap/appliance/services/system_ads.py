@@ -21,7 +21,7 @@ from eap.appliance.services.ads_requests import begin_answer
 from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.state_control import control_state
 from eap.appliance.services.station_device import StationDevice
-from eap.codec.ads import AdsDeviceInfo, AdsStates, AdsSystemState
+from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, AdsSystemState
 from eap.codec.ams import SYSTEM_PORT
 
 
@@ -59,6 +59,9 @@ class SystemAds:
         self, client: Client, operation: Operation
     ) -> OperationOutcome | Awaitable[OperationOutcome]:
         if isinstance(operation, WriteControl):
+            if operation.ads_state == AdsState.RESET:
+                # TwinCAT's system service goes to RUN by it; ads-client knows no other way.
+                operation = operation._replace(ads_state=AdsState.RUN)
             return control_state(self._device, operation)
         return self._ads.perform(operation, client, monotonic_ns())
 

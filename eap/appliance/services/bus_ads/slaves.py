@@ -90,7 +90,8 @@ class Slaves:
         if not slave.protocols & (protocol | SiiProtocol.AOE):
             if space is None:
                 raise AdsRefusedError(AdsError.INDEX_GROUP)
-            why = f"slave {slave.station} does not speak {protocol.name}"
+            name = str(protocol.name).replace("OE", "oE")
+            why = f"slave {slave.station} does not speak {name}"
             raise AdsRefusedError(AdsError.SERVICE, why)
         if not slave.state:
             raise AdsRefusedError(AdsError.TIMEOUT, f"slave {slave.station} does not answer")

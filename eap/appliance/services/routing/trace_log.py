@@ -51,7 +51,9 @@ class TraceLog:
             text = "%s: %d more packets met errors"
             logger.warning(text, self._station, allowance.skipped)
             allowance.skipped = 0
-        logger.log(level, "%s: %s (0x%x)", self._station, trace.text, trace.error_code)
+        # Results inside an answer are in the text.
+        code = f" (0x{trace.error_code:x})" if trace.error_code else ""
+        logger.log(level, "%s: %s%s", self._station, trace.text, code)
 
     def _allowance(self, trace: Trace) -> Allowance:
         whose = "", ""

@@ -71,7 +71,7 @@ def test_table_is_uploaded(space) -> None:
     assert end == len(space.read_write(G.SYMBOL_ENTRY_BY_NAME, 0, 798, b"count"))
     info = space.read(G.SYMBOL_UPLOAD_INFO_2, 0, 1024)
     assert info[:8] == space.read(G.SYMBOL_UPLOAD_INFO, 0, 1024)
-    assert len(info) == 24
+    assert len(info) == 64
     with pytest.raises(AdsRefusedError, match="SIZE"):
         space.read(G.SYMBOL_UPLOAD, 0, size - 1)
 

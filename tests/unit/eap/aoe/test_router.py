@@ -68,8 +68,9 @@ def test_what_a_service_says_of_a_refusal_is_kept() -> None:
     station = Station()
     delivered = station.delivered(Ams(DEVICE, CLIENT), TCP)
     why = "0x2000:00: object does not exist (0x06020000)"
-    station.router.receive_answer(delivered.ticket, AmsAnswer(b"data", why=why), 5)
-    assert station.events() == [(Outcome.ANSWERED, f"READ of {DEVICE} for {CLIENT} ({TCP}): {why}")]
+    station.router.receive_answer(delivered.ticket, AmsAnswer(b"\x0c\7\0\0", why=why), 5)
+    text = f"READ of {DEVICE} for {CLIENT} ({TCP}): {why} (0x70c)"
+    assert station.events() == [(Outcome.ANSWERED, text)]
 
 
 def test_error_of_a_service_that_gives_no_reason_has_words() -> None:

@@ -27,7 +27,27 @@ ENTRIES = st.builds(
     TEXTS,
     TEXTS,
     TEXTS,
+    attributes=st.just(()),
 )
+
+
+def test_attributes_stand_behind_the_texts() -> None:
+    """As the open client ads-client takes them apart."""
+    bare = SymbolEntry(SymbolPlace(1, 2, 3), AdsType.STRING, 0, "a", "b", "c")
+    octets = encode_entry(bare._replace(attributes=(("TcEncoding", "UTF-8"),)))
+    behind = b"\1\0\x0a\5TcEncoding\0UTF-8\0"
+    assert octets.endswith(b"a\0b\0c\0" + behind)
+    decoded, end = decode_entry(octets)
+    assert decoded == bare._replace(flags=SymbolFlag.ATTRIBUTES)
+    assert end == len(octets) == len(encode_entry(bare)) + len(behind)
+
+
+def test_info_has_the_newest_version_that_there_is_room_for() -> None:
+    info = UploadInfo(1, 2, 3, 4)
+    assert info.encode_for(8) == b"\1\0\0\0\2\0\0\0"
+    assert info.encode_for(63) == info.encode()
+    third = info.encode() + bytes(4) + (1252).to_bytes(4, "little") + bytes(32)
+    assert info.encode_for(64) == info.encode_for(99) == third
 
 
 def test_entry_lies_as_in_the_description_of_pyads() -> None:

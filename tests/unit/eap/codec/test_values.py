@@ -111,6 +111,10 @@ def test_octets(text: str, value: Any, octets: str) -> None:
     assert kind.encode(kind.read(bytes.fromhex(octets), 0)).hex() == octets
 
 
+def test_octets_of_a_text_are_taken_as_they_are() -> None:
+    assert parse("STRING(3)").encode(b"\xe4\xf6\0") == b"\xe4\xf6\0"
+
+
 @pytest.mark.parametrize(
     ("text", "value", "reason"),
     [
@@ -124,7 +128,7 @@ def test_octets(text: str, value: Any, octets: str) -> None:
         ("STRING(3)", "abcd", "at most 3 octets, this text has 4"),
         ("STRING(3)", "a\0b", "without NUL"),
         ("STRING(3)", "\ud800", "surrogates"),
-        ("STRING(3)", b"abc", "a text"),
+        ("STRING(3)", b"ab", "a text"),
         ("BLOCK(3)", b"ab", "3 octets, these are 2"),
         ("BLOCK(3)", "abc", "3 octets"),
         ("UINT[2]", [1], "2 values, these are 1"),

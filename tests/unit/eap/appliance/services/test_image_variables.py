@@ -60,9 +60,11 @@ def test_variables_of_others_are_only_read(symbols):
         symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "load"), b"\0")
 
 
-def test_octets_that_are_no_value_are_refused(symbols):
-    with pytest.raises(AdsRefusedError, match="VALUE: name: "):
-        symbols.write(G.VALUE_BY_HANDLE, handle(symbols, "name"), b"\xff" * 8)
+def test_text_in_another_encoding_stays_as_its_client_wrote_it(symbols):
+    place = handle(symbols, "name")
+    symbols.write(G.VALUE_BY_HANDLE, place, "größe\0".encode("latin-1"))
+    assert symbols.read(G.VALUE_BY_HANDLE, place, 6) == "größe\0".encode("latin-1")
+    assert entry(symbols, "name").flags == SymbolFlag.ATTRIBUTES
 
 
 def test_variable_that_has_just_gone_is_refused(symbols, stations, files):

@@ -63,6 +63,12 @@ def test_states_are_those_of_the_station(ask, device):
     assert ask(AmsCommand.READ_STATE) == OK + b"\x0f\0\2\0"
 
 
+def test_reset_is_how_clients_of_twincat_ask_for_run(ask, device):
+    assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.CONFIG, 0, 0)) == OK
+    assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.RESET, 0, 0)) == OK
+    assert device[1].state is DeviceState.OP
+
+
 def test_notifications_end_with_their_connection(ask, system):
     watched = struct.pack("<6I16x", G.DEVICE_DATA, 0, 4, TransMode.SERVER_CYCLE, 0, 0)
     assert ask(AmsCommand.ADD_NOTIFICATION, watched)[:4] == OK

@@ -71,3 +71,9 @@ def test_clients_are_forgotten(caplog):
     for number in range(3 * MAX_CLIENTS):
         log.write(denied(f"10.0.{number // 250}.{number % 250}:1"))
     assert len(caplog.messages) == 3 * MAX_CLIENTS
+
+
+def test_what_was_answered_without_an_error_of_the_header_has_no_code(caplog):
+    caplog.set_level(logging.INFO)
+    TraceLog("island").write(trace(Outcome.ANSWERED)._replace(error_code=0))
+    assert caplog.messages == ["island: no way"]
