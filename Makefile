@@ -9,6 +9,9 @@ ARGS ?=
 
 BIN := .venv/bin
 
+# Where it is set, each process of an appliance would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help setup demo valve test check bench clean
 

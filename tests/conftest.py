@@ -8,9 +8,11 @@ loadfile``), the other workers wait while a file of them runs.
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from uuid import uuid4
@@ -31,6 +33,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts what it puts into the background that way, and programs inherit it: those of
     # the tests would not hear the Ctrl-C that they are sent.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tests start hundreds of processes.  Where Python is told to keep no bytecode, each of them would
+# compile all that it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 _CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_SYS_ADMIN": 21}
 """What a network namespace with a veth pair and a raw socket takes: name to bit."""
@@ -86,6 +93,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if reason is not None and item.get_closest_marker(marker) is not None:
                 item.add_marker(pytest.mark.skip(reason=reason))
     items.sort(key=_is_net)
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector pass over the thousands of tests that are there to the end."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
