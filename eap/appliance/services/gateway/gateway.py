@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic_ns
 from typing import NamedTuple, TypeAlias
 
-from devicebus.mailbox.counter import next_counter
 from eap.aoe.access import AccessList, Verdict
 from eap.aoe.ads_operation import Operation
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
+from eap.appliance.services.gateway.answering import Answering, Request, Send, refusals
 from eap.appliance.services.gateway.dialect_desk import DialectDesk
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
 from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Target, result_of
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.refusal_log import RefusalLog
 from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.sessions import SessionKey, Sessions
 from eap.appliance.services.gateway.slave_book import SlaveBook
@@ -32,20 +31,16 @@ from eap.appliance.services.gateway.slave_session import (
     SlaveSession,
     find_refusal,
 )
-from eap.appliance.services.gateway.tally import Tally
-from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
+from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.gateway import dialect
 from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, RemoteSlave, Slave
 from eap.gateway.ledger import Admission, ClientLimits, Ledger
-from eap.gateway.refusal import Reason, refuse
+from eap.gateway.refusal import Reason
 from eap.gateway.rights import operation_of
 from eap.ids import NetId
 
 ANSWER_S = 0.9
 """How long an answer may take: before a usual client gives up."""
-
-Send: TypeAlias = Callable[[bytes], None]
-"""Sends a frame back to who sent a request, now or later."""
 
 OpenRemote: TypeAlias = Callable[[RemoteSlave, MailboxType], RemoteSession]
 
@@ -65,13 +60,6 @@ class Settings(NamedTuple):
     limits: ClientLimits = ClientLimits()
     name: str = ""
     """Of the bus port, for log lines."""
-
-
-class _Request(NamedTuple):
-    header: MailboxHeader
-    body: bytes
-    way: Way
-    send: Send
 
 
 class _Judged(NamedTuple):
@@ -116,8 +104,9 @@ class MailboxGateway:
         addresses: AddressMap,
         open_remote: OpenRemote,
     ) -> None:
-        self.tally = Tally()
         self.ledger = Ledger(settings.limits)
+        self._answering = Answering(self.ledger, settings.name, is_silent=settings.is_silent)
+        self.tally = self._answering.tally
         self.guard = Guard(access)
         self.settings = settings
         self.is_open = True
@@ -136,8 +125,6 @@ class MailboxGateway:
         self._remotes: Sessions[RemoteSession] = Sessions()
         self._tasks: set[asyncio.Task[None]] = set()
         self._listeners = EoeListeners()
-        self._log = RefusalLog(settings.name)
-        self._counter = 0
         bus.listen(self._take_unasked)
 
     def start(self) -> None:
@@ -168,9 +155,9 @@ class MailboxGateway:
         admission = self.ledger.admit(way, frame, monotonic_ns())
         if admission is Admission.REPEATED:
             return None
-        request = _Request(header, body, way, send)
+        request = Request(header, body, way, send)
         if admission is Admission.CROWDED:
-            self._refuse(request, Reason.CROWDED)
+            self._answering.refuse(request, Reason.CROWDED)
             return None
         if self._answer_at_once(request):
             self.ledger.answered(way, frame)
@@ -216,27 +203,27 @@ class MailboxGateway:
         if not task.cancelled() and (error := task.exception()) is not None:
             logger.error("gateway: a request of %s failed", way, exc_info=error)
 
-    async def _serve(self, request: _Request) -> None:
+    async def _serve(self, request: Request) -> None:
         kind = dialect.kind_of(request.header)
         if kind is not None:
             await self._serve_dialect(request, kind)
             return
         if request.header.type is MailboxType.ERR:
-            self._refuse(request, Reason.SERVICE)
+            self._answering.refuse(request, Reason.SERVICE)
             return
         stations = await self._stations(request.header.address)
         found = self._addresses.resolve(request.header.address, stations)
         if not isinstance(found, Group):
             await self._ask(request, found, request.header.address)
         elif not found.members:
-            self._refuse(request, Reason.NO_SLAVE)
+            self._answering.refuse(request, Reason.NO_SLAVE)
         else:
             members = ((self._addresses.resolve(each, stations), each) for each in found.members)
             await asyncio.gather(
                 *(self._ask(request, one, address, is_group=True) for one, address in members)
             )
 
-    def _answer_at_once(self, request: _Request) -> bool:
+    def _answer_at_once(self, request: Request) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
         header, body, way, _ = request
         start_ns = monotonic_ns()
@@ -250,7 +237,11 @@ class MailboxGateway:
         if not master.is_ready(operation):
             return False
         judged = self._judge(way, MASTER_ADDRESS, self._target(Master()), operation)
-        replies = master.ask_now(body) if judged.is_allowed else _denied(MailboxType.COE, body)
+        replies = (
+            master.ask_now(body)
+            if judged.is_allowed
+            else refusals(MailboxType.COE, body, Reason.DENIED)
+        )
         self._finish(request, judged, MASTER_ADDRESS, replies, start_ns)
         return True
 
@@ -261,7 +252,7 @@ class MailboxGateway:
         return await self._book.stations()
 
     async def _ask(
-        self, request: _Request, found: object, address: int, *, is_group: bool = False
+        self, request: Request, found: object, address: int, *, is_group: bool = False
     ) -> None:
         """Ask the master or one slave, and answer from *address*."""
         kind, body, way = request.header.type, request.body, request.way
@@ -270,7 +261,7 @@ class MailboxGateway:
         station = found.station if isinstance(found, Slave) else address
         judged = self._judge(way, station, self._target(found), operation, by_rule=is_group)
         if not judged.is_allowed:
-            replies = _denied(kind, body)
+            replies = refusals(kind, body, Reason.DENIED)
         elif isinstance(found, Slave):
             replies = await self._ask_slave(request, station, is_step=operation is None)
         elif isinstance(found, Master):
@@ -280,7 +271,7 @@ class MailboxGateway:
             begin = partial(self._open_remote, found, kind)
             replies = await self._remotes.take(SessionKey(way, station, kind), begin).ask(body)
         else:  # a group within a group
-            replies = [Reply(*refuse(kind, body, Reason.NO_SLAVE), reason=Reason.NO_SLAVE)]
+            replies = refusals(kind, body, Reason.NO_SLAVE)
         self._finish(request, judged, address, replies, start_ns)
 
     def _judge(
@@ -299,7 +290,7 @@ class MailboxGateway:
 
     def _finish(
         self,
-        request: _Request,
+        request: Request,
         judged: _Judged,
         address: int,
         replies: Sequence[Reply],
@@ -309,8 +300,8 @@ class MailboxGateway:
         station, target, operation, verdict = judged
         if operation is not None and verdict is not None:
             self.guard.tell(request.way, target, operation, verdict, result_of(replies))
-        self._note(request, station, replies, monotonic_ns() - start_ns)
-        self._answer(request, address, replies)
+        took_ns = monotonic_ns() - start_ns
+        self._answering.answer(request, station, address, replies, took_ns)
 
     def _target(self, found: object) -> Target:
         """Return by what rules name somebody."""
@@ -319,14 +310,14 @@ class MailboxGateway:
         port = found.station if isinstance(found, Slave) else MASTER_PORT
         return Target(self.settings.net_id, port)
 
-    async def _ask_slave(self, request: _Request, station: int, *, is_step: bool) -> list[Reply]:
+    async def _ask_slave(self, request: Request, station: int, *, is_step: bool) -> list[Reply]:
         kind, body = request.header.type, request.body
         slave = await self._book.find(station)
         if isinstance(slave, Reason):
-            return [Reply(*refuse(kind, body, slave), reason=slave)]
+            return refusals(kind, body, slave)
         reason = find_refusal(kind, body, slave)
         if reason is not None:
-            return [Reply(*refuse(kind, body, reason), reason=reason)]
+            return refusals(kind, body, reason)
 
         if kind is MailboxType.EOE:
             address, now_ns = request.header.address, monotonic_ns()
@@ -344,58 +335,12 @@ class MailboxGateway:
         if message.kind != MailboxType.EOE:
             return
         for listener in self._listeners.of(message.station, monotonic_ns()):
-            header = MailboxHeader(
-                0, listener.address, type=MailboxType.EOE, counter=self._next_counter()
-            )
-            listener.send(encode_frame(header, message.data))
+            self._answering.send(listener.send, listener.address, MailboxType.EOE, message.data)
 
-    async def _serve_dialect(self, request: _Request, kind: MailboxType) -> None:
+    async def _serve_dialect(self, request: Request, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()
         found = self._addresses.resolve(address, ())
         station = found.station if isinstance(found, Slave) else address
         answer, reason = await self._dialect.answer(kind, station, request.body, request.way)
-        self.tally.note(address, kind, [reason], monotonic_ns() - start_ns)
-        self._tell_refusals(request, kind, [reason])
-        if not (self.settings.is_silent and reason is not None):
-            request.send(encode_frame(dialect.encode_header(kind, address), answer))
-
-    def _refuse(self, request: _Request, reason: Reason) -> None:
-        kind = request.header.type
-        replies = [Reply(*refuse(kind, request.body, reason), reason=reason)]
-        self._note(request, request.header.address, replies, 0)
-        self._answer(request, request.header.address, replies)
-
-    def _note(
-        self, request: _Request, station: int, replies: Sequence[Reply], took_ns: int
-    ) -> None:
-        reasons = [each.reason for each in replies]
-        self.tally.note(station, request.header.type, reasons, took_ns)
-        self._tell_refusals(request, request.header.type, reasons)
-
-    def _tell_refusals(
-        self, request: _Request, kind: MailboxType, reasons: Iterable[Reason | None]
-    ) -> None:
-        """Count what the gateway answers itself, and log it."""
-        reason = next((each for each in reasons if each is not None), None)
-        if reason is None:
-            return
-        counts = self.ledger.counts_of(request.way)
-        if counts is not None:
-            counts.errors += 1
-        self._log.write(request.way, request.header.address, kind, reason)
-
-    def _answer(self, request: _Request, address: int, replies: Iterable[Reply]) -> None:
-        for reply in replies:
-            if reply.reason is not None and self.settings.is_silent:
-                continue
-            counter = reply.counter or self._next_counter()
-            header = MailboxHeader(0, address, type=reply.type, counter=counter)
-            request.send(encode_frame(header, reply.body))
-
-    def _next_counter(self) -> int:
-        self._counter = next_counter(self._counter)
-        return self._counter
-
-
-def _denied(kind: MailboxType, body: bytes) -> list[Reply]:
-    return [Reply(*refuse(kind, body, Reason.DENIED), reason=Reason.DENIED)]
+        took_ns = monotonic_ns() - start_ns
+        self._answering.answer_dialect(request, kind, answer, reason, took_ns)
