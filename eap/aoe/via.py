@@ -11,20 +11,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from functools import cache
 from ipaddress import AddressValueError, IPv4Address
 
 from eap.aoe.directory import Directory
 from eap.aoe.spec import DirectoryPort, DirectoryStation, DoorKind, HopSpec
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
-from eap.ids import InterfaceUri, MacAddr, NetId
+from eap.ids import InterfaceUri, MacAddr, NetId, parse_host
 
 FORMS = "STATION/PORT, ams-tcp:HOST, udp:ADDRESS, tcp:ADDRESS, ethernet:MAC or mqtt:NETWORK"
 _IP = ("udp", "tcp")
 _ADDRESS = re.compile(r"\d+(\.\d+){3}(:\d+)?", re.ASCII)
 _MAC = re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}")
 _NET_ID_DOTS = 5
-_MAX_PORT = 0xFFFF
 
 
 def parse_via(
@@ -76,14 +76,28 @@ def _ports(station: DirectoryStation, name: str) -> Sequence[DirectoryPort]:
 def _hop(mine: DirectoryPort, there: DirectoryPort) -> HopSpec | None:
     here, target = InterfaceUri.parse(mine.interface), InterfaceUri.parse(there.interface)
     if here.scheme in _IP and target.scheme in _IP:
-        ours, theirs = IPv4Address(here.host), IPv4Address(target.host)
-        if theirs.is_unspecified or ours.is_loopback != theirs.is_loopback:
-            return None
-        kind = DoorKind.UDP if here.scheme == target.scheme == "udp" else DoorKind.TCP
-        return HopSpec(kind, mine.name, f"{target.host}:{target.port or EAP_PORT}")
+        return ip_hop(mine.name, here, target)
     if here.scheme == target.scheme == "ethernet" and here.host == target.host:
         return HopSpec(DoorKind.ETHERNET, mine.name, there.net_id)
     return None
+
+
+def ip_hop(port: str, here: InterfaceUri, there: InterfaceUri) -> HopSpec | None:
+    """Return the hop by the EAP port *port*, at *here*, to another one at *there*.
+
+    Both are of IP.  None says that they cannot reach each other: one of them is on its host only.
+    """
+    own, other = read_address(here.host), read_address(there.host)
+    if other.is_unspecified or (not own.is_unspecified and own.is_loopback != other.is_loopback):
+        return None
+    kind = DoorKind.UDP if here.scheme == there.scheme == "udp" else DoorKind.TCP
+    return HopSpec(kind, port, f"{there.host}:{there.port or EAP_PORT}")
+
+
+@cache
+def read_address(host: str) -> IPv4Address:
+    """Read an address that is one of very many pairs in a large plant."""
+    return IPv4Address(host)
 
 
 def _complete(text: str) -> str:
@@ -100,7 +114,7 @@ def _complete(text: str) -> str:
 
 def _by_ams_tcp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
     del ports
-    host, port = _split(rest, AMS_TCP_PORT)
+    host, port = parse_host(rest, AMS_TCP_PORT)
     return HopSpec(DoorKind.AMS_TCP, "", f"{host}:{port}")
 
 
@@ -145,18 +159,8 @@ def _first(ports: Sequence[DirectoryPort], schemes: tuple[str, ...]) -> str:
 
 
 def _ip_address(text: str) -> str:
-    host, port = _split(text, EAP_PORT)
+    host, port = parse_host(text, EAP_PORT)
     try:
         return f"{IPv4Address(host)}:{port}"
     except AddressValueError as exc:
         raise ValueError(f"{host!r} is no IPv4 address: {exc}") from None
-
-
-def _split(text: str, usual: int) -> tuple[str, int]:
-    """Return host and port."""
-    host, colon, port = text.rpartition(":")
-    if not colon:
-        return text, usual
-    if not host or not (port.isascii() and port.isdigit() and 0 < int(port) <= _MAX_PORT):
-        raise ValueError(f"{text!r} is no HOST:PORT (port 1 to {_MAX_PORT})")
-    return host, int(port)

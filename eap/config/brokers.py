@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from eap.aoe.spec import MqttSpec, TlsSpec
-from eap.config.hosts import parse_host
 from eap.config.structs import Route, Station, Tls
+from eap.ids import parse_host
 
 URL = "mqtt://HOST[:PORT], or mqtts:// with TLS"
 _PORTS = {"mqtt": 1883, "mqtts": 8883}

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
-from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from eap.aoe.spec import DoorKind, HopSpec
-from eap.codec.ethercat import EAP_PORT
+from eap.aoe.via import ip_hop, read_address
 from eap.config.index import Index
 from eap.config.structs import Port, Station
-from eap.ids import InterfaceUri, MacAddr, NetId
+from eap.ids import MacAddr, NetId
 from eap.pd.spec import PortKind
 
 _IP_SCHEMES = {"udp", "tcp"}
@@ -74,28 +72,15 @@ def _hop(
     """
     uri, target = index.uris[own], index.uris[other]
     if uri.scheme in _IP_SCHEMES and target.scheme in _IP_SCHEMES:
-        return _ip_hop(own[1], uri, target)
+        hop = ip_hop(own[1], uri, target)
+        bits = (int(read_address(uri.host)) ^ int(read_address(target.host))).bit_length()
+        return None if hop is None else (hop, bits)
     if uri.scheme == target.scheme == "ethernet":
         port, there = index.ports[own], index.ports[other]
         if is_wanted or (uri.host == target.host and _vid(port) == _vid(there)):
             address = MacAddr.parse(there.mac) if there.mac else NetId.parse(there.net_id)
             return HopSpec(DoorKind.ETHERNET, own[1], str(address)), 0
     return None
-
-
-def _ip_hop(port: str, uri: InterfaceUri, target: InterfaceUri) -> tuple[HopSpec, int] | None:
-    here, there = _address(uri.host), _address(target.host)
-    if there.is_unspecified or (not here.is_unspecified and here.is_loopback != there.is_loopback):
-        return None
-    kind = DoorKind.UDP if uri.scheme == target.scheme == "udp" else DoorKind.TCP
-    hop = HopSpec(kind, port, f"{target.host}:{target.port or EAP_PORT}")
-    return hop, (int(here) ^ int(there)).bit_length()
-
-
-@cache
-def _address(host: str) -> IPv4Address:
-    """Read an address that is one of very many pairs in a large plant."""
-    return IPv4Address(host)
 
 
 def _vid(port: Port) -> int:

@@ -14,6 +14,7 @@ from eap.appliance.discards import Refusal
 from eap.appliance.services.ams_uplink import AmsUplink, Hops, Peer
 from eap.appliance.services.routing.service import Carrier
 from eap.codec.amstcp import AMS_TCP_PORT
+from eap.ids import parse_host
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +84,7 @@ class AmsUplinks:
 
     def _open(self, hop: Way) -> None:
         try:
-            peer = parse_peer(hop.connection)
+            peer = Peer(*parse_host(hop.connection, AMS_TCP_PORT))
         except ValueError as exc:
             logger.warning("a route leads nowhere: %s", exc)
             return
@@ -108,15 +109,3 @@ class AmsUplinks:
     def _start(self, hop: Way) -> None:
         if self._group is not None:
             self._tasks[hop] = self._group.create_task(self._uplinks[hop].serve())
-
-
-def parse_peer(address: str) -> Peer:
-    """Read ``HOST`` or ``HOST:PORT``.
-
-    Raises:
-        ValueError: it is neither.
-    """
-    host, _, port = address.partition(":")
-    if not host or (port and not (port.isdecimal() and 0 < int(port) < 1 << 16)):
-        raise ValueError(f"{address!r} is not a host, or a host and a TCP port (plc:48898)")
-    return Peer(host, int(port or AMS_TCP_PORT))

@@ -24,9 +24,8 @@ from eap.codec.ads import AdsError
 from eap.codec.ams import SYSTEM_PORT, AmsHeader
 from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
 from eap.codec.amstcp import AMS_TCP_PORT
-from eap.config.hosts import parse_host
 from eap.errors import ControlError, EnvironmentalError
-from eap.ids import STATION_OCTETS, NetId
+from eap.ids import STATION_OCTETS, NetId, parse_host
 
 BURST = 10
 """Requests that are looked at, at once; one a second for long.  Passwords take time to guess."""

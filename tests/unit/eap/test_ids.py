@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +14,7 @@ from eap.ids import (
     InterfaceUri,
     MacAddr,
     NetId,
+    parse_host,
     prefix_text,
 )
 
@@ -140,3 +143,41 @@ def test_destination_mac_has_one_spelling() -> None:
 def test_destination_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is not a"):
         Destination.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        ("192.168.1.5", "192.168.1.5", 48898),
+        ("192.168.1.5:4000", "192.168.1.5", 4000),
+        ("plc", "plc", 48898),
+        ("plc-3.line_1.example:1", "plc-3.line_1.example", 1),
+    ],
+)
+def test_a_host_has_a_name_or_an_address(text: str, host: str, port: int) -> None:
+    assert parse_host(text, 48898) == (host, port)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "'' is no name of a host"),
+        ("-a", "'-a' is no name of a host"),
+        ("a b", "'a b' is no name of a host"),
+        ("a..b", "'a..b' is no name of a host"),
+        ("a" * 64, "is no name of a host"),
+        (".".join(["abcdefgh"] * 29), "is no name of a host"),
+        ("1.2.3", "'1.2.3' is not the IPv4 address of a host"),
+        ("1.2.3.256", "'1.2.3.256' is not the IPv4 address of a host"),
+        ("239.1.1.1", "is not the IPv4 address of a host"),
+        ("0.0.0.0", "is not the IPv4 address of a host"),
+        ("255.255.255.255", "is not the IPv4 address of a host"),
+        ("plc:0", "'0' is not a port (1 to 65535)"),
+        ("plc:65536", "'65536' is not a port (1 to 65535)"),
+        ("plc:", "'' is not a port (1 to 65535)"),
+        ("::1", "is not a port"),
+    ],
+)
+def test_what_is_no_host_says_why(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        parse_host(text, 1)

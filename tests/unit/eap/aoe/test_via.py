@@ -61,6 +61,12 @@ def test_places(text: str, hop: HopSpec) -> None:
     assert parse_via(text, FAR, OWN, PLANT) == hop
 
 
+def test_station_at_all_addresses_of_its_host_reaches_others_and_that_host() -> None:
+    own = PLANT.stations["s6"]
+    for name, address in (("s2", "10.0.0.2"), ("s7", "127.0.0.7")):
+        assert parse_via(name, FAR, own, PLANT).address == f"{address}:34980"
+
+
 def test_port_is_chosen() -> None:
     assert parse_via("tcp:127.0.0.9", FAR, OWN, PLANT, port="eap2").port == "eap2"
     with pytest.raises(ValueError, match="no EAP port here is on udp: eap2"):
@@ -79,8 +85,8 @@ def test_port_is_chosen() -> None:
         ("s5", "no port of s1 shares an interface with it"),
         ("s6", "no port of s1 shares an interface with it"),
         ("udp:plc", "'plc' is no IPv4 address"),
-        ("udp:10.0.0.9:0", "is no HOST:PORT"),
-        ("ams-tcp:plc:x", "is no HOST:PORT"),
+        ("udp:10.0.0.9:0", "'0' is not a port"),
+        ("ams-tcp:plc:x", "'x' is not a port"),
         ("ethernet:eth0", "is not a MAC address"),
         ("ethernet:1.2.3", "is not an AMS NetID"),
         ("mqtt:line/x", "is not an AMS NetID"),

@@ -11,8 +11,7 @@ import pytest
 
 from eap.aoe.routes import Route
 from eap.aoe.way import Door, Way
-from eap.appliance.services.ams_uplink import Peer
-from eap.appliance.services.ams_uplinks import AmsUplinks, parse_peer
+from eap.appliance.services.ams_uplinks import AmsUplinks
 from eap.ids import NetId
 from tests.support.eventually import eventually
 
@@ -143,18 +142,4 @@ def test_address_that_is_none_is_said(caplog):
     router = Router(route("plc:nothing"))
     AmsUplinks(router, [], [].append)
     assert router.doors == {}
-    assert "'plc:nothing' is not a host" in caplog.messages[0]
-
-
-@pytest.mark.parametrize(
-    ("text", "peer"),
-    [("10.0.0.1", Peer("10.0.0.1", 48898)), ("plc.local:5000", Peer("plc.local", 5000))],
-)
-def test_addresses(text, peer):
-    assert parse_peer(text) == peer
-
-
-@pytest.mark.parametrize("text", ["", ":48898", "plc:x", "plc:0", "plc:65536", "plc:1:2"])
-def test_what_is_no_address(text):
-    with pytest.raises(ValueError, match="is not a host"):
-        parse_peer(text)
+    assert "'nothing' is not a port" in caplog.messages[0]
