@@ -39,6 +39,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+# A width that readline found out for pytest goes on to xdist's workers: tables would follow it.
+os.environ.pop("COLUMNS", None)
+
 _CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_SYS_ADMIN": 21}
 """What a network namespace with a veth pair and a raw socket takes: name to bit."""
 
