@@ -3,6 +3,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from eap.appliance.change import needs_new_start
+from eap.pd.gateway import GatewaySpec
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec
 from tests.unit.eap.appliance.conftest import eap_port, left
 
@@ -42,3 +43,9 @@ def test_a_bus_is_not_written_out():
     before = replace(left(), ports=(BUS,))
     after = replace(left(), ports=(replace(BUS, bus=BusPortSpec("/y.yaml")),))
     assert needs_new_start(before, after) == [f"port bus0: bus is another one{END}"]
+
+
+def test_nor_is_what_a_gateway_is_told():
+    before = replace(left(), ports=(replace(BUS, gateway=GatewaySpec()),))
+    after = replace(left(), ports=(replace(BUS, gateway=GatewaySpec(silent=True)),))
+    assert needs_new_start(before, after) == [f"port bus0: gateway is another one{END}"]
