@@ -222,7 +222,7 @@ class RequestRow(Document, frozen=True, kw_only=True):
 
     Attributes:
         at: Wall clock, seconds of Unix time.
-        outcome: ``answered``, ``failed``, ``loop``, ``late`` or ``dropped``.
+        outcome: ``answered``, ``failed``, ``denied``, ``loop``, ``late`` or ``dropped``.
         service: Of ADS; empty where the packet could not be read, as with the next two.
         target: NetID and AMS port.
         source: NetID and AMS port.
