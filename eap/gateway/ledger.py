@@ -151,3 +151,28 @@ class Ledger:
             return False
         client.credit -= 1
         return True
+
+
+class Ticket:
+    """A request that was taken, until it is answered.
+
+    It has to be given back before the answer goes out: who has that may send the same octets anew.
+
+    Args:
+        ledger: That took it.
+        way: Connection, or address, of the client.
+        frame: All octets of the request.
+    """
+
+    __slots__ = ("_frame", "_ledger", "_way")
+
+    def __init__(self, ledger: Ledger, way: Way, frame: bytes) -> None:
+        self._ledger: Ledger | None = ledger
+        self._way = way
+        self._frame = frame
+
+    def give_back(self) -> None:
+        """The request waits no more; harmless the second time."""
+        ledger, self._ledger = self._ledger, None
+        if ledger is not None:
+            ledger.answered(self._way, self._frame)

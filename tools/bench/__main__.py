@@ -30,7 +30,8 @@ from tools.bench.settings import Settings, quick
 
 NAMES = (
     "throughput", "latency", "poll", "lateness", "solar", "limits", "receive", "objects", "change",
-    "routing", "ads", "files", "startup", "acyclic", "cycle", "plantbus", "recovery", "segment",
+    "routing", "ads", "gateway", "files", "startup", "acyclic", "cycle", "plantbus", "recovery",
+    "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
 BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"

@@ -12,7 +12,7 @@ from eap.appliance.services.gateway.slave_session import Reply
 from eap.appliance.services.gateway.tally import Tally
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
 from eap.gateway import dialect
-from eap.gateway.ledger import Ledger
+from eap.gateway.ledger import Ledger, Ticket
 from eap.gateway.refusal import Reason, refuse
 
 Send: TypeAlias = Callable[[bytes], None]
@@ -26,6 +26,13 @@ class Request(NamedTuple):
     body: bytes
     way: Way
     send: Send
+    ticket: Ticket | None = None
+    """None if it was not taken."""
+
+    def give_back(self) -> None:
+        """Note that it waits no more."""
+        if self.ticket is not None:
+            self.ticket.give_back()
 
 
 class Answering:
@@ -54,6 +61,8 @@ class Answering:
         reasons = [each.reason for each in replies]
         self.tally.note(station, request.header.type, reasons, took_ns)
         self._note_refusals(request, request.header.type, reasons)
+        if address == request.header.address:  # not one of many
+            request.give_back()
         for reply in replies:
             if reply.reason is not None and self._is_silent:
                 continue
@@ -71,6 +80,7 @@ class Answering:
         address = request.header.address
         self.tally.note(address, kind, [reason], took_ns)
         self._note_refusals(request, kind, [reason])
+        request.give_back()
         if not (self._is_silent and reason is not None):
             request.send(encode_frame(dialect.encode_header(kind, address), body))
 

@@ -13,14 +13,14 @@ from functools import partial
 from time import monotonic_ns
 from typing import NamedTuple, TypeAlias
 
-from eap.aoe.access import AccessList, Verdict
+from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
 from eap.appliance.services.gateway.answering import Answering, Request, Send, refusals
 from eap.appliance.services.gateway.dialect_desk import DialectDesk
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
-from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Target, result_of
+from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Judged, Target, result_of
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.sessions import SessionKey, Sessions
@@ -34,7 +34,7 @@ from eap.appliance.services.gateway.slave_session import (
 from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.gateway import dialect
 from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, RemoteSlave, Slave
-from eap.gateway.ledger import Admission, ClientLimits, Ledger
+from eap.gateway.ledger import Admission, ClientLimits, Ledger, Ticket
 from eap.gateway.refusal import Reason
 from eap.gateway.rights import operation_of
 from eap.ids import NetId
@@ -60,19 +60,6 @@ class Settings(NamedTuple):
     limits: ClientLimits = ClientLimits()
     name: str = ""
     """Of the bus port, for log lines."""
-
-
-class _Judged(NamedTuple):
-    """What a request does, to whom, and whether it may."""
-
-    station: int
-    target: Target
-    operation: Operation | None
-    verdict: Verdict | None
-
-    @property
-    def is_allowed(self) -> bool:
-        return self.verdict is None or self.verdict.is_allowed
 
 
 class MailboxGateway:
@@ -159,12 +146,12 @@ class MailboxGateway:
         if admission is Admission.CROWDED:
             self._answering.refuse(request, Reason.CROWDED)
             return None
+        request = request._replace(ticket=Ticket(self.ledger, way, frame))
         if self._answer_at_once(request):
-            self.ledger.answered(way, frame)
             return None
         task = asyncio.get_running_loop().create_task(self._serve(request))
         self._tasks.add(task)
-        task.add_done_callback(partial(self._done, way, frame))
+        task.add_done_callback(partial(self._done, request))
         return task
 
     def connection_closed(self, way: Way) -> None:
@@ -197,11 +184,11 @@ class MailboxGateway:
         self._masters.close()
         self._remotes.close()
 
-    def _done(self, way: Way, frame: bytes, task: asyncio.Task[None]) -> None:
+    def _done(self, request: Request, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
-        self.ledger.answered(way, frame)
+        request.give_back()
         if not task.cancelled() and (error := task.exception()) is not None:
-            logger.error("gateway: a request of %s failed", way, exc_info=error)
+            logger.error("gateway: a request of %s failed", request.way, exc_info=error)
 
     async def _serve(self, request: Request) -> None:
         kind = dialect.kind_of(request.header)
@@ -225,7 +212,7 @@ class MailboxGateway:
 
     def _answer_at_once(self, request: Request) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
-        header, body, way, _ = request
+        header, body, way = request[:3]
         start_ns = monotonic_ns()
         if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
             return False
@@ -282,16 +269,16 @@ class MailboxGateway:
         operation: Operation | None,
         *,
         by_rule: bool = False,
-    ) -> _Judged:
+    ) -> Judged:
         if operation is None:  # a step of what was judged when it began
-            return _Judged(station, target, None, None)
+            return Judged(station, target, None, None)
         verdict = self.guard.judge(way, target, operation, by_rule=by_rule)
-        return _Judged(station, target, operation, verdict)
+        return Judged(station, target, operation, verdict)
 
     def _finish(
         self,
         request: Request,
-        judged: _Judged,
+        judged: Judged,
         address: int,
         replies: Sequence[Reply],
         start_ns: int,

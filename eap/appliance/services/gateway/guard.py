@@ -42,6 +42,27 @@ class Target(NamedTuple):
     port: int
 
 
+class Judged(NamedTuple):
+    """What a request does, to whom, and whether it may.
+
+    Attributes:
+        station: Mailbox address that is counted.
+        target: Whom rules name.
+        operation: None for a step of what was judged when it began.
+        verdict: Likewise.
+    """
+
+    station: int
+    target: Target
+    operation: Operation | None
+    verdict: Verdict | None
+
+    @property
+    def is_allowed(self) -> bool:
+        """Whether it may be done."""
+        return self.verdict is None or self.verdict.is_allowed
+
+
 class Guard:
     """Judges requests.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eap.aoe.way import Way
-from eap.gateway.ledger import Admission, ClientLimits, Ledger
+from eap.gateway.ledger import Admission, ClientLimits, Ledger, Ticket
 
 A, B, C = (Way("udp", f"10.0.0.{number}:5") for number in (1, 2, 3))
 SECOND = 1_000_000_000
@@ -59,3 +59,13 @@ def test_who_was_silent_longest_makes_room() -> None:
     assert list(ledger.table()) == [A, C]
     ledger.admit(A, b"y", 4)
     assert list(ledger.table()) == [C, A]
+
+
+def test_a_ticket_is_given_back_once() -> None:
+    ledger = Ledger()
+    ledger.admit(A, b"a", 0)
+    ticket = Ticket(ledger, A, b"a")
+    ticket.give_back()
+    assert ledger.admit(A, b"a", 1) is Admission.TAKEN
+    ticket.give_back()
+    assert ledger.waiting(A) == 1

@@ -549,3 +549,22 @@ def test_the_dialect_of_who_may_only_read() -> None:
         assert frame[8:] == bytes.fromhex("0020 80 4060 00 02000106")
 
     play(scene)
+
+
+@pytest.mark.parametrize("address", [0, 1001])
+def test_the_same_octets_right_behind_the_answer_are_a_new_request(address: int) -> None:
+    async def scene(desk: Desk) -> None:
+        answers: list[bytes] = []
+        header = MailboxHeader(0, address, type=COE, counter=3)
+
+        def ask_again(octets: bytes) -> None:
+            answers.append(octets)
+            if len(answers) < 6:
+                desk.gateway.receive(header, bytes.fromhex(VENDOR), HERE, ask_again)
+
+        desk.gateway.receive(header, bytes.fromhex(VENDOR), HERE, ask_again)
+        await desk.gateway.wait_idle()
+        assert len(answers) == 6
+        assert desk.gateway.ledger.waiting(HERE) == 0
+
+    play(scene)
