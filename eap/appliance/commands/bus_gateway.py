@@ -18,7 +18,7 @@ from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import AlStatus
 from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
-from eap.gateway.address import MASTER_ADDRESS
+from eap.gateway.address import MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.client import GatewayClient
 from eap.gateway.slaves import MasterSlave
 from eap.od.abort import SdoAbortError
@@ -44,15 +44,21 @@ class GatewayBus:
         return [_slave(each) for each in self._slaves]
 
     def find(self, name: str) -> Slave:
-        """Return the slave with a station address or a name, the master for 0."""
+        """Return the slave with a station address or a name, the master for 0.
+
+        Virtual addresses, from 0x8000 on, are for the gateway to know.
+        """
         if name in {"0", "master"}:
             return msgspec.structs.replace(_unknown(MASTER_ADDRESS), name="master")
+        number = _number(name)
+        if number >= VIRTUAL_BIT:
+            return _unknown(number)  # the gateway knows whom it means
         try:
             slaves = self.scan()
         except (SdoAbortError, MailboxRefusedError):
-            if not name.isdecimal():
+            if number < 0:
                 raise
-            slaves = [_unknown(int(name))]  # of a master without a dictionary
+            slaves = [_unknown(number)]  # of a master without a dictionary
         return choose(slaves, name)
 
     def converse(
@@ -87,9 +93,16 @@ class GatewayBus:
         for each in self._slaves or ():
             if each.station == slave.station and each.to_slave:
                 return MailboxSizes(each.to_slave, each.to_master)
-        if self._slaves is None:
+        if self._slaves is None or slave.station >= VIRTUAL_BIT:
             return MailboxSizes()
         raise no_mailbox(slave, state_name(slave.status.state))
+
+
+def _number(text: str) -> int:
+    try:
+        return int(text, 0)
+    except ValueError:
+        return -1
 
 
 def _unknown(station: int) -> Slave:

@@ -37,6 +37,13 @@ def test_slaves_and_the_master(bus) -> None:
         bus.find("7")
 
 
+def test_virtual_addresses_are_the_gateways_business(bus) -> None:
+    slave = bus.find("0x9001")
+    assert slave.station == 0x9001
+    with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL"):
+        bus.converse(slave, lambda _: coe_client.upload(0x2000, 0), "x")
+
+
 def test_objects(bus) -> None:
     write_entry(bus, "drive", 0x2000, 0, "77", kind=None, complete=False)
     assert read_entry(bus, "drive", 0x2000, 0, kind=None, complete=False)["value"] == 77
