@@ -44,7 +44,6 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         address: That they go to.
         target: NetID of the target over there.
         state: Of the route: ``up``, ``down`` or ``unknown``.
-        round_trip_us: Of that hop alone, None if nobody measured it.
         why: Why it passes nothing on; empty if it does.
         may: What access rules let the asker do: true, false, or null if that depends on the object.
         error: Of ADS, why the router that was asked next did not answer; 0 if there was none.
@@ -59,7 +58,6 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     address: str = ""
     target: str = ""
     state: str = ""
-    round_trip_us: int | None = None
     why: str = ""
     may: dict[AccessService, bool | None] = {}
     error: int = 0
@@ -83,7 +81,6 @@ def report_of(station: str, net_id: NetId, target: NetId, location: Location) ->
         address=route.hop.connection,
         target=str(route.to_real(target)),
         state=found.state,
-        round_trip_us=None if found.round_trip_ns is None else found.round_trip_ns // 1000,
     )
 
 

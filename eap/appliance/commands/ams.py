@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, TypeVar
 
-from eap.appliance.commands.client import connect
+from eap.appliance.commands.client import Client, connect
 from eap.appliance.control import ErrorCode
 from eap.errors import ControlError
+
+T = TypeVar("T")
 
 TRACE_S = 60.0
 SCAN_S = 120.0
@@ -45,19 +48,39 @@ def scan(plant: str | None = None, via: str | None = None) -> list[dict[str, Any
 def _ask_first(
     plant: str | None, via: str | None, method: str, patience_s: float, **params: Any
 ) -> dict[str, Any]:
-    """Return the answer of the first appliance that knows the names in a request."""
+    def ask(client: Client) -> dict[str, Any]:
+        answer: dict[str, Any] = client.request_within(patience_s, method, via=via or "", **params)
+        return answer
+
+    with first_that_knows(ask, plant, via) as (_, answer):
+        return answer
+
+
+@contextmanager
+def first_that_knows(
+    ask: Callable[[Client], T], plant: str | None, via: str | None = None
+) -> Iterator[tuple[Client, T]]:
+    """Ask one appliance after the other; give the first that knows the names, and its answer.
+
+    Args:
+        ask: Raises ControlError where a name is not known.
+        plant: Of the appliance; None for any.
+        via: Station that has to run there; None for any.
+
+    Raises:
+        ControlError: nothing runs, nobody knows the names, or *ask* failed in another way.
+    """
     unknown: ControlError | None = None
     with ExitStack() as stack:
         for client in [stack.enter_context(each) for each in connect(plant, via)]:
             try:
-                answer: dict[str, Any] = client.request_within(
-                    patience_s, method, via=via or "", **params
-                )
+                answer = ask(client)
             except ControlError as exc:
                 if exc.code != ErrorCode.UNKNOWN_NAME:
                     raise
                 unknown = unknown or exc
             else:
-                return answer
+                yield client, answer
+                return
     assert unknown is not None  # noqa: S101  connect() found at least one
     raise unknown

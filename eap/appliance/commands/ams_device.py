@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 from eap.aoe.ads_operation import Operation, OperationOutcome, ReadState
 from eap.aoe.ads_query import decode_outcome, encode_query
-from eap.appliance.commands.client import Client, connect
+from eap.appliance.commands.ams import first_that_knows
+from eap.appliance.commands.client import Client
 from eap.appliance.control import ErrorCode
 from eap.codec.ads import AdsError
 from eap.errors import ControlError
@@ -78,18 +79,6 @@ def open_ams(target: str, plant: str | None) -> Iterator[AmsDevice]:
     Raises:
         ControlError: nothing runs, or nobody knows the target.
     """
-    unknown: ControlError | None = None
-    with ExitStack() as stack:
-        for client in [stack.enter_context(each) for each in connect(plant)]:
-            device = AmsDevice(client, target)
-            try:
-                device.ask(ReadState())
-            except ControlError as exc:
-                if exc.code != ErrorCode.UNKNOWN_NAME:
-                    raise
-                unknown = unknown or exc
-            else:
-                yield device
-                return
-    assert unknown is not None  # noqa: S101  connect() found at least one
-    raise unknown
+    with first_that_knows(lambda each: AmsDevice(each, target).ask(ReadState()), plant) as found:
+        client, _ = found
+        yield AmsDevice(client, target)

@@ -21,6 +21,8 @@ from eap.od.model import Access, ObjectCode
 _ROOM = 0x20002
 """Octets of the longest description: a list of all indexes there can be."""
 _COMPLETE = 0x100
+_LIST_TYPE = 2
+"""Octets in front of the indexes of a list."""
 _PADDED = 2
 """Octets of subindex 0 in a whole object."""
 _UNTOLD = frozenset((AdsError.NOT_FOUND, AdsError.SERVICE, AdsError.INDEX_GROUP, AdsError.GENERAL))
@@ -39,8 +41,8 @@ class AdsOd:
     def objects(self) -> list[ObjectInfo]:
         """Return all objects that the device describes, without their entries."""
         body = self._read(IndexGroup.OBJECT_LIST, ListType.ALL << 16, "object list")
-        _, *indexes = struct.unpack(f"<{len(body) // 2}H", body[: len(body) // 2 * 2])
-        return [self._object(index) for index in indexes]
+        indexes = body[_LIST_TYPE : len(body) // 2 * 2]
+        return [self._object(index) for (index,) in struct.iter_unpack("<H", indexes)]
 
     def describe(self, index: int) -> ObjectInfo:
         """Return one object with its entries."""

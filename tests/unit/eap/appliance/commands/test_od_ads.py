@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.appliance.commands.ams_device import AmsRefusedError, open_ams
+from eap.appliance.commands.ams_device import AmsDevice, AmsRefusedError, open_ams
 from eap.appliance.commands.od_ads import AdsOd
 from eap.errors import ControlError
 from tests.support.adstarget import TARGET, AdsTarget
@@ -29,6 +29,12 @@ def far(target):
 def test_objects(far):
     names = {each.index: (each.name, each.code, each.max_subindex) for each in far.objects()}
     assert names[0xD000] == ("TxPD 0", "RECORD", 7)
+
+
+@pytest.mark.parametrize("octets", [b"", b"\1", b"\1\0", b"\1\0\0"])
+def test_list_without_objects(far, monkeypatch, octets):
+    monkeypatch.setattr(AmsDevice, "demand", lambda *_: octets)
+    assert far.objects() == []
 
 
 def test_description(far):
