@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple, TypeAlias
 
 from eap.codec.ams import AmsHeader
-from eap.codec.amstcp import AmsTcpHeader, decode_prefix
+from eap.codec.amstcp import AmsTcpHeader, RouterCommand, decode_prefix
 from eap.codec.wire import Buffer
+from eap.errors import MalformedError
 
 
 class TooLong(NamedTuple):
@@ -17,7 +18,18 @@ class TooLong(NamedTuple):
     """Of the whole packet in octets, as its prefix says."""
 
 
-Piece: TypeAlias = bytes | TooLong
+class Asked(NamedTuple):
+    """What a local client asks the router itself."""
+
+    command: RouterCommand
+    data: bytes
+
+
+Piece: TypeAlias = bytes | TooLong | Asked
+
+_COMMANDS = frozenset(RouterCommand)
+_LONGEST_COMMAND = 16
+"""Octets behind the prefix of one."""
 
 
 class PacketCutter:
@@ -69,6 +81,8 @@ class PacketCutter:
         start = AmsTcpHeader.SIZE
         if len(self._buffer) < start:
             return None
+        if int.from_bytes(self._buffer[:2], "little") in _COMMANDS:
+            return self._cut_command()
         length = decode_prefix(self._buffer)
         if length > self._limit:
             return self._cut_header(length)
@@ -77,6 +91,21 @@ class PacketCutter:
         packet = bytes(self._buffer[start : start + length])
         del self._buffer[: start + length]
         return packet
+
+    def _cut_command(self) -> Asked | None:
+        start, prefix = AmsTcpHeader.SIZE, AmsTcpHeader.decode(self._buffer)
+        end = start + prefix.length
+        if prefix.length > _LONGEST_COMMAND:
+            raise MalformedError(
+                f"length {prefix.length} behind a command, expected {_LONGEST_COMMAND} or less",
+                layout="AmsTcpHeader",
+                offset=0,
+            )
+        if len(self._buffer) < end:
+            return None
+        asked = Asked(RouterCommand(prefix.reserved), bytes(self._buffer[start:end]))
+        del self._buffer[:end]
+        return asked
 
     def _cut_header(self, length: int) -> TooLong | None:
         start = AmsTcpHeader.SIZE

@@ -7,11 +7,14 @@ Rule 3: a connection that this side opened is always read from: what comes are a
 two stations that wait for each other to read would wait for ever.
 Rule 4: a connection has a name that no other one ever has: clients of one host share its NetID, and
 often ports and numbers of requests too.
+Rule 5: who asks for an AMS address, as local clients of a TwinCAT router do, is given one to ask
+by; answers come back by the connection, so nothing is kept of it.
 """
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import socket
 from collections.abc import Iterable
@@ -20,13 +23,19 @@ from typing import Protocol
 import msgspec
 
 from eap.aoe.answer import AmsAnswer, response_to
-from eap.aoe.stream import PacketCutter, Piece, TooLong
+from eap.aoe.stream import Asked, PacketCutter, Piece, TooLong
 from eap.appliance.discards import Refusal
 from eap.appliance.services.ams_window import AmsWindow
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
-from eap.codec.amstcp import encode_with_prefix
+from eap.codec.amstcp import (
+    RouterCommand,
+    encode_net_id,
+    encode_opened_port,
+    encode_with_prefix,
+)
 from eap.errors import MalformedError
+from eap.ids import NetId
 
 LONGEST_PACKET = 256 << 10
 """Octets of an AMS packet; nothing here has a value a quarter as long."""
@@ -42,6 +51,8 @@ _RECEIVED = memoryview(bytearray(64 << 10))
 kernel and given back each time, which takes longer than all the rest."""
 _PER_TURN = 8
 """Packets of one connection before others have their turn."""
+_PORTS = itertools.cycle(range(32768, 40960))
+"""For clients that ask for one, as a TwinCAT router numbers them."""
 _PROBE_AFTER_S = 30
 _PROBES = 3
 _PROBE_S = 10
@@ -208,7 +219,7 @@ class AmsConnection(asyncio.BufferedProtocol):
             try:
                 piece = self._cutter.next_piece()
             except MalformedError as exc:
-                self._break_off(exc)
+                self._break_off(str(exc))
                 return
             if piece is None:
                 self._read_on()
@@ -225,11 +236,11 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._is_held = False
             self._transport.resume_reading()
 
-    def _break_off(self, exc: MalformedError) -> None:
+    def _break_off(self, why: str) -> None:
         """Read no more: these are no AMS packets."""
-        logger.debug("AMS/TCP connection %s closed: %s", self.name, exc)
+        logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
         self._taker.refuse(Refusal.AMS_TYPE)
-        self._why = f"no AMS packets: {exc}"
+        self._why = f"no AMS packets: {why}"
         self._cutter = PacketCutter(0)
         self._has_ended = True
         self._hold()
@@ -242,12 +253,30 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _take(self, piece: Piece) -> None:
         if isinstance(piece, TooLong):
             self._refuse_length(piece.header)
+        elif isinstance(piece, Asked):
+            self._answer_client(piece)
         elif int.from_bytes(piece[20:24], "little") != len(piece) - AmsHeader.SIZE:
             self._refuse_length(AmsHeader.decode(piece))
         elif self._window.take_in(piece):
             self._taker.take_answer(piece, self)
         else:
             self._taker.take_packet(piece, self)
+
+    def _answer_client(self, asked: Asked) -> None:
+        net_id = NetId.parse(f"{self.host}.1.1")
+        port = int.from_bytes(asked.data, "little")
+        if self._is_ours:
+            self._break_off("a router that asks for an address")
+        elif asked.command is RouterCommand.NET_ID:
+            self._transport.write(encode_net_id(net_id))
+        elif asked.command is RouterCommand.CLOSE_PORT:
+            self._why = "the client gave its port back"
+            self._has_ended = True
+            self._close_when_done()
+        elif port:
+            self._break_off(f"programs cannot serve AMS port {port} of a router")
+        else:
+            self._transport.write(encode_opened_port(net_id, next(_PORTS)))
 
     def _refuse_length(self, header: AmsHeader) -> None:
         self._taker.refuse(Refusal.AMS_LENGTH)

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.aoe.stream import PacketCutter, TooLong
+from eap.aoe.stream import Asked, PacketCutter, TooLong
 from eap.codec.ams import AmsHeader, encode_packet
-from eap.codec.amstcp import AmsTcpHeader, encode_with_prefix
+from eap.codec.amstcp import AmsTcpHeader, RouterCommand, encode_with_prefix
 from eap.errors import MalformedError
 from eap.ids import NetId
 
@@ -93,4 +93,22 @@ def test_what_is_no_such_stream_cannot_be_cut() -> None:
     cutter.receive(encode_with_prefix(packet(1)) + b"GET / HTTP/1.1")
     assert cutter.next_piece() == packet(1)
     with pytest.raises(MalformedError, match="reserved is 0x4547"):
+        cutter.next_piece()
+
+
+def test_questions_to_the_router_stand_among_packets() -> None:
+    cutter, found = PacketCutter(LIMIT), []
+    asked = AmsTcpHeader(RouterCommand.OPEN_PORT, 2).encode() + b"\1\2"
+    for octet in asked + encode_with_prefix(packet(3)) + asked:
+        cutter.receive(bytes((octet,)))
+        found += take(cutter)
+    question = Asked(RouterCommand.OPEN_PORT, b"\1\2")
+    assert found == [question, packet(3), question]
+    assert not cutter.has_begun
+
+
+def test_question_that_is_too_long_is_none() -> None:
+    cutter = PacketCutter(LIMIT)
+    cutter.receive(AmsTcpHeader(RouterCommand.NET_ID, 17).encode())
+    with pytest.raises(MalformedError, match="length 17 behind a command, expected 16 or less"):
         cutter.next_piece()

@@ -4,8 +4,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.codec.amstcp import AmsTcpHeader, decode_prefix, encode_with_prefix
+from eap.codec.amstcp import (
+    AmsTcpHeader,
+    decode_prefix,
+    encode_net_id,
+    encode_opened_port,
+    encode_with_prefix,
+)
 from eap.errors import MalformedError, TruncatedError
+from eap.ids import NetId
 
 
 @given(st.binary(min_size=32, max_size=200), st.binary(max_size=5))
@@ -32,3 +39,10 @@ def test_every_prefix_of_it_is_truncated(size: int) -> None:
 def test_what_is_no_packet_is_refused(header: AmsTcpHeader, text: str) -> None:
     with pytest.raises(MalformedError, match=text):
         decode_prefix(header.encode())
+
+
+def test_address_of_a_local_client() -> None:
+    """As the open client ads-client takes it: command, length, NetID, port."""
+    net_id = NetId.parse("1.2.3.4.5.6")
+    assert encode_opened_port(net_id, 0x8001) == bytes.fromhex("0010 08000000 010203040506 0180")
+    assert encode_net_id(net_id) == bytes.fromhex("0210 06000000 010203040506")

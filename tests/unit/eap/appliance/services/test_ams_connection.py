@@ -78,7 +78,7 @@ class Taker:
         self.connection.send([self.waiting.pop(number)])
 
 
-def talk(script: Script, *, patience_s: float = 5, **more: Any) -> Taker:
+def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more: Any) -> Taker:
     """Run ``script(reader, writer, taker)`` on a connection, and wait for its end."""
     made: list[Taker] = []
 
@@ -90,7 +90,7 @@ def talk(script: Script, *, patience_s: float = 5, **more: Any) -> Taker:
             ours = socket.create_connection(listener.getsockname())
             theirs, (host, port) = listener.accept()
         set_options(theirs)
-        connection = AmsConnection(f"{host}:{port}#1", host, taker)
+        connection = AmsConnection(f"{host}:{port}#1", host, taker, is_ours=is_ours)
         await loop.connect_accepted_socket(lambda: connection, theirs)
         reader, writer = await asyncio.open_connection(sock=ours)
         watch = asyncio.ensure_future(look_for_slow(connection, taker, patience_s))
@@ -214,6 +214,38 @@ def test_what_is_no_ams_packet_ends_the_connection_when_all_has_been_answered(oc
     taker = talk(script, is_slow=True)
     assert taker.refused == [Refusal.AMS_TYPE]
     assert taker.why.startswith("no AMS packets: AmsTcpHeader")
+
+
+def test_local_client_is_given_an_address_to_ask_by() -> None:
+    async def script(reader, writer, taker):
+        for _ in range(2):
+            writer.write(prefixed(b"\0\0", reserved=0x1000))
+        writer.write(prefixed(bytes(4), reserved=0x1002) + ask(b"x", 9))
+        first, second = [await reader.readexactly(14) for _ in range(2)]
+        assert first[:12] == second[:12] == bytes.fromhex("0010 08000000 7f0000010101")
+        assert first[12:] != second[12:]
+        assert await reader.readexactly(12) == bytes.fromhex("0210 06000000 7f0000010101")
+        assert (await hear(reader))[:2] == (0, 9)
+        writer.write(prefixed(first[12:], reserved=1))
+        assert await reader.read() == b""
+
+    taker = talk(script)
+    assert not taker.refused
+    assert taker.why == "the client gave its port back"
+
+
+@pytest.mark.parametrize(
+    ("port", "is_ours", "why"),
+    [(30012, False, "programs cannot serve AMS port 30012"), (0, True, "a router that asks")],
+)
+def test_who_wants_to_serve_a_port_is_sent_away(port, is_ours, why) -> None:
+    async def script(reader, writer, taker):
+        writer.write(prefixed(port.to_bytes(2, "little"), reserved=0x1000))
+        assert await reader.read() == b""
+
+    taker = talk(script, is_ours=is_ours)
+    assert taker.refused == [Refusal.AMS_TYPE]
+    assert taker.why.startswith(f"no AMS packets: {why}")
 
 
 def test_answers_are_told_from_requests() -> None:

@@ -185,7 +185,7 @@ def test_there_is_a_limit_and_room_again_when_somebody_leaves(monkeypatch):
 
 def test_client_that_breaks_the_rules_is_disconnected():
     async def script(connect, door):
-        for octets in (b"\1\0" + bytes(4), question(b"x")[:10]):
+        for octets in (b"\2\0" + bytes(4), question(b"x")[:10]):
             reader, writer = await connect()
             writer.write(octets)
             assert await reader.read() == b""
