@@ -58,6 +58,9 @@ class MasterDictionary(ObjectDictionary):
         padded: Whether in complete access an entry of an even size begins at an even octet.
     """
 
+    # ETG.1510 clients ask for all there is, and take whatever stands behind the rights for a name.
+    tells_values = False
+
     def __init__(
         self,
         values: MasterValues,

@@ -15,7 +15,13 @@ from eap.od.model import Access, Entry, OdObject, OdState
 
 
 class ObjectDictionary:
-    """The objects of one device, by index."""
+    """The objects of one device, by index.
+
+    Attributes:
+        tells_values: Whether descriptions of entries hold units, defaults and limits if asked for.
+    """
+
+    tells_values = True
 
     def __init__(self, objects: Iterable[OdObject] = ()) -> None:
         self._objects: dict[int, OdObject] = {}
