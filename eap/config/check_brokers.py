@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from eap.aoe.mqtt_topics import check_network
 from eap.config.brokers import URL, Broker, brokers_of, parse_url
 from eap.config.finding import Report
 from eap.config.hosts import why_unreadable
 from eap.config.index import Index
 from eap.config.structs import Route, Station
 
-_NETWORK = "one level of a topic: a text without spaces and without / + #"
+_NETWORK = "one level of a topic: up to 128 characters, no spaces, no / + #, and no $ in front"
 _FILE = "a file, its path from the plant file on"
 _MAX_CLIENT_ID = 65_535
 
@@ -51,7 +52,7 @@ def _check_networks(station: Station, report: Report) -> None:
         path = f"{route.at}.network"
         if not route.network:
             report.add(route.at, f"broker {route.mqtt} has no network", _NETWORK)
-        elif any(each in "/+#\0" or each.isspace() for each in route.network):
+        elif not _is_network(route.network):
             report.add(path, f"network {route.network!r}", _NETWORK)
         elif route.network in first:
             line = report.line_of(f"{first[route.network].at}.network")
@@ -59,6 +60,14 @@ def _check_networks(station: Station, report: Report) -> None:
             report.add(path, f"{message} (line {line})", "each network once")
         else:
             first[route.network] = route
+
+
+def _is_network(name: str) -> bool:
+    try:
+        check_network(name)
+    except ValueError:
+        return False
+    return not any(each == "/" or each.isspace() for each in name)
 
 
 def _check_secrets(route: Route, report: Report, folder: Path) -> None:

@@ -21,6 +21,12 @@ ONE = "mqtt: mqtt://b, network: n"
         (["mqtt: mqtt://b"], "8: broker mqtt://b has no network; one level of a topic"),
         (["mqtt: mqtt://b, network: a/b"], "8: network 'a/b'; one level of a topic"),
         (["mqtt: mqtt://b, network: '+'"], "8: network '+'; one level of a topic"),
+        (["mqtt: mqtt://b, network: $x"], "8: network '$x'; one level of a topic"),
+        (["mqtt: mqtt://b, network: a b"], "8: network 'a b'; one level of a topic"),
+        (
+            [f"mqtt: mqtt://b, network: {'n' * 129}"],
+            f"8: network '{'n' * 129}'; one level of a topic",
+        ),
         ([ONE, "mqtt: mqtt://c, network: n"], "9: station left is in network 'n' already (line 8)"),
         ([f"{ONE}, password_file: line.yaml"], "8: a password without a user; user: as well"),
         (
