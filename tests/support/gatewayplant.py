@@ -10,7 +10,7 @@ from tests.support.appliance import Appliance, plants, wait_until
 DRIVE, COUPLER, SENSOR, MUTE, LAST = 1001, 1002, 1003, 1004, 1005
 """Every protocol; no mailbox; only CoE; takes nothing any more; only CoE."""
 FILE = b"firmware 1.0 of a simulated drive"
-_BUS = """\
+BUS = """\
 bus: gateway
 slaves:
   - name: drive
@@ -49,7 +49,7 @@ stations:
 def gateway_plant(address: str) -> Iterator[Appliance]:
     """Run it until its bus is in OP and *mute* is silent."""
     with plants() as farm:
-        farm.write(_BUS, "gateway.yaml")
+        farm.write(BUS, "gateway.yaml")
         appliance = farm.run(farm.write(plant_of(address)))
         wait_until(lambda: state_of(appliance) == 8)
         appliance.command("sim", "fault", "mill/bus0", "mailbox", "slave=mute")
