@@ -30,6 +30,8 @@ from eap.ids import NetId
 
 _RESPONSE = StateFlags.RESPONSE.value  # plain numbers: enums and operators of flags are slow
 _FRAGMENT = AmsCommand.FRAGMENT.value
+_PLC_PORTS = frozenset((801, 811, 821, 831, *range(851, 860)))
+"""Of the runtimes of TwinCAT 2 and 3."""
 _NOBODY = 0
 """Ticket of a request that has no answer."""
 
@@ -324,4 +326,8 @@ class Router:
 
 
 def _no_port(header: AmsHeader) -> str:
-    return f"nothing has port {header.target_port} of {header.target}"
+    text = f"nothing has port {header.target_port} of {header.target}"
+    if header.target_port in _PLC_PORTS:
+        # Where clients look that were told of no port.
+        text += ": it is no PLC; the variables of a station are at port 65535 of its EAP ports"
+    return text

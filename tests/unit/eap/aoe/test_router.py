@@ -88,6 +88,12 @@ def test_error_of_a_service_that_gives_no_reason_has_words() -> None:
     [
         (FAR_DEVICE, 7, "no route to 6.1.1.1.1.1"),
         ("5.1.1.1.2.1:1001", 6, "nothing has port 1001 of 5.1.1.1.2.1"),
+        (
+            "5.1.1.1.2.1:851",
+            6,
+            "nothing has port 851 of 5.1.1.1.2.1: it is no PLC; the variables of a station are at "
+            "port 65535 of its EAP ports",
+        ),
     ],
 )
 def test_unknown_targets_are_answered_and_named(target: str, error: int, text: str) -> None:
