@@ -91,8 +91,10 @@ def test_error_of_a_service_that_gives_no_reason_has_words() -> None:
         (
             "5.1.1.1.2.1:851",
             6,
-            "nothing has port 851 of 5.1.1.1.2.1: it is no PLC; the variables of a station are at "
-            "port 65535 of its EAP ports",
+            (
+                "nothing has port 851 of 5.1.1.1.2.1: it is no PLC; the variables of a station "
+                "are at port 65535 of its EAP ports"
+            ),
         ),
     ],
 )
