@@ -170,7 +170,7 @@ def _split_port(text: str) -> tuple[str, int]:
         raise ValueError(f"{host!r} is not an IPv4 address") from None
     if not separator:
         return address, 0
-    if not port.isdigit() or not 0 < int(port) < 65536:
+    if not port.isdecimal() or not 0 < int(port) < 65536:
         raise ValueError(f"{port!r} is not a port (1 to 65535)")
     return address, int(port)
 
@@ -185,10 +185,10 @@ def parse_host(text: str, usual_port: int) -> tuple[str, int]:
     Whether the name of a host is known is seen when it is needed.
     """
     host, separator, number = text.partition(":")
-    if separator and not (number.isdigit() and 0 < int(number) < 65536):
+    if separator and not (number.isdecimal() and 0 < int(number) < 65536):
         raise ValueError(f"{number!r} is not a port (1 to 65535)")
     labels = host.rstrip(".").split(".")
-    if all(each.isdigit() for each in labels):
+    if all(each.isdecimal() for each in labels):
         if not _is_host(host):
             raise ValueError(f"{host!r} is not the IPv4 address of a host")
     elif len(host) > _MAX_HOST_NAME or not all(map(_LABEL.fullmatch, labels)):

@@ -96,7 +96,7 @@ def parse_target(index: Index, text: str, loose: set[str]) -> list[AccessTarget]
     where, separator, number = text.partition(":")
     if not separator:
         return _targets(index, text, loose)
-    if not number.isdigit() or int(number) > _TOP_PORT:
+    if not number.isdecimal() or int(number) > _TOP_PORT:
         raise MisfitError("", f"{number!r} is no AMS port", TARGET)
     return [AccessTarget(each.net_id, int(number)) for each in _targets(index, where, loose)]
 
@@ -160,7 +160,7 @@ def _slave(index: Index, station: Station, port: Port, slave: str) -> int:
         raise MisfitError("", f"{station.name}/{port.name} has no slaves", "a bus port")
     if slave in known:
         return known[slave]
-    if slave.isdigit() and (int(slave) in known.values() or not known) and int(slave) < _TOP_PORT:
+    if slave.isdecimal() and (int(slave) in known.values() or not known) and int(slave) < _TOP_PORT:
         return int(slave)
     message = f"bus {station.name}/{port.name} has no slave {slave!r}{near(slave, known)}"
     raise MisfitError("", message, one_of([*known, *map(str, known.values())]))

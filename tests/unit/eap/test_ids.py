@@ -174,6 +174,7 @@ def test_a_host_has_a_name_or_an_address(text: str, host: str, port: int) -> Non
         ("255.255.255.255", "is not the IPv4 address of a host"),
         ("plc:0", "'0' is not a port (1 to 65535)"),
         ("plc:65536", "'65536' is not a port (1 to 65535)"),
+        ("plc:²", "'²' is not a port (1 to 65535)"),
         ("plc:", "'' is not a port (1 to 65535)"),
         ("::1", "is not a port"),
     ],

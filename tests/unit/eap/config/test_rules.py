@@ -93,6 +93,8 @@ def test_a_station_without_a_prefix_is_all_its_net_ids(plant):
         ("left/bus0/1002", "bus left/bus0 has no slave '1002'"),
         ("left:65536", "'65536' is no AMS port"),
         ("left:x", "'x' is no AMS port"),
+        ("left:²", "'²' is no AMS port"),
+        ("left/bus0/²", "bus left/bus0 has no slave '²'"),
         ("5.1.2", "'5.1.2' is no NetID, nor the first numbers of one"),
         ("5.1.2.256", "'5.1.2.256' is no NetID"),
         ("5.1.2.3.4.5.6", "'5.1.2.3.4.5.6' is no NetID"),
