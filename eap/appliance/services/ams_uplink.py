@@ -21,7 +21,7 @@ from eap.appliance.services.resolving import resolve
 CONNECT_S = 3.0
 """How long a peer may take to accept a connection."""
 FIRST_WAIT_S = 0.5
-LONGEST_WAIT_S = 15.0
+LONGEST_WAIT_S = 5.0
 """Before a connection is tried again."""
 MAX_EARLY = 64
 """Packets that wait for the first connection."""
