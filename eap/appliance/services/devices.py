@@ -66,33 +66,14 @@ class Devices:
         self.routing: dict[str, StationRouting] = {}
         self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
+        self._plant = plant
+        self._release = release
         self._images = images
         self._has_restarted = asyncio.Event()
         for station in stations:
-            name, image = station.name, images[station.name]
-            keeper = StationKeeper(station, states.get(name, DeviceState.OP), store, engine)
-            if _runs(image):
-                self._has_restarted.set()  # services before this one, in the middle of a change
-            player = SourcePlayer(station, image)
-            keeper.on_change = player.change
-            self._players.append(player)
-            identity = Identity(
-                device_name=f"EAP station {name}",
-                hardware_version=platform.machine(),
-                software_version=release,
-            )
-            device = StationDevice(keeper, ImageValues(image), identity)
-            self.by_station[name] = device
-            told = routing.get(name, RoutingSpec())
-            self.routers[name] = router = make_router(station, told)
-            self.routing[name] = StationRouting(
-                name,
-                StationRoutes(router, told, RouteStore(plant, name)),
-                RoutingStore(plant, name),
-                partial(_set_access, station, router),
-            )
-            self.routing[name].start()
-            self.ads[name] = StationAds(station, device, image, router, identity)
+            state = states.get(station.name, DeviceState.OP)
+            keeper = StationKeeper(station, state, store, engine)
+            self._add(station, keeper, routing.get(station.name, RoutingSpec()))
 
     async def serve(self) -> None:
         """Serve all of them until cancelled.
@@ -114,6 +95,30 @@ class Devices:
     def engine_has_restarted(self) -> None:
         """Tell the new engine, soon, what it may have missed."""
         self._has_restarted.set()
+
+    def _add(self, station: StationSpec, keeper: StationKeeper, told: RoutingSpec) -> None:
+        name, image = station.name, self._images[station.name]
+        if _runs(image):
+            self._has_restarted.set()  # services before this one, in the middle of a change
+        player = SourcePlayer(station, image)
+        keeper.on_change = player.change
+        self._players.append(player)
+        identity = Identity(
+            device_name=f"EAP station {name}",
+            hardware_version=platform.machine(),
+            software_version=self._release,
+        )
+        device = StationDevice(keeper, ImageValues(image), identity)
+        self.by_station[name] = device
+        self.routers[name] = router = make_router(station, told)
+        self.routing[name] = StationRouting(
+            name,
+            StationRoutes(router, told, RouteStore(self._plant, name)),
+            RoutingStore(self._plant, name),
+            partial(_set_access, station, router),
+        )
+        self.routing[name].start()
+        self.ads[name] = StationAds(station, device, image, router, identity)
 
     async def _follow_restarts(self) -> None:
         while True:
