@@ -109,8 +109,9 @@ def test_master_groups(plant: Appliance) -> None:
         assert master.read(9, 0, 6) == b"\x08\0" * 3
         command = bytes.fromhex("01ff 0000 0000 0400 0000 00000000 0000")
         assert master.ask(0x2C, 0, command, 16)[2:4] == b"\3\0"
+        assert master.u32(SDO, 0x1000 << 16) == 1100 << 16 | 5001  # its dictionary
         with pytest.raises(pyads.ADSError) as refused:
-            master.u32(SDO, 0x1018_0001)
+            master.u32(SOE, 0)
         assert refused.value.err_code == 0x702
 
 
