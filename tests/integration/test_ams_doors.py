@@ -14,7 +14,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.appliance.services.ams_shares import MAX_OF_HOST
+from eap.appliance.services.ams.ams_shares import MAX_OF_HOST
 from tests.support import aoe
 from tests.support.amsclient import AmsClient
 from tests.support.appliance import Appliance, Plants, wait_until

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from msgspec.structs import replace
 
-from eap.appliance.services.station_device import StationDevice
+from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.store import effective, settle
 from eap.device.eap_read import read_back
 from eap.errors import EngineGoneError, EngineRefusedError

@@ -12,8 +12,8 @@ from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite, 
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.service import BusService
-from eap.appliance.services.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest

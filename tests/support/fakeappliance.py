@@ -16,12 +16,12 @@ from devicebus.wire.alstatus import AlState
 from eap.appliance.control import encode_request
 from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
-from eap.appliance.services.bus_client import BusClient
-from eap.appliance.services.bus_methods import Buses
+from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_methods import Buses
+from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.appliance.services.control_server import ControlServer
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.methods import Methods
-from eap.appliance.services.segment_link import SegmentLink
 from eap.appliance.services.status import ProcessMeter, appliance_status
 from eap.appliance.station_image import StationImage
 from eap.net.image_file import ImageFile, create_image

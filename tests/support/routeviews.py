@@ -14,10 +14,10 @@ from eap.aoe.spec import (
 )
 from eap.aoe.way import Door, Way
 from eap.appliance.route_store import RouteStore
-from eap.appliance.services.route_rows import RouterView
+from eap.appliance.services.routes.route_rows import RouterView
+from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.station_routes import StationRoutes
 from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
 from tests.support.routing import KeepingCarrier, StubService

@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from eap.appliance.services.station_device import StationDevice
-from eap.appliance.services.station_keeper import StationKeeper
+from eap.appliance.services.device.station_device import StationDevice
+from eap.appliance.services.device.station_keeper import StationKeeper
 from eap.appliance.store import Store
 from eap.device.eap_content import Identity
 from eap.device.live import NothingRuns

@@ -14,7 +14,7 @@ from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.spec import AccessRule
 from eap.aoe.way import Door, Way
-from eap.appliance.services.tracing import answer_question
+from eap.appliance.services.routes.tracing import answer_question
 from eap.codec.ads import AdsError, IndexGroup, encode_result
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId

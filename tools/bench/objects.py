@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic_ns, perf_counter_ns
 
-from eap.appliance.services.image_values import ImageValues
+from eap.appliance.services.device.image_values import ImageValues
 from eap.appliance.station_image import StationImage
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill

@@ -35,7 +35,7 @@ from eap.appliance.control import (
     request_id,
 )
 from eap.appliance.control_bus import BUS_METHODS
-from eap.appliance.services.bus_methods import BusConnection, Buses
+from eap.appliance.services.bus.bus_methods import BusConnection, Buses
 from eap.appliance.services.methods import Methods, Watch
 from eap.errors import ControlError, ImageError
 from eap.od.abort import SdoAbortError

@@ -31,15 +31,15 @@ from eap.appliance.handover import (
     tell_ready,
 )
 from eap.appliance.runtime import ApplianceFolder
-from eap.appliance.services.ams_methods import AmsMethods
 from eap.appliance.services.audit import Audit
+from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_methods import Buses
+from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.appliance.services.bus_ads.service import BusService
-from eap.appliance.services.bus_client import BusClient
-from eap.appliance.services.bus_methods import Buses
 from eap.appliance.services.control_server import ControlServer
-from eap.appliance.services.device_methods import DeviceMethods
-from eap.appliance.services.devices import Devices
-from eap.appliance.services.engine_client import EngineClient
+from eap.appliance.services.device.device_methods import DeviceMethods
+from eap.appliance.services.device.devices import Devices
+from eap.appliance.services.device.engine_client import EngineClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.gateway.gateway_methods import GatewayMethods
@@ -48,12 +48,12 @@ from eap.appliance.services.gateway.opening import open_desks, open_gateways
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
-from eap.appliance.services.route_methods import RouteMethods
-from eap.appliance.services.route_rows import RouterView
+from eap.appliance.services.routes.ams_methods import AmsMethods
+from eap.appliance.services.routes.route_methods import RouteMethods
+from eap.appliance.services.routes.route_rows import RouterView
+from eap.appliance.services.routes.routing_methods import RoutingMethods
 from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.routing_methods import RoutingMethods
-from eap.appliance.services.segment_link import SegmentLink
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.status import ProcessMeter, appliance_status
 from eap.appliance.station_image import StationImage

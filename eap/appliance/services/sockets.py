@@ -12,14 +12,15 @@ from eap.aoe.spec import DoorKind
 from eap.aoe.way import Door
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
-from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
-from eap.appliance.services.ams_door import AmsClients, AmsDoor
-from eap.appliance.services.ams_questions import AmsQuestions
-from eap.appliance.services.ams_uplinks import AmsUplinks
+from eap.appliance.services.ams.ams_discovery import AmsDiscovery, RouterName
+from eap.appliance.services.ams.ams_door import AmsClients, AmsDoor
+from eap.appliance.services.ams.ams_uplinks import AmsUplinks
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.intake import FrameIntake, watch_channel
-from eap.appliance.services.route_desk import RouteDesk
+from eap.appliance.services.routes.ams_questions import AmsQuestions
+from eap.appliance.services.routes.route_desk import RouteDesk
+from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.link_watch import LinkWatch
 from eap.appliance.services.routing.mailbox_frames import FRAME_OVERHEAD
@@ -27,7 +28,6 @@ from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, Mailbo
 from eap.appliance.services.routing.mailbox_stream import LARGEST_FRAME, MailboxStreams
 from eap.appliance.services.routing.segment import Segment, SegmentCarrier
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.station_routes import StationRoutes
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME
 from eap.errors import EnvironmentalError

@@ -11,7 +11,7 @@ from typing import Any
 from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
-from eap.appliance.services.bus_status import bus_document, bus_link
+from eap.appliance.services.bus.bus_status import bus_document, bus_link
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.interface import interface_of, link_is_up

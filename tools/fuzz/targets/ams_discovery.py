@@ -13,10 +13,10 @@ from eap.aoe.spec import AmsUser, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.discards import Refusal
 from eap.appliance.route_store import RouteStore
-from eap.appliance.services.ams_discovery import AmsDiscovery, RouterName
-from eap.appliance.services.ams_questions import AmsQuestions
-from eap.appliance.services.route_desk import RouteDesk
-from eap.appliance.services.station_routes import StationRoutes
+from eap.appliance.services.ams.ams_discovery import AmsDiscovery, RouterName
+from eap.appliance.services.routes.ams_questions import AmsQuestions
+from eap.appliance.services.routes.route_desk import RouteDesk
+from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.codec.amsdiscovery import (
     decode_discovery,
     decode_text,

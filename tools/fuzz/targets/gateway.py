@@ -20,7 +20,7 @@ from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation, OperationOutcome, Read
 from eap.aoe.spec import AccessRule, AccessService
 from eap.appliance.bus_request import BusReport, Heard, SlaveReport
-from eap.appliance.services.bus_talk import Talk
+from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession

@@ -17,9 +17,9 @@ from typing import TypeVar
 from devicebus.wire.sii import SiiProtocol
 from eap.aoe.ads_operation import AdsRefusedError
 from eap.appliance.handover import PortName
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.slave_space import Asked, SlaveSpace
 from eap.appliance.services.bus_ads.transfer import Transfer
-from eap.appliance.services.bus_client import BusClient
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError

@@ -16,8 +16,8 @@ from devicebus.mailbox.soe_procedure import CLEAR, START
 from devicebus.wire.sii import SiiProtocol
 from eap.aoe.ads_operation import AdsRefusedError
 from eap.appliance.handover import PortName
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.slave_space import Asked, SlaveSpace
-from eap.appliance.services.bus_client import BusClient
 from eap.codec.ads import AdsError, IndexGroup, SoePlace
 from eap.codec.soe import DataState, Element, Idn
 from eap.codec.soeerror import SoeErrorCode

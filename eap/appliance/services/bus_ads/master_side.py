@@ -17,7 +17,7 @@ from eap.aoe.ads_operation import WriteControl
 from eap.aoe.ads_state import INIT, al_state_for, states_of
 from eap.appliance.bus_request import BusReport, SlaveReport
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.codec.ads import AdsStates
 from eap.errors import EapError
 

@@ -13,8 +13,8 @@ from devicebus.mailbox import aoe_client
 from eap.aoe.ads_operation import Operation, OperationOutcome, Write
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.appliance.handover import PortName
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.slave_space import Asked
-from eap.appliance.services.bus_client import BusClient
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from devicebus import errors
 from eap.aoe.ads_operation import AdsRefusedError
-from eap.appliance.services.ads_result import ads_result
+from eap.appliance.services.ads.ads_result import ads_result
 from eap.codec.ads import AdsError
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxError

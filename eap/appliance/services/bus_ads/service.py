@@ -31,16 +31,16 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
-from eap.appliance.services.ads_requests import answer_request
-from eap.appliance.services.ads_result import ads_result
+from eap.appliance.services.ads.ads_requests import answer_request
+from eap.appliance.services.ads.ads_result import ads_result
+from eap.appliance.services.ads.eap_ads import device_info
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.master_side import MasterSide
 from eap.appliance.services.bus_ads.master_watch import MasterWatch, Send
 from eap.appliance.services.bus_ads.raw_command import RawCommands
 from eap.appliance.services.bus_ads.results import refusal
 from eap.appliance.services.bus_ads.slave_space import Asked
 from eap.appliance.services.bus_ads.slaves import Slaves
-from eap.appliance.services.bus_client import BusClient
-from eap.appliance.services.eap_ads import device_info
 from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup

@@ -12,7 +12,7 @@ from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import AdsRefusedError
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.codec.ads import AdsError
 
 T = TypeVar("T")

@@ -18,6 +18,7 @@ from eap.aoe.ads_operation import (
 from eap.aoe.ads_state import DeviceDataSpace, al_state_for, states_of
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.handover import PortName
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.files import SlaveFiles
 from eap.appliance.services.bus_ads.idns import SlaveIdns
 from eap.appliance.services.bus_ads.master_side import MasterSide
@@ -25,7 +26,6 @@ from eap.appliance.services.bus_ads.objects import SlaveObjects
 from eap.appliance.services.bus_ads.passthrough import Passthrough
 from eap.appliance.services.bus_ads.slave_space import Asked, SlaveSpace
 from eap.appliance.services.bus_ads.vendor import SlaveVendor
-from eap.appliance.services.bus_client import BusClient
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, device_name
 from eap.ids import NetId
 

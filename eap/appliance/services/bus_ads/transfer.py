@@ -13,7 +13,7 @@ from devicebus.errors import BusError
 from devicebus.mailbox import foe_client
 from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.appliance.services.bus_talk import Talk
+from eap.appliance.services.bus.bus_talk import Talk
 from eap.codec.foe import DATA_OVERHEAD, FoeOpcode
 from eap.errors import EapError
 

@@ -14,7 +14,7 @@ from eap.aoe.ads_operation import Operation
 from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
-from eap.appliance.services.ads_result import ads_result
+from eap.appliance.services.ads.ads_result import ads_result
 from eap.appliance.services.gateway.slave_session import Reply
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader

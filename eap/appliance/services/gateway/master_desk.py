@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.master_values import MasterView
 from eap.device.eap_content import Identity

@@ -18,7 +18,7 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import DlStatus
 from eap.appliance.bus_request import BusReport, SlaveReport
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.master_look import LOOPS, PORTS, Found, Seen, detect, look_at
 from eap.errors import EapError
 from eap.od.abort import AbortCode, SdoAbortError

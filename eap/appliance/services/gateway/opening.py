@@ -9,7 +9,7 @@ from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation, OperationOutcome
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.appliance.handover import Handover, PortName
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.gateway.remote_session import RemoteSession

@@ -8,8 +8,8 @@ from typing import Protocol, TypeVar
 from devicebus.mailbox.conversation import Conversation
 from eap.appliance.bus_request import BusReport, Heard
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus_client import BusClient
-from eap.appliance.services.bus_talk import Talk
+from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_talk import Talk
 from eap.codec.mailbox import MailboxType
 
 T = TypeVar("T")

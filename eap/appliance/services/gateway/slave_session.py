@@ -22,7 +22,7 @@ from devicebus.mailbox.conversation import Ask, Message
 from devicebus.mailbox.match import has_more
 from devicebus.wire.sii import SiiProtocol
 from eap.appliance.bus_request import SlaveReport
-from eap.appliance.services.bus_talk import Talk
+from eap.appliance.services.bus.bus_talk import Talk
 from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.codec.sdoinfo import SdoInfoHeader

@@ -12,8 +12,8 @@ from eap.aoe.ads_request import encode_outcome, parse_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.hop_report import HopQuestion, encode_report
 from eap.aoe.way import Way
+from eap.appliance.services.routes.tracing import Station, answer_question
 from eap.appliance.services.routing.service import LocalRequest, Service
-from eap.appliance.services.tracing import Station, answer_question
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
 from eap.errors import CodecError

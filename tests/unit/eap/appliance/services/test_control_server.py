@@ -10,8 +10,8 @@ import pytest
 
 from eap.appliance.control import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.appliance.services import control_server
-from eap.appliance.services.bus_client import BusClient
-from eap.appliance.services.bus_methods import Buses
+from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_methods import Buses
 from eap.appliance.services.control_server import ControlServer
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.methods import Methods, Watch

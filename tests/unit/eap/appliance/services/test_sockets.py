@@ -14,8 +14,8 @@ from eap.aoe.spec import RoutingSpec
 from eap.appliance.discards import DiscardCounters
 from eap.appliance.handover import Handover
 from eap.appliance.route_store import RouteStore
+from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.sockets import open_doors
-from eap.appliance.services.station_routes import StationRoutes
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EAP_PORT
 from tests.support import aoe

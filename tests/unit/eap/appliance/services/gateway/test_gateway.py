@@ -14,7 +14,7 @@ from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.codec.mailbox import MailboxType

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from eap.appliance.bus_request import Bring, Transfer
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.master_values import FRESH_S, MasterView
 from eap.od.abort import SdoAbortError

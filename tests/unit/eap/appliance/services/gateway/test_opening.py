@@ -7,7 +7,7 @@ import asyncio
 from msgspec.structs import replace
 
 from eap.appliance.handover import BusSocket, Handover, PortName
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.opening import open_desks, open_gateways
 from eap.od.model import OdState

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from devicebus.mailbox import coe_client
-from eap.appliance.services.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.slave_link import PortLink
 from eap.codec.mailbox import MailboxType

@@ -6,14 +6,14 @@ from inspect import signature
 
 import pytest
 
-from eap.appliance.services.ams_door import AmsClients
-from eap.appliance.services.eap_ads import EapAds
-from eap.appliance.services.router_ads import RouterAds
+from eap.appliance.services.ads.eap_ads import EapAds
+from eap.appliance.services.ads.router_ads import RouterAds
+from eap.appliance.services.ads.system_ads import SystemAds
+from eap.appliance.services.ams.ams_door import AmsClients
 from eap.appliance.services.routing.local_client import LocalClient
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.appliance.services.routing.service import Carrier, Service
-from eap.appliance.services.system_ads import SystemAds
 from tests.support.routing import KeepingCarrier, StubService
 
 

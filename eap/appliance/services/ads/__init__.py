@@ -1,0 +1,1 @@
+"""What answers ADS behind the NetIDs of a station: dictionaries, variables, states, I/O list."""

@@ -1,0 +1,148 @@
+"""The ADS services of an EAP port: its dictionary, its states, the variables of its station.
+
+What changes a dictionary or a state waits for its turn, for the engine has to agree; everything
+else is answered at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+from time import monotonic_ns
+
+from eap.aoe.ads_device import AdsDevice
+from eap.aoe.ads_io import NoSegmentSpace
+from eap.aoe.ads_notifications import Client, NotificationTable
+from eap.aoe.ads_objects import ObjectSpace
+from eap.aoe.ads_operation import (
+    AdsRefusedError,
+    Operation,
+    OperationOutcome,
+    ReadWrite,
+    Write,
+    WriteControl,
+)
+from eap.aoe.ads_state import states_of
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.way import Way
+from eap.appliance.services.ads.ads_requests import begin_answer
+from eap.appliance.services.ads.ads_result import ads_result
+from eap.appliance.services.ads.image_variables import StationSymbols
+from eap.appliance.services.ads.state_control import control_state
+from eap.appliance.services.device.station_device import StationDevice
+from eap.appliance.services.routing.service import LocalRequest
+from eap.codec.ads import (
+    AdsDeviceInfo,
+    AdsError,
+    AdsRange,
+    AdsStates,
+    IndexGroup,
+    device_name,
+    encode_result,
+)
+from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
+from eap.errors import ControlError
+from eap.od.abort import SdoAbortError
+
+_READ, _DONE = AmsCommand.READ.value, AdsError.NONE.value  # members of enums are slow
+_BUSY_PAUSE_S = 0.005
+_BUSY_PAUSES = 20
+"""Before a client is told that a writer has stopped in the middle of writing."""
+
+
+class EapAds:
+    """What clients reach at the NetID of one EAP port.
+
+    Args:
+        device: Of the station.
+        port: Name of the port.
+        symbols: The station's variables.
+        info: What ReadDeviceInfo tells.
+    """
+
+    ports = frozenset((DEVICE_PORT,))
+
+    def __init__(
+        self, device: StationDevice, port: str, symbols: StationSymbols, info: AdsDeviceInfo
+    ) -> None:
+        self._device = device
+        self._port = port
+        objects = ObjectSpace(device.dictionaries[port], device.od_state, ads_result)
+        self._ads = AdsDevice(info, self._states, [objects, symbols, NoSegmentSpace()])
+
+    @property
+    def notifications(self) -> NotificationTable:
+        """Whom it tells of what."""
+        return self._ads.notifications
+
+    def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
+        """Answer a request, at once where nobody has to be waited for."""
+        header = request.header
+        client = Client(request.came_by, header.source, header.source_port)
+        return begin_answer(header.command, request.body, partial(self._perform, client))
+
+    def answer_now(self, header: AmsHeader, body: bytes) -> AmsAnswer | None:
+        """Answer a Read that nothing speaks against; None for all else, which :meth:`answer` does.
+
+        Most requests are such.
+        """
+        if header.command != _READ or len(body) != AdsRange.SIZE:
+            return None
+        asked = AdsRange.decode(body)
+        try:
+            data = self._ads.read(asked.group, asked.offset, asked.length)
+        except AdsRefusedError:
+            return None
+        return AmsAnswer(encode_result(_DONE, data))
+
+    def client_gone(self, way: Way) -> None:
+        """End the notifications of a connection."""
+        self._ads.notifications.forget(way)
+
+    def _perform(
+        self, client: Client, operation: Operation
+    ) -> OperationOutcome | Awaitable[OperationOutcome]:
+        if isinstance(operation, WriteControl):
+            return control_state(self._device, operation)
+        perform = partial(self._ads.perform, operation, client, monotonic_ns())
+        if _changes_objects(operation):
+            return self._change(perform)
+        outcome = perform()
+        if outcome.result == AdsError.BUSY and not isinstance(operation, Write):
+            return _try_again(perform)
+        return outcome
+
+    async def _change(self, perform: Callable[[], OperationOutcome]) -> OperationOutcome:
+        try:
+            return await self._device.change(self._port, perform)
+        except SdoAbortError as exc:
+            return OperationOutcome(ads_result(exc), why=str(exc))
+        except ControlError as exc:
+            return OperationOutcome(AdsError.BUSY, why=str(exc))
+
+    def _states(self) -> AdsStates:
+        return states_of(self._device.status.state)
+
+
+async def _try_again(perform: Callable[[], OperationOutcome]) -> OperationOutcome:
+    """Wait for a writer in the middle of writing; one that died there is told."""
+    for _ in range(_BUSY_PAUSES):
+        await asyncio.sleep(_BUSY_PAUSE_S)
+        outcome = perform()
+        if outcome.result != AdsError.BUSY:
+            break
+    return outcome
+
+
+def device_info(name: str, release: str) -> AdsDeviceInfo:
+    """Return what a device of this software tells of itself; *release* is such as ``0.1.0``."""
+    numbers = [int(part) if part.isdecimal() else 0 for part in release.split(".")]
+    major, minor, build = (*numbers, 0, 0, 0)[:3]
+    return AdsDeviceInfo(major & 0xFF, minor & 0xFF, build & 0xFFFF, device_name(name))
+
+
+def _changes_objects(operation: Operation) -> bool:
+    if isinstance(operation, ReadWrite):
+        return operation.group == IndexGroup.SDO and bool(operation.data)
+    return isinstance(operation, Write) and operation.group == IndexGroup.SDO

@@ -1,0 +1,70 @@
+"""All ADS services of a station, but those of its buses: given to its router, and kept going."""
+
+from __future__ import annotations
+
+from eap.appliance.services.ads.eap_ads import EapAds, device_info
+from eap.appliance.services.ads.image_variables import StationSymbols
+from eap.appliance.services.ads.notification_pump import NotificationPump
+from eap.appliance.services.ads.router_ads import RouterAds
+from eap.appliance.services.ads.router_values import LiveRouter
+from eap.appliance.services.ads.system_ads import SystemAds
+from eap.appliance.services.device.station_device import StationDevice
+from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.services.routing.whereabouts import Whereabouts
+from eap.appliance.station_image import StationImage
+from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
+from eap.device.eap_content import Identity
+from eap.device.router_dictionary import RouterDictionary
+from eap.ids import NetId
+from eap.pd.spec import StationSpec
+
+
+class StationAds:
+    """The services behind the NetIDs of one station's router and EAP ports.
+
+    Args:
+        station: As it was handed over.
+        device: Its EAP device.
+        image: Its process image.
+        router: Where requests come from, and which sends notifications.
+        identity: Of the station's devices.
+
+    Attributes:
+        dictionary: Of the router.
+        pump: Tells whom notifications are for; devices of buses may be added.
+    """
+
+    def __init__(
+        self,
+        station: StationSpec,
+        device: StationDevice,
+        image: StationImage,
+        router: StationRouter,
+        identity: Identity,
+    ) -> None:
+        symbols = StationSymbols(image)
+        self.pump = NotificationPump(symbols, router.send_notification)
+        values = LiveRouter(router, device, image, station.ports)
+        self.dictionary = RouterDictionary(station, values, identity)
+        release = identity.software_version
+        info = device_info(station.name, release)
+        own = RouterAds(station, device, self.dictionary, info)
+        router.add_service(router.net_id, own)
+        for ams_port, table in own.notifications.items():
+            self.pump.add(table, router.net_id, ams_port)
+        system = SystemAds(device, info)
+        router.add_service(router.net_id, Whereabouts(router, system))
+        self.pump.add(system.notifications, router.net_id, SYSTEM_PORT)
+        net_ids = {port.name: NetId.parse(port.net_id) for port in station.ports}
+        for port in device.dictionaries:
+            net_id, name = net_ids[port], f"{station.name}/{port}"
+            of_port = EapAds(device, port, symbols, device_info(name, release))
+            router.add_service(net_id, of_port)
+            self.pump.add(of_port.notifications, net_id, DEVICE_PORT)
+            system = SystemAds(device, info)
+            router.add_service(net_id, system)
+            self.pump.add(system.notifications, net_id, SYSTEM_PORT)
+
+    async def serve(self) -> None:
+        """Tell whom notifications are for, until cancelled."""
+        await self.pump.serve()

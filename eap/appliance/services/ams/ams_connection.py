@@ -1,0 +1,309 @@
+"""One AMS/TCP connection, whoever opened it: packets in, and packets out (Beckhoff ADS, AMS/TCP).
+
+Rule 1: requests are handed on as they come, and answered in any order; who sends ahead of too many
+answers, or takes none, is not read from until that has changed.
+Rule 2: after a few packets others have their turn, however much more of them wait here.
+Rule 3: a connection that this side opened is always read from: what comes are answers mostly, and
+two stations that wait for each other to read would wait for ever.
+Rule 4: a connection has a name that no other one ever has: clients of one host share its NetID, and
+often ports and numbers of requests too.
+Rule 5: who asks for an AMS address, as local clients of a TwinCAT router do, is given one to ask
+by; answers come back by the connection, so nothing is kept of it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import socket
+from collections.abc import Iterable
+from typing import Protocol
+
+import msgspec
+
+from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.stream import Asked, PacketCutter, Piece, TooLong
+from eap.appliance.discards import Refusal
+from eap.appliance.services.ams.ams_window import AmsWindow
+from eap.codec.ads import AdsError
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
+from eap.codec.amstcp import (
+    RouterCommand,
+    encode_net_id,
+    encode_opened_port,
+    encode_with_prefix,
+)
+from eap.errors import MalformedError
+from eap.ids import NetId
+
+LONGEST_PACKET = 256 << 10
+"""Octets of an AMS packet; nothing here has a value a quarter as long."""
+LONGEST_ANSWER = 4 << 20
+"""Octets of a packet by a connection that this side opened: the symbols of a large controller."""
+PATIENCE_S = 10.0
+"""How long a packet may take from its first octet to its last, and answers to be taken."""
+MAX_UNSENT = 8 << 20
+"""Octets that wait for a peer to take them; a client is kept below by what it may ask for at a
+time, unless it does not keep up with its notifications."""
+_RECEIVED = memoryview(bytearray(64 << 10))
+"""Of all connections.  What asyncio takes by default, 256 KB anew for each packet, is asked of the
+kernel and given back each time, which takes longer than all the rest."""
+_PER_TURN = 8
+"""Packets of one connection before others have their turn."""
+_PORTS = itertools.cycle(range(32768, 40960))
+"""For clients that ask for one, as a TwinCAT router numbers them."""
+_PROBE_AFTER_S = 30
+_PROBES = 3
+_PROBE_S = 10
+_NO_RETURN = StateFlags.NO_RETURN.value  # a plain number: operators of flags are slow
+
+logger = logging.getLogger(__name__)
+
+
+class PacketTaker(Protocol):
+    """Who acts on what a connection brings."""
+
+    def connection_opened(self, connection: AmsConnection) -> None:
+        """Take *connection*, by which can be sent from now on."""
+
+    def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
+        """Act on a request whose length is right; its answer goes back by *connection*."""
+
+    def take_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        """Act on a response."""
+
+    def connection_closed(self, connection: AmsConnection, why: str) -> None:
+        """Forget it: nothing comes and nothing can be sent any more; *why* is for people."""
+
+    def refuse(self, reason: Refusal) -> None:
+        """Count what is not taken."""
+
+
+class AmsConnection(asyncio.BufferedProtocol):
+    """One connection.
+
+    Args:
+        name: Of this one and no other.
+        host: The peer's address.
+        taker: Acts on what it brings.
+        is_ours: Whether this side opened it.
+
+    Attributes:
+        name: As above.
+        host: As above.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        host: str,
+        taker: PacketTaker,
+        *,
+        is_ours: bool = False,
+    ) -> None:
+        self.name = name
+        self.host = host
+        self._taker = taker
+        self._is_ours = is_ours
+        self._window = AmsWindow()
+        self._cutter = PacketCutter(LONGEST_ANSWER if is_ours else LONGEST_PACKET)
+        self._transport: asyncio.Transport
+        self._is_held = False
+        self._is_scheduled = False
+        self._is_blocked = False
+        self._has_ended = False
+        self._late_since: float | None = None
+        self._why = "closed by the peer"
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin (asyncio)."""
+        assert isinstance(transport, asyncio.Transport)  # noqa: S101  for the type
+        self._transport = transport
+        self._taker.connection_opened(self)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Return where octets go; they are taken before anybody else has a turn (asyncio)."""
+        del sizehint
+        return _RECEIVED
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Take octets (asyncio)."""
+        packet = self._cutter.receive_one(bytes(_RECEIVED[:nbytes]))
+        if packet is None:
+            self._go_on()
+        else:
+            self._take(packet)
+            if not self._is_ours and (self._is_blocked or self._window.is_full):
+                self._hold()
+
+    def eof_received(self) -> bool:
+        """Take the end of what the peer sends; it may still wait for answers (asyncio)."""
+        self._has_ended = True
+        self._close_when_done()
+        return True
+
+    def pause_writing(self) -> None:
+        """Read no more: the peer does not take what waits for it (asyncio)."""
+        self._is_blocked = True
+        self._late_since = None
+        if not self._is_ours:
+            self._hold()
+
+    def resume_writing(self) -> None:
+        """Read again (asyncio)."""
+        self._is_blocked = False
+        self._late_since = None
+        self._schedule()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End (asyncio)."""
+        if isinstance(exc, OSError) and exc.strerror:
+            self._why = exc.strerror
+        self._taker.connection_closed(self, self._why)
+
+    def send(self, packets: Iterable[bytes]) -> str | None:
+        """Send packets; return why not if that is not possible any more."""
+        transport = self._transport
+        if transport.is_closing():
+            return "the connection was closed"
+        if self._is_blocked and transport.get_write_buffer_size() > MAX_UNSENT:
+            if not self._is_ours:
+                self._give_up()
+            return "the peer takes nothing"
+        for packet in packets:
+            transport.write(encode_with_prefix(packet))
+            if self._window.take_out(packet) and (self._is_held or self._has_ended):
+                self._schedule()
+        return None
+
+    def close(self, why: str) -> None:
+        """Close it at once; the taker is told *why*."""
+        self._why = why
+        self._transport.abort()
+
+    def find_slow(self, now: float, patience_s: float) -> None:
+        """Close it if the peer lets something wait for too long; to be called now and then."""
+        is_waiting_for_rest = self._cutter.has_begun and not self._is_held
+        if not (self._is_blocked or is_waiting_for_rest or self._transport.is_closing()):
+            self._late_since = None
+        elif self._late_since is None:
+            self._late_since = now
+        elif now - self._late_since >= patience_s:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        if not self._has_ended:
+            self._taker.refuse(Refusal.AMS_SLOW)
+        self.close("too slow: it left a packet unfinished, or took no answers")
+
+    def _schedule(self) -> None:
+        if not self._is_scheduled:
+            self._is_scheduled = True
+            asyncio.get_running_loop().call_soon(self._go_on)
+
+    def _hold(self) -> None:
+        if not self._is_held:
+            self._is_held = True
+            self._transport.pause_reading()
+
+    def _go_on(self) -> None:
+        """Take some of the packets that are here, and read on when there are no more."""
+        self._is_scheduled = False
+        for _ in range(_PER_TURN):
+            if self._transport.is_closing():
+                return
+            if not self._is_ours and (self._is_blocked or self._window.is_full):
+                self._hold()
+                return
+            try:
+                piece = self._cutter.next_piece()
+            except MalformedError as exc:
+                self._break_off(str(exc))
+                return
+            if piece is None:
+                self._read_on()
+                return
+            self._late_since = None
+            self._take(piece)
+        self._hold()
+        self._schedule()
+
+    def _read_on(self) -> None:
+        if self._has_ended:
+            self._close_when_done()
+        elif self._is_held:
+            self._is_held = False
+            self._transport.resume_reading()
+
+    def _break_off(self, why: str) -> None:
+        """Read no more: these are no AMS packets."""
+        logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
+        self._taker.refuse(Refusal.AMS_TYPE)
+        self._why = f"no AMS packets: {why}"
+        self._cutter = PacketCutter(0)
+        self._has_ended = True
+        self._hold()
+        self._close_when_done()
+
+    def _close_when_done(self) -> None:
+        if self._is_ours or not (self._window.requests or self._is_scheduled):
+            self._transport.close()
+
+    def _take(self, piece: Piece) -> None:
+        if isinstance(piece, TooLong):
+            self._refuse_length(piece.header)
+        elif isinstance(piece, Asked):
+            self._answer_client(piece)
+        elif int.from_bytes(piece[20:24], "little") != len(piece) - AmsHeader.SIZE:
+            self._refuse_length(AmsHeader.decode(piece))
+        elif self._window.take_in(piece):
+            self._taker.take_answer(piece, self)
+        else:
+            self._taker.take_packet(piece, self)
+
+    def _answer_client(self, asked: Asked) -> None:
+        net_id = NetId.parse(f"{self.host}.1.1")
+        port = int.from_bytes(asked.data, "little")
+        if self._is_ours:
+            self._break_off("a router that asks for an address")
+        elif asked.command is RouterCommand.NET_ID:
+            self._transport.write(encode_net_id(net_id))
+        elif asked.command is RouterCommand.CLOSE_PORT:
+            self._why = "the client gave its port back"
+            self._has_ended = True
+            self._close_when_done()
+        elif port:
+            self._break_off(f"programs cannot serve AMS port {port} of a router")
+        else:
+            self._transport.write(encode_opened_port(net_id, next(_PORTS)))
+
+    def _refuse_length(self, header: AmsHeader) -> None:
+        self._taker.refuse(Refusal.AMS_LENGTH)
+        if header.state_flags & StateFlags.RESPONSE:
+            # Whoever waits for this answer need not wait any longer.
+            answer = msgspec.structs.replace(header, length=0, error_code=AdsError.AMS_LENGTH)
+            self._taker.take_answer(answer.encode(), self)
+        elif not header.state_flags & _NO_RETURN and header.command != AmsCommand.NOTIFICATION:
+            refusal = response_to(header, AmsAnswer(error_code=AdsError.AMS_LENGTH))
+            self._transport.write(encode_with_prefix(refusal))
+
+
+def set_options(sock: socket.socket, unanswered_s: float = 60.0) -> None:
+    """Have the kernel find out that a peer has vanished without a word.
+
+    Args:
+        sock: Of the connection.
+        unanswered_s: After how long it is given up what the peer does not confirm; where nothing
+            is sent it takes a minute.
+    """
+    sock.setblocking(False)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        (socket.TCP_KEEPIDLE, _PROBE_AFTER_S),
+        (socket.TCP_KEEPINTVL, _PROBE_S),
+        (socket.TCP_KEEPCNT, _PROBES),
+        (socket.TCP_NODELAY, 1),
+        (socket.TCP_USER_TIMEOUT, int(1000 * unanswered_s)),
+    ):
+        sock.setsockopt(socket.IPPROTO_TCP, option, value)

@@ -1,0 +1,1 @@
+"""The buses of the appliance: conversations and procedures, step by step by the engine."""

@@ -1,0 +1,197 @@
+"""Services' side of the buses: conversations, procedures and states, step by step by the engine.
+
+Rule: the engine is asked for single steps only.  Whole transfers, their order and their errors are
+handled here, so that the engine never waits for a file or for a client.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Hashable, Sequence
+from time import monotonic_ns
+from typing import TypeVar
+
+from devicebus.errors import BusError
+from devicebus.mailbox.conversation import Conversation
+from devicebus.master.access import Access, Reply
+from devicebus.master.procedure import Answer, Procedure, Sleep
+from devicebus.wire.alstatus import AlState
+from eap.appliance.bus_request import (
+    Bring,
+    BusReport,
+    Datagram,
+    Describe,
+    Heard,
+    Transfer,
+)
+from eap.appliance.control_bus import BRING_S, PATIENCE_S, TRANSFER_S
+from eap.appliance.handover import PortName
+from eap.appliance.services.bus.bus_talk import Talk, lead
+from eap.appliance.services.bus.turns import Turns
+from eap.appliance.services.engine_link import EngineLink
+from eap.codec.mailbox import MailboxType
+from eap.errors import EapError, EngineGoneError
+
+T = TypeVar("T")
+
+DESCRIBE_S = 1.0
+_LOOK_S = 0.05
+_S = 1_000_000_000
+
+
+class BusClient:
+    """What services do on the buses of the appliance.
+
+    Args:
+        link: To the engine.
+        ports: All bus ports in the order that numbers them.
+    """
+
+    def __init__(self, link: EngineLink, ports: Sequence[PortName]) -> None:
+        self.ports = tuple(ports)
+        self._link = link
+        self._numbers = {port: number for number, port in enumerate(ports)}
+        self._turns = Turns()
+        self._up: set[PortName] = set()
+        link.on_restart.append(self._up.clear)
+
+    def listen(self, port: PortName, heard: Callable[[Heard], None]) -> None:
+        """Call *heard* with each message that a slave of a bus sends unasked."""
+        number = self._numbers[port]
+
+        def take(message: Heard) -> None:
+            if message.bus == number:
+                heard(message)
+
+        self._link.on_heard.append(take)
+
+    async def describe(self, port: PortName, timeout_s: float = DESCRIBE_S) -> BusReport:
+        """Return how a bus is now; raises EngineGoneError."""
+        bus = self._numbers[port]
+        answer = await self._link.ask(lambda number: Describe(id=number, bus=bus), timeout_s)
+        if answer.report is None:
+            raise BusError(f"{_name(port)}: the engine says nothing about it")
+        return answer.report
+
+    async def wait_up(self, port: PortName) -> BusReport:
+        """Return how a bus is once it is up.
+
+        Raises:
+            BusError: it is not after PATIENCE_S, with the reason.
+            EngineGoneError: there is no engine all the while.
+        """
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + PATIENCE_S
+        while True:
+            error: EapError
+            try:
+                report = await self.describe(port)
+            except EngineGoneError as exc:
+                error = exc
+            else:
+                if report.is_up:
+                    self._up.add(port)
+                    return report
+                error = BusError(f"{_name(port)} is not up: {report.fault or 'it begins'}")
+            if loop.time() >= end_s:
+                raise error
+            await asyncio.sleep(_LOOK_S)
+
+    async def open_talk(
+        self, port: PortName, station: int, kind: MailboxType, requester: Hashable
+    ) -> Talk:
+        """Wait for a turn at the mailbox of a slave; raises as :meth:`wait_up` does."""
+        await self._be_up(port)
+        thing = port, station, kind
+        await self._turns.take(thing, requester)
+        bus = self._numbers[port]
+        return Talk(self._link, bus, station, kind, lambda: self._turns.give_back(thing))
+
+    async def converse(
+        self, port: PortName, station: int, conversation: Conversation[T], requester: Hashable
+    ) -> T:
+        """Lead a conversation with a slave to its end; return its result.
+
+        Raises:
+            BusError: the slave has no mailbox, does not answer, or refuses; as its class says.
+            SdoAbortError: it refuses an SDO.
+            EngineGoneError: there is no engine, or not the one with which it began.
+        """
+        try:
+            ask = next(conversation)
+        except StopIteration as end:
+            value: T = end.value
+            return value
+        try:
+            talk = await self.open_talk(port, station, ask.type, requester)
+        except BaseException:
+            conversation.close()
+            raise
+        try:
+            value = await lead(conversation, talk, ask)
+        except asyncio.CancelledError:
+            talk.abandon()
+            raise
+        finally:
+            conversation.close()
+            talk.close()
+        return value
+
+    async def run(self, port: PortName, procedure: Procedure[T]) -> T:
+        """Run a procedure to its end; return its result or raise what went wrong."""
+        await self._be_up(port)
+        try:
+            step = next(procedure)
+            while True:
+                try:
+                    if isinstance(step, Sleep):
+                        await asyncio.sleep(step.duration_ns / _S)
+                        replies: Sequence[Reply] = ()
+                    else:
+                        replies = await self.transfer(port, step)
+                except BusError as exc:
+                    step = procedure.throw(exc)
+                else:
+                    step = procedure.send(Answer(replies, monotonic_ns()))
+        except StopIteration as end:
+            value: T = end.value
+            return value
+        finally:
+            procedure.close()
+
+    async def transfer(self, port: PortName, accesses: Sequence[Access]) -> list[Reply]:
+        """Send datagrams, none of them logical, and return what came back for each.
+
+        Raises:
+            FrameLostError: nothing came back.
+            EngineGoneError: there is no engine.
+        """
+        await self._be_up(port)
+        bus = self._numbers[port]
+        datagrams = tuple(Datagram(*access) for access in accesses)
+        answer = await self._link.ask(
+            lambda number: Transfer(id=number, bus=bus, datagrams=datagrams), TRANSFER_S
+        )
+        return [Reply(each.data, each.wkc, each.tries) for each in answer.outcomes]
+
+    async def bring(self, port: PortName, station: int, target: AlState) -> None:
+        """Bring a slave, or with station 0 all of them, to a state where they are kept then.
+
+        Raises:
+            AlStatusError, StateTimeoutError: one refuses, or takes too long.
+            BusError: there is no such slave, or several refuse.
+            EngineGoneError: there is no engine.
+        """
+        await self._be_up(port)
+        bus = self._numbers[port]
+        await self._link.ask(
+            lambda number: Bring(id=number, bus=bus, station=station, target=target), BRING_S
+        )
+
+    async def _be_up(self, port: PortName) -> None:
+        if port not in self._up:
+            await self.wait_up(port)
+
+
+def _name(port: PortName) -> str:
+    return f"{port.station}/{port.port}"

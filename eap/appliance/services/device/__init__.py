@@ -1,0 +1,1 @@
+"""The EAP devices of the stations: dictionaries, states, changes, and values from outside."""

@@ -1,0 +1,184 @@
+"""Routes that tools ask for by UDP 48899: who may have them, and what becomes of the request.
+
+A route asked for is one to the tool: its NetID, and the host where it serves AMS/TCP if it does.
+Nobody needs one to be answered, so it makes no difference to a tool that only asks.
+"""
+
+from __future__ import annotations
+
+import hmac
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from time import monotonic
+from typing import NamedTuple
+
+from eap.aoe.access import Verdict
+from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
+from eap.aoe.routes import Origin, RouteTable
+from eap.aoe.spec import AccessService, AmsUser, DoorKind, HopSpec, RouteSpec
+from eap.aoe.way import Way
+from eap.appliance.services.allowance import Allowance
+from eap.appliance.services.routes.station_routes import StationRoutes
+from eap.codec.ads import AdsError
+from eap.codec.ams import SYSTEM_PORT, AmsHeader
+from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.errors import ControlError, EnvironmentalError
+from eap.ids import STATION_OCTETS, NetId, parse_host
+
+BURST = 10
+"""Requests that are looked at, at once; one a second for long.  Passwords take time to guess."""
+_MAX_PASSWORD = 4096
+_SHOWN = 80
+
+logger = logging.getLogger(__name__)
+
+
+class _Request(NamedTuple):
+    name: str
+    net_id: NetId
+    host: str
+    port: int
+    is_kept: bool
+
+
+class RouteDesk:
+    """Takes the requests that come to one address.
+
+    Args:
+        stations: The routes of each station there; all of them get a route.
+        clock: In seconds.
+    """
+
+    def __init__(
+        self, stations: Sequence[StationRoutes], *, clock: Callable[[], float] = monotonic
+    ) -> None:
+        self._stations = stations
+        self._clock = clock
+        self._allowance = Allowance(BURST, BURST / 10, clock())
+
+    def take(self, question: Discovery, sender: str, *, is_this_host: bool) -> AdsError | None:
+        """Add the route that *question* asks for, and return the result for its sender.
+
+        None says nothing: too many ask.
+
+        Args:
+            question: The datagram.
+            sender: IPv4 address that it came from.
+            is_this_host: Whether a program of this host sent it.
+        """
+        if not self._allowance.take(self._clock()):
+            return None
+        name = decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN]
+        results = []
+        for station in self._stations:
+            result, why = _decide(station, question, sender, is_this_host=is_this_host)
+            level = logging.INFO if result == AdsError.NONE else logging.WARNING
+            logger.log(level, "route %r asked for by %s: %s", name, sender, why)
+            entry = _audited(station.router.net_id, question, sender, result, why)
+            for write in station.router.on_audit:
+                write(entry)
+            results.append(result)
+        return next((each for each in results if each != AdsError.NONE), AdsError.NONE)
+
+
+def _audited(
+    router: NetId, question: Discovery, sender: str, result: AdsError, why: str
+) -> AuditEntry:
+    """Return what the audit says of a request."""
+    octets = (question.find(Tag.NET_ID) or b"")[:6].ljust(6, b"\0")
+    wanted = AddRoute(
+        decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN],
+        str(NetId(octets)),
+        decode_text(question.find(Tag.HOST) or b"")[:_SHOWN],
+        decode_text(question.find(Tag.USER) or b"")[:_SHOWN],
+    )
+    verdict = Verdict(AccessService.CONTROL, result != AdsError.ACCESS, why)
+    header = AmsHeader(router, SYSTEM_PORT, NetId(octets), 0, 0)
+    done = AuditedOperation(wanted, verdict, result)
+    return AuditEntry(Way("ams-udp", sender), header, "", (done,))
+
+
+def _decide(
+    station: StationRoutes, question: Discovery, sender: str, *, is_this_host: bool
+) -> tuple[AdsError, str]:
+    """Return the result for the sender, and what was done in words."""
+    if refused := _why_not(station.spec.users, question, is_this_host=is_this_host):
+        return AdsError.ACCESS, f"refused: {refused}"
+    try:
+        wanted = _read(question, sender)
+        written = _written(station.router.table, wanted.net_id)
+        if written:
+            return AdsError.NONE, f"route {written!r} of the plant file leads there"
+        _add(station, wanted)
+    except (ValueError, ControlError) as exc:
+        return AdsError.VALUE, f"refused: {exc}"
+    except EnvironmentalError as exc:
+        return AdsError.INTERNAL, f"not added: {exc}"
+    return AdsError.NONE, f"added, to {wanted.net_id} at {wanted.host}:{wanted.port}"
+
+
+def _why_not(users: Sequence[AmsUser], question: Discovery, *, is_this_host: bool) -> str:
+    """Return why the sender may have no route, empty if it may."""
+    if users:
+        user = decode_text(question.find(Tag.USER) or b"")[:_SHOWN]
+        return "" if _is_known(users, question) else f"user {user!r} or the password is wrong"
+    return "" if is_this_host else "the station has no users, so only this host may"
+
+
+def _is_known(users: Sequence[AmsUser], question: Discovery) -> bool:
+    name = decode_text(question.find(Tag.USER) or b"")
+    given = (question.find(Tag.PASSWORD) or b"").partition(b"\0")[0]
+    is_known = False
+    for user in users:  # all of them: how long it takes tells nobody whether a name is right
+        password = _password(user)
+        is_right = password is not None and hmac.compare_digest(password, given)
+        is_known |= is_right and hmac.compare_digest(user.name.encode(), name.encode())
+    return is_known
+
+
+def _password(user: AmsUser) -> bytes | None:
+    """Return the password of *user*, None if there is none, with a warning."""
+    try:
+        with Path(user.password_file).open("rb") as file:
+            password = file.readline(_MAX_PASSWORD).rstrip(b"\r\n")
+        reason = "" if password else "its first line is empty"
+    except OSError as exc:
+        password, reason = b"", exc.strerror or str(exc)
+    if reason:
+        logger.warning("password of user %s: %s: %s", user.name, user.password_file, reason)
+    return password or None
+
+
+def _read(question: Discovery, sender: str) -> _Request:
+    """Return what is wanted; raise ValueError if that can be nothing."""
+    octets = question.find(Tag.NET_ID) or b""
+    if len(octets) != 6 or not any(octets):
+        raise ValueError("it names no NetID")
+    where = decode_text(question.find(Tag.HOST) or b"").strip() or sender
+    host, port = parse_host(where, AMS_TCP_PORT)
+    name = decode_text(question.find(Tag.ROUTE_NAME) or b"").strip() or where
+    options = int.from_bytes((question.find(Tag.OPTIONS) or b"")[:4], "little")
+    return _Request(name, NetId(octets), host, port, not options & TEMPORARY)
+
+
+def _written(table: RouteTable, net_id: NetId) -> str:
+    """Return the route of the plant file that *net_id* takes, empty if there is none."""
+    found = table.find(net_id)
+    is_written = found is not None and found[1] and found[0].origin is Origin.STATIC
+    return found[0].name if found is not None and is_written else ""
+
+
+def _add(station: StationRoutes, wanted: _Request) -> None:
+    """Add a route for all NetIDs that begin as the wanted one, or for that alone."""
+    hop = HopSpec(DoorKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
+    is_here = station.has(wanted.net_id.station)
+    spec = RouteSpec(
+        name=wanted.name,
+        net_id=str(wanted.net_id),
+        hop=hop,
+        octets=len(wanted.net_id) if is_here else STATION_OCTETS,
+        is_probed=False,  # most tools answer nobody
+    )
+    station.add(spec, is_kept=wanted.is_kept)

@@ -1,0 +1,263 @@
+"""The methods of the control protocol about routes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from ipaddress import IPv4Address
+from time import monotonic_ns
+from typing import Any
+
+from eap.aoe.directory import Directory
+from eap.aoe.spec import DoorKind, RouteSpec
+from eap.aoe.via import parse_via
+from eap.appliance.control import ErrorCode, near, of_station, parameters, unless_unavailable
+from eap.appliance.control_routes import (
+    Export,
+    ImportRow,
+    IntroducedRow,
+    NeighbourRow,
+    RouteRow,
+    RouterRow,
+    RoutesAddParameters,
+    RoutesExportParameters,
+    RoutesImportParameters,
+    RoutesIntroduceParameters,
+    RoutesListParameters,
+    RoutesRemoveParameters,
+    RoutesScanParameters,
+    RoutesTestParameters,
+    TestResult,
+)
+from eap.appliance.services.routes.neighbours import (
+    Found,
+    Introduction,
+    find_neighbours,
+    introduce,
+)
+from eap.appliance.services.routes.route_probe import find_target, probe_target
+from eap.appliance.services.routes.route_rows import RouterView, route_row
+from eap.codec import staticroutes
+from eap.codec.ads import AdsError
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.staticroutes import TCP_IP, StaticRoute
+from eap.errors import ControlError
+from eap.ids import NetId
+
+_ANY = NetId(bytes(6))
+"""Stands in a default route."""
+_USUAL_PORT = f":{AMS_TCP_PORT}"
+
+
+class RouteMethods:
+    """What can be asked about the routers of all stations here.
+
+    Args:
+        views: The routers by the names of their stations.
+        directory: Of the plant.
+    """
+
+    def __init__(self, views: Mapping[str, RouterView], directory: Directory) -> None:
+        self._views = views
+        self._directory = directory
+
+    def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the methods by name."""
+        return {
+            "routes_list": self._list,
+            "routes_add": self._add,
+            "routes_remove": self._remove,
+            "routes_introduce": self._introduce,
+            "routes_scan": self._scan,
+            "routes_test": self._test,
+            "routes_import": self._import,
+            "routes_export": self._export,
+        }
+
+    def _list(self, params: dict[str, Any]) -> list[RouterRow]:
+        wanted = parameters(params, RoutesListParameters)
+        views = [self._view(wanted.station)] if wanted.station else self._views.values()
+        return [view.row(wanted) for view in views]
+
+    def _add(self, params: dict[str, Any]) -> dict[str, Any]:
+        wanted = parameters(params, RoutesAddParameters)
+        view = self._view(wanted.station)
+        row = self._take(view, wanted)
+        warnings = [text for text in view.warnings() if f"route {row.name} " in text]
+        return {"route": row, "warnings": warnings}
+
+    def _remove(self, params: dict[str, Any]) -> dict[str, RouteRow]:
+        wanted = parameters(params, RoutesRemoveParameters)
+        routes = self._view(wanted.station).routes
+        with unless_unavailable():
+            spec = routes.remove(wanted.route, door=wanted.door, address=wanted.address)
+        return {"route": _removed(spec)}
+
+    async def _test(self, params: dict[str, Any]) -> TestResult:
+        wanted = parameters(params, RoutesTestParameters)
+        router = self._view(wanted.station).router
+        target = find_target(router, self._directory, wanted.target)
+        return await probe_target(router, target, wanted.timeout_ms / 1000)
+
+    async def _scan(self, params: dict[str, Any]) -> list[NeighbourRow]:
+        wanted = parameters(params, RoutesScanParameters)
+        if wanted.address:
+            _address(wanted.address)
+        if wanted.station:
+            return await self._scan_from(self._view(wanted.station), wanted)
+        views = [view for view in self._views.values() if view.routes.scanners]
+        rows = await asyncio.gather(*(self._scan_from(view, wanted) for view in views))
+        return [row for each in rows for row in each]
+
+    async def _introduce(self, params: dict[str, Any]) -> IntroducedRow:
+        wanted = parameters(params, RoutesIntroduceParameters)
+        view, address = self._view(wanted.station), _address(wanted.address)
+        name = wanted.name or view.router.name
+        if "\0" in name + wanted.user + wanted.password:
+            raise ControlError("a NUL in a text", code=ErrorCode.VALUE)
+        route = Introduction(name, view.router.net_id, wanted.user, wanted.password)
+        with unless_unavailable():
+            result = await introduce(view.routes, route, address, wanted.wait_ms / 1000)
+        if result is None:
+            return IntroducedRow(ok=False, result=None, text="no answer by UDP 48899")
+        text = "added" if result == AdsError.NONE else AdsError.words_of(result)
+        return IntroducedRow(ok=result == AdsError.NONE, result=result, text=text)
+
+    async def _scan_from(
+        self, view: RouterView, wanted: RoutesScanParameters
+    ) -> list[NeighbourRow]:
+        with unless_unavailable():
+            found = await find_neighbours(view.routes, wanted.address, wanted.wait_ms / 1000)
+        return [_neighbour_row(view, each) for each in found]
+
+    async def _import(self, params: dict[str, Any]) -> list[ImportRow]:
+        wanted = parameters(params, RoutesImportParameters)
+        view = self._view(wanted.station)
+        try:
+            found = staticroutes.parse(wanted.xml)
+        except ValueError as exc:
+            raise ControlError(str(exc), code=ErrorCode.VALUE) from None
+        rows = []
+        for route in found:
+            rows.append(self._import_one(view, route, dry_run=wanted.dry_run))
+            await asyncio.sleep(0)  # each is written to disk: others have their turns between
+        return rows
+
+    def _export(self, params: dict[str, Any]) -> Export:
+        view = self._view(parameters(params, RoutesExportParameters).station)
+        routes, left_out = [], []
+        for route in view.router.table:
+            is_plain = route.octets and route.real is None
+            if is_plain and route.hop.kind == DoorKind.AMS_TCP:
+                address = route.hop.connection.removesuffix(_USUAL_PORT)
+                routes.append(StaticRoute(route.name, str(route.net_id), address))
+            else:
+                left_out.append(route.name)
+        router = view.router
+        xml = staticroutes.dump(router.name, str(router.net_id), routes, tcp_port=AMS_TCP_PORT)
+        return Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
+
+    def _import_one(self, view: RouterView, route: StaticRoute, *, dry_run: bool) -> ImportRow:
+        via, reason = f"{DoorKind.AMS_TCP}:{route.address}", ""
+        wanted = RoutesAddParameters(
+            station=view.router.name, name=route.name, net_id=route.net_id, via=via
+        )
+        if route.type != TCP_IP:
+            reason = f"its type is {route.type!r}, expected {TCP_IP}"
+        elif not route.address or not route.net_id or not route.name:
+            reason = "it lacks Name, NetId or Address"
+        else:
+            try:
+                if dry_run:
+                    view.routes.check(self._spec(wanted))
+                else:
+                    self._take(view, wanted)
+            except ControlError as exc:
+                reason = str(exc)
+        return ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
+
+    def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
+        spec = self._spec(wanted)
+        with unless_unavailable():
+            route = view.routes.add(spec, replaces=wanted.replaces)
+        return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
+
+    def _spec(self, wanted: RoutesAddParameters) -> RouteSpec:
+        """Return the route that is wanted; raise ControlError if there cannot be one."""
+        try:
+            net_id = self._net_id(wanted)
+            hop = parse_via(
+                wanted.via, net_id, self._directory.stations[wanted.station], self._directory,
+                port=wanted.port,
+            )  # fmt: skip
+        except ValueError as exc:
+            raise ControlError(str(exc), code=ErrorCode.VALUE) from None
+        beside = self._directory.stations.get(wanted.via.partition("/")[0])
+        return RouteSpec(
+            name=wanted.name,
+            net_id=net_id,
+            hop=hop,
+            octets=wanted.octets,
+            router=beside.net_id if beside else "",
+            virtual=wanted.virtual,
+            is_unidirectional=wanted.unidirectional,
+            timeout_ms=wanted.timeout_ms,
+            is_probed=wanted.probed,
+        )
+
+    def _net_id(self, wanted: RoutesAddParameters) -> str:
+        """Return the NetID of a route; raise ValueError if there is none."""
+        stations = self._directory.stations
+        if wanted.net_id:
+            return str(NetId.parse(wanted.net_id))
+        if not wanted.octets:
+            return str(_ANY)
+        if wanted.name in stations:
+            return stations[wanted.name].net_id
+        raise ValueError(
+            f"a NetID is needed: {wanted.name!r} is no station of the plant"
+            f"{near(wanted.name, stations)}"
+        )
+
+    def _view(self, station: str) -> RouterView:
+        return of_station(station, self._views)
+
+
+def _neighbour_row(view: RouterView, found: Found) -> NeighbourRow:
+    name, net_id, address, version = found.neighbour
+    route = view.router.table.find(net_id)
+    is_own = route is not None and route[1] > 0  # a default route leads anywhere
+    return NeighbourRow(
+        station=view.router.name,
+        name=name,
+        net_id=str(net_id),
+        address=address,
+        version=version,
+        route=route[0].name if route is not None and is_own else "",
+        is_learned=found.is_learned,
+    )
+
+
+def _address(text: str) -> IPv4Address:
+    try:
+        return IPv4Address(text)
+    except ValueError as exc:
+        raise ControlError(f"address: {exc}", code=ErrorCode.VALUE) from None
+
+
+def _removed(spec: RouteSpec) -> RouteRow:
+    kind, port, address = spec.hop.kind, spec.hop.port, spec.hop.address
+    return RouteRow(
+        name=spec.name,
+        net_id=spec.virtual or spec.net_id,
+        octets=spec.octets,
+        door=f"{kind}:{port}" if port else kind,
+        address=address,
+        origin="added",
+        state="down",
+        why="removed",
+        real=spec.net_id if spec.virtual else "",
+        unidirectional=spec.is_unidirectional,
+        timeout_ms=spec.timeout_ms,
+        probed=spec.is_probed,
+    )

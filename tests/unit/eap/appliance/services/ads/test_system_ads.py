@@ -1,0 +1,77 @@
+"""The system service of a station."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from eap.aoe.answer import AmsAnswer
+from eap.aoe.way import Way
+from eap.appliance.services.ads.eap_ads import device_info
+from eap.appliance.services.ads.system_ads import SystemAds
+from eap.appliance.services.routing.service import LocalRequest
+from eap.codec.ads import AdsError, AdsState
+from eap.codec.ads import IndexGroup as G
+from eap.codec.adsnotification import TransMode
+from eap.codec.ams import AmsCommand, AmsHeader
+from eap.ids import NetId
+from eap.pd.device import DeviceState
+from tests.support import aoe
+from tests.support.stationengine import make_device, while_serving
+
+WAY = Way("ams-tcp", "1")
+HERE = NetId.parse("1.2.3.4.1.1")
+OK = bytes(4)
+
+
+@pytest.fixture
+def device(stations):
+    return make_device(stations[0])
+
+
+@pytest.fixture
+def system(device):
+    return SystemAds(device[0], device_info("left", "1.2.3"))
+
+
+@pytest.fixture
+def ask(system, device):
+    def ask(command, body=b""):
+        header = AmsHeader(HERE, 10_000, HERE, 1, command)
+        answer = system.answer(LocalRequest(header, body, WAY))
+        if isinstance(answer, AmsAnswer):
+            return answer.data
+        return while_serving(device[0], lambda: answer).data
+
+    return ask
+
+
+def test_it_says_who_and_how_the_station_is(system, ask):
+    assert system.ports == {10_000}
+    assert ask(AmsCommand.READ_DEVICE_INFO) == OK + b"\1\2\3\0" + b"left".ljust(16, b"\0")
+    assert ask(AmsCommand.READ_STATE) == OK + b"\5\0\x08\0"
+    state = ask(AmsCommand.READ, aoe.read_body(0, 16, group=G.SYSTEM_STATE))
+    assert struct.unpack("<HHHBBH", state[8:18]) == (AdsState.RUN, 8, 0, 1, 2, 3)
+    unknown = ask(AmsCommand.READ, aoe.read_body(0, group=G.SDO))
+    assert unknown[:4] == AdsError.INDEX_GROUP.to_bytes(4, "little")
+
+
+def test_states_are_those_of_the_station(ask, device):
+    assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.CONFIG, 0, 0)) == OK
+    assert device[1].state is DeviceState.PREOP
+    assert ask(AmsCommand.READ_STATE) == OK + b"\x0f\0\2\0"
+
+
+def test_reset_is_how_clients_of_twincat_ask_for_run(ask, device):
+    assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.CONFIG, 0, 0)) == OK
+    assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.RESET, 0, 0)) == OK
+    assert device[1].state is DeviceState.OP
+
+
+def test_notifications_end_with_their_connection(ask, system):
+    watched = struct.pack("<6I16x", G.DEVICE_DATA, 0, 4, TransMode.SERVER_CYCLE, 0, 0)
+    assert ask(AmsCommand.ADD_NOTIFICATION, watched)[:4] == OK
+    assert len(system.notifications) == 1
+    system.client_gone(WAY)
+    assert len(system.notifications) == 0

@@ -1,0 +1,69 @@
+"""What of a connection is under way."""
+
+from __future__ import annotations
+
+import struct
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.appliance.services.ams.ams_window import MAX_OCTETS, MAX_REQUESTS, AmsWindow
+from tests.support import aoe
+
+TARGET = "1.1.1.1.2.1"
+
+
+def request(body: bytes = b"", command: int = aoe.READ_STATE, flags: int = 4) -> bytes:
+    return aoe.packet(TARGET, command, body, flags=flags)
+
+
+def answer(body: bytes = b"", command: int = aoe.READ_STATE) -> bytes:
+    return request(body, command, 5)
+
+
+def test_too_many_requests_fill_it_and_an_answer_makes_room() -> None:
+    window = AmsWindow()
+    for _ in range(MAX_REQUESTS):
+        assert not window.is_full
+        assert not window.take_in(request())
+    assert window.is_full
+    assert window.take_out(answer())
+    assert not window.is_full
+
+
+def test_long_requests_fill_it_and_so_do_those_for_long_answers() -> None:
+    for packet in (request(bytes(MAX_OCTETS)), request(aoe.read_body(0, 1 << 31), aoe.READ)):
+        window = AmsWindow()
+        window.take_in(packet)
+        assert window.is_full
+        window.take_out(answer())
+        assert not window.is_full
+
+
+def test_what_is_not_answered_does_not_wait() -> None:
+    window = AmsWindow()
+    window.take_in(request(flags=4 | 2))
+    window.take_in(request(command=8))
+    window.take_in(request(command=0x0902))
+    assert window.take_in(answer())
+    assert window.requests == 0
+    assert not window.take_out(answer(command=0x0902))
+    assert not window.take_out(request())
+    assert not window.take_out(answer())
+    assert window.requests == 0
+
+
+def test_read_without_a_length_is_a_short_one() -> None:
+    window = AmsWindow()
+    window.take_in(request(struct.pack("<I", 1), aoe.READ))
+    assert not window.is_full
+
+
+@given(st.lists(st.integers(0, 70_000), max_size=30))
+def test_nothing_is_left_when_all_have_been_answered(sizes: list[int]) -> None:
+    window = AmsWindow()
+    for size in sizes:
+        window.take_in(request(bytes(size)))
+    for _ in sizes:
+        window.take_out(answer())
+    assert (window.requests, window._octets) == (0, 0)

@@ -1,0 +1,256 @@
+"""Services on the buses: conversations, procedures and states, one step after the other."""
+
+from __future__ import annotations
+
+import asyncio
+from io import BytesIO
+
+import pytest
+
+from devicebus.errors import AlStatusError, BusError, FrameLostError, MailboxTimeoutError
+from devicebus.mailbox import coe_client, foe_client
+from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.diagnosis import diagnose
+from devicebus.master.procedure import Sleep, read
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.register import Register
+from eap.appliance.bus_request import AskMailbox, Cancel
+from eap.appliance.handover import PortName
+from eap.appliance.services.bus import bus_client
+from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.engine_link import EngineLink
+from eap.codec.mailbox import MailboxType
+from eap.errors import EngineGoneError
+from eap.od.abort import SdoAbortError
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.loopbus import LoopBus
+
+SENSOR = 1003
+DRIVE = 1001
+
+
+def play(scene, name="coe"):
+    """Run *scene* with a client and the engine it asks."""
+
+    async def run():
+        engine = FakeEngine(FakeBus(LoopBus(name)))
+        link = EngineLink(engine.services, look_s=0.05)
+        try:
+            async with asyncio.timeout(20):
+                return await scene(BusClient(link, [PORT]), engine)
+        finally:
+            link.close()
+            engine.close()
+
+    return asyncio.run(run())
+
+
+def vendor():
+    return coe_client.upload(0x1018, 1)
+
+
+def test_describe():
+    async def scene(client, engine):
+        report = await client.describe(PORT)
+        assert [each.name for each in report.slaves] == ["coupler", "buttons", "sensor"]
+
+    play(scene)
+
+
+def test_conversation():
+    async def scene(client, engine):
+        assert await client.converse(PORT, SENSOR, vendor(), "me") == b"\x5a\x0e\0\0"
+        with pytest.raises(SdoAbortError):
+            await client.converse(PORT, SENSOR, coe_client.upload(0x5555, 0), "me")
+        with pytest.raises(BusError, match="no slave 1009"):
+            await client.converse(PORT, 1009, vendor(), "me")
+
+    play(scene)
+
+
+def test_conversation_of_no_step():
+    async def scene(client, engine):
+        def nothing():
+            if False:
+                yield
+            return 7
+
+        assert await client.converse(PORT, SENSOR, nothing(), "me") == 7
+        assert not engine.of(AskMailbox)
+
+    play(scene)
+
+
+def test_whole_object_in_segments():
+    async def scene(client, engine):
+        assert len(await client.converse(PORT, SENSOR, coe_client.upload(0x8001, 0), 1)) == 2048
+        assert len(engine.of(AskMailbox)) > 5
+
+    play(scene)
+
+
+def test_errors_reach_the_conversation_as_what_they_are():
+    async def scene(client, engine):
+        engine.buses[0].line.fault(kind="mailbox", slave="sensor")
+        seen = []
+
+        def stubborn():
+            try:
+                yield Ask(MailboxType.COE, bytes(10), timeout_ns=5_000_000)
+            except MailboxTimeoutError as exc:
+                seen.append(exc)
+            return "done"
+
+        assert await client.converse(PORT, SENSOR, stubborn(), "me") == "done"
+        assert "no COE reply within 5 ms" in str(seen[0])
+
+    play(scene)
+
+
+def test_one_transfer_at_a_time_and_requesters_take_turns():
+    order = []
+
+    async def scene(client, engine):
+        async def use(requester):
+            value = await client.converse(PORT, SENSOR, coe_client.upload(0x8001, 0), requester)
+            assert len(value) == 2048
+            order.append(requester)
+
+        async with asyncio.TaskGroup() as group:
+            for requester in "aaab":
+                group.create_task(use(requester))
+
+    play(scene)
+    assert order == ["a", "a", "b", "a"]
+
+
+def test_file_and_objects_at_once():
+    content = bytes(range(256)) * 800
+
+    async def scene(client, engine):
+        sizes = MailboxSizes(*_sizes(await client.describe(PORT)))
+        write = foe_client.write("firmware.bin", BytesIO(content).read, sizes)
+        written = asyncio.ensure_future(client.converse(PORT, DRIVE, write, "file"))
+        reads = 0
+        while not written.done():
+            assert await client.converse(PORT, DRIVE, vendor(), "objects") == b"\x5a\x0e\0\0"
+            reads += 1
+        assert (await written, reads > 5) == (len(content), True)
+        back = bytearray()
+        await client.converse(PORT, DRIVE, foe_client.read("firmware.bin", back.extend, sizes), 1)
+        assert back == content
+
+    play(scene, "drive")
+
+
+def _sizes(report):
+    return report.slaves[0].to_slave, report.slaves[0].to_master
+
+
+def test_who_leaves_in_the_middle_of_a_file_leaves_the_slave_usable():
+    async def scene(client, engine):
+        sizes = MailboxSizes(*_sizes(await client.describe(PORT)))
+        write = foe_client.write("firmware.bin", bytes, sizes)  # a file without an end
+        writing = asyncio.ensure_future(client.converse(PORT, DRIVE, write, "file"))
+        await engine.wait_for(20)
+        engine.holds = True
+        await asyncio.sleep(0.01)
+        writing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await writing
+        await asyncio.sleep(0.01)
+        asked = [each for each in engine.requests if isinstance(each, (AskMailbox, Cancel))]
+        assert isinstance(asked[-2], Cancel)
+        assert (asked[-1].type, asked[-1].expects_reply) == (MailboxType.FOE, False)
+        engine.release()
+        back = bytearray()
+        await client.converse(PORT, DRIVE, foe_client.read("firmware.bin", back.extend, sizes), 1)
+        assert back
+        assert 0 not in back  # as it was before
+
+    play(scene, "drive")
+
+
+def test_turn_that_was_not_used_is_given_back_without_a_word():
+    async def scene(client, engine):
+        talk = await client.open_talk(PORT, DRIVE, MailboxType.FOE, 1)
+        talk.abandon()
+        talk.close()
+        await asyncio.wait_for(client.open_talk(PORT, DRIVE, MailboxType.FOE, 2), 1)
+        assert not engine.of(AskMailbox)
+
+    play(scene, "drive")
+
+
+def test_procedures():
+    async def scene(client, engine):
+        octets = await client.run(PORT, read(SENSOR, Register.STATION_ADDRESS, 2))
+        assert int.from_bytes(octets, "little") == SENSOR
+        found = await client.run(PORT, diagnose([1001, 1002, SENSOR]))
+        assert all(slave.answers for slave in found.slaves)
+
+        def sleeper():
+            _, before_ns = yield Sleep(0)
+            _, now_ns = yield Sleep(10_000_000)
+            return now_ns - before_ns
+
+        assert await client.run(PORT, sleeper()) >= 10_000_000
+        engine.buses[0].line.fault(kind="loss")
+        with pytest.raises(FrameLostError):
+            await client.run(PORT, read(SENSOR, Register.TYPE, 1))
+
+    play(scene)
+
+
+def test_states():
+    async def scene(client, engine):
+        await client.bring(PORT, 0, AlState.INIT)
+        await client.bring(PORT, SENSOR, AlState.PREOP)
+        states = [each.state for each in (await client.describe(PORT)).slaves]
+        assert states == [AlState.INIT, AlState.INIT, AlState.PREOP]
+        engine.buses[0].line.fault(kind="refuse", slave="buttons", state="PREOP", code=0x51)
+        with pytest.raises(AlStatusError, match="EEPROM error") as caught:
+            await client.bring(PORT, 1002, AlState.PREOP)
+        assert (caught.value.code, caught.value.state) == (0x51, AlState.INIT)
+
+    play(scene)
+
+
+def test_bus_that_is_not_up_is_waited_for(monkeypatch):
+    async def scene(client, engine):
+        engine.buses[0].is_up = False
+        asyncio.get_running_loop().call_later(0.1, setattr, engine.buses[0], "is_up", True)
+        assert await client.converse(PORT, SENSOR, vendor(), 1) == b"\x5a\x0e\0\0"
+        engine.say_hello()
+        await asyncio.sleep(0.01)
+        engine.buses[0].is_up = False
+        monkeypatch.setattr(bus_client, "PATIENCE_S", 0.1)
+        with pytest.raises(BusError, match="left/bus0 is not up: no frame comes back"):
+            await client.converse(PORT, SENSOR, vendor(), 1)
+        assert not (await client.describe(PORT)).is_up
+
+    play(scene)
+
+
+def test_engine_that_is_gone(monkeypatch):
+    async def scene(client, engine):
+        await client.wait_up(PORT)
+        engine.holds = True
+        with pytest.raises(EngineGoneError):
+            await client.converse(PORT, SENSOR, vendor(), 1)
+        with pytest.raises(EngineGoneError):
+            await client.describe(PORT, 0.05)
+        monkeypatch.setattr(bus_client, "PATIENCE_S", 0.1)
+        with pytest.raises(EngineGoneError):
+            await client.wait_up(PORT)
+
+    play(scene)
+
+
+def test_port_that_is_none():
+    async def scene(client, engine):
+        with pytest.raises(KeyError):
+            await client.describe(PortName("left", "eap0"))
+
+    play(scene)

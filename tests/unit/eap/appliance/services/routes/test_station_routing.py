@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from eap.aoe.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
+from eap.appliance.route_store import RouteStore, RoutingStore
+from eap.appliance.services.routes.station_routes import StationRoutes
+from eap.appliance.services.routes.station_routing import StationRouting
+from eap.errors import ControlError, EnvironmentalError
+from tests.support.routing import station
+
+HOP = HopSpec(DoorKind.UDP, "eap0", "10.0.0.2:34980")
+MILL = RouteSpec(name="mill", net_id="10.0.0.2.1.1", hop=HOP)
+SAW = RouteSpec(name="saw", net_id="10.0.0.3.1.1", hop=HOP)
+FILE = RoutingSpec(routes=(MILL,))
+OTHER = RoutingSpec(routes=(SAW,), access=(AccessRule("a"),))
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_STATE_DIR", str(tmp_path / "state"))
+
+
+class House:
+    """A station that may start again, with another plant file."""
+
+    def __init__(self, told=FILE):
+        self.access = []
+        self.router = station("10.0.0.1.2.1")
+        routes = StationRoutes(self.router, told, RouteStore("p", "left"))
+        store = RoutingStore("p", "left")
+        self.routing = StationRouting("left", routes, store, self.access.append)
+        self.routing.start()
+
+    def names(self):
+        return [route.name for route in self.router.table]
+
+
+def test_what_is_applied_is_in_force_at_once_and_after_a_new_start(caplog):
+    house = House()
+    assert house.routing.applied is None
+    changes = ["route mill: removed", "route saw: added", "access rule a: added"]
+    assert house.routing.plan(OTHER).changes == changes
+    assert house.routing.apply(OTHER, "1") == changes
+    assert (house.names(), house.access) == (["saw"], [FILE, OTHER])
+    again = House()
+    assert (again.names(), again.access) == (["saw"], [OTHER])
+    assert "station left: routes and access rules are as applied last" in caplog.text
+
+
+def test_who_edits_the_plant_file_has_the_last_word(caplog):
+    House().routing.apply(OTHER, "1")
+    edited = House(RoutingSpec())
+    assert edited.names() == []
+    assert edited.routing.applied is None
+    assert "the plant file was edited since routes or access rules were changed" in caplog.text
+    caplog.clear()
+    assert House().names() == ["mill"]  # nor does it come back with the file as it was
+    assert caplog.text == ""
+
+
+def test_a_file_that_says_what_was_applied_is_nothing_to_speak_of(caplog):
+    House().routing.apply(OTHER, "1")
+    assert House(OTHER).names() == ["saw"]
+    assert caplog.text == ""
+
+
+def test_a_change_is_taken_back_and_made_again():
+    house = House()
+    house.routing.apply(OTHER, "1")
+    assert house.routing.roll_back() == [
+        "route saw: removed",
+        "route mill: added",
+        "access rule a: removed",
+    ]
+    assert house.names() == ["mill"]
+    assert house.routing.applied.undone
+    house.routing.roll_back()
+    assert House().names() == ["saw"]
+    assert not house.routing.applied.undone
+
+
+def test_steps_of_one_change_are_taken_back_together():
+    house = House()
+    house.routing.apply(OTHER, "1")
+    house.routing.apply(RoutingSpec(), "1")
+    house.routing.roll_back()
+    assert house.names() == ["mill"]
+
+
+def test_what_is_the_same_is_no_change():
+    house = House()
+    assert house.routing.apply(FILE, "1") == []
+    assert house.routing.applied is None
+    with pytest.raises(ControlError, match="were not changed while the station ran"):
+        house.routing.roll_back()
+
+
+def test_a_broker_does_not_change_while_it_runs():
+    broker = replace(FILE, mqtt=(MqttSpec(network="n", host="broker"),))
+    house = House()
+    with pytest.raises(ControlError, match="MQTT network n: added: this needs a new start"):
+        house.routing.apply(broker, "1")
+    assert house.routing.plan(broker).refused
+    assert house.routing.applied is None
+
+
+def test_what_cannot_be_kept_is_not_in_force(monkeypatch):
+    monkeypatch.setenv("EAP_STATE_DIR", "/dev/null/x")
+    house = House()
+    with pytest.raises(EnvironmentalError, match="routes and access rules cannot be kept"):
+        house.routing.apply(OTHER, "1")
+    assert house.names() == ["mill"]
