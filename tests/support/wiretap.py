@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from eap.appliance.commands.packets import unwrap
+from eap.codec.ethercat import FrameType
 from eap.codec.pd import PD_FRAME_START, PdFrameHeader, iter_pds
 
 _ALL = 3  # ETH_P_ALL; taps for one EtherType are not shown what leaves
@@ -19,7 +20,7 @@ _SO_RCVBUFFORCE = 33
 
 @dataclass(frozen=True)
 class Tapped:
-    """One EtherCAT frame that passed an interface; addresses are those of its transport."""
+    """One frame of process data that passed an interface; addresses are those of its transport."""
 
     frame: bytes
     at_ns: int
@@ -48,15 +49,15 @@ class Wiretap:
         self._tapped: list[Tapped] = []
 
     def tapped(self) -> list[Tapped]:
-        """Return all EtherCAT frames so far, oldest first."""
+        """Return all frames of type 4 so far, oldest first."""
         while True:
             try:
                 octets, ancillary, _, address = self._sock.recvmsg(4096, 64)
             except BlockingIOError:
                 return sorted(self._tapped, key=lambda passed: passed.at_ns)
             packet = unwrap(octets)
-            if packet is None:
-                continue
+            if packet is None or packet.payload[1] >> 4 != FrameType.PROCESS_DATA:
+                continue  # routers ask each other whether they are alive, by type 5
             seconds, rest = struct.unpack("@qq", ancillary[0][2])
             at_ns = seconds * 1_000_000_000 + rest
             leaves = address[2] == _OUTGOING
