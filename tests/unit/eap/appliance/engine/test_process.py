@@ -51,10 +51,14 @@ def test_every_cycle_runs_until_the_signal(tmp_path):
     try:
         stop = StopFlag()
         signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
-        signal.setitimer(signal.ITIMER_REAL, 0.2)
+
+        def ready() -> None:
+            told.append(cycles(tmp_path))
+            signal.setitimer(signal.ITIMER_REAL, 0.2)  # not before: to begin takes its time
+
         plant.start(monotonic_ns())
         with engine, services:
-            run_cycles(plant, engine, stop, lambda: told.append(cycles(tmp_path)))
+            run_cycles(plant, engine, stop, ready)
         assert stop.is_set
     finally:
         plant.close()
