@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import doctest
 from pathlib import Path
 
 import pytest
 
 from tests.support.appliance import Plants
+from tests.support.pages import run_examples
 
 pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 
@@ -19,8 +19,4 @@ PAGE = ROOT / "docs" / "ads.md"
 
 def test_examples(farm: Plants) -> None:
     farm.run(ROOT / "config" / "demo.yaml")
-    test = doctest.DocTestParser().get_doctest(PAGE.read_text(), {}, PAGE.name, PAGE.name, 0)
-    told: list[str] = []
-    result = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=told.append)
-    assert result.attempted > 25
-    assert not result.failed, "".join(told)
+    run_examples(PAGE, at_least=25)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import doctest
 from pathlib import Path
 
 import pytest
 
 from tests.support.appliance import Plants, wait_until
+from tests.support.pages import run_examples
 
 pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 
@@ -21,8 +21,4 @@ def test_examples(farm: Plants) -> None:
     demo = farm.run(ROOT / "config" / "demo.yaml")
     state = {"bus0.state": 8}
     wait_until(lambda: demo.request("read", station="island-01", names=[*state])["values"] == state)
-    test = doctest.DocTestParser().get_doctest(PAGE.read_text(), {}, PAGE.name, PAGE.name, 0)
-    told: list[str] = []
-    result = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=told.append)
-    assert result.attempted > 30
-    assert not result.failed, "".join(told)
+    run_examples(PAGE, at_least=30)
