@@ -22,7 +22,11 @@ def run_examples(page: Path, at_least: int) -> None:
     Not in the process of the tests: pyads keeps connections there that another test's plant ended.
     """
     done = subprocess.run(
-        [sys.executable, "-c", _RUN, str(page)], capture_output=True, text=True, timeout=100
+        [sys.executable, "-c", _RUN, str(page)],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=100,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(done.stdout.splitlines()[-1].split()[0]) >= at_least
