@@ -13,16 +13,15 @@ from ipaddress import IPv4Address
 from itertools import starmap
 from typing import Any, Protocol
 
-from eap.codec import datatypes
-from eap.codec.datatypes import DataType
 from eap.device.eap_content import Identity
+from eap.device.live_objects import make_object
 from eap.ids import InterfaceUri, NetId
 from eap.od.dictionary import ObjectDictionary
-from eap.od.model import RO, Entry, ObjectCode, OdObject
+from eap.od.model import OdObject
 from eap.od.profiles import eap1000
 from eap.od.profiles import router9000 as profile
 from eap.od.profiles.router9000 import Live
-from eap.od.profiles.table import UNITS, EntryRow, ObjectRange
+from eap.od.profiles.table import ObjectRange
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 _IP_SCHEMES = ("udp", "tcp")
@@ -64,7 +63,7 @@ class RouterDictionary(ObjectDictionary):
             profile.DEVICE.first + number: port.name for number, port in enumerate(station.ports)
         }
         for row in profile.STATIC:
-            self.add(_make(row, row.first, self._read, last=len(station.ports)))
+            self.add(_make(row, row.first, self._read, count=len(station.ports)))
         for number, port in enumerate(station.ports):
             index = profile.DEVICE.first + number
             self.add(_make(profile.DEVICE, index, partial(self._read_device, port.name)))
@@ -138,34 +137,8 @@ class RouterDictionary(ObjectDictionary):
 _PROFILES = {PortKind.EAP: eap1000.MODULE_PROFILE, PortKind.BUS: profile.MASTER_PROFILE}
 
 
-def _octets(kind: DataType, key: Live, read: Callable[[Live], Any]) -> bytes:
-    """Return what a live entry shows, as near as its type can hold it."""
-    value = read(key)
-    if kind.is_text:
-        return str(value).encode()[: kind.size]
-    if kind.scalar_range is not None:
-        value = min(value, int(kind.scalar_range[1]))
-    return kind.encode(value)
-
-
-def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, last: int = 0) -> OdObject:
-    """Return an object; *last* is that of a list's sub-indexes."""
-    entries = {}
-    for each in row.entries:
-        for subindex in range(each.subindex, (last if each.last else each.subindex) + 1):
-            entries[subindex] = _make_entry(each, subindex, read)
-    if row.code is not ObjectCode.VAR:
-        entries[0] = Entry("SubIndex 000", "USINT", RO, max(entries, default=0))
-    is_array = row.code is ObjectCode.ARRAY
-    code = datatypes.parse(row.entries[-1].kind).code if is_array else None
-    return OdObject(index, row.title(index), row.code, entries, data_type=code)
-
-
-def _make_entry(row: EntryRow, subindex: int, read: Callable[[Live], Any]) -> Entry:
-    kind = datatypes.parse(row.kind)
-    reader = partial(_octets, kind, Live(row.live), read) if row.live else None
-    name = row.numbered(subindex)
-    return Entry(name, kind, row.access, row.default, read=reader, unit=UNITS[row.unit])
+def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, count: int = 0) -> OdObject:
+    return make_object(row, index, lambda key: read(Live(key)), count=count)
 
 
 def _is_route(index: int) -> bool:

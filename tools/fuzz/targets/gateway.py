@@ -169,7 +169,7 @@ async def _serve(data: bytes) -> None:
     answered: list[bytes] = []
     for frame, client in zip(_frames(data), cycle("ab"), strict=False):
         door.receive(frame, client, lambda to, octets: answered.append(octets))
-        await gateway.wait_idle()
+        await door.wait_below(client, 1)
     for octets in answered:
         decode_frame(octets)
     await gateway.close()

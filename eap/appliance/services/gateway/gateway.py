@@ -167,11 +167,6 @@ class MailboxGateway:
         while self.ledger.waiting(way) >= count and self._tasks:
             await asyncio.wait(self._tasks, return_when=asyncio.FIRST_COMPLETED)
 
-    async def wait_idle(self) -> None:
-        """Wait until everybody has an answer."""
-        while self._tasks:
-            await asyncio.wait(self._tasks)
-
     async def close(self) -> None:
         """End everything that is under way."""
         for task in self._tasks:

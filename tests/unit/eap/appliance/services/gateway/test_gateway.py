@@ -464,7 +464,7 @@ def test_the_same_request_is_answered_once_until_then() -> None:
         answers: list[bytes] = []
         for _ in range(3):
             desk.gateway.receive(header, bytes(body), HERE, answers.append)
-        await desk.gateway.wait_idle()
+        await desk.gateway.wait_below(HERE, 1)
         assert len(answers) == 1
         assert len(await desk.ask_frame(frame)) == 1
 
@@ -479,7 +479,7 @@ def test_who_asks_too_much_at_once_is_told() -> None:
             body = b"\0\x20\x40" + bytes((index, 0x60)) + bytes(5)
             desk.gateway.receive(header, body, HERE, answers.append)
         assert [decoded(each)[1][-4:].hex() for each in answers] == ["05000405"] * 2
-        await desk.gateway.wait_idle()
+        await desk.gateway.wait_below(HERE, 1)
         assert len(answers) == 4
 
     play(scene, settings=Settings(NET_ID, limits=ClientLimits(in_flight=2)))
@@ -563,7 +563,7 @@ def test_the_same_octets_right_behind_the_answer_are_a_new_request(address: int)
                 desk.gateway.receive(header, bytes.fromhex(VENDOR), HERE, ask_again)
 
         desk.gateway.receive(header, bytes.fromhex(VENDOR), HERE, ask_again)
-        await desk.gateway.wait_idle()
+        await desk.gateway.wait_below(HERE, 1)
         assert len(answers) == 6
         assert desk.gateway.ledger.waiting(HERE) == 0
 
