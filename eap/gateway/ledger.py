@@ -35,7 +35,9 @@ class Admission(Enum):
     REPEATED = "repeated"
     """The same one waits already: its answer is on the way."""
     CROWDED = "crowded"
-    """Too much waits, or too many came in too short a time."""
+    """Too much waits."""
+    TOO_FAST = "too fast"
+    """Too many came in too short a time."""
 
 
 class Counts:
@@ -91,8 +93,10 @@ class Ledger:
             return Admission.REPEATED
         limits = self._limits
         is_full = len(client.waiting) >= limits.in_flight
-        if is_full or self._in_flight >= limits.in_flight_in_all or not self._pay(client, now_ns):
+        if is_full or self._in_flight >= limits.in_flight_in_all:
             return Admission.CROWDED
+        if not self._pay(client, now_ns):
+            return Admission.TOO_FAST
         client.waiting.add(frame)
         client.counts.requests += 1
         self._in_flight += 1

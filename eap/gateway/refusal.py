@@ -123,6 +123,14 @@ class Reason(Enum):
         FoeErrorCode.NO_USER,
         AdsError.NO_MEMORY,
     )
+    TOO_FAST = _Codes(
+        "more requests a second than the plant file allows",
+        MailboxError.SERVICE_IN_WORK,
+        AbortCode.LOCAL_CONTROL,
+        SoeErrorCode.GENERAL,
+        FoeErrorCode.NOT_DEFINED,
+        AdsError.BUSY,
+    )
     DENIED = _Codes(
         "access refused: the plant file has no rule that allows it",
         MailboxError.SERVICE_NOT_SUPPORTED,
@@ -136,6 +144,9 @@ class Reason(Enum):
     def text(self) -> str:
         """For people."""
         return self.value.text
+
+
+_ASK_AGAIN = frozenset((Reason.BUSY, Reason.TOO_FAST))
 
 
 class Answer(NamedTuple):
@@ -184,7 +195,7 @@ def _refuse_foe(request: bytes, reason: Reason, text: str) -> bytes | None:
     words = text.encode() + b"\0"
     if not request:
         return None
-    if reason is Reason.BUSY:  # no end of the transfer, only of patience
+    if reason in _ASK_AGAIN:  # no end of the transfer, only of patience
         return encode_foe(FoeOpcode.BUSY, _NOT_BEGUN.number, words)
     return encode_foe(FoeOpcode.ERROR, reason.value.foe, words)
 

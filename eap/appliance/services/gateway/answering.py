@@ -61,6 +61,8 @@ class Answering:
         reasons = [each.reason for each in replies]
         self.tally.note(station, request.header.type, reasons, took_ns)
         self._note_refusals(request, request.header.type, reasons)
+        if replies and replies[0].is_again:
+            self._note_repeated(request.way)
         if address == request.header.address:  # not one of many
             request.give_back()
         for reply in replies:
@@ -96,6 +98,11 @@ class Answering:
         if not counter:
             counter = self._counter = next_counter(self._counter)
         send(encode_frame(MailboxHeader(0, address, type=kind, counter=counter), body))
+
+    def _note_repeated(self, way: Way) -> None:
+        counts = self._ledger.counts_of(way)
+        if counts is not None:
+            counts.repeated += 1
 
     def _note_refusals(
         self, request: Request, kind: MailboxType, reasons: Iterable[Reason | None]

@@ -42,6 +42,8 @@ from eap.ids import NetId
 ANSWER_S = 0.9
 """How long an answer may take: before a usual client gives up."""
 
+_NOT_TAKEN = {Admission.CROWDED: Reason.CROWDED, Admission.TOO_FAST: Reason.TOO_FAST}
+
 OpenRemote: TypeAlias = Callable[[RemoteSlave, MailboxType], RemoteSession]
 
 logger = logging.getLogger(__name__)
@@ -143,8 +145,8 @@ class MailboxGateway:
         if admission is Admission.REPEATED:
             return None
         request = Request(header, body, way, send)
-        if admission is Admission.CROWDED:
-            self._answering.refuse(request, Reason.CROWDED)
+        if admission is not Admission.TAKEN:
+            self._answering.refuse(request, _NOT_TAKEN[admission])
             return None
         request = request._replace(ticket=Ticket(self.ledger, way, frame))
         if self._answer_at_once(request):

@@ -19,7 +19,7 @@ PER_S = 2
 """And for long."""
 MAX_CLIENTS = 256
 """Whose lines are counted apart."""
-_TOLD = frozenset((Reason.DENIED, Reason.CROWDED, Reason.TIMEOUT, Reason.BUS_DOWN))
+_TOLD = frozenset((Reason.DENIED, Reason.CROWDED, Reason.TOO_FAST, Reason.TIMEOUT, Reason.BUS_DOWN))
 """What somebody may want to do something about; the rest is between client and slave."""
 
 logger = logging.getLogger(__name__)

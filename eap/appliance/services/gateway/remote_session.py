@@ -15,7 +15,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.sdo_server import SdoServer
 from eap.aoe.ads_operation import Operation, OperationOutcome, Read, Write
 from eap.appliance.services.gateway.remote_entries import RemoteEntries
-from eap.appliance.services.gateway.slave_session import IDLE_S, Reply
+from eap.appliance.services.gateway.slave_session import IDLE_S, Reply, again
 from eap.codec.ads import IndexGroup
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.coe import encode_message as encode_coe
@@ -80,7 +80,7 @@ class RemoteSession:
         """Return the answers to a request, which may be none."""
         async with self._turn:
             if self._transfer.is_repeated(body):
-                return self._last
+                return again(self._last)
             self._stop_timer()
             self._transfer.ask(body)
             self._last = await self._answer(body)

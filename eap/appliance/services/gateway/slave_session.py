@@ -9,7 +9,7 @@ Rule 3: a transfer that nobody goes on with is ended, and the slave is told.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import NamedTuple
 
 from devicebus.errors import (
@@ -50,6 +50,13 @@ class Reply(NamedTuple):
     counter: int = 0
     reason: Reason | None = None
     """Why, if the gateway itself answers."""
+    is_again: bool = False
+    """Whether it answers a repeated step of a transfer, as it answered the step itself."""
+
+
+def again(replies: Iterable[Reply]) -> list[Reply]:
+    """Return replies as what answers a step that is repeated."""
+    return [each._replace(is_again=True) for each in replies]
 
 
 class NoTurnError(EapError):
@@ -111,7 +118,7 @@ class SlaveSession:
 
     async def _ask(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[Reply]:
         if self._transfer.is_repeated(body):
-            return self._last
+            return again(self._last)
         if is_step and not self.is_running:
             return self._refuse(body, Reason.SERVICE, "no transfer is under way")
         self._stop_timer()

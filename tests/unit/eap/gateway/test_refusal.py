@@ -63,11 +63,14 @@ def test_a_file_transfer_ends_with_words() -> None:
     assert text_of(body) == "no slave 1009"
 
 
-def test_who_is_busy_with_a_file_asks_for_patience() -> None:
-    header, body = decode_message(refuse(FOE, bytes.fromhex("01 00 00000000 66"), Reason.BUSY).body)
+@pytest.mark.parametrize(
+    ("reason", "words"), [(Reason.BUSY, "another client"), (Reason.TOO_FAST, "a second")]
+)
+def test_whose_file_has_to_wait_is_asked_for_patience(reason, words) -> None:
+    header, body = decode_message(refuse(FOE, bytes.fromhex("01 00 00000000 66"), reason).body)
     assert header.opcode is FoeOpcode.BUSY
     assert Busy.of(header.number) == Busy(0, 100)
-    assert "another client" in text_of(body)
+    assert words in text_of(body)
 
 
 def test_an_ams_packet_comes_back() -> None:

@@ -229,6 +229,28 @@ def test_an_engine_that_is_gone_is_answered_for_too() -> None:
     play(scene)
 
 
+def test_a_repeated_step_of_a_transfer_is_answered_and_counted() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
+        packet = "03 00 01000000" + "61" * 1012
+        first = await desk.one(FOE, 1001, packet)
+        assert await desk.one(FOE, 1001, packet) == first
+        counts = desk.gateway.ledger.counts_of(HERE)
+        assert (counts.requests, counts.repeated) == (3, 1)
+        await desk.one(FOE, 1001, "03 00 02000000")
+
+    play(scene)
+
+
+def test_who_is_too_fast_is_told_so() -> None:
+    async def scene(desk: Desk) -> None:
+        await desk.one(COE, 1001, VENDOR)
+        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
+        assert desk.gateway.tally.report()[0]["errors"] == {"too_fast": 1}
+
+    play(scene, settings=Settings(NET_ID, limits=ClientLimits(rate=1)))
+
+
 def test_the_masters_dictionary() -> None:
     async def scene(desk: Desk) -> None:
         assert await desk.one(COE, 0, "0020 40 0010 00 00000000") == "00 30 43 00 10 00 00 51 00 00"

@@ -31,15 +31,15 @@ def test_segments_of_two_clients_do_not_meet() -> None:
     objects = ObjectDictionary([variable(0x1008, "N", "STRING(200)", value="n" * 200)])
     first, second = (MasterSession(objects, 100, nothing, lambda index: True) for _ in range(2))
     upload = bytes.fromhex("0020 40 0810 00 00000000")
-    ((_, head, _, _),) = asyncio.run(first.ask(COE, upload))
-    assert head[2] == 0x41
-    ((_, other, _, _),) = asyncio.run(second.ask(COE, bytes.fromhex("0020 60 00000000000000")))
-    assert other[2] == 0x80
-    ((_, segment, _, _),) = asyncio.run(first.ask(COE, bytes.fromhex("0020 60 00000000000000")))
-    assert segment[2] >> 5 == 0
+    (head,) = asyncio.run(first.ask(COE, upload))
+    assert head.body[2] == 0x41
+    (other,) = asyncio.run(second.ask(COE, bytes.fromhex("0020 60 00000000000000")))
+    assert other.body[2] == 0x80
+    (segment,) = asyncio.run(first.ask(COE, bytes.fromhex("0020 60 00000000000000")))
+    assert segment.body[2] >> 5 == 0
     first.close()
-    ((_, segment, _, _),) = asyncio.run(first.ask(COE, bytes.fromhex("0020 70 00000000000000")))
-    assert segment[2] == 0x80
+    (segment,) = asyncio.run(first.ask(COE, bytes.fromhex("0020 70 00000000000000")))
+    assert segment.body[2] == 0x80
 
 
 def test_refusals() -> None:
