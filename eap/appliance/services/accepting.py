@@ -11,7 +11,7 @@ from itertools import count
 from typing import Any
 
 _PAUSE_S = 1.0
-"""After an error of the listener: mostly there are no descriptors left."""
+"""After an error of the listener: mostly there are no descriptors left; who waits keeps waiting."""
 _numbers = count(1)
 
 logger = logging.getLogger(__name__)
@@ -20,16 +20,16 @@ logger = logging.getLogger(__name__)
 async def accept_connections(
     listener: socket.socket,
     what: str,
-    serve: Callable[[socket.socket, str], Coroutine[Any, Any, None] | None],
+    serve: Callable[[socket.socket, Any], Coroutine[Any, Any, None] | None],
 ) -> None:
     """Accept at *listener* until cancelled, with a task for each connection.
 
     Args:
         listener: It stays open.
         what: It is for, in words of the log.
-        serve: Called with each connection and its peer's ``address:port``, before the next one is
-            accepted, so that a crowd is counted before it runs.  It returns what the task does,
-            or None for one that it has closed.
+        serve: Called with each connection and its peer's address (of IP: host and port), before
+            the next one is accepted, so that a crowd is counted before it runs.  It returns what
+            the task does, or None for one that it has closed.
     """
     listener.setblocking(False)
     loop = asyncio.get_running_loop()
@@ -41,7 +41,7 @@ async def accept_connections(
                 logger.warning("%s listener: %s", what, exc.strerror)
                 await asyncio.sleep(_PAUSE_S)
                 continue
-            work = serve(connection, f"{address[0]}:{address[1]}")
+            work = serve(connection, address)
             if work is not None:
                 group.create_task(work)
 

@@ -35,6 +35,7 @@ from eap.appliance.control import (
     request_id,
 )
 from eap.appliance.control_bus import BUS_METHODS
+from eap.appliance.services.accepting import accept_connections
 from eap.appliance.services.bus.bus_methods import BusConnection, Buses
 from eap.appliance.services.methods import Methods, Watch
 from eap.errors import ControlError, ImageError
@@ -56,18 +57,9 @@ class ControlServer:
 
     async def serve(self, listener: socket.socket) -> None:
         """Accept clients until cancelled; *listener* stays open."""
-        listener.setblocking(False)
-        loop = asyncio.get_running_loop()
-        async with asyncio.TaskGroup() as group:
-            while True:
-                try:
-                    connection, _ = await loop.sock_accept(listener)
-                except OSError as exc:
-                    # Out of descriptors: those who wait keep waiting, the plant goes on.
-                    logger.warning("control socket: %s", exc.strerror)
-                    await asyncio.sleep(1)
-                    continue
-                group.create_task(self.serve_client(connection))
+        await accept_connections(
+            listener, "control socket", lambda client, _: self.serve_client(client)
+        )
 
     async def serve_client(self, connection: socket.socket) -> None:
         """Answer one client until it leaves."""

@@ -68,7 +68,10 @@ class TcpDoor:
         finally:
             await self._mailboxes.close()
 
-    def _take(self, connection: socket.socket, peer: str) -> Coroutine[Any, Any, None] | None:
+    def _take(
+        self, connection: socket.socket, address: tuple[str, int]
+    ) -> Coroutine[Any, Any, None] | None:
+        peer = "{}:{}".format(*address)
         if self._waiting >= MAX_WAITING:
             self._close(connection, peer, Refusal.TCP_FULL)
             return None

@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.accepting import connection_name
+from eap.appliance.services.accepting import accept_connections, connection_name
 from eap.appliance.services.ams.ams_connection import PATIENCE_S, AmsConnection, set_options
 from eap.appliance.services.ams.ams_shares import Shares
 from eap.appliance.services.routing.entrance import Entrance
@@ -71,12 +72,10 @@ class AmsDoor:
 
     async def serve(self) -> None:
         """Accept until cancelled; then close all connections."""
-        self._listener.setblocking(False)
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._watch_slow())
-                while True:
-                    await self._accept()
+                await accept_connections(self._listener, "AMS/TCP", self._take)
         finally:
             for connection in list(self._connections):
                 connection.close("the appliance ends")
@@ -103,20 +102,20 @@ class AmsDoor:
         del packet, connection
         self.refuse(Refusal.AMS_UNASKED)
 
-    async def _accept(self) -> None:
-        loop = asyncio.get_running_loop()
-        try:
-            sock, (host, *_) = await loop.sock_accept(self._listener)
-        except OSError as exc:
-            logger.warning("AMS/TCP listener: %s", exc.strerror)
-            await asyncio.sleep(1)
-            return
+    def _take(
+        self, sock: socket.socket, address: tuple[str, int]
+    ) -> Coroutine[Any, Any, None] | None:
+        host, _ = address
         why_not = self._shares.take(host, sock.getsockname()[0])
         if why_not is not None:
             logger.debug("AMS/TCP connection from %s closed: %s", host, why_not)
             self.refuse(Refusal.AMS_FULL)
             sock.close()
-            return
+            return None
+        return self._open(sock, host)
+
+    async def _open(self, sock: socket.socket, host: str) -> None:
+        loop = asyncio.get_running_loop()
         name = connection_name(sock)
         try:
             set_options(sock)

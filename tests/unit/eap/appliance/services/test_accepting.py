@@ -15,14 +15,14 @@ pytestmark = pytest.mark.net
 
 def test_connections_are_counted_before_they_run(monkeypatch, caplog):
     monkeypatch.setattr(accepting, "_PAUSE_S", 0.0)
-    accepted: list[str] = []
+    accepted: list[tuple[str, int]] = []
 
     async def answer(connection):
         with connection:
             await asyncio.get_running_loop().sock_sendall(connection, b"x")
 
-    def serve(connection, peer):
-        accepted.append(peer)
+    def serve(connection, address):
+        accepted.append(address)
         if len(accepted) == 2:
             connection.close()
             return None
@@ -42,7 +42,7 @@ def test_connections_are_counted_before_they_run(monkeypatch, caplog):
 
     heard = asyncio.run(script())
     assert [octets for octets, _ in heard] == [b"x", b"", b"x"]
-    assert accepted == [f"{host}:{port}" for _, (host, port) in heard]
+    assert accepted == [name for _, name in heard]
 
 
 def test_listener_that_fails_is_asked_again(monkeypatch, caplog):
