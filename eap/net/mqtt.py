@@ -12,12 +12,12 @@ import logging
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from random import uniform
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from eap.aoe.mqtt_network import Publish, Subscribe
 from eap.aoe.spec import MqttSpec
 from eap.errors import EnvironmentalError
+from eap.net.backoff import Backoff
 
 if TYPE_CHECKING:
     from eap.net.mqttclient import Client
@@ -28,7 +28,7 @@ MAX_WAITING = 1024
 """Messages that wait to be sent."""
 MAX_WAITING_OCTETS = 8 << 20
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 15.0
-"""Between two attempts to connect: twice as long each time."""
+"""Between two attempts to connect: the longest that the first wait may be, and the limit."""
 _STABLE_S = 10.0
 """How long a connection has to last to be a good one."""
 _GOODBYE_S = 0.3
@@ -96,20 +96,20 @@ class MqttLink:
 
     async def run(self) -> None:
         """Keep the connection until cancelled."""
-        pause_s = FIRST_PAUSE_S
+        backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         loop = asyncio.get_running_loop()
         while True:
             began_s, count = loop.time(), self._connections
             why = await self._connect_once()
             if loop.time() - began_s > _STABLE_S:
-                pause_s, self._connections = FIRST_PAUSE_S, 0
+                backoff.reset()
+                self._connections = 0
             elif self._connections > max(count, 1):
                 why += f"; has another client the name {self._client_id!r} (client_id) too?"
             if why != self._said:  # a broker that is away for long is no flood of lines
                 logger.warning("%s: %s; trying again", self._name, why)
                 self._said = why
-            await asyncio.sleep(pause_s * uniform(0.8, 1.2))  # noqa: S311  spreads a crowd
-            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+            await asyncio.sleep(backoff.next_s())
 
     async def _connect_once(self) -> str:
         """Connect and serve until the connection is lost; return why it was."""

@@ -15,8 +15,8 @@ from typing import NamedTuple, Protocol
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.ams.ams_connection import PATIENCE_S, AmsConnection, set_options
-from eap.appliance.services.backoff import Backoff
 from eap.appliance.services.resolving import resolve
+from eap.net.backoff import Backoff
 
 CONNECT_S = 3.0
 """How long a peer may take to accept a connection."""

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Protocol, TypeAlias
 
-from eap.appliance.services.backoff import Backoff
+from eap.net.backoff import Backoff
 
 CONNECT_S = 3.0
 """How long the other side may take to accept."""

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.appliance.services.backoff import Backoff
+from eap.net.backoff import Backoff
 
 
 def test_waits_grow_up_to_a_limit_and_begin_anew() -> None:
