@@ -11,9 +11,8 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from time import monotonic_ns
 
-from eap.aoe.ads_device import AdsDevice
 from eap.aoe.ads_io import NoSegmentSpace
-from eap.aoe.ads_notifications import Client, NotificationTable
+from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.ads_operation import (
     AdsRefusedError,
@@ -23,20 +22,15 @@ from eap.aoe.ads_operation import (
     Write,
     WriteControl,
 )
-from eap.aoe.ads_state import states_of
 from eap.aoe.answer import AmsAnswer
-from eap.aoe.way import Way
-from eap.appliance.services.ads.ads_requests import begin_answer
 from eap.appliance.services.ads.ads_result import ads_result
+from eap.appliance.services.ads.ads_service import AdsService
 from eap.appliance.services.ads.image_variables import StationSymbols
-from eap.appliance.services.ads.state_control import control_state
 from eap.appliance.services.device.station_device import StationDevice
-from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,
     AdsRange,
-    AdsStates,
     IndexGroup,
     device_name,
     encode_result,
@@ -51,7 +45,7 @@ _BUSY_PAUSES = 20
 """Before a client is told that a writer has stopped in the middle of writing."""
 
 
-class EapAds:
+class EapAds(AdsService):
     """What clients reach at the NetID of one EAP port.
 
     Args:
@@ -61,26 +55,13 @@ class EapAds:
         info: What ReadDeviceInfo tells.
     """
 
-    ports = frozenset((DEVICE_PORT,))
-
     def __init__(
         self, device: StationDevice, port: str, symbols: StationSymbols, info: AdsDeviceInfo
     ) -> None:
-        self._device = device
-        self._port = port
         objects = ObjectSpace(device.dictionaries[port], device.od_state, ads_result)
-        self._ads = AdsDevice(info, self._states, [objects, symbols, NoSegmentSpace()])
-
-    @property
-    def notifications(self) -> NotificationTable:
-        """Whom it tells of what."""
-        return self._ads.notifications
-
-    def answer(self, request: LocalRequest) -> AmsAnswer | Awaitable[AmsAnswer]:
-        """Answer a request, at once where nobody has to be waited for."""
-        header = request.header
-        client = Client(request.came_by, header.source, header.source_port)
-        return begin_answer(header.command, request.body, partial(self._perform, client))
+        super().__init__(device, info, {DEVICE_PORT: [objects, symbols, NoSegmentSpace()]})
+        self._port = port
+        self._ads = self.devices[DEVICE_PORT]
 
     def answer_now(self, header: AmsHeader, body: bytes) -> AmsAnswer | None:
         """Answer a Read that nothing speaks against; None for all else, which :meth:`answer` does.
@@ -96,15 +77,12 @@ class EapAds:
             return None
         return AmsAnswer(encode_result(_DONE, data))
 
-    def client_gone(self, way: Way) -> None:
-        """End the notifications of a connection."""
-        self._ads.notifications.forget(way)
-
-    def _perform(
-        self, client: Client, operation: Operation
+    def perform(
+        self, port: int, client: Client, operation: Operation
     ) -> OperationOutcome | Awaitable[OperationOutcome]:
+        """Do one operation; what changes objects or the state, or finds a writer, takes time."""
         if isinstance(operation, WriteControl):
-            return control_state(self._device, operation)
+            return super().perform(port, client, operation)
         perform = partial(self._ads.perform, operation, client, monotonic_ns())
         if _changes_objects(operation):
             return self._change(perform)
@@ -115,14 +93,11 @@ class EapAds:
 
     async def _change(self, perform: Callable[[], OperationOutcome]) -> OperationOutcome:
         try:
-            return await self._device.change(self._port, perform)
+            return await self.device.change(self._port, perform)
         except SdoAbortError as exc:
             return OperationOutcome(ads_result(exc), why=str(exc))
         except ControlError as exc:
             return OperationOutcome(AdsError.BUSY, why=str(exc))
-
-    def _states(self) -> AdsStates:
-        return states_of(self._device.status.state)
 
 
 async def _try_again(perform: Callable[[], OperationOutcome]) -> OperationOutcome:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from eap.appliance.services.ads.ads_service import AdsService
 from eap.appliance.services.ads.eap_ads import EapAds, device_info
 from eap.appliance.services.ads.image_variables import StationSymbols
 from eap.appliance.services.ads.notification_pump import NotificationPump
@@ -12,7 +13,6 @@ from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.appliance.station_image import StationImage
-from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
 from eap.device.eap_content import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
@@ -50,21 +50,22 @@ class StationAds:
         info = device_info(station.name, release)
         own = RouterAds(station, device, self.dictionary, info)
         router.add_service(router.net_id, own)
-        for ams_port, table in own.notifications.items():
-            self.pump.add(table, router.net_id, ams_port)
+        self._drive(own, router.net_id)
         system = SystemAds(device, info)
         router.add_service(router.net_id, Whereabouts(router, system))
-        self.pump.add(system.notifications, router.net_id, SYSTEM_PORT)
+        self._drive(system, router.net_id)
         net_ids = {port.name: NetId.parse(port.net_id) for port in station.ports}
         for port in device.dictionaries:
             net_id, name = net_ids[port], f"{station.name}/{port}"
             of_port = EapAds(device, port, symbols, device_info(name, release))
-            router.add_service(net_id, of_port)
-            self.pump.add(of_port.notifications, net_id, DEVICE_PORT)
-            system = SystemAds(device, info)
-            router.add_service(net_id, system)
-            self.pump.add(system.notifications, net_id, SYSTEM_PORT)
+            for service in (of_port, SystemAds(device, info)):
+                router.add_service(net_id, service)
+                self._drive(service, net_id)
 
     async def serve(self) -> None:
         """Tell whom notifications are for, until cancelled."""
         await self.pump.serve()
+
+    def _drive(self, service: AdsService, net_id: NetId) -> None:
+        for ams_port, table in service.notifications.items():
+            self.pump.add(table, net_id, ams_port)

@@ -16,7 +16,6 @@ from eap.appliance.services.device.jobs import MAX_WAITING
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
-from eap.codec.adsnotification import TransMode
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
 from eap.device.fault import FaultCode
 from eap.errors import EngineRefusedError
@@ -210,19 +209,5 @@ def test_crowd_of_changes_is_busy(bench):
         assert all("wait already" in each.why for each in crowded)
         bench.engine.gate.set()
         await asyncio.gather(*changes)
-
-    bench.run(script)
-
-
-def test_notifications_belong_to_the_connection(bench):
-    async def script():
-        watched = struct.pack("<6I16x", G.DEVICE_DATA, 0, 4, TransMode.SERVER_CYCLE, 0, 0)
-        added = await bench.ask(AmsCommand.ADD_NOTIFICATION, watched)
-        assert result(added) == 0
-        assert bench.ads.notifications.stats().notifications == 1
-        bench.ads.client_gone(Way("ams-tcp", "2"))
-        assert bench.ads.notifications.stats().notifications == 1
-        bench.ads.client_gone(CLIENT.way)
-        assert bench.ads.notifications.stats().notifications == 0
 
     bench.run(script)

@@ -17,7 +17,6 @@ from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
-from eap.codec.adsnotification import TransMode
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.device.eap_content import Identity
 from eap.device.router_dictionary import RouterDictionary
@@ -104,16 +103,6 @@ def test_states_are_those_of_the_station(bench):
     assert bench.control(DEVICE, AdsState.RUN) == 0
     assert bench.engine.state is DeviceState.OP
     assert bench.control(IO, AdsState.CONFIG) == AdsError.SERVICE
-
-
-def test_notifications_end_with_their_connection(bench):
-    watched = struct.pack("<6I16x", G.DEVICE_DATA, 0, 4, TransMode.SERVER_CYCLE, 0, 0)
-    for port in bench.ads.ports:
-        assert bench.ask(port, AmsCommand.ADD_NOTIFICATION, watched).data[:4] == OK
-    tables = bench.ads.notifications
-    assert [tables[port].stats().notifications for port in (IO, DEVICE)] == [1, 1]
-    bench.ads.client_gone(WAY)
-    assert [tables[port].stats().notifications for port in (IO, DEVICE)] == [0, 0]
 
 
 def test_sum_commands(bench):

@@ -13,7 +13,6 @@ from eap.appliance.services.ads.system_ads import SystemAds
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
-from eap.codec.adsnotification import TransMode
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.pd.device import DeviceState
@@ -67,11 +66,3 @@ def test_reset_is_how_clients_of_twincat_ask_for_run(ask, device):
     assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.CONFIG, 0, 0)) == OK
     assert ask(AmsCommand.WRITE_CONTROL, struct.pack("<HHI", AdsState.RESET, 0, 0)) == OK
     assert device[1].state is DeviceState.OP
-
-
-def test_notifications_end_with_their_connection(ask, system):
-    watched = struct.pack("<6I16x", G.DEVICE_DATA, 0, 4, TransMode.SERVER_CYCLE, 0, 0)
-    assert ask(AmsCommand.ADD_NOTIFICATION, watched)[:4] == OK
-    assert len(system.notifications) == 1
-    system.client_gone(WAY)
-    assert len(system.notifications) == 0

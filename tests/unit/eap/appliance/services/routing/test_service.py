@@ -6,9 +6,7 @@ from inspect import signature
 
 import pytest
 
-from eap.appliance.services.ads.eap_ads import EapAds
-from eap.appliance.services.ads.router_ads import RouterAds
-from eap.appliance.services.ads.system_ads import SystemAds
+from eap.appliance.services.ads.ads_service import AdsService
 from eap.appliance.services.ams.ams_door import AmsClients
 from eap.appliance.services.routing.local_client import LocalClient
 from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
@@ -17,7 +15,7 @@ from eap.appliance.services.routing.service import Carrier, Service
 from tests.support.routing import KeepingCarrier, StubService
 
 
-@pytest.mark.parametrize("service", [EapAds, RouterAds, SystemAds, StubService])
+@pytest.mark.parametrize("service", [AdsService, StubService])
 def test_services(service):
     for method in ("answer", "client_gone"):
         asked = [*signature(getattr(Service, method)).parameters]
