@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from difflib import get_close_matches
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from eap.aoe.spec import DirectoryPort, DirectoryStation
 from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
 from eap.ids import NetId
+from eap.near import near
 from eap.od.profiles.router9000 import ROUTER
 
 _MAX_PORT = 0xFFFF
@@ -54,7 +54,7 @@ class Directory:
         name, _, rest = text.partition("/")
         station = self.stations.get(name)
         if station is None:
-            raise ValueError(f"no station {name!r} in this plant{_near(name, self.stations)}")
+            raise ValueError(f"no station {name!r} in this plant{near(name, self.stations)}")
         if not rest:
             return AmsAddress(NetId.parse(station.net_id), SYSTEM_PORT)
         port_name, slash, slave = rest.partition("/")
@@ -63,7 +63,7 @@ class Directory:
         if port is None and rest == ROUTER:
             return AmsAddress(NetId.parse(station.net_id), DEVICE_PORT)
         if port is None:
-            hint = _near(port_name, ports) or f"; it has {', '.join(ports) or 'none'}"
+            hint = near(port_name, ports) or f"; it has {', '.join(ports) or 'none'}"
             raise ValueError(f"station {name} has no port {port_name!r}{hint}")
         number = _slave(f"{name}/{port_name}", port, slave) if slash else DEVICE_PORT
         return AmsAddress(NetId.parse(port.net_id), number)
@@ -112,10 +112,5 @@ def _slave(owner: str, port: DirectoryPort, slave: str) -> int:
     if slave.isascii() and slave.isdigit() and 0 < int(slave) < DEVICE_PORT:
         return int(slave)
     known = ", ".join(f"{name} ({number})" for name, number in port.slaves.items())
-    hint = _near(slave, port.slaves) or (f"; they are {known}" if known else "")
+    hint = near(slave, port.slaves) or (f"; they are {known}" if known else "")
     raise ValueError(f"no slave {slave!r} behind {owner}{hint}")
-
-
-def _near(name: str, known: Iterable[str]) -> str:
-    found = get_close_matches(name, list(known), n=1)
-    return f", did you mean {found[0]}?" if found else ""

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from difflib import get_close_matches
 from pathlib import Path
 from time import monotonic_ns, time_ns
 from types import TracebackType
@@ -22,6 +21,7 @@ from typing import Any, Self
 from eap.appliance.runtime import find_running, runtime_root
 from eap.appliance.station_image import StationImage
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
+from eap.near import near
 from eap.pd.image import Image
 from eap.pd.layout import VAR_CTRL
 from eap.pd.report import station_status
@@ -168,9 +168,7 @@ class AttachedStation:
         places = self._file.image.places
         if name in places:
             return name
-        near = get_close_matches(name, places, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ImageError(f"station {self.name} has no variable {name!r}{hint}")
+        raise ImageError(f"station {self.name} has no variable {name!r}{near(name, places)}")
 
 
 def attach(station: str, *, plant: str = "") -> AttachedStation:

@@ -20,8 +20,9 @@ from devicebus.wire import sii
 from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave
 from eap.config.convert import convert_to
 from eap.config.document import read
-from eap.config.finding import Finding, Report, near, one_of
+from eap.config.finding import Finding, Report, one_of
 from eap.errors import ConfigError
+from eap.near import near
 from eap.od.dictionary import ObjectDictionary
 
 MAX_RESOURCE = 16 << 20

@@ -6,15 +6,15 @@ records, so that they cannot disagree about a name.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from difflib import get_close_matches
 from enum import StrEnum, auto
 from typing import Any, Literal, TypeVar
 
 import msgspec
 
 from eap.errors import ControlError, EnvironmentalError
+from eap.near import near
 
 VERSION = 1
 MAX_LINE = 1 << 23
@@ -157,12 +157,6 @@ def parameters(params: dict[str, Any], kind: type[ParametersT]) -> ParametersT:
         return msgspec.convert(params, kind)
     except msgspec.ValidationError as exc:
         raise ControlError(f"params: {exc}", code=ErrorCode.BAD_REQUEST) from None
-
-
-def near(name: str, known: Iterable[str]) -> str:
-    """Return ``, did you mean …?``, or nothing if no known name comes near."""
-    found = get_close_matches(name, list(known), n=1)
-    return f", did you mean {found[0]}?" if found else ""
 
 
 def of_station(name: str, known: Mapping[str, ItemT]) -> ItemT:

@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import click
 
 from eap.errors import ConfigError, EapError, EnvironmentalError
+from eap.near import near
 
 DEBUG_VARIABLE = "EAP_DEBUG"
 
@@ -60,15 +61,9 @@ class LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the subcommand that *args* start with; raise UsageError with one that comes near."""
         if args[0] not in self._commands_at and not ctx.resilient_parsing:
-            from difflib import get_close_matches
-
-            near = get_close_matches(args[0], self._commands_at, n=1)
-            hint = (
-                f"did you mean {near[0]!r}?"
-                if near
-                else f"there are {', '.join(self.list_commands(ctx))}"
-            )
-            raise click.UsageError(f"no command {args[0]!r}: {hint}", ctx)
+            known = ", ".join(self.list_commands(ctx))
+            hint = near(args[0], self._commands_at) or f": there are {known}"
+            raise click.UsageError(f"no command {args[0]!r}{hint}", ctx)
         return super().resolve_command(ctx, args)
 
     def main(self, *args: Any, **extra: Any) -> NoReturn:

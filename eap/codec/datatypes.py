@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from eap.codec.values import Array, Block, Boolean, DataType, Integer, Plain, Real, String, Value
+from eap.near import near
 
 __all__ = ["MAX_SIZE", "DataType", "Plain", "Value", "parse"]
 
@@ -109,7 +110,9 @@ def _scalar(text: str, name: str, length: str | None) -> DataType:
             raise ValueError(f"{text!r}: {name} has a fixed length, arrays are {name}[{length}]")
         return _NUMBERS[name]
     if name not in _SIZED:
-        raise ValueError(f"{text!r} is not a data type{_near(name)}")
+        known = [*_NUMBERS, *_SIZED, *_ALIASES]
+        hint = near(name, known) or " (such as UINT, REAL[4] or STRING(16))"
+        raise ValueError(f"{text!r} is not a data type{hint}")
     if length is None:
         raise ValueError(f"{text!r} lacks its length in octets, such as {name}(16)")
     _check_size(text, int(length))
@@ -135,10 +138,3 @@ def _array(text: str, element: DataType, count: int) -> DataType:
 def _check_size(text: str, size: int) -> None:
     if not 0 < size <= MAX_SIZE:
         raise ValueError(f"{text!r} has {size} octets, expected 1 to {MAX_SIZE}")
-
-
-def _near(name: str) -> str:
-    from difflib import get_close_matches
-
-    near = get_close_matches(name, [*_NUMBERS, *_SIZED, *_ALIASES], n=1)
-    return f", did you mean {near[0]}?" if near else " (such as UINT, REAL[4] or STRING(16))"

@@ -11,7 +11,7 @@ from eap.aoe.spec import IP_DOORS, AccessRule, AccessService, DoorKind, ObjectRa
 from eap.config.brokers import brokers_of
 from eap.config.check_brokers import check_file
 from eap.config.check_ports import check_names
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.index import Index
 from eap.config.reach import without_prefix
 from eap.config.routes import MisfitError
@@ -24,6 +24,7 @@ from eap.config.rules import (
     parse_target,
 )
 from eap.config.structs import Access, Station
+from eap.near import near
 from eap.pd.spec import PortKind
 
 T = TypeVar("T")

@@ -5,10 +5,11 @@ from __future__ import annotations
 from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.config.check_publish import is_unread
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.index import Index
 from eap.config.links import Ends, ends, find_circles, is_bitwise, is_scaled
 from eap.config.structs import Link, Station
+from eap.near import near
 
 _TARGET = "a variable of the station's own, or an output of a bus"
 

@@ -6,9 +6,10 @@ that is a request again would make the traffic of one station depend on that of 
 
 from __future__ import annotations
 
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import Frame, Publish, Station, Subscribe
+from eap.near import near
 from eap.pd.spec import REQUESTER
 
 _PUSHED = "a request that is sent by itself"

@@ -7,9 +7,10 @@ from eap.codec.pd import FIRST_PD, PdHeader
 from eap.config.check_address import check_address, check_monitoring
 from eap.config.check_ports import check_names
 from eap.config.destination import EXPECTED, frame_budget, resolve
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.index import Index
 from eap.config.structs import Frame, Publish, Station
+from eap.near import near
 from eap.pd.spec import REQUESTER, PortKind
 
 

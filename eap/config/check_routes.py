@@ -6,12 +6,13 @@ from pathlib import Path
 
 from eap.aoe.spec import DEFAULT_TARGET
 from eap.config.check_brokers import check_brokers
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.index import Index
 from eap.config.reach import reach, without_prefix
 from eap.config.routes import MQTT, MisfitError, next_hop, target_of
 from eap.config.structs import Route, Station
 from eap.ids import NetId, prefix_text
+from eap.near import near
 
 _OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four numbers"
 

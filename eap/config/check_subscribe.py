@@ -6,10 +6,11 @@ from eap.codec import datatypes
 from eap.config.check_ports import check_names
 from eap.config.check_publish import check_port_reference
 from eap.config.destination import reaches, resolve
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import From, Station, Subscribe
 from eap.ids import NetId
+from eap.near import near
 from eap.pd.spec import REQUESTER
 
 

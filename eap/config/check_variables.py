@@ -8,9 +8,10 @@ from pathlib import Path
 from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.config.check_ports import check_names
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.index import Index
 from eap.config.structs import Station, Variable
+from eap.near import near
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL
 from eap.pd.spec import (
     INTERFACE_MEASURES,

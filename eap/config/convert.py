@@ -13,8 +13,9 @@ from typing import Any, TypeVar
 from msgspec import inspect
 
 from eap.config.document import Node, ScalarNode
-from eap.config.finding import Report, near, one_of
+from eap.config.finding import Report, one_of
 from eap.config.structs import PlantFile, Section
+from eap.near import near, nearest
 
 T = TypeVar("T")
 
@@ -167,10 +168,10 @@ class _Converter:
                 continue
             where = f"{path}.{name}" if path else name
             missing = [each for each in shown if each not in given]
-            hint = near(name, missing)
-            self._report.add(where, f"unknown key {name!r}{hint}", one_of(shown), line=line)
-            if hint:
-                meant = next(each for each in missing if hint.endswith(f"{each!r}?"))
+            message = f"unknown key {name!r}{near(name, missing)}"
+            self._report.add(where, message, one_of(shown), line=line)
+            meant = nearest(name, missing)
+            if meant is not None:
                 given[meant] = node
                 self._report.lines[f"{path}.{meant}" if path else meant] = line
         return given

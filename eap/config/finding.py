@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -67,12 +66,6 @@ class Report:
         """Return all findings in the order of the file, then those of other files."""
         own = sorted(self._findings.values(), key=lambda finding: finding.line)
         return (*own, *self._adopted)
-
-
-def near(name: str, known: Iterable[str]) -> str:
-    """Return ``, did you mean …?`` when one of *known* comes near to *name*, else nothing."""
-    matches = get_close_matches(name, list(known), n=1)
-    return f", did you mean {matches[0]!r}?" if matches else ""
 
 
 def one_of(known: Iterable[str]) -> str:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from eap.codec.ethercat import EAP_PORT
-from eap.config.finding import near
 from eap.config.index import Index
 from eap.config.routes import MisfitError
 from eap.config.structs import Plain, Port, Station
 from eap.ids import NetId
+from eap.near import near
 from eap.pd.gateway import GatewayAddress, GatewaySpec
 from eap.pd.spec import BusSlaveSpec, PortKind
 

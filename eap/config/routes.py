@@ -9,12 +9,13 @@ from eap.aoe.spec import DEFAULT_TARGET, DoorKind, HopSpec
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.brokers import brokers_of, find_network
-from eap.config.finding import near, one_of
+from eap.config.finding import one_of
 from eap.config.hosts import HOST
 from eap.config.index import Index
 from eap.config.neighbours import find_hop
 from eap.config.structs import Route, Station
 from eap.ids import Destination, DestinationKind, InterfaceUri, NetId, parse_host
+from eap.near import near
 from eap.pd.spec import PortKind
 
 VIA = "STATION/PORT, mqtt:NETWORK, an IPv4 address, tcp:// and one, a MAC address or a NetID"

@@ -7,12 +7,13 @@ from collections.abc import Iterator
 from ipaddress import IPv4Network
 
 from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
-from eap.config.finding import near, one_of
+from eap.config.finding import one_of
 from eap.config.index import Index
 from eap.config.reach import WHOLE, net_ids_of
 from eap.config.routes import MisfitError
 from eap.config.structs import Access, Port, Station
 from eap.ids import STATION_OCTETS, MacAddr, NetId
+from eap.near import near
 from eap.pd.spec import PortKind
 
 ALL = "all"

@@ -10,16 +10,10 @@ from typing import Any, Self
 
 from eap.appliance.bus_failure import to_error
 from eap.appliance.bus_request import Failure
-from eap.appliance.control import (
-    MAX_LINE,
-    ErrorCode,
-    Reply,
-    decode_reply,
-    encode_request,
-    near,
-)
+from eap.appliance.control import MAX_LINE, ErrorCode, Reply, decode_reply, encode_request
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_running, runtime_root
 from eap.errors import ControlError
+from eap.near import near
 
 TIMEOUT_S = 10.0
 """Patience for one answer: services may be on their way back from a restart."""

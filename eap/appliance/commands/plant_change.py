@@ -18,12 +18,12 @@ import msgspec
 
 from eap.appliance.commands.plant_link import Outcome, PlantLink, StationPlan
 from eap.appliance.configuration import new_cause
-from eap.appliance.control import near
 from eap.appliance.control_routing import RoutingDifference
 from eap.appliance.plantfile import load_plant
 from eap.config.load import Plant
 from eap.device.rollout import Step, steps, without_alternates
 from eap.errors import ConfigError
+from eap.near import near
 from eap.pd.spec import StationSpec
 
 Do: TypeAlias = Callable[[StationSpec], Outcome]

@@ -12,11 +12,12 @@ from inspect import isawaitable
 from typing import Any
 
 from eap.appliance import control
-from eap.appliance.control import VERSION, ErrorCode, near, of_station, parameters
+from eap.appliance.control import VERSION, ErrorCode, of_station, parameters
 from eap.appliance.control_bus import BUS_METHODS
 from eap.appliance.station_image import StationImage
 from eap.codec import datatypes
 from eap.errors import ControlError, WriterConflictError
+from eap.near import near
 from eap.pd.image import Image
 from eap.pd.layout import VariablePlace
 from eap.pd.report import account_word, pd_list, quality

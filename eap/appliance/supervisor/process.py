@@ -13,7 +13,6 @@ import signal
 import sys
 from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
-from difflib import get_close_matches
 from pathlib import Path
 from time import monotonic_ns
 
@@ -33,6 +32,7 @@ from eap.appliance.supervisor.sockets import SharedSockets
 from eap.appliance.supervisor.what_runs import what_runs_now
 from eap.config.load import Plant
 from eap.errors import ConfigError
+from eap.near import near
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
@@ -144,9 +144,8 @@ def _choose(plant: Plant, wanted: Sequence[str]) -> tuple[StationSpec, ...]:
     known = [station.name for station in plant.stations]
     for name in wanted:
         if name not in known:
-            near = get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
-            raise ConfigError(f"plant {plant.name} has no station {name!r}: {hint}")
+            hint = near(name, known) or f": it has {', '.join(known)}"
+            raise ConfigError(f"plant {plant.name} has no station {name!r}{hint}")
     return tuple(s for s in plant.stations if not wanted or s.name in wanted)
 
 

@@ -13,6 +13,4 @@ def test_module_is_the_command() -> None:
         [sys.executable, "-m", "eap", "chek"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
-    assert done.stderr == (
-        "eapctl: no command 'chek': did you mean 'check'? (see 'eapctl --help')\n"
-    )
+    assert done.stderr == "eapctl: no command 'chek', did you mean check? (see 'eapctl --help')\n"

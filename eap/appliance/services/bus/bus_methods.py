@@ -16,7 +16,7 @@ from devicebus.sim.spec import FaultKind
 from devicebus.wire.alstatus import AlState
 from eap.appliance import control_bus
 from eap.appliance.bus_request import BusReport
-from eap.appliance.control import ErrorCode, near, of_station, parameters
+from eap.appliance.control import ErrorCode, of_station, parameters
 from eap.appliance.control_bus import BusParameters, kind_of, reply_row, to_access, to_ask
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
@@ -24,6 +24,7 @@ from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError, EapError
+from eap.near import near
 from eap.pd.spec import PortKind, StationSpec
 
 

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 import msgspec
 
 from eap.appliance import control_device as words
-from eap.appliance.control import ErrorCode, near, of_station, parameters
+from eap.appliance.control import ErrorCode, of_station, parameters
 from eap.appliance.control_bus import to_octets
 from eap.appliance.services.device.station_device import StationDevice
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.router_dictionary import RouterDictionary
 from eap.errors import ControlError
+from eap.near import near
 from eap.od.model import Access, OdObject
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.router9000 import ROUTER

@@ -11,7 +11,7 @@ from typing import Any
 from eap.aoe.directory import Directory
 from eap.aoe.spec import DoorKind, RouteSpec
 from eap.aoe.via import parse_via
-from eap.appliance.control import ErrorCode, near, of_station, parameters, unless_unavailable
+from eap.appliance.control import ErrorCode, of_station, parameters, unless_unavailable
 from eap.appliance.control_routes import (
     Export,
     ImportRow,
@@ -43,6 +43,7 @@ from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.staticroutes import TCP_IP, StaticRoute
 from eap.errors import ControlError
 from eap.ids import NetId
+from eap.near import near
 
 _ANY = NetId(bytes(6))
 """Stands in a default route."""

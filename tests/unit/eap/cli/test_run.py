@@ -36,7 +36,7 @@ def test_unknown_station_is_refused(tmp_path: Path) -> None:
     path.write_text(PLANT)
     result = CliRunner().invoke(main, ["run", str(path), "--station", "mixr"])
     assert result.exit_code == 2
-    assert result.stderr == "plant line has no station 'mixr': did you mean mixer?\n"
+    assert result.stderr == "plant line has no station 'mixr', did you mean mixer?\n"
 
 
 def test_runtime_directory_that_cannot_be_made(

@@ -40,7 +40,7 @@ def test_these_can_be(findings, gateway):
         ("{addresses: {0x10: 1001, 16: 1001}}", "gateway address 16 is 0x10 once more"),
         ("{addresses: {0x83E9: 1001}}", "gateway address 0x83E9 is that of slave 1001 with bit 15"),
         ("{addresses: {9: 1002}}", "left/bus0 has no slave 1002; its last one is 1001"),
-        ("{addresses: {9: valve}}", "left/bus0 has no slave 'valve', did you mean 'valves'?"),
+        ("{addresses: {9: valve}}", "left/bus0 has no slave 'valve', did you mean valves?"),
         ("{addresses: {9: left/eap0/1001}}", "there is no bus port for 'left/eap0/1001'"),
         ("{addresses: {9: left/bus1/1001}}", "there is no bus port for 'left/bus1/1001', did you"),
         ("{addresses: {9: left/bus0/1001/2}}", "there is no bus port for"),

@@ -25,7 +25,7 @@ PLC = "to: plc, net_id: 5.1.2.3.1.1, ams_tcp: plc"
     [
         (["{via: right/eap0}"], "8: route has neither to nor mqtt; to: STATION, or mqtt: URL"),
         (["{to: left}"], "8: route of left to itself; another station"),
-        (["{to: rihgt}"], "8: no station 'rihgt' in this plant, did you mean 'right'?, and no net"),
+        (["{to: rihgt}"], "8: no station 'rihgt' in this plant, did you mean right?, and no net"),
         (["{to: third}"], "8: left and third share no interface; via: a station between them, or"),
         (["{to: third, via: left/eap0}"], "8: left/eap0 is of station left itself; a port of ano"),
         (["{to: right, net_id: 1.1.1.1.1.1}"], "8: right is a station of this plant, it needs no"),

@@ -26,7 +26,7 @@ def source(name, text):
             ("count: UDINT", "count: UDINT\n      raw: {type: BLOCK(2), default: 0011}"),
             "10: default of raw: 11 is not a value of BLOCK(2); 2 octets in hexadecimal",
         ),
-        (source("cuont", "{kind: counter}"), "11: 'cuont' is no variable of left, did you mean 'c"),
+        (source("cuont", "{kind: counter}"), "11: 'cuont' is no variable of left, did you mean c"),
         (
             source("speed", "{kind: sine, amplitude: 1, period_ms: 0}"),
             "11: period_ms is 0; more th",
@@ -92,7 +92,7 @@ def test_a_variable_is_owned_or_received_once(findings):
         ("time,heat\n0,1\n1,2.5\n", None),
         (
             "time,haet\n0,1\n",
-            "11: oven.csv has no column 'heat', did you mean 'haet'?; one of time",
+            "11: oven.csv has no column 'heat', did you mean haet?; one of time",
         ),
         ("heat\n1\nhot\n", "11: oven.csv, line 3: 'hot' is not a value of REAL"),
         ("heat\n", "11: oven.csv has no rows; at least one row"),

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.config.finding import Finding, Report, near, one_of
+from eap.config.finding import Finding, Report, one_of
 
 
 def test_a_finding_reads_as_file_line_what_and_what_was_expected():
@@ -26,11 +26,6 @@ def test_findings_are_in_the_order_of_the_file_and_told_once():
     report.add("a", "first", "x", line=2)
     report.add("c", "second", "x", line=5)
     assert [(f.line, f.path) for f in report.findings()] == [(2, "a"), (5, "b")]
-
-
-def test_near_suggests_only_what_is_near():
-    assert near("cylce_us", ["cycle_us", "name"]) == ", did you mean 'cycle_us'?"
-    assert near("xyz", ["cycle_us"]) == ""
 
 
 def test_one_of_nothing_says_so():
