@@ -12,7 +12,7 @@ from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
-from eap.gateway.dialogue import Dialogue
+from eap.gateway.dialogue import Dialogue, patience
 from eap.gateway.slaves import MasterSlave, read_slaves, sizes_of
 
 T = TypeVar("T")
@@ -109,8 +109,10 @@ class AsyncGatewayClient:
                 while not dialogue.is_done:
                     await self._step(dialogue, frames)
         finally:
+            farewell = dialogue.close()
             self._counter = dialogue.counter
-            dialogue.close()
+            if farewell is not None:
+                self._protocol.send(farewell)
         return dialogue.result()
 
     async def _step(self, dialogue: Dialogue[T], frames: asyncio.Queue[bytes]) -> None:
@@ -129,7 +131,8 @@ class AsyncGatewayClient:
             except TimeoutError:
                 continue
             return
-        dialogue.expire()
+        host, port = self._place
+        dialogue.expire(f"gateway {host}:{port} {patience(self._timeout_s, self._tries, 'UDP')}")
 
 
 class _Datagrams(asyncio.DatagramProtocol):

@@ -14,6 +14,7 @@ import io
 import select
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 from time import monotonic
 from types import TracebackType
 from typing import Self, TypeVar
@@ -36,7 +37,7 @@ from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.async_client import PORT, TIMEOUT_S, TRIES, AsyncGatewayClient
-from eap.gateway.dialogue import Dialogue
+from eap.gateway.dialogue import Dialogue, patience
 from eap.gateway.slaves import MasterSlave, read_slaves, sizes_of
 
 T = TypeVar("T")
@@ -59,7 +60,8 @@ class GatewayClient:
         tries: How often a datagram is sent; by TCP the client waits as long in all.
 
     Raises:
-        EnvironmentalError: the host has no address, or does not take the connection.
+        EnvironmentalError: the host has no address, or no way leads there.
+        BusError: nobody takes the connection.
     """
 
     def __init__(
@@ -77,13 +79,21 @@ class GatewayClient:
         self._counter = 0
         self._rest = b""
         kind = socket.SOCK_STREAM if tcp else socket.SOCK_DGRAM
+        self._place = f"gateway {host}:{port}"
+        self._patience = patience(timeout_s, tries, "TCP" if tcp else "UDP")
         self._socket = socket.socket(socket.AF_INET, kind)
         self._socket.settimeout(self._timeout_s)
         try:
             self._socket.connect((host, port))
+        except (ConnectionError, TimeoutError) as exc:
+            self._socket.close()
+            raise self._failure(exc) from None
         except OSError as exc:
             self._socket.close()
-            raise EnvironmentalError(f"gateway {host}:{port}: {exc.strerror or exc}") from None
+            raise EnvironmentalError(f"{self._place}: {exc.strerror or exc}") from None
+        except TypeError:  # as sockets put it
+            self._socket.close()
+            raise EnvironmentalError(f"{self._place}: it is no name of a host") from None
 
     def __enter__(self) -> Self:
         return self
@@ -205,8 +215,11 @@ class GatewayClient:
                 if meanwhile is not None:
                     meanwhile()
         finally:
+            farewell = dialogue.close()
             self._counter = dialogue.counter
-            dialogue.close()
+            if farewell is not None:
+                with suppress(BusError):
+                    self._send(farewell)
         return dialogue.result()
 
     def _step(self, dialogue: Dialogue[T]) -> None:
@@ -222,13 +235,13 @@ class GatewayClient:
             while (octets := self._receive(deadline_s)) is not None:
                 if dialogue.receive(octets):
                     return
-        dialogue.expire()
+        dialogue.expire(f"{self._place} {self._patience}")
 
     def _send(self, frame: bytes) -> None:
         try:
             self._socket.sendall(frame)
         except OSError as exc:
-            raise BusError(f"the gateway takes nothing: {exc.strerror or exc}") from None
+            raise self._failure(exc) from None
 
     def _receive(self, deadline_s: float) -> bytes | None:
         """Return the next frame, None if there is none in time."""
@@ -239,15 +252,19 @@ class GatewayClient:
             except TimeoutError:
                 return None
             except OSError as exc:
-                raise BusError(f"the gateway does not answer: {exc.strerror or exc}") from None
+                raise self._failure(exc) from None
             if not self._is_stream:
                 return octets
             frame, self._rest = cut_frame(self._rest + octets)
             if frame is not None:
                 return frame
             if not octets:
-                raise BusError("the gateway has closed the connection")
+                raise BusError(f"{self._place} has closed the connection")
         return None
+
+    def _failure(self, error: OSError) -> BusError:
+        hint = ": nobody serves it there" if isinstance(error, ConnectionRefusedError) else ""
+        return BusError(f"{self._place} does not answer: {error.strerror or error}{hint}")
 
 
 def cut_frame(octets: bytes) -> tuple[bytes | None, bytes]:

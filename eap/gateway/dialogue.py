@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.counter import next_counter
+from devicebus.mailbox.farewell import FAREWELLS
 from devicebus.mailbox.match import answers
 from eap.codec.mailbox import (
     MailboxError,
@@ -95,14 +96,16 @@ class Dialogue(Generic[T]):
         """Whether somebody answers *frame*."""
         return self._ask is None or self._ask.expects_reply
 
-    def expire(self) -> None:
-        """Give up waiting."""
-        self._throw(MailboxTimeoutError(f"address {self._address}: no answer from the gateway"))
+    def expire(self, reason: str) -> None:
+        """Give up waiting; *reason* says for whom."""
+        self._throw(MailboxTimeoutError(f"no answer from address {self._address}: {reason}"))
 
-    def close(self) -> None:
-        """Cancel the conversation."""
-        self.is_done = True
+    def close(self) -> bytes | None:
+        """End it; return a frame, not answered, that frees the slave if that was in the middle."""
+        ask, was_done, self.is_done = self._ask, self.is_done, True
         self._conversation.close()
+        farewell = None if was_done or ask is None else FAREWELLS.get(ask.type)
+        return None if farewell is None else self._frame_of(farewell)
 
     def _advance(self, message: Message | None) -> None:
         try:
@@ -133,13 +136,24 @@ class Dialogue(Generic[T]):
         if ask.listen:
             self.frame = None
             return
+        self.frame = self._frame_of(ask)
+
+    def _frame_of(self, ask: Ask) -> bytes:
         self.counter = next_counter(self.counter)
         header = MailboxHeader(0, self._address, type=ask.type, counter=self.counter)
-        self.frame = encode_frame(header, ask.request)
+        return encode_frame(header, ask.request)
 
     def _end(self) -> None:
         self.is_done = True
         self.frame = self._ask = None
+
+
+def patience(timeout_s: float, tries: int, transport: str) -> str:
+    """Return in words how long a gateway was silent, and what that may mean."""
+    return (
+        f"was silent for {timeout_s * tries:g} s; is it started, and does a firewall let"
+        f" {transport} through?"
+    )
 
 
 def _refusal(data: bytes) -> MailboxRefusedError:

@@ -68,10 +68,12 @@ class FakeGateway:
     Attributes:
         drop: Requests by UDP that are not heard, from now on.
         has_master: Whether address 0 has a dictionary.
+        heard: The messages that came, without headers.
     """
 
     def __init__(self) -> None:
         self.drop = 0
+        self.heard: list[bytes] = []
         self.has_master = True
         slave = ObjectDictionary(
             [
@@ -116,6 +118,7 @@ class FakeGateway:
 
     def _answers(self, frame: bytes) -> list[bytes]:
         header, body = decode_message(frame, EtherCatHeader.SIZE)
+        self.heard.append(bytes(body))
         box = self._boxes.get(header.address)
         if box is None or (header.address == 0 and not self.has_master):
             detail = MailboxErrorReply(detail=MailboxError.UNSUPPORTED_PROTOCOL).encode()

@@ -65,7 +65,7 @@ def _lead(dialogue: Dialogue[Any], kind: MailboxType, messages: list[bytes]) -> 
             continue
         body = next(rest, None)
         if body is None:
-            dialogue.expire()
+            dialogue.expire("")
         else:
             told = MailboxType.ERR if len(body) == 4 else kind
             dialogue.receive(encode_frame(MailboxHeader(0, 1001, type=told), body))

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
-from eap.appliance.bus_farewell import FAREWELLS
+from devicebus.mailbox.farewell import FAREWELLS
 from eap.appliance.bus_request import AskMailbox
 from eap.appliance.control_bus import MARGIN_S
 from eap.appliance.services.engine_link import EngineLink

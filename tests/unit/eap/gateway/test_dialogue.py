@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox import coe_client, voe_client
+from devicebus.mailbox import coe_client, foe_client, voe_client
 from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.mailbox import MailboxType
 from eap.gateway.dialogue import Dialogue
 
@@ -52,8 +53,8 @@ def test_errors_end_it() -> None:
     with pytest.raises(MailboxRefusedError, match="without a reason"):
         one.result()
     one = dialogue()
-    one.expire()
-    with pytest.raises(MailboxTimeoutError):
+    one.expire("a:1 was silent")
+    with pytest.raises(MailboxTimeoutError, match="no answer from address 1001: a:1 was silent"):
         one.result()
 
 
@@ -89,7 +90,7 @@ def test_a_conversation_that_takes_an_error_goes_on() -> None:
             return "late"
 
     one = Dialogue(careful(), 1)
-    one.expire()
+    one.expire("")
     assert one.result() == "late"
 
     def patient():
@@ -99,8 +100,21 @@ def test_a_conversation_that_takes_an_error_goes_on() -> None:
             yield Ask(MailboxType.VOE, b"again!")
 
     one = Dialogue(patient(), 1)
-    one.expire()
+    one.expire("")
     assert one.frame is not None
     assert one.frame.endswith(b"again!")
     one.close()
     assert one.is_done
+
+
+def test_who_leaves_in_the_middle_frees_the_slave() -> None:
+    files = Dialogue(foe_client.read("f", bytes, MailboxSizes(128, 128)), 1001, 3)
+    farewell = files.close()
+    assert farewell is not None
+    assert (files.is_done, files.counter) == (True, 5)
+    assert farewell == bytes.fromhex("0c50 0600 e903 00 54 0500 00800000")
+    assert files.close() is None
+    done = dialogue()
+    done.receive(REPLY)
+    assert done.close() is None
+    assert Dialogue(voe_client.exchange(1, 2, b""), 1001).close() is None, "nothing stays open"

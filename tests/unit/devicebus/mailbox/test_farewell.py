@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.mailbox import coe_client
-from eap.appliance.bus_farewell import FAREWELLS
+from devicebus.mailbox.farewell import FAREWELLS
 from tests.support.loopbus import LoopBus
 
 
