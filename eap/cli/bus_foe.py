@@ -17,6 +17,8 @@ from eap.cli.bus_place import BusCommand, Place, bus_options, open_session
 from eap.cli.output import write_json, write_text
 from eap.cli.params import CommandT, json_option
 
+_STANDARD = Path("-")
+
 
 def _password_option(command: CommandT) -> CommandT:
     return click.option(
@@ -50,14 +52,18 @@ def get(
 ) -> None:
     """Read the file NAME of a slave into FILE.
 
-    FILE is NAME in this folder if left out.
+    FILE is NAME in this folder if left out, and - for stdout.
     """
     from eap.appliance.commands.bus_foe import get_file
 
     target = file or Path(Path(name).name)
+    is_stdout = target == _STANDARD
+    if is_stdout and as_json:
+        raise click.UsageError("the file and --json cannot both go to stdout")
     with open_session(bus) as session, _progress(name, hidden=as_json) as report:
-        row = get_file(session, slave, name, target, password=password, report=report)
-    _show(row, f"{row['name']} → {row['file']}", as_json=as_json)
+        whole = None if is_stdout else target
+        row = get_file(session, slave, name, whole, password=password, report=report)
+    _show(row, f"{row['name']} → {row['file']}", as_json=as_json, is_stdout_taken=is_stdout)
 
 
 @foe.command(cls=BusCommand)
@@ -75,22 +81,34 @@ def put(
     bus: Place,
     as_json: bool,
 ) -> None:
-    """Write FILE to a slave, as NAME if that is given."""
+    """Write FILE to a slave, as NAME if that is given.
+
+    FILE is - for stdin, which needs a NAME.
+    """
     from eap.appliance.commands.bus_foe import put_file
 
+    is_stdin = file == _STANDARD
+    if is_stdin and not name:
+        raise click.UsageError("what comes from stdin needs a NAME at the slave")
     target = name or file.name
     with open_session(bus) as session, _progress(target, hidden=as_json) as report:
-        row = put_file(session, slave, file, target, password=password, report=report)
+        source = None if is_stdin else file
+        row = put_file(session, slave, source, target, password=password, report=report)
     _show(row, f"{row['file']} → {row['name']}", as_json=as_json)
 
 
-def _show(row: dict[str, Any], what: str, *, as_json: bool) -> None:
+def _show(row: dict[str, Any], what: str, *, as_json: bool, is_stdout_taken: bool = False) -> None:
     if as_json:
         write_json(row)
         return
     speed = f"{row['rate'] / 1000:.0f} kB/s"
-    write_text(f"{what}: {row['octets']} octets in {row['seconds']:.1f} s, {speed}")
-    write_text(f"sha256 {row['sha256']}")
+    text = (
+        f"{what}: {row['octets']} octets in {row['seconds']:.1f} s, {speed}\nsha256 {row['sha256']}"
+    )
+    if is_stdout_taken:
+        click.echo(text, err=True)
+    else:
+        write_text(text)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from importlib import import_module
 from typing import Any, NoReturn
@@ -71,6 +71,10 @@ class LazyGroup(click.Group):
         extra["standalone_mode"] = False
         try:
             code = super().main(*args, **extra)
+        except SystemExit:  # how click ends when a pipe breaks
+            if _has_reader_left():
+                sys.exit(ExitCode.DONE)
+            raise
         except Exception as exc:  # noqa: BLE001  the outermost edge of the process
             _report(exc)
             sys.exit(exit_code_of(exc))
@@ -102,7 +106,23 @@ def describe(error: Exception) -> str:
         text = str(error) or type(error).__name__
     else:
         text = f"unexpected {type(error).__name__}: {error} ({DEBUG_VARIABLE}=1 shows where)"
-    return " ".join(text.split())
+    return " ".join("; ".join((text, *_notes_of(error))).split())
+
+
+def _has_reader_left() -> bool:
+    """Say whether it is stdout that broke, as of ``--help | head``, and no socket."""
+    import select
+
+    poll = select.poll()
+    poll.register(1, 0)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def _notes_of(error: BaseException) -> Sequence[str]:
+    """Return what was noted on an error; click hides a KeyboardInterrupt behind its own."""
+    cause = error.__cause__ if isinstance(error, click.Abort) else None
+    notes: Sequence[str] = getattr(cause or error, "__notes__", ())
+    return notes
 
 
 def _report(error: Exception) -> None:

@@ -12,6 +12,7 @@ from eap.cli.group import LazyGroup
 from eap.cli.params import examples
 
 _PORT = 34980
+_TCP = "--tcp"
 
 
 def _parse_place(ctx: click.Context, param: click.Parameter, text: str) -> GatewayPlace:
@@ -26,6 +27,13 @@ def _parse_place(ctx: click.Context, param: click.Parameter, text: str) -> Gatew
 
 class GatewayGroup(LazyGroup):
     """Commands of ``eapctl bus``, whose bus is the gateway."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Take ``--tcp`` wherever it stands: behind HOST it would be taken for a command."""
+        words = args[: args.index("--")] if "--" in args else args
+        others = [word for word in words if word != _TCP]
+        first = [_TCP] if len(others) < len(words) else []
+        return super().parse_args(ctx, [*first, *others, *args[len(words) :]])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import one subcommand, and give it the gateway in the place of a bus."""
@@ -70,10 +78,12 @@ def _call(command: click.Command, **values: Any) -> Any:
         "eapctl gw 127.0.1.1 scan",
         "eapctl gw 127.0.1.1 sdo read 1001 0x1018:1",
         "eapctl gw 127.0.1.1 od 0",
-        "eapctl gw --tcp 127.0.1.1 foe put 1001 new.bin firmware.bin",
+        "eapctl gw 127.0.1.1 foe put 1001 new.bin firmware.bin --tcp",
     ),
 )
-@click.option("--tcp", is_flag=True, help="Connect by TCP; otherwise datagrams are sent (UDP).")
+@click.option(
+    _TCP, is_flag=True, help="Connect by TCP, else datagrams are sent (UDP); anywhere on the line."
+)
 @click.argument("place", metavar="HOST[:PORT]", callback=_parse_place)
 @click.pass_context
 def gw(ctx: click.Context, place: GatewayPlace, tcp: bool) -> None:

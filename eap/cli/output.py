@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from eap.errors import EnvironmentalError
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
@@ -28,13 +30,20 @@ def write_json(document: Any) -> None:
 
 
 def write_text(text: str, *, end: str = "\n") -> None:
-    """Print *text* on stdout at once."""
+    """Print *text* on stdout at once; raise EnvironmentalError if it cannot be written."""
     try:
         click.echo(text + end, nl=False)
     except BrokenPipeError:
-        # What is still buffered would fail again when the interpreter flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _close_stdout()
         raise SystemExit(0) from None
+    except OSError as exc:
+        _close_stdout()
+        raise EnvironmentalError(f"stdout cannot be written: {exc.strerror}") from None
+
+
+def _close_stdout() -> None:
+    """What is still buffered would fail again when the interpreter flushes at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def write_tables(parts: Iterable[RenderableType]) -> None:

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 from devicebus.errors import MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
 from devicebus.mailbox.conversation import Progress
-from eap.appliance.commands.bus_slave import SlaveBus
-from eap.errors import ConfigError, EnvironmentalError
+from eap.appliance.commands.bus_slave import Begin, Slave, SlaveBus
+from eap.errors import ConfigError, EapError, EnvironmentalError
 
 Report: TypeAlias = Callable[[int, int | None], None]
 """Called now and then with the octets done, and how many there are if that is known."""
 
 
 def get_file(
-    bus: SlaveBus, slave: str, name: str, target: Path, *, password: int, report: Report
+    bus: SlaveBus, slave: str, name: str, target: Path | None, *, password: int, report: Report
 ) -> dict[str, Any]:
-    """Read the file *name* of a slave into *target*, which appears once it is complete.
+    """Read the file *name* of a slave into *target*, None for stdout.
+
+    A regular file appears once it is complete; a pipe or a device is written as it is.
 
     Raises:
         FoeError: the slave refuses.
@@ -31,34 +36,22 @@ def get_file(
         EnvironmentalError: *target* cannot be written.
     """
     unit = bus.find(slave)
-    partial = target.with_name(f"{target.name}.part")
     progress = Progress()
     digest = hashlib.sha256()
     start = time.monotonic()
-    try:
-        with partial.open("wb") as file:
+    with _writing(target) as file, _telling_how_far(progress, "read"):
 
-            def sink(data: bytes) -> None:
-                file.write(data)
-                digest.update(data)
+        def sink(data: bytes) -> None:
+            file.write(data)
+            digest.update(data)
 
-            bus.converse(
-                unit,
-                lambda sizes: foe_client.read(
-                    name, sink, sizes, password=password, progress=progress
-                ),
-                f"FoE read of {name!r}",
-                lambda: report(progress.done, None),
-            )
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(target)
-    except MailboxSizeError as exc:
-        raise ConfigError(f"file {name!r}: {exc}") from None
-    except OSError as exc:
-        raise EnvironmentalError(f"{target} cannot be written: {exc.strerror}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+        _converse(
+            bus,
+            unit,
+            lambda sizes: foe_client.read(name, sink, sizes, password=password, progress=progress),
+            f"FoE read of {name!r}",
+            lambda: report(progress.done, None),
+        )
     report(progress.done, progress.done)
     return _summary(unit.station, name, target, progress, time.monotonic() - start) | {
         "sha256": digest.hexdigest()
@@ -66,9 +59,9 @@ def get_file(
 
 
 def put_file(
-    bus: SlaveBus, slave: str, source: Path, name: str, *, password: int, report: Report
+    bus: SlaveBus, slave: str, source: Path | None, name: str, *, password: int, report: Report
 ) -> dict[str, Any]:
-    """Write *source* to a slave as the file *name*.
+    """Write *source*, None for stdin, to a slave as the file *name*.
 
     Raises:
         FoeError: the slave refuses.
@@ -79,16 +72,18 @@ def put_file(
     unit = bus.find(slave)
     digest = hashlib.sha256()
     start = time.monotonic()
-    try:
-        with source.open("rb") as file:
-            progress = Progress(os.fstat(file.fileno()).st_size)
+    with _reading(source) as file:
+        is_regular = source is not None and source.is_file()
+        progress = Progress(os.fstat(file.fileno()).st_size if is_regular else None)
 
-            def take(size: int) -> bytes:
-                data = file.read(size)
-                digest.update(data)
-                return data
+        def take(size: int) -> bytes:
+            data = file.read(size)
+            digest.update(data)
+            return data
 
-            bus.converse(
+        with _telling_how_far(progress, "written"):
+            _converse(
+                bus,
                 unit,
                 lambda sizes: foe_client.write(
                     name, take, sizes, password=password, progress=progress
@@ -96,14 +91,74 @@ def put_file(
                 f"FoE write of {name!r}",
                 lambda: report(progress.done, progress.total),
             )
-    except MailboxSizeError as exc:
-        raise ConfigError(f"file {name!r}: {exc}") from None
-    except OSError as exc:
-        raise EnvironmentalError(f"{source} cannot be read: {exc.strerror}") from None
     report(progress.done, progress.done)
     return _summary(unit.station, name, source, progress, time.monotonic() - start) | {
         "sha256": digest.hexdigest()
     }
+
+
+@contextmanager
+def _writing(target: Path | None) -> Iterator[BinaryIO]:
+    """Open what is to be written; a regular file is replaced when the block is through."""
+    if target is None:
+        yield sys.stdout.buffer
+        sys.stdout.flush()
+        return
+    whole = target.resolve()
+    partial = whole.with_name(f".{whole.name}.{os.getpid()}")
+    try:
+        if whole.exists() and not whole.is_file():
+            with whole.open("wb") as file:
+                yield file
+            return
+        if whole.exists() and not os.access(whole, os.W_OK):
+            raise PermissionError(errno.EACCES, "it is read only")
+        try:
+            with partial.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(whole)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as exc:
+        raise EnvironmentalError(f"{target} cannot be written: {exc.strerror}") from None
+
+
+@contextmanager
+def _reading(source: Path | None) -> Iterator[BinaryIO]:
+    if source is None:
+        yield sys.stdin.buffer
+        return
+    try:
+        with source.open("rb") as file:
+            yield file
+    except OSError as exc:
+        raise EnvironmentalError(f"{source} cannot be read: {exc.strerror}") from None
+
+
+@contextmanager
+def _telling_how_far(progress: Progress, done: str) -> Iterator[None]:
+    """Note on whatever ends a transfer early how far it came."""
+    try:
+        yield
+    except (EapError, KeyboardInterrupt) as exc:
+        if progress.done:
+            of = f" of {progress.total}" if progress.total else ""
+            exc.add_note(
+                f"{progress.done}{of} octets were {done}; FoE does not go on in the middle of a"
+                " file: the same command begins anew"
+            )
+        raise
+
+
+def _converse(
+    bus: SlaveBus, unit: Slave, begin: Begin[int], name: str, meanwhile: Callable[[], None]
+) -> None:
+    try:
+        bus.converse(unit, begin, name, meanwhile)
+    except MailboxSizeError as exc:
+        raise ConfigError(str(exc)) from None
 
 
 def exchange(
@@ -127,12 +182,12 @@ def exchange(
 
 
 def _summary(
-    station: int, name: str, path: Path, progress: Progress, seconds: float
+    station: int, name: str, path: Path | None, progress: Progress, seconds: float
 ) -> dict[str, Any]:
     return {
         "slave": station,
         "name": name,
-        "file": str(path),
+        "file": "-" if path is None else str(path),
         "octets": progress.done,
         "seconds": round(seconds, 3),
         "rate": round(progress.done / seconds) if seconds else 0,

@@ -45,3 +45,21 @@ def test_bar_on_a_terminal(command, monkeypatch):
 def test_file_that_is_not_there(command):
     assert exit_code_of(command("get", "drive", "nothing", "x").exception) == 1
     assert exit_code_of(command("put", "drive", "nothing").exception) == 2
+
+
+def test_stdin_and_stdout(monkeypatch, tmp_path):
+    LoopBus("drive").replace(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    words = ["put", "drive", "-", "firmware.bin", *WHERE]
+    assert CliRunner().invoke(foe, words, input=CONTENT).exit_code == 0
+    result = CliRunner().invoke(foe, ["get", "drive", "firmware.bin", "-", *WHERE])
+    assert result.stdout_bytes == CONTENT
+    assert f"sha256 {sha256(CONTENT).hexdigest()}" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stdin_has_no_name_and_stdout_takes_one_thing(command):
+    nameless = command("put", "drive", "-")
+    assert (nameless.exit_code, "needs a NAME" in nameless.stderr) == (2, True)
+    both = command("get", "drive", "firmware.bin", "-", "--json")
+    assert (both.exit_code, "cannot both go to stdout" in both.stderr) == (2, True)

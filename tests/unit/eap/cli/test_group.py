@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -135,6 +136,23 @@ HELP = [
     ["state"],
     ["status"],
 ]
+
+
+def test_notes_on_an_error_follow_it() -> None:
+    for error, text in ((ControlError("refused"), "refused"), (KeyboardInterrupt(), "interrupted")):
+        error.add_note("3 of 4 were done")
+        result = CliRunner().invoke(failing(error), ["x"])
+        assert result.stderr.lstrip() == f"{text}; 3 of 4 were done\n"
+
+
+@pytest.mark.net
+def test_help_for_a_reader_that_left_is_done() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        words = [sys.executable, "-m", "eap", "bus", "--help"]
+        done = subprocess.run(words, stdout=closed, stderr=subprocess.PIPE, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 @pytest.mark.net

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from eap.cli import main
+from eap.gateway.client import GatewayClient
 from tests.support.fakegateway import FILE, FakeGateway
 
 pytestmark = pytest.mark.net
@@ -31,6 +32,17 @@ def test_objects_are_read_and_written(gateway, options) -> None:
     assert json.loads(found.output)["value"] == 5
     master = run(gateway, "sdo", "read", "0", "0x1008", options=options)
     assert master.output.endswith(" M\n")
+
+
+@pytest.mark.parametrize("words", [("--tcp", "scan"), ("scan", "--tcp")])
+def test_tcp_may_stand_behind_the_host(gateway, words, monkeypatch) -> None:
+    opened = []
+    monkeypatch.setattr(
+        "eap.appliance.commands.bus_gateway.GatewayClient",
+        lambda *place, tcp: opened.append(tcp) or GatewayClient(*place, tcp=tcp),
+    )
+    assert run(gateway, *words).exit_code == 0
+    assert opened == [True]
 
 
 def test_scan(gateway) -> None:

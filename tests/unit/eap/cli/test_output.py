@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 from rich.table import Table
 
 from eap.cli.output import WIDTH, write_json, write_tables, write_text
+from eap.errors import EnvironmentalError
 
 
 def test_json_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
@@ -50,3 +52,10 @@ def test_a_reader_that_left_ends_the_command(monkeypatch: pytest.MonkeyPatch) ->
         with pytest.raises(SystemExit) as end:
             write_text("a")
     assert end.value.code == 0
+
+
+def test_stdout_that_is_full_is_an_error_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr("sys.stdout", full)
+        with pytest.raises(EnvironmentalError, match="stdout cannot be written: No space left"):
+            write_text("a")

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import random
+import re
 
 import pytest
 
 from devicebus.errors import FoeError
 from eap.appliance.commands.bus_foe import exchange, get_file, put_file
+from eap.appliance.commands.bus_gateway import open_gateway
 from eap.errors import ConfigError, EnvironmentalError
+from tests.support.fakegateway import FILE, FakeGateway
 from tests.support.loopbus import LoopBus
+
+pytestmark = pytest.mark.net
 
 CONTENT = random.Random(1).randbytes(50_000)
 
@@ -70,12 +76,56 @@ def test_files_of_this_machine_that_do_not_work(bus, tmp_path, reports):
         get(bus, "firmware.bin", tmp_path / "no" / "folder", reports)
 
 
+def test_a_pipe_or_device_is_written_as_it_is(bus, tmp_path, reports):
+    pipe, source = tmp_path / "pipe", tmp_path / "a.bin"
+    source.write_bytes(CONTENT)
+    put(bus, source, "firmware.bin", reports)
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    get(bus, "firmware.bin", pipe, reports)
+    assert os.read(reader, 1 << 17) == CONTENT
+    os.close(reader)
+    assert pipe.is_fifo()
+
+
+def test_a_link_stays_one_and_what_is_read_only_stays(bus, tmp_path, reports, monkeypatch):
+    target, link = tmp_path / "b.bin", tmp_path / "link"
+    target.write_bytes(b"as it was")
+    link.symlink_to(target)
+    get(bus, "firmware.bin", link, reports)
+    assert link.is_symlink()
+    content = target.read_bytes()
+    assert content != b"as it was"
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(EnvironmentalError, match=r"b\.bin cannot be written: it is read only"):
+        get(bus, "firmware.bin", target, reports)
+    assert target.read_bytes() == content
+
+
+def test_who_breaks_off_is_told_how_far_it_came(tmp_path):
+    source, target = tmp_path / "a.bin", tmp_path / "b.bin"
+    source.write_bytes(FILE)
+
+    def leave(done, total):
+        if done > 500:
+            raise KeyboardInterrupt
+
+    with FakeGateway() as gateway, open_gateway("127.0.0.1", gateway.port, tcp=False) as bus:
+        with pytest.raises(KeyboardInterrupt) as caught:
+            put_file(bus, "drive", source, "f", password=0, report=leave)
+        assert re.match(r"5\d\d of 1024 octets were written; FoE does", caught.value.__notes__[0])
+        with pytest.raises(KeyboardInterrupt) as caught:
+            get_file(bus, "drive", "f", target, password=0, report=leave)
+        assert re.match(r"5\d\d octets were read; FoE does", caught.value.__notes__[0])
+    assert [path.name for path in tmp_path.iterdir()] == ["a.bin"]
+
+
 def test_name_that_does_not_fit_the_mailbox(bus, tmp_path, reports):
     source = tmp_path / "a.bin"
     source.write_bytes(CONTENT)
-    with pytest.raises(ConfigError, match="file 'xxx"):
+    with pytest.raises(ConfigError, match="file name 'xxx"):
         put(bus, source, "x" * 2000, reports)
-    with pytest.raises(ConfigError, match="file 'xxx"):
+    with pytest.raises(ConfigError, match="file name 'xxx"):
         get(bus, "x" * 2000, tmp_path / "b", reports)
 
 
