@@ -12,6 +12,7 @@ from devicebus.mailbox.protocol import MailboxSizes, refuse
 from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxError
 from eap.codec.sdo import (
+    EXPEDITED_SIZE,
     INITIATE_OVERHEAD,
     SEGMENT_OVERHEAD,
     SdoHeader,
@@ -28,6 +29,11 @@ from eap.codec.sdo import (
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
+
+# Plain numbers, because members of enums are slow to reach.
+_UPLOAD, _DOWNLOAD, _ABORT = (SdoRequest[name].value for name in ("UPLOAD", "DOWNLOAD", "ABORT"))
+_OF_SEGMENTS = (SdoRequest.DOWNLOAD_SEGMENT.value, SdoRequest.UPLOAD_SEGMENT.value)
+_UPLOADED, _RESPONSE = SdoResponse.UPLOAD, CoeService.SDO_RESPONSE
 
 
 class _Transfer:
@@ -72,10 +78,10 @@ class SdoServer:
         if len(body) < SdoHeader.SIZE:
             refuse(MailboxError.SIZE_TOO_SHORT, f"an SDO of {len(body)} octets, expected 8")
         specifier = body[0] >> 5
-        if specifier == SdoRequest.ABORT:
+        if specifier == _ABORT:
             self._transfer = None
             return []
-        if specifier in {SdoRequest.DOWNLOAD_SEGMENT, SdoRequest.UPLOAD_SEGMENT}:
+        if specifier in _OF_SEGMENTS:
             answer = self._continue(SdoRequest(specifier), body)
         else:
             answer = self._start(SdoHeader.decode(body), body[SdoHeader.SIZE :])
@@ -84,26 +90,25 @@ class SdoServer:
     def _start(self, head: SdoHeader, rest: bytes) -> bytes:
         self._transfer = None
         try:
-            if head.specifier == SdoRequest.UPLOAD:
+            if head.specifier == _UPLOAD:
                 body = self._start_upload(head)
-            elif head.specifier == SdoRequest.DOWNLOAD:
+            elif head.specifier == _DOWNLOAD:
                 body = self._start_download(head, rest)
             else:
                 return encode_abort(head.index, head.subindex, AbortCode.COMMAND)
         except SdoAbortError as exc:
             return encode_abort(head.index, head.subindex, exc.code)
-        return encode_message(CoeService.SDO_RESPONSE, body)
+        return encode_message(_RESPONSE, body)
 
     def _start_upload(self, head: SdoHeader) -> bytes:
-        where = (head.index, head.subindex)
-        read = self._dictionary.upload_complete if head.complete else self._dictionary.upload
-        data = read(*where, self._state())
+        index, subindex, complete = head.index, head.subindex, bool(head.complete)
+        read = self._dictionary.upload_complete if complete else self._dictionary.upload
+        data = read(index, subindex, self._state())
         room = self._sizes.to_master - INITIATE_OVERHEAD
-        if len(data) > max(room, 4):
+        if len(data) > max(room, EXPEDITED_SIZE):
             rest = bytearray(data[room:])
             self._transfer = _Transfer(head, rest, len(data), is_upload=True)
-        complete = bool(head.complete)
-        return encode_initiate(SdoResponse.UPLOAD, *where, data, complete=complete, room=room)
+        return encode_initiate(_UPLOADED, index, subindex, data, complete=complete, room=room)
 
     def _start_download(self, head: SdoHeader, rest: bytes) -> bytes:
         where = (head.index, head.subindex)
@@ -143,7 +148,7 @@ class SdoServer:
             self._transfer = None
             return encode_abort(transfer.index, transfer.subindex, exc.code)
         transfer.toggle ^= 1
-        return encode_message(CoeService.SDO_RESPONSE, answer)
+        return encode_message(_RESPONSE, answer)
 
     def _send_segment(self, transfer: _Transfer) -> bytes:
         room = self._sizes.to_master - SEGMENT_OVERHEAD

@@ -46,11 +46,15 @@ LOOKUPS = frozenset(
 """Groups whose ReadWrite changes nothing but what a client keeps of its own."""
 
 
+_PLACED = (Read, Write, ReadWrite, AddNotification)
+"""Operations that say where.  A tuple: a union would be made anew at each question."""
+
+
 def service_of(operation: Operation) -> AccessService:
     """Return the kind of access that an operation needs."""
     if isinstance(operation, WriteControl):
         return AccessService.CONTROL
-    if not isinstance(operation, Write | ReadWrite):
+    if not isinstance(operation, (Write, ReadWrite)):
         return AccessService.READ
     group = operation.group
     if group in _RAW:
@@ -64,7 +68,7 @@ def service_of(operation: Operation) -> AccessService:
 
 def place_of(operation: Operation) -> tuple[int | None, int]:
     """Return index group and offset, no group for what has none."""
-    if isinstance(operation, Read | Write | ReadWrite | AddNotification):
+    if isinstance(operation, _PLACED):
         return operation.group, operation.offset
     return None, 0
 

@@ -24,6 +24,8 @@ class CoeService(IntEnum):
     RX_PDO_REMOTE_REQUEST = 7
     SDO_INFORMATION = 8
 
+    __hash__ = int.__hash__  # that of enums is slow
+
 
 class CoeHeader(WireStruct, frozen=True):
     """ETG.1000.6: the two octets behind the mailbox header; *number* is that of a PDO, else 0."""
@@ -53,4 +55,8 @@ def decode_message(data: Buffer) -> tuple[CoeHeader, memoryview]:
 
 def encode_message(service: CoeService, body: Buffer, *, number: int = 0) -> bytes:
     """Return the data of a mailbox message."""
-    return CoeHeader(number, service=service).encode() + body
+    head = CoeHeader(number, service=service).encode() if number else _PLAIN_HEADERS[service]
+    return head + body
+
+
+_PLAIN_HEADERS = {service: CoeHeader(service=service).encode() for service in CoeService}

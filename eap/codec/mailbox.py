@@ -26,6 +26,8 @@ class MailboxType(IntEnum):
     SOE = 5
     VOE = 15
 
+    __hash__ = int.__hash__  # that of enums is slow
+
 
 class MailboxHeader(WireStruct, frozen=True):
     """ETG.1000.4: the six octets in front of every mailbox message.
@@ -117,6 +119,15 @@ def decode_frame(data: Buffer) -> tuple[MailboxHeader, memoryview]:
         TruncatedError: the frame is shorter than its Length, or its message than its length.
         MalformedError: the frame is of another type, or nobody knows the protocol.
     """
+    if len(data) >= _HEADS.size:  # the usual frame in one step
+        word, size, address, lane, kind = _HEADS.unpack_from(data)
+        end, protocol = _HEADS.size + size, _TYPES.get(kind & _TYPE_MASK)
+        whole = EtherCatHeader.SIZE + (word & _LENGTH_MASK)
+        if word >> _TYPE_AT == _MAILBOX and end <= whole <= len(data) and protocol is not None:
+            header = MailboxHeader(
+                size, address, lane & 0x3F, lane >> 6, protocol, kind >> _COUNTER_AT & 7, kind >> 7
+            )
+            return header, memoryview(data)[_HEADS.size : end]
     ethercat = EtherCatHeader.decode(data)
     if ethercat.type != FrameType.MAILBOX:
         raise MalformedError(f"frame type {ethercat.type}, expected 5", layout="EtherCatHeader")
@@ -151,19 +162,17 @@ def encode_frame(header: MailboxHeader, body: Buffer) -> bytes:
     return EtherCatHeader(len(message), type=FrameType.MAILBOX).encode() + message
 
 
-def encode_aoe_frame(counter: int, packet: bytes) -> bytes:
-    """Return a whole frame of type 5 to address 0 around an AMS packet.
+def encode_plain_frame(kind: MailboxType, address: int, counter: int, body: bytes) -> bytes:
+    """Return a whole frame of type 5, in channel 0 and without priority.
 
-    These are the frames that stations send each other; this does in one step what
-    :func:`encode_frame` does, and raises the same.
+    This does in one step what :func:`encode_frame` does, and raises the same.
     """
-    size = len(packet)
+    size = len(body)
     length = size + MailboxHeader.SIZE
     if length >> _LENGTH_BITS:
-        header = MailboxHeader(0, type=MailboxType.AOE, counter=counter)
-        return encode_frame(header, packet)
+        return encode_frame(MailboxHeader(0, address, type=kind, counter=counter), body)
     word = length | _MAILBOX << _TYPE_AT
-    return _HEADS.pack(word, size, 0, 0, _AOE | counter << _COUNTER_AT) + packet
+    return _HEADS.pack(word, size, address, 0, kind | counter << _COUNTER_AT) + body
 
 
 def aoe_packet_in(data: Buffer) -> bytes | None:
@@ -193,3 +202,4 @@ _MAILBOX, _AOE = FrameType.MAILBOX.value, MailboxType.AOE.value  # members of en
 _LENGTH_BITS, _TYPE_AT = 11, 12
 _LENGTH_MASK = (1 << _LENGTH_BITS) - 1
 _TYPE_MASK, _COUNTER_AT = 0x0F, 4
+_TYPES = {each.value: each for each in MailboxType}

@@ -9,6 +9,8 @@ per frame.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
+from enum import Enum
 from typing import Annotated, Any, ClassVar, Self, TypeAlias, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -73,6 +75,21 @@ class WireStruct(msgspec.Struct, frozen=True, gc=False):
         raise NotImplementedError  # every subclass gets its own from _compile()
 
 
+def _reader(wrap: type | None) -> Callable[[Any], Any] | None:
+    """Return what makes a value of *wrap*; for an enum a look-up, because calling one is slow."""
+    if wrap is None or not issubclass(wrap, Enum):
+        return wrap
+    members = wrap._value2member_map_
+
+    def member_of(value: Any) -> Any:
+        try:
+            return members[value]
+        except KeyError:
+            return wrap(value)  # says what is wrong with it
+
+    return member_of
+
+
 def _compile(cls: type[WireStruct]) -> None:
     codes: list[str] = []  # one struct code a word
     reads: list[str] = []  # one expression over w0, w1, ... a field
@@ -99,7 +116,7 @@ def _compile(cls: type[WireStruct]) -> None:
             codes.append(kind.code)
             writes.append(f"self.{name}")
             reads.append(f"w{word}" if kind.wrap is None else f"c{word}(w{word})")
-            scope[f"c{word}"] = kind.wrap
+            scope[f"c{word}"] = _reader(kind.wrap)
             if kind.code.endswith("s"):
                 checks.append(f"len(self.{name}) != {struct.calcsize(kind.code)}")
         else:
@@ -108,7 +125,7 @@ def _compile(cls: type[WireStruct]) -> None:
                 writes.append("0")
             part = f"w{len(codes) - 1} >> {filled} & {(1 << kind.width) - 1:#x}"
             reads.append(part if kind.wrap is None else f"c_{name}({part})")
-            scope[f"c_{name}"] = kind.wrap
+            scope[f"c_{name}"] = _reader(kind.wrap)
             writes[-1] += f" | self.{name} << {filled}"
             checks.append(f"self.{name} >> {kind.width}")
             filled += kind.width

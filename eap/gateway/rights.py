@@ -6,6 +6,8 @@ protocols become the operations that an ADS client would ask for to have the sam
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from eap.aoe.ads_operation import Operation, Read, ReadWrite, Write
 from eap.codec.ads import IndexGroup
 from eap.codec.coe import CoeHeader, CoeService
@@ -19,6 +21,10 @@ from eap.codec.soe import SoeHeader, SoeOpcode
 _COMPLETE = 0x100
 _RAW = ReadWrite(IndexGroup.VOE, 0, 0, b"")
 """What cannot be looked into."""
+# Members of enums are slow to reach.
+_SDO = IndexGroup.SDO
+_INFORMATION, _REQUEST = CoeService.SDO_INFORMATION, CoeService.SDO_REQUEST
+_UPLOAD, _DOWNLOAD = SdoRequest.UPLOAD, SdoRequest.DOWNLOAD
 _EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
 
 
@@ -27,24 +33,16 @@ def operation_of(kind: MailboxType, body: bytes) -> Operation | None:
 
     AoE is for the router, which judges it itself.
     """
-    match kind:
-        case MailboxType.COE:
-            return _of_coe(body)
-        case MailboxType.SOE:
-            return _of_soe(body)
-        case MailboxType.FOE:
-            return _of_foe(body)
-        case MailboxType.EOE if body and body[0] & 0x0F in _EOE_READS:
-            return Read(IndexGroup.OBJECT_LIST, 0, 0)
-    return _RAW
+    find = _BY_KIND.get(kind)
+    return find(body) if find is not None else _RAW
 
 
 def sdo(index: int, subindex: int, *, complete: bool, data: bytes | None = None) -> Operation:
     """Return the upload of an entry or object, or with *data* its download."""
     offset = index << 16 | (_COMPLETE if complete else subindex)
     if data is None:
-        return Read(IndexGroup.SDO, offset, 0)
-    return Write(IndexGroup.SDO, offset, data)
+        return Read(_SDO, offset, 0)
+    return Write(_SDO, offset, data)
 
 
 def idn(number: int, drive: int, data: bytes | None = None) -> Operation:
@@ -57,15 +55,17 @@ def idn(number: int, drive: int, data: bytes | None = None) -> Operation:
 
 def _of_coe(body: bytes) -> Operation | None:
     service = body[1] >> 4 if len(body) >= CoeHeader.SIZE else 0
-    if service == CoeService.SDO_INFORMATION and len(body) > CoeHeader.SIZE:
+    if service == _INFORMATION and len(body) > CoeHeader.SIZE:
         return _of_info(body)
-    if service != CoeService.SDO_REQUEST or len(body) < CoeHeader.SIZE + 4:
-        return _RAW if service != CoeService.SDO_REQUEST else None
-    command, index, subindex = body[2], int.from_bytes(body[3:5], "little"), body[5]
+    if service != _REQUEST:
+        return _RAW
+    if len(body) < CoeHeader.SIZE + 4:
+        return None
+    command, index, subindex = body[2], body[3] | body[4] << 8, body[5]
     specifier, complete = command >> 5, bool(command & 0x10)
-    if specifier == SdoRequest.UPLOAD:
+    if specifier == _UPLOAD:
         return sdo(index, subindex, complete=complete)
-    if specifier == SdoRequest.DOWNLOAD:
+    if specifier == _DOWNLOAD:
         return sdo(index, subindex, complete=complete, data=_written(body))
     return None
 
@@ -107,3 +107,16 @@ def _of_foe(body: bytes) -> Operation | None:
     if opcode == FoeOpcode.WRITE:
         return ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 0, body[6:])
     return None
+
+
+def _of_eoe(body: bytes) -> Operation:
+    is_read = bool(body) and body[0] & 0x0F in _EOE_READS
+    return Read(IndexGroup.OBJECT_LIST, 0, 0) if is_read else _RAW
+
+
+_BY_KIND: dict[MailboxType, Callable[[bytes], Operation | None]] = {
+    MailboxType.COE: _of_coe,
+    MailboxType.SOE: _of_soe,
+    MailboxType.FOE: _of_foe,
+    MailboxType.EOE: _of_eoe,
+}

@@ -93,6 +93,7 @@ def memory_kib(appliance: Appliance) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
 
 
+@pytest.mark.timeout(REQUESTS // 200 + 120)
 def test_after_all_of_it_everything_works() -> None:
     dice = random.Random(86)
     with gateway_plant(HOST) as appliance:

@@ -10,7 +10,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.gateway.refusal_log import RefusalLog
 from eap.appliance.services.gateway.slave_session import Reply
 from eap.appliance.services.gateway.tally import Tally
-from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame
+from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_plain_frame
 from eap.gateway import dialect
 from eap.gateway.ledger import Ledger, Ticket
 from eap.gateway.refusal import Reason, refuse
@@ -59,8 +59,9 @@ class Answering:
     ) -> None:
         """Answer a request from *address*; it is counted for *station*."""
         reasons = [each.reason for each in replies]
-        self.tally.note(station, request.header.type, reasons, took_ns)
-        self._note_refusals(request, request.header.type, reasons)
+        kind = request.header.type
+        self.tally.note(station, kind, reasons, took_ns)
+        self._note_refusals(request, kind, reasons)
         if replies and replies[0].is_again:
             self._note_repeated(request.way)
         if address == request.header.address:  # not one of many
@@ -97,7 +98,7 @@ class Answering:
         """Send a message from *address*, with the slave's *counter* or, if that is 0, our own."""
         if not counter:
             counter = self._counter = next_counter(self._counter)
-        send(encode_frame(MailboxHeader(0, address, type=kind, counter=counter), body))
+        send(encode_plain_frame(kind, address, counter, body))
 
     def _note_repeated(self, way: Way) -> None:
         counts = self._ledger.counts_of(way)
@@ -108,8 +109,10 @@ class Answering:
         self, request: Request, kind: MailboxType, reasons: Iterable[Reason | None]
     ) -> None:
         """Count what the gateway answers itself, and log it."""
-        reason = next((each for each in reasons if each is not None), None)
-        if reason is None:
+        for reason in reasons:
+            if reason is not None:
+                break
+        else:
             return
         counts = self._ledger.counts_of(request.way)
         if counts is not None:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from eap.aoe.way import Way
 from eap.appliance.discards import Refusal
 from eap.appliance.services.gateway.gateway import MailboxGateway
-from eap.codec.mailbox import MailboxError, MailboxHeader, decode_frame, encode_frame
-from eap.codec.wire import Buffer
+from eap.appliance.services.routing.mailbox_frames import refusal_of
+from eap.codec.mailbox import MailboxError, encode_plain_frame
 from eap.errors import MalformedError, TruncatedError
 from eap.gateway.refusal import mailbox_error
 
@@ -35,7 +35,7 @@ class GatewayDoor:
         return self._gateway is not None
 
     def receive(
-        self, frame: Buffer, connection: str, send: Callable[[str, bytes], object]
+        self, frame: bytes, connection: str, send: Callable[[str, bytes], object]
     ) -> Refusal | None:
         """Act on a frame; return why not if it is not taken.
 
@@ -45,7 +45,7 @@ class GatewayDoor:
             send: Sends a frame to *connection*.
         """
         if self._gateway is None:
-            return Refusal.MAILBOX
+            return refusal_of(frame)
         if not self._gateway.is_open:
             self._gateway.turned_away += 1
             return Refusal.GATEWAY_OFF
@@ -54,13 +54,12 @@ class GatewayDoor:
             send(connection, frame)
 
         try:
-            header, body = decode_frame(frame)
+            self._gateway.receive(frame, Way(self._name, connection), answer)
         except TruncatedError:
             return Refusal.TRUNCATED
         except MalformedError:
-            _refuse_type(bytes(frame), answer)
+            _refuse_type(frame, answer)
             return Refusal.MAILBOX
-        self._gateway.receive(header, bytes(body), Way(self._name, connection), answer)
         return None
 
     def connection_closed(self, connection: str) -> None:
@@ -78,4 +77,4 @@ def _refuse_type(frame: bytes, answer: Callable[[bytes], None]) -> None:
     """Say that nobody speaks the protocol of a frame."""
     kind, body = mailbox_error(MailboxError.UNSUPPORTED_PROTOCOL)
     address = int.from_bytes(frame[_ADDRESS], "little")
-    answer(encode_frame(MailboxHeader(0, address, type=kind), body))
+    answer(encode_plain_frame(kind, address, 0, body))

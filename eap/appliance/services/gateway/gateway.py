@@ -31,7 +31,7 @@ from eap.appliance.services.gateway.slave_session import (
     SlaveSession,
     find_refusal,
 )
-from eap.codec.mailbox import MailboxHeader, MailboxType
+from eap.codec.mailbox import MailboxType, decode_frame
 from eap.gateway import dialect
 from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, RemoteSlave, Slave
 from eap.gateway.ledger import Admission, ClientLimits, Ledger, Ticket
@@ -101,6 +101,7 @@ class MailboxGateway:
         self.is_open = True
         self.turned_away = 0
         self._bus = bus
+        self._master = Target(settings.net_id, MASTER_PORT)
         self._open_master = open_master
         self._addresses = addresses
         self._open_remote = open_remote
@@ -129,28 +130,30 @@ class MailboxGateway:
         """Return the transfers that are under way."""
         return [*self._slaves.running(), *self._remotes.running()]
 
-    def receive(
-        self, header: MailboxHeader, body: bytes, way: Way, send: Send
-    ) -> asyncio.Task[None] | None:
+    def receive(self, frame: bytes, way: Way, send: Send) -> asyncio.Task[None] | None:
         """Take a request; its answers go back by *send*, until the task that is returned is done.
 
         Args:
-            header: Of the mailbox message.
-            body: What follows it.
+            frame: From its EtherCAT header on.
             way: Connection, or address, of the client.
             send: Takes whole frames.
+
+        Raises:
+            TruncatedError: it is shorter than its headers say.
+            MalformedError: nobody knows its protocol.
         """
-        frame = header.encode() + body
-        admission = self.ledger.admit(way, frame, monotonic_ns())
+        header, body = decode_frame(frame)
+        now_ns = monotonic_ns()
+        admission = self.ledger.admit(way, frame, now_ns)
         if admission is Admission.REPEATED:
             return None
-        request = Request(header, body, way, send)
+        request = Request(header, bytes(body), way, send)
         if admission is not Admission.TAKEN:
             self._answering.refuse(request, _NOT_TAKEN[admission])
             return None
-        request = request._replace(ticket=Ticket(self.ledger, way, frame))
-        if self._answer_at_once(request):
+        if self._answer_at_once(request, frame, now_ns):
             return None
+        request = request._replace(ticket=Ticket(self.ledger, way, frame))
         task = asyncio.get_running_loop().create_task(self._serve(request))
         self._tasks.add(task)
         task.add_done_callback(partial(self._done, request))
@@ -207,10 +210,9 @@ class MailboxGateway:
                 *(self._ask(request, one, address, is_group=True) for one, address in members)
             )
 
-    def _answer_at_once(self, request: Request) -> bool:
+    def _answer_at_once(self, request: Request, frame: bytes, start_ns: int) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
-        header, body, way = request[:3]
-        start_ns = monotonic_ns()
+        header, body, way, _, _ = request
         if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
             return False
         if self.ledger.waiting(way) > 1:
@@ -220,7 +222,8 @@ class MailboxGateway:
         master = self._masters.take(key, self._open_master)
         if not master.is_ready(operation):
             return False
-        judged = self._judge(way, MASTER_ADDRESS, self._target(Master()), operation)
+        self.ledger.answered(way, frame)
+        judged = self._judge(way, MASTER_ADDRESS, self._master, operation)
         replies = (
             master.ask_now(body)
             if judged.is_allowed
@@ -267,7 +270,7 @@ class MailboxGateway:
         *,
         by_rule: bool = False,
     ) -> Judged:
-        if operation is None:  # a step of what was judged when it began
+        if operation is None or self.guard.may_read(way, target, operation):
             return Judged(station, target, None, None)
         verdict = self.guard.judge(way, target, operation, by_rule=by_rule)
         return Judged(station, target, operation, verdict)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from eap.aoe.access import AccessList, Verdict
-from eap.aoe.ads_operation import Operation
+from eap.aoe.ads_operation import Operation, Read
 from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
@@ -48,7 +48,8 @@ class Judged(NamedTuple):
     Attributes:
         station: Mailbox address that is counted.
         target: Whom rules name.
-        operation: None for a step of what was judged when it began.
+        operation: None for what needs no verdict: a step of what was judged when it began, and a
+            read where everything may be read.
         verdict: Likewise.
     """
 
@@ -76,6 +77,12 @@ class Guard:
     def __init__(self, access: Callable[[], AccessList]) -> None:
         self.on_audit: list[Callable[[AuditEntry], None]] = []
         self._access = access
+
+    def may_read(self, way: Way, target: Target, operation: Operation) -> bool:
+        """Say whether an operation is a read, of somebody of whom a client may read everything."""
+        if not isinstance(operation, Read):
+            return False
+        return self._access().grants(way, NOBODY, *target).may_read
 
     def judge(
         self, way: Way, target: Target, operation: Operation, *, by_rule: bool = False

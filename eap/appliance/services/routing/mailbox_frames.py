@@ -11,7 +11,13 @@ from devicebus.mailbox.counter import next_counter
 from eap.appliance.discards import Refusal
 from eap.codec.ams import AmsHeader
 from eap.codec.ethercat import EtherCatHeader
-from eap.codec.mailbox import MailboxHeader, aoe_packet_in, decode_frame, encode_aoe_frame
+from eap.codec.mailbox import (
+    MailboxHeader,
+    MailboxType,
+    aoe_packet_in,
+    decode_frame,
+    encode_plain_frame,
+)
 from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
 
@@ -19,11 +25,14 @@ FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
 _MAX_PEERS = 1024
 
 
-def aoe_packet(data: Buffer) -> bytes | Refusal:
-    """Return the AMS packet in a frame of type 5, or why there is none for a station."""
+def aoe_packet(data: Buffer) -> bytes | None:
+    """Return the AMS packet in a frame of type 5 that is for a station, None if it is for none."""
     packet = aoe_packet_in(data)
-    if packet is not None and len(packet) >= AmsHeader.SIZE:
-        return packet
+    return packet if packet is not None and len(packet) >= AmsHeader.SIZE else None
+
+
+def refusal_of(data: Buffer) -> Refusal:
+    """Return why nobody takes a frame of type 5 that is neither for a station nor for a gateway."""
     try:
         decode_frame(data)
     except MalformedError:
@@ -49,4 +58,4 @@ class MailboxCounters:
         self._latest[peer] = counter
         if len(self._latest) > _MAX_PEERS:
             self._latest.popitem(last=False)
-        return encode_aoe_frame(counter, packet)
+        return encode_plain_frame(MailboxType.AOE, 0, counter, packet)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.gateway.door import GatewayDoor
-from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
+from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet, refusal_of
 from eap.pd.link import Channel, Origin, OutFrame
 
 
@@ -49,25 +49,25 @@ class MailboxIntake:
         """Act on a frame; return why not if it is not taken."""
         del at_ns
         sender = origin.sender_of(data)
-        packet = aoe_packet(data[:size])
         if not sender:
             return Refusal.MAILBOX
-        if not isinstance(packet, Refusal) and not self._is_aoe_here:
-            packet = Refusal.MAILBOX
-        if isinstance(packet, Refusal):
-            if packet is not Refusal.MAILBOX or self._is_for_many(data):
-                return packet
-            return self._gateway.receive(data[:size], sender, self._carrier.send_frame)
-        self._entrance.receive(packet, sender, for_all=self._is_for_many(data))
-        return None
+        frame, is_for_many = data[:size], self._is_for_many(data)
+        packet = aoe_packet(frame) if self._is_aoe_here else None
+        if packet is not None:
+            self._entrance.receive(packet, sender, for_all=is_for_many)
+            return None
+        if is_for_many:
+            return refusal_of(frame)
+        return self._gateway.receive(bytes(frame), sender, self._carrier.send_frame)
 
     def judge(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
         """Return why a frame is not taken that this intake gets too, without acting on it."""
         del at_ns, origin
-        packet = aoe_packet(data[:size])
-        if packet is Refusal.MAILBOX and self._gateway.is_there and not self._is_for_many(data):
+        if aoe_packet(data[:size]) is not None:
             return None
-        return packet if isinstance(packet, Refusal) else None
+        reason = refusal_of(data[:size])
+        is_taken = self._gateway.is_there and not self._is_for_many(data)
+        return None if is_taken and reason is Refusal.MAILBOX else reason
 
 
 class ChannelCarrier:

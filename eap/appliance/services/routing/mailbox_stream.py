@@ -123,19 +123,15 @@ class MailboxStreams:
                 frame = head + await reader.readexactly(header.length)
             except asyncio.IncompleteReadError:
                 return
-            packet = aoe_packet(frame)
-            if not isinstance(packet, Refusal) and not self._is_aoe_here:
-                packet = Refusal.MAILBOX
-            if packet is Refusal.MAILBOX:
+            packet = aoe_packet(frame) if self._is_aoe_here else None
+            if packet is not None:
+                self._entrance.receive(packet, name)
+                await self._entrance.wait_below(name, MAX_UNANSWERED)
+            else:
                 refusal = self._gateway.receive(frame, name, self.send_frame)
                 if refusal is not None:
                     self._refuse(refusal)
                 await self._gateway.wait_below(name, MAX_AT_GATEWAY)
-            elif isinstance(packet, Refusal):
-                self._refuse(packet)
-            else:
-                self._entrance.receive(packet, name)
-                await self._entrance.wait_below(name, MAX_UNANSWERED)
             async with asyncio.timeout(SLOW_READER_S):
                 await writer.drain()
             await asyncio.sleep(0)  # others first: more of this one may be there already

@@ -13,9 +13,9 @@ from eap.codec.mailbox import (
     aoe_packet_in,
     decode_frame,
     decode_message,
-    encode_aoe_frame,
     encode_frame,
     encode_message,
+    encode_plain_frame,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
 from tests.support.records import records
@@ -94,17 +94,45 @@ def test_error_reply_names_its_reason() -> None:
     assert MailboxError.name_of(0x1234) == "0x1234"
 
 
-@given(st.integers(0, 7), st.binary(max_size=2100))
-def test_aoe_frame_is_made_in_one_step_as_in_two(counter: int, packet: bytes) -> None:
-    header = MailboxHeader(0, type=MailboxType.AOE, counter=counter)
+@given(
+    st.sampled_from(MailboxType), st.integers(0, 0xFFFF), st.integers(0, 7),
+    st.binary(max_size=2100),
+)  # fmt: skip
+def test_plain_frame_is_made_in_one_step_as_in_two(
+    kind: MailboxType, address: int, counter: int, body: bytes
+) -> None:
+    header = MailboxHeader(0, address, type=kind, counter=counter)
     try:
-        frame = encode_frame(header, packet)
+        frame = encode_frame(header, body)
     except CodecError:
         with pytest.raises(CodecError):
-            encode_aoe_frame(counter, packet)
+            encode_plain_frame(kind, address, counter, body)
         return
-    assert encode_aoe_frame(counter, packet) == frame
+    assert encode_plain_frame(kind, address, counter, body) == frame
+
+
+@given(st.integers(0, 7), st.binary(max_size=64))
+def test_aoe_packet_is_found_behind_both_headers(counter: int, packet: bytes) -> None:
+    frame = encode_plain_frame(MailboxType.AOE, 0, counter, packet)
     assert aoe_packet_in(frame + b"padding") == aoe_packet_in(memoryview(frame)) == packet
+
+
+@given(headers, st.binary(max_size=64), st.integers(0, 80), st.binary(max_size=8))
+def test_frame_is_read_in_one_step_as_in_two(
+    header: MailboxHeader, body: bytes, cut: int, damage: bytes
+) -> None:
+    frame = encode_frame(header, body)[:cut] + damage
+    try:
+        ethercat = EtherCatHeader.decode(frame)
+        end = EtherCatHeader.SIZE + ethercat.length
+        expected = decode_message(frame[:end], EtherCatHeader.SIZE)
+    except CodecError:
+        expected = None
+    if expected is None or ethercat.type != FrameType.MAILBOX or end > len(frame):
+        with pytest.raises(CodecError):
+            decode_frame(frame)
+    else:
+        assert decode_frame(frame) == expected
 
 
 @given(headers, st.binary(max_size=64), st.integers(0, 80), st.binary(max_size=8))

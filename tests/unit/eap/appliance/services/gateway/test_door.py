@@ -8,6 +8,7 @@ from typing import Any
 from eap.aoe.way import Way
 from eap.appliance.discards import Refusal
 from eap.appliance.services.gateway.door import GatewayDoor
+from eap.codec.mailbox import decode_frame
 
 UPLOAD = bytes.fromhex("10 50 0a 00 e9 03 00 23 00 20 41 18 10 02 00 00 00 00")
 
@@ -18,8 +19,9 @@ class Gateway:
         self.turned_away = 0
         self.heard: list[Any] = []
 
-    def receive(self, header, body, way, send) -> None:
-        self.heard.append((header.address, body, way))
+    def receive(self, frame, way, send) -> None:
+        header, body = decode_frame(frame)
+        self.heard.append((header.address, bytes(body), way))
         send(b"answer")
 
     def connection_closed(self, way) -> None:

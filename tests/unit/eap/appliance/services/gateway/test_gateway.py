@@ -22,7 +22,13 @@ from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.slave_link import PortLink
 from eap.codec.ads import IndexGroup
 from eap.codec.ethercat import EtherCatHeader
-from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame, encode_frame
+from eap.codec.mailbox import (
+    MailboxHeader,
+    MailboxType,
+    decode_frame,
+    encode_frame,
+    encode_plain_frame,
+)
 from eap.gateway.address import AddressMap, RemoteSlave, Slave
 from eap.gateway.elsewhere import ROOM
 from eap.gateway.ledger import ClientLimits
@@ -93,9 +99,8 @@ class Desk:
         return [decoded(each) for each in await self.ask_frame(frame, way)]
 
     async def ask_frame(self, frame: bytes, way: Way = HERE) -> list[bytes]:
-        header, body = decode_frame(frame)
         answers: list[bytes] = []
-        task = self.gateway.receive(header, bytes(body), way, answers.append)
+        task = self.gateway.receive(frame, way, answers.append)
         if task is not None:
             await task
         return answers
@@ -482,10 +487,9 @@ def test_errors_are_counted_for_their_client() -> None:
 def test_the_same_request_is_answered_once_until_then() -> None:
     async def scene(desk: Desk) -> None:
         frame = encode_frame(MailboxHeader(0, 1001, type=COE, counter=1), bytes.fromhex(VENDOR))
-        header, body = decode_frame(frame)
         answers: list[bytes] = []
         for _ in range(3):
-            desk.gateway.receive(header, bytes(body), HERE, answers.append)
+            desk.gateway.receive(frame, HERE, answers.append)
         await desk.gateway.wait_below(HERE, 1)
         assert len(answers) == 1
         assert len(await desk.ask_frame(frame)) == 1
@@ -495,11 +499,10 @@ def test_the_same_request_is_answered_once_until_then() -> None:
 
 def test_who_asks_too_much_at_once_is_told() -> None:
     async def scene(desk: Desk) -> None:
-        header = MailboxHeader(10, 1001, type=COE)
         answers: list[bytes] = []
         for index in range(4):
             body = b"\0\x20\x40" + bytes((index, 0x60)) + bytes(5)
-            desk.gateway.receive(header, body, HERE, answers.append)
+            desk.gateway.receive(encode_plain_frame(COE, 1001, 0, body), HERE, answers.append)
         assert [decoded(each)[1][-4:].hex() for each in answers] == ["05000405"] * 2
         await desk.gateway.wait_below(HERE, 1)
         assert len(answers) == 4
@@ -522,8 +525,7 @@ def test_ethernet_frames_of_a_slave_go_to_who_talks_to_it() -> None:
         frame = encode_frame(
             MailboxHeader(0, 1001, type=EOE), bytes.fromhex("00010000") + bytes(60)
         )
-        header, body = decode_frame(frame)
-        task = desk.gateway.receive(header, bytes(body), HERE, heard.append)
+        task = desk.gateway.receive(frame, HERE, heard.append)
         assert task is not None
         await task
         desk.engine.tell(Heard(0, 1001, EOE, b"an Ethernet frame"))
@@ -577,14 +579,14 @@ def test_the_dialect_of_who_may_only_read() -> None:
 def test_the_same_octets_right_behind_the_answer_are_a_new_request(address: int) -> None:
     async def scene(desk: Desk) -> None:
         answers: list[bytes] = []
-        header = MailboxHeader(0, address, type=COE, counter=3)
+        frame = encode_plain_frame(COE, address, 3, bytes.fromhex(VENDOR))
 
         def ask_again(octets: bytes) -> None:
             answers.append(octets)
             if len(answers) < 6:
-                desk.gateway.receive(header, bytes.fromhex(VENDOR), HERE, ask_again)
+                desk.gateway.receive(frame, HERE, ask_again)
 
-        desk.gateway.receive(header, bytes.fromhex(VENDOR), HERE, ask_again)
+        desk.gateway.receive(frame, HERE, ask_again)
         await desk.gateway.wait_below(HERE, 1)
         assert len(answers) == 6
         assert desk.gateway.ledger.waiting(HERE) == 0

@@ -6,7 +6,11 @@ import pytest
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.routing import mailbox_frames
-from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
+from eap.appliance.services.routing.mailbox_frames import (
+    MailboxCounters,
+    aoe_packet,
+    refusal_of,
+)
 from tests.support import aoe
 
 PACKET = aoe.packet("1.1.1.1.2.1", 4, b"abc")
@@ -29,7 +33,8 @@ def test_aoe_to_address_0_is_taken(frame):
     ],
 )
 def test_others_are_not_taken(frame, reason):
-    assert aoe_packet(frame) is reason
+    assert aoe_packet(frame) is None
+    assert refusal_of(frame) is reason
 
 
 def test_each_peer_gets_its_own_counter(monkeypatch):
