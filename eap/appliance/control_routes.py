@@ -133,15 +133,37 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
     """Base of what is told; a field that somebody newer tells is not looked at."""
 
 
-class RouteRow(Document, frozen=True, kw_only=True):
-    """One route.
+class WayRow(Document, frozen=True, kw_only=True):
+    """One way of packets, and what was asked by it.
+
+    Attributes:
+        door: That packets come and go by.
+        address: Of the other end.
+        requests: That went out by a route, or came in by a connection.
+        answers: To them.
+        errors: Requests that did not get to their targets.
+        octets_out: Of packets that left here.
+        octets_in: Of packets that came here.
+        last_error: In words, empty while there was none.
+    """
+
+    door: str
+    address: str
+    requests: int = 0
+    answers: int = 0
+    errors: int = 0
+    octets_out: int = 0
+    octets_in: int = 0
+    last_error: str = ""
+
+
+class RouteRow(WayRow, frozen=True, kw_only=True):
+    """One route: a way to the next hop.
 
     Attributes:
         name: As people call it.
         net_id: As it is asked for here.
         octets: How many of its octets have to match; 0 for a default route.
-        door: By which packets leave.
-        address: That they go to.
         origin: Who says so: the plant file, its ports, somebody at run time, the station itself.
         state: Whether a request would go on.
         why: What is wrong with one that is down.
@@ -151,19 +173,11 @@ class RouteRow(Document, frozen=True, kw_only=True):
         unidirectional: Whether nothing may be asked from there.
         timeout_ms: How long an answer may take; 0 for as long as usual.
         probed: Whether the next hop is asked from time to time.
-        requests: That went out by it.
-        answers: To them.
-        errors: Requests that did not get to their targets.
-        octets_out: Of packets that left here.
-        octets_in: Of packets that came here.
-        last_error: In words, empty while there was none.
     """
 
     name: str
     net_id: str
     octets: int
-    door: str
-    address: str
     origin: OriginName
     state: StateName
     why: str = ""
@@ -173,12 +187,6 @@ class RouteRow(Document, frozen=True, kw_only=True):
     unidirectional: bool = False
     timeout_ms: int = 0
     probed: bool = True
-    requests: int = 0
-    answers: int = 0
-    errors: int = 0
-    octets_out: int = 0
-    octets_in: int = 0
-    last_error: str = ""
 
     @property
     def pattern(self) -> str:
@@ -187,34 +195,18 @@ class RouteRow(Document, frozen=True, kw_only=True):
         return ".".join([*octets, *["*"] * (6 - self.octets)]) if self.octets else "default"
 
 
-class ConnectionRow(Document, frozen=True, kw_only=True):
+class ConnectionRow(WayRow, frozen=True, kw_only=True):
     """One connection that requests came by, or one sender where there are none.
 
     Attributes:
-        door: That it came by.
-        address: Of the other end.
         since_s: For how many seconds it has been used.
         net_ids: That asked by it, the first few.
         took_us: How long the latest answer took; None before the first.
-        requests: That came in by it.
-        answers: To them.
-        errors: Requests that did not get to their targets.
-        octets_out: Of packets that left here.
-        octets_in: Of packets that came here.
-        last_error: In words, empty while there was none.
     """
 
-    door: str
-    address: str
     since_s: int
     net_ids: list[str] = []
     took_us: int | None = None
-    requests: int = 0
-    answers: int = 0
-    errors: int = 0
-    octets_out: int = 0
-    octets_in: int = 0
-    last_error: str = ""
 
 
 class RequestRow(Document, frozen=True, kw_only=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from eap.aoe.way import Way
-from eap.appliance.control_routes import ConnectionRow, RequestRow, RouteRow, RouterRow
+from eap.appliance.control_routes import ConnectionRow, RequestRow, RouteRow, RouterRow, WayRow
 from eap.cli import words
 
 _UNITS = ("", "k", "M", "G", "T", "P", "E")
@@ -23,17 +23,17 @@ def short(number: int) -> str:
     )
 
 
-def octets(row: RouteRow | ConnectionRow) -> str:
+def octets(row: WayRow) -> str:
     """Return all octets, both ways."""
     return short(row.octets_in + row.octets_out)
 
 
-def door(row: RouteRow | ConnectionRow) -> str:
+def door(row: WayRow) -> str:
     """Return the door; one to an address of its own is called by its kind."""
     return row.door.removesuffix(f":{row.address}")
 
 
-def way(row: RouteRow | ConnectionRow) -> str:
+def way(row: WayRow) -> str:
     """Return address and door."""
     return str(Way(row.door, row.address))
 
@@ -70,7 +70,7 @@ def route_state(row: RouteRow) -> str:
     return f"{row.state}: {rest}" if rest else row.state
 
 
-def figures(row: RouteRow | ConnectionRow) -> str:
+def figures(row: WayRow) -> str:
     """Return all figures of a row in words."""
     return (
         f"{words.count(row.requests, 'request')}, {words.count(row.answers, 'answer')},"
