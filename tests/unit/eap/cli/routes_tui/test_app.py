@@ -8,6 +8,7 @@ from threading import Event
 import msgspec
 import pytest
 
+from eap.cli.routes_tui import app
 from eap.cli.routes_tui.app import RoutesApp
 from eap.cli.routes_tui.link import Link
 from tests.support.controlstub import ControlStub
@@ -258,7 +259,7 @@ def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
         assert goes_on.wait(20)
         return answer(params)
 
-    monkeypatch.setattr("eap.cli.routes_tui.app.PATIENCE_S", 0.0)
+    monkeypatch.setattr(app, "PATIENCE_S", 0.0)
 
     async def script(screen):
         stub._methods["routes_list"] = hang
