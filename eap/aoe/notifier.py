@@ -1,4 +1,4 @@
-"""Notifications that pass a router: who asked for them, who gets them, and how they end."""
+"""Notifications that pass a router: who asked for them, and who gets them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from collections.abc import Callable
 from eap.aoe.action import Reply
 from eap.aoe.inflight import Pending
 from eap.aoe.outlet import Outlet
-from eap.aoe.routes import Route
 from eap.aoe.subscriptions import MAX_PER_WAY, Subscription, Subscriptions, divide
 from eap.aoe.way import Way
 from eap.codec.ads import AdsReadWrite, IndexGroup
 from eap.codec.adsnotification import decode_notification
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
+from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
 from eap.ids import NetId
 
-_ADDRESSES = struct.Struct("<6sH6sH")
 _GRANTED = struct.Struct("<II")  # result, handle
 _HANDLE = 4
 _OF_NOTIFICATIONS = frozenset(
@@ -81,7 +79,7 @@ class Notifier:
         Raises:
             CodecError: it is shorter or longer than it says.
         """
-        onward = _ADDRESSES.pack(
+        onward = ADDRESSES.pack(
             header.source, header.source_port, header.target, header.target_port
         )
         handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
@@ -93,7 +91,7 @@ class Notifier:
         Raises:
             CodecError: it is shorter or longer than it says.
         """
-        onward = _ADDRESSES.pack(
+        onward = ADDRESSES.pack(
             header.source, header.source_port, header.target, header.target_port
         )
         parts = divide(body, onward, self.subscriptions, is_hop)
@@ -113,29 +111,6 @@ class Notifier:
             replies.append(self._outlet.reply(way, encode_packet(head, part)))
         return replies
 
-    def end_unwanted(self, header: AmsHeader, body: bytes, way: Way) -> list[Reply]:
-        """Return what ends a notification that nobody here has, at the server that sent it.
-
-        It is the first that a packet tells of: one may have many handles, and ask for many packets.
-        Others come again.
-
-        Raises:
-            CodecError: the notification is shorter or longer than it says.
-        """
-        handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
-        handle = next(handles, None)
-        if handle is None:
-            return []
-        head = AmsHeader(
-            header.source,
-            header.source_port,
-            header.target,
-            header.target_port,
-            AmsCommand.DELETE_NOTIFICATION,
-            StateFlags.ADS | StateFlags.NO_RETURN,
-        )
-        return [self._outlet.reply(way, encode_packet(head, handle.to_bytes(4, "little")))]
-
     def _delete(self, onward: bytes, handles: bytes, way: Way) -> None:
         for at in range(0, len(handles) - _HANDLE + 1, _HANDLE):
             handle = int.from_bytes(handles[at : at + _HANDLE], "little")
@@ -146,17 +121,3 @@ class Notifier:
 
 def _whole(granted: bytes) -> int:
     return len(granted) // _GRANTED.size * _GRANTED.size
-
-
-def request_to_end(subscription: Subscription) -> tuple[AmsHeader, bytes, Route]:
-    """Return the request that ends a notification, as it goes to its hop."""
-    target, target_port, source, source_port = _ADDRESSES.unpack(subscription.onward)
-    header = AmsHeader(
-        NetId(target),
-        target_port,
-        NetId(source),
-        source_port,
-        AmsCommand.DELETE_NOTIFICATION,
-        StateFlags.ADS,
-    )
-    return header, subscription.handle.to_bytes(4, "little"), subscription.route

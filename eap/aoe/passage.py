@@ -7,32 +7,29 @@ router before this one gave is kept: a packet that runs in a circle is known by 
 
 from __future__ import annotations
 
-import struct
-
 from eap.aoe.action import Action, Outcome, Trace
 from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.ending import Ending
 from eap.aoe.gate import Gate, exchange_body
 from eap.aoe.inflight import InFlight, Pending
 from eap.aoe.invoke import InvokeIds, is_marked
 from eap.aoe.judge import Judge, Limits
 from eap.aoe.judged import Judged
-from eap.aoe.notifier import Notifier, request_to_end
+from eap.aoe.notifier import Notifier
 from eap.aoe.outlet import Outlet
 from eap.aoe.passed import Passed
 from eap.aoe.prober import Prober
 from eap.aoe.record import Record, describe
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
 from eap.aoe.routes import Route, RouteTable
-from eap.aoe.subscriptions import Subscription
 from eap.aoe.way import Way
 from eap.codec.ads import AdsError
-from eap.codec.ams import AmsCommand, AmsHeader, encode_packet
+from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
 from eap.ids import NetId
 
 _NOTIFICATION = AmsCommand.NOTIFICATION.value  # taken once: members of enums are slow
 _ANSWERED = Outcome.ANSWERED
-_ADDRESSES = struct.Struct("<6sH6sH")
-_HALF = _ADDRESSES.size // 2
+_HALF = ADDRESSES.size // 2
 _INVOKE_ID = 28
 """Where it stands in a packet; between the addresses and it nothing changes on the way."""
 
@@ -70,6 +67,7 @@ class Passage:
         self._ids = InvokeIds(first_invoke_id)
         self._judge = Judge(net_id, table, outlet.doors, self.in_flight, limits, prober)
         self._passed = Passed()
+        self._ending = Ending(outlet, self.in_flight, self._ids, limits)
 
     def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
         """Pass a request on that is for nobody here, or refuse it.
@@ -87,10 +85,12 @@ class Passage:
         found = self._let_on(header, data, way, now_ns)
         if isinstance(found, Refusal):
             if header.command == _NOTIFICATION and found.error == AdsError.TARGET_MACHINE:
-                return self._end_unwanted(header, data, way, now_ns)
+                text = "nobody here asked for it, or not any more"
+                self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
+                return self._ending.end_unwanted(header, data[AmsHeader.SIZE :], way)
             return self._refuser.refuse(header, way, found, now_ns)
         route, data, judged = found
-        onward = _ADDRESSES.pack(
+        onward = ADDRESSES.pack(
             route.to_real(header.target), header.target_port,
             self._table.to_virtual(header.source, way), header.source_port,
         )  # fmt: skip
@@ -109,7 +109,7 @@ class Passage:
         self, header: AmsHeader, data: bytes, way: Way, judged: Judged | None, now_ns: int
     ) -> int | list[Action]:
         """Remember a request that a service of this station gets; return its ticket, or refuse."""
-        pending = self._admit(header, data, data[: _ADDRESSES.size], way, None, now_ns)
+        pending = self._admit(header, data, data[: ADDRESSES.size], way, None, now_ns)
         if not isinstance(pending, Pending):
             return pending
         pending.judged = judged
@@ -123,9 +123,8 @@ class Passage:
         self.in_flight.pop(header.invoke_id)
         if self._prober is not None and pending.route is not None:
             self._prober.hear(pending.route.hop, now_ns)
-        actions: list[Action] = []
-        for surplus in self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :]):
-            actions += self._end(surplus, now_ns)
+        surplus = self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :])
+        actions = self._ending.end(surplus, now_ns)
         if pending.came_by is None:
             if header.command != AmsCommand.DELETE_NOTIFICATION:  # most of those are our own
                 self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
@@ -135,9 +134,9 @@ class Passage:
             body = data[AmsHeader.SIZE :]
             body = self._gate.take_answer(pending.judged, header.error_code, body)
             data = exchange_body(data, body)
-        back = _ADDRESSES.pack(asked.source, asked.source_port, asked.target, asked.target_port)
+        back = ADDRESSES.pack(asked.source, asked.source_port, asked.target, asked.target_port)
         number = asked.invoke_id.to_bytes(4, "little")
-        packet = back + data[_ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
+        packet = back + data[ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
         actions += self._send_back(pending, pending.came_by, packet, header.error_code, now_ns)
         return actions
 
@@ -179,10 +178,7 @@ class Passage:
             self._give_up(pending)
             if pending.route is None:
                 self.in_flight.pop(pending.invoke_id)
-        actions: list[Action] = []
-        for subscription in self.notifier.subscriptions.close(way):
-            actions += self._end(subscription, now_ns)
-        return actions
+        return self._ending.end(self.notifier.subscriptions.close(way), now_ns)
 
     def hop_down(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop, and refuse what will be for it."""
@@ -277,7 +273,7 @@ class Passage:
 
     def _forward(self, invoke_id: int, data: bytes, onward: bytes, route: Route) -> Action:
         number = invoke_id.to_bytes(4, "little")
-        packet = onward + data[_ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
+        packet = onward + data[ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
         return self._outlet.forward(route.hop, packet, invoke_id)
 
     def _is_answer(self, header: AmsHeader, data: bytes, way: Way, pending: Pending) -> bool:
@@ -345,28 +341,6 @@ class Passage:
         if pending.judged is not None:
             self._gate.give_up(pending.judged, error_code)
             pending.judged = None
-
-    def _end_unwanted(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
-        """Have a notification ended that nobody here has, as after a new start of this router.
-
-        Not while the answer may still come that tells its handle: datagrams overtake each other.
-        """
-        text = "nobody here asked for it, or not any more"
-        self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
-        if any(pending.handles for pending in self.in_flight.on(way.door, None)):
-            return []
-        return list(self.notifier.end_unwanted(header, data[AmsHeader.SIZE :], way))
-
-    def _end(self, subscription: Subscription, now_ns: int) -> list[Action]:
-        """Ask the server to end a notification, for nobody and if there is room to wait for it."""
-        if len(self.in_flight) >= self._limits.in_flight and not self.in_flight.make_room():
-            return []
-        header, body, route = request_to_end(subscription)
-        invoke_id = self._ids.take(self.in_flight)
-        deadline_ns = now_ns + self._limits.timeout_ns
-        pending = Pending(invoke_id, header, None, route, subscription.onward, now_ns, deadline_ns)
-        self.in_flight.add(pending)
-        return [self._forward(invoke_id, encode_packet(header, body), subscription.onward, route)]
 
 
 def _with_result(answer: AmsAnswer) -> str:

@@ -6,6 +6,7 @@ behind the prefix of AMS/TCP.
 
 from __future__ import annotations
 
+import struct
 from enum import IntEnum, IntFlag
 
 from eap.codec.wire import Buffer, WireStruct, net_id, u16, u32
@@ -17,6 +18,9 @@ IO_PORT = 300
 """AMS port of the I/O server, which knows the masters of a station."""
 DEVICE_PORT = 0xFFFF
 """AMS port of an EAP device, of a master, and of the dictionary of a router."""
+
+ADDRESSES = struct.Struct("<6sH6sH")
+"""The head of an AMS header by itself: target and source, a NetID and a port each."""
 
 
 class AmsCommand(IntEnum):
