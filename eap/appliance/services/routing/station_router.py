@@ -35,13 +35,10 @@ from eap.aoe.way import Door, Way
 from eap.appliance.services.routing.lanes import Lanes
 from eap.appliance.services.routing.local_client import LOCAL_DOOR, LocalClient
 from eap.appliance.services.routing.service import AnswerNow, Carrier, LocalRequest, Service
+from eap.appliance.services.routing.timer import RouterTimer
 from eap.appliance.services.routing.trace_log import TraceLog
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
-
-_SHORTEST_WAIT_S = 0.001
-_MOMENT_S = 0.02
-"""How late a time-out may be noticed."""
 
 
 class StationRouter:
@@ -98,9 +95,7 @@ class StationRouter:
         self._client = LocalClient(self)
         self.add_door(LOCAL_DOOR, self._client)
         self._settling: dict[Way, tuple[int, asyncio.Event]] = {}
-        self._timer: asyncio.TimerHandle | None = None
-        self._is_soon = False
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._timer = RouterTimer(self._router.next_timeout, self._handle_timeout)
 
     @property
     def net_ids(self) -> Collection[NetId]:
@@ -135,14 +130,11 @@ class StationRouter:
 
     async def serve(self) -> None:
         """Look after time-outs and hops until cancelled."""
-        self._loop = asyncio.get_running_loop()
-        self._schedule()
+        self._timer.start()
         try:
             await asyncio.Event().wait()
         finally:
-            self._loop = None
-            if self._timer is not None:
-                self._timer.cancel()
+            self._timer.stop()
             await self._lanes.close()
 
     def add_door(self, door: Door, carrier: Carrier) -> None:
@@ -168,7 +160,7 @@ class StationRouter:
         is_taken = self.table.add(route)
         for follow in self.on_routes:
             follow(route.hop)
-        self._schedule()
+        self._timer.set()
         return is_taken
 
     def remove_route(self, net_id: NetId, hop: Way) -> bool:
@@ -176,7 +168,7 @@ class StationRouter:
         was_there = self.table.remove(net_id, hop)
         for follow in self.on_routes:
             follow(hop)
-        self._schedule()
+        self._timer.set()
         return was_there
 
     def is_down(self, hop: Way) -> bool:
@@ -239,7 +231,7 @@ class StationRouter:
     def hop_up(self, door: str, address: str | None) -> None:
         """Pass requests on again; the arguments are those of :meth:`hop_down`."""
         self._router.hop_up(door, address)
-        self._schedule()
+        self._timer.set()
 
     def send_notification(self, way: Way, packet: bytes) -> None:
         """Send what a service has for a client of it, in fragments where they are needed."""
@@ -285,7 +277,7 @@ class StationRouter:
         for way, (count, event) in self._settling.items():
             if self._router.waiting(way) < count:
                 event.set()
-        self._schedule_soon()
+        self._timer.set_soon()
 
     def _tell(self) -> None:
         while (trace := self._router.next_event()) is not None:
@@ -329,38 +321,12 @@ class StationRouter:
     def _finish(self, ticket: int, answer: AmsAnswer) -> None:
         self._act(self._router.receive_answer(ticket, answer, monotonic_ns()))
 
-    def _schedule(self) -> None:
-        """Have the router called when it has something to do."""
-        at_ns = self._router.next_timeout()
-        if at_ns is None or self._loop is None:
-            return
-        if self._timer is not None:
-            if self._is_soon or self._timer.when() <= at_ns / 1e9:
-                return
-            self._timer.cancel()
-        at_s = max(at_ns / 1e9, self._loop.time() + _SHORTEST_WAIT_S)
-        self._timer = self._loop.call_at(at_s, self._handle_timeout)
-
-    def _schedule_soon(self) -> None:
-        """Have the router called after a moment, as something may be due earlier than it was.
-
-        That is cheap; when exactly it is due is looked up then, and not for each packet.
-        """
-        if self._is_soon or self._loop is None:
-            return
-        self._is_soon = True
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = self._loop.call_later(_MOMENT_S, self._handle_timeout)
-
     def _handle_timeout(self) -> None:
-        self._timer = None
-        self._is_soon = False
         actions = self._router.handle_timeout(monotonic_ns())
         if actions:
             self._act(actions)
         else:
-            self._schedule()
+            self._timer.set()
 
 
 class _Ports:
