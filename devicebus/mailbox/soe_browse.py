@@ -25,6 +25,8 @@ class IdnDescription(msgspec.Struct, frozen=True):
     minimum: SoeScalar | None = None
     maximum: SoeScalar | None = None
     default: SoeValue | None = None
+    data_state: int | None = None
+    """Of a procedure command; other IDNs usually have none."""
 
 
 def idn_list(idn: Idn = LIST_OF_ALL, *, drive: int = 0) -> Conversation[list[Idn]]:
@@ -49,6 +51,7 @@ def describe(idn: Idn, *, drive: int = 0) -> Conversation[IdnDescription]:
     minimum = yield from _read_if_any(idn, Element.MINIMUM, drive)
     maximum = yield from _read_if_any(idn, Element.MAXIMUM, drive)
     default = yield from _read_if_any(idn, Element.DEFAULT, drive)
+    state = yield from _read_if_any(idn, Element.DATA_STATE, drive)
     with reading(f"elements of {idn}"):
         return IdnDescription(
             idn,
@@ -59,6 +62,7 @@ def describe(idn: Idn, *, drive: int = 0) -> Conversation[IdnDescription]:
             None if minimum is None else decode_scalar(attribute, minimum),
             None if maximum is None else decode_scalar(attribute, maximum),
             None if default is None else decode_value(attribute, default),
+            None if state is None else int.from_bytes(state, "little"),
         )
 
 

@@ -15,6 +15,7 @@ from eap.od import abort
 Row: TypeAlias = dict[str, Any]
 
 _SHOWN_OCTETS = 32
+_COMMAND_STATES = {0x0: "idle", 0x3: "done", 0x7: "executing", 0xF: "failed"}
 _COUNTERS = ("invalid_frames", "physical", "forwarded", "lost_links")
 
 
@@ -32,7 +33,7 @@ def scan_tables(rows: Iterable[Row]) -> Iterator[Table | Text]:
             str(row["serial"]),
             str(row["alias"] or ""),
             _state(row["state"]),
-            " ".join(row["mailbox"]),
+            "?" if row["mailbox"] is None else " ".join(row["mailbox"]),
         )
         if row["fault"]:
             faults.append(f"{row['name']} ({row['address']}): {row['fault']}")
@@ -137,9 +138,15 @@ def idn_lines(row: Row) -> Iterator[str]:
     """Yield an IDN and what else is known of it."""
     unit = f" {row['unit']}" if row["unit"] else ""
     yield f"{row['idn']} = {_plain(row['value'])}{unit}"
-    for key in ("name", "minimum", "maximum", "default"):
-        if row[key] is not None:
-            yield f"  {key:8} {_plain(row[key])}"
+    shown = {key: row[key] for key in ("name", "minimum", "maximum", "default")}
+    shown["attribute"] = _attribute(row)
+    state = row["data_state"]
+    if state is not None:
+        word = f" ({_COMMAND_STATES.get(state, 'unknown')})" if row["is_command"] else ""
+        shown["data state"] = f"0x{state:04X}{word}"
+    for key, value in shown.items():
+        if value is not None:
+            yield f"  {key:10} {_plain(value)}"
 
 
 def idn_table(rows: Iterable[Row]) -> Table:
@@ -165,6 +172,22 @@ def _state(name: str | None) -> Text:
 
 def _reason(row: Row) -> str:
     return f"{row['reason']} (0x{row['code']:04X})" if row["code"] else str(row["reason"])
+
+
+def _attribute(row: Row) -> str:
+    """Return how an IDN's value is to be read, and where it cannot be written."""
+    parts = [row["display"].lower(), count(row["octets"], "octet")]
+    if row["is_list"]:
+        parts[1] += " each, a list"
+    if row["decimals"]:
+        parts.append(count(row["decimals"], "decimal"))
+    if row["factor"] != 1:
+        parts.append(f"factor {row['factor']}")
+    if row["is_command"]:
+        parts.append("a procedure command")
+    if row["protected_in"]:
+        parts.append(f"read only in {', '.join(row['protected_in'])}")
+    return ", ".join(parts)
 
 
 def _plain(value: Any) -> str:

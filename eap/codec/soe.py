@@ -124,7 +124,7 @@ class Idn(NamedTuple):
         """Read the written form; raise ValueError with the reason if it is none."""
         match = _IDN.fullmatch(text.strip())
         if not match or int(match[2]) > 7 or int(match[3]) > 0xFFF:
-            raise ValueError(f"{text!r} is not an IDN (such as S-0-0032 or P-0-0100)")
+            raise ValueError(f"{text!r} is not an IDN, such as S-0-0032 or P-7-4095")
         return cls(match[1] in "Pp", int(match[2]), int(match[3]))
 
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 from devicebus.errors import BusError
@@ -10,6 +11,7 @@ from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.gateway.address import VIRTUAL_BIT
+from eap.od.abort import SdoAbortError
 
 
 class MasterSlave(NamedTuple):
@@ -24,6 +26,8 @@ class MasterSlave(NamedTuple):
     to_slave: int
     to_master: int
     al_status: int
+    protocols: int | None = None
+    """Bits as in its EEPROM, None if the dictionary ends before them."""
 
 
 def read_slaves() -> Conversation[list[MasterSlave]]:
@@ -44,6 +48,9 @@ def _read_slave(number: int) -> Conversation[MasterSlave]:
         values[subindex] = int.from_bytes(octets, "little")
     name = yield from coe_client.upload(index, 3)
     state = yield from coe_client.upload(0xA000 + number, 1)
+    protocols = None
+    with suppress(SdoAbortError):
+        protocols = int.from_bytes((yield from coe_client.upload(index, 39)), "little")
     return MasterSlave(
         station=values[1],
         name=name.rstrip(b"\0").decode(errors="replace"),
@@ -54,6 +61,7 @@ def _read_slave(number: int) -> Conversation[MasterSlave]:
         to_slave=values[33],
         to_master=values[34],
         al_status=int.from_bytes(state, "little"),
+        protocols=protocols,
     )
 
 

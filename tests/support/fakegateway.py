@@ -45,7 +45,7 @@ class _OneSlave:
     def of_configured(self, station: int, key: Live) -> int | str:
         texts = {Live.NAME: "drive", Live.TYPE: "D1"}
         return {Live.ADDRESS: 1001, Live.VENDOR: 5, Live.MAILBOX_OUT: 128, Live.MAILBOX_IN: 128,
-                **texts}.get(key, 0)  # fmt: skip
+                Live.PROTOCOLS: 0x0C, **texts}.get(key, 0)  # fmt: skip
 
     of_detected = of_configured
 
@@ -65,13 +65,16 @@ class _OneSlave:
 class FakeGateway:
     """Answers on UDP and TCP at the same port of 127.0.0.1.
 
+    Args:
+        full: Whether the master's dictionary has all entries.
+
     Attributes:
         drop: Requests by UDP that are not heard, from now on.
         has_master: Whether address 0 has a dictionary.
         heard: The messages that came, without headers.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, full: bool = False) -> None:
         self.drop = 0
         self.heard: list[bytes] = []
         self.has_master = True
@@ -90,7 +93,8 @@ class FakeGateway:
             MailboxType.VOE: VoeServer(),
         }
         large = MailboxSizes(1400, 1400)
-        master = CoeServer(MasterDictionary(_OneSlave(), Identity(device_name="M")), _op, large)
+        objects = MasterDictionary(_OneSlave(), Identity(device_name="M"), full=full)
+        master = CoeServer(objects, _op, large)
         self._boxes = {
             1001: MailboxServer(servers, SIZES),
             0: MailboxServer({MailboxType.COE: master}, large),

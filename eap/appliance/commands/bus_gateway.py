@@ -119,7 +119,7 @@ def _slave(slave: MasterSlave) -> Slave:
         serial=slave.serial,
         alias=0,
         status=AlStatus.decode(slave.al_status.to_bytes(AlStatus.SIZE, "little")),
-        protocols=0,
+        protocols=slave.protocols if slave.to_slave else 0,
         parent=None,
         ports=(),
     )

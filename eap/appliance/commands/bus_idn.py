@@ -37,8 +37,18 @@ def read_idn(bus: SlaveBus, slave: str, idn: Idn, *, drive: int) -> dict[str, An
         "display": Display(display).name if display in kinds else str(display),
         "octets": attribute.size,
         "decimals": attribute.decimals,
+        "factor": attribute.factor,
         "is_list": bool(attribute.is_list),
         "is_command": bool(attribute.is_command),
+        "protected_in": [
+            state
+            for state, is_protected in (
+                ("PREOP", attribute.protected_preop),
+                ("SAFEOP", attribute.protected_safeop),
+                ("OP", attribute.protected_op),
+            )
+            if is_protected
+        ],
     }
 
 

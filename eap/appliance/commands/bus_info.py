@@ -122,7 +122,7 @@ def write_eeprom(bus: SlaveBus, slave: str, image: bytes) -> dict[str, Any]:
 
 def _slave(slave: Slave) -> dict[str, Any]:
     status = slave.status
-    protocols = SiiProtocol(slave.protocols & sum(SiiProtocol))
+    protocols = None if slave.protocols is None else SiiProtocol(slave.protocols & sum(SiiProtocol))
     return {
         "address": slave.station,
         "name": slave.name,
@@ -133,7 +133,7 @@ def _slave(slave: Slave) -> dict[str, Any]:
         "alias": slave.alias,
         "state": state_name(status.state | status.error << 4) if status.state else None,
         "code": status.code,
-        "mailbox": [f"{str(each.name)[0]}oE" for each in protocols],
+        "mailbox": None if protocols is None else [f"{str(each.name)[0]}oE" for each in protocols],
         "parent": slave.parent,
         "ports": list(slave.ports),
         "fault": slave.fault,

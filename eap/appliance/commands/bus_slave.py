@@ -33,8 +33,8 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     serial: int
     alias: int
     status: AlStatus
-    protocols: int
-    """As in its EEPROM."""
+    protocols: int | None
+    """As in its EEPROM; None where nobody tells."""
     parent: int | None
     """Position of the slave that it is wired to; None for the master."""
     ports: tuple[int, ...]

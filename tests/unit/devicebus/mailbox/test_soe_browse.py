@@ -57,12 +57,12 @@ def test_idn_that_is_not_there() -> None:
     ("answers", "reason"),
     [
         (["02 04 2400 0100"], "attribute of S-0-0036"),
-        (["02 04 2400 01002200", "02 40 2400 01", *["12 40 2400 0120"] * 5], "elements of"),
+        (["02 04 2400 01002200", "02 40 2400 01", *["12 40 2400 0120"] * 6], "elements of"),
         (["02 04 2400 01002200", "02 40 2400 00000000", "02 02 2400 05000500"], "elements of"),
     ],
 )
 def test_answer_that_breaks_the_protocol(answers: list[str], reason: str) -> None:
-    refusals = ["12 00 2400 0120"] * 5
+    refusals = ["12 00 2400 0120"] * 6
     with pytest.raises(MailboxProtocolError, match=reason):
         talk_to(SOE, soe_browse.describe(Idn.parse("S-0-0036")), *answers, *refusals)
 

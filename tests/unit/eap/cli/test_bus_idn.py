@@ -23,7 +23,10 @@ def command(monkeypatch):
 
 def test_read(command):
     out = command("read", "drive", "S-0-0032").output
-    assert out == "S-0-0032 = 2\n  name     Primary operation mode\n  default  2\n"
+    assert out == (
+        "S-0-0032 = 2\n  name       Primary operation mode\n  default    2\n"
+        "  attribute  unsigned, 4 octets\n"
+    )
     assert json.loads(command("read", "1001", "32", "--json").output)["value"] == 2
 
 

@@ -36,12 +36,19 @@ def port(number, **counters):
 def test_slave_whose_eeprom_is_unreadable():
     row = {"address": 1001, "name": "", "vendor": 0, "product": 0, "revision": 0, "serial": 0,
            "alias": 7, "state": "INIT+ERROR", "mailbox": [], "fault": "no end"}  # fmt: skip
-    gone = row | {"address": 1002, "name": "b", "state": None, "fault": "it does not answer"}
+    gone = row | {
+        "address": 1002,
+        "name": "b",
+        "state": None,
+        "fault": "it does not answer",
+        "mailbox": None,
+    }
     text = shown(*scan_tables([row, gone]))
     assert "no end" in text
     assert "b (1002): it does not answer" in text
     assert "no answer" in text
     assert "INIT+ERROR" in text
+    assert "?" in text
 
 
 def test_state_with_its_reason():
@@ -119,6 +126,18 @@ def test_objects_and_entries():
 
 def test_idns():
     row = {"idn": "S-0-0024", "value": [1, 2], "unit": "mm", "name": "Targets", "minimum": None,
-           "maximum": 5, "default": None}  # fmt: skip
-    assert list(idn_lines(row)) == ["S-0-0024 = 1, 2 mm", "  name     Targets", "  maximum  5"]
+           "maximum": 5, "default": None, "data_state": None, "display": "SIGNED", "octets": 2,
+           "decimals": 1, "factor": 10, "is_list": True, "is_command": False,
+           "protected_in": ["SAFEOP", "OP"]}  # fmt: skip
+    assert list(idn_lines(row)) == [
+        "S-0-0024 = 1, 2 mm",
+        "  name       Targets",
+        "  maximum    5",
+        "  attribute  signed, 2 octets each, a list, 1 decimal, factor 10, read only in SAFEOP, OP",
+    ]
+    command = row | {"is_list": False, "is_command": True, "data_state": 7, "protected_in": []}
+    assert list(idn_lines(command))[-2:] == [
+        "  attribute  signed, 2 octets, 1 decimal, factor 10, a procedure command",
+        "  data state 0x0007 (executing)",
+    ]
     assert "Targets" in shown(idn_table([row]))

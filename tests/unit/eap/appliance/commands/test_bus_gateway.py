@@ -31,10 +31,19 @@ def bus(gateway):
 def test_slaves_and_the_master(bus) -> None:
     (row,) = scan_rows(bus)
     assert (row["address"], row["name"], row["state"]) == (1001, "drive", "OP")
+    assert row["mailbox"] is None, "the usual dictionary ends before them"
     assert bus.find("drive").station == bus.find("1001").station == 1001
     assert bus.find("master").station == bus.find("0").station == 0
     with pytest.raises(BusError, match=r"no slave '7'; there are 1001 \(drive\)"):
         bus.find("7")
+
+
+def test_a_dictionary_with_all_entries_tells_the_protocols() -> None:
+    with (
+        FakeGateway(full=True) as gateway,
+        open_gateway("127.0.0.1", gateway.port, tcp=True) as bus,
+    ):
+        assert scan_rows(bus)[0]["mailbox"] == ["CoE", "FoE"]
 
 
 def test_virtual_addresses_are_the_gateways_business(bus) -> None:

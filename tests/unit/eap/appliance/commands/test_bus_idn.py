@@ -21,6 +21,11 @@ def test_read(bus):
     row = read_idn(bus, "drive", Idn.parse("S-0-0032"), drive=0)
     assert (row["idn"], row["name"], row["value"]) == ("S-0-0032", "Primary operation mode", 2)
     assert (row["octets"], row["is_list"], row["display"]) == (4, False, "UNSIGNED")
+    assert (row["data_state"], row["factor"], row["protected_in"]) == (None, 1, [])
+    command = read_idn(bus, "drive", Idn.parse("S-0-0099"), drive=0)
+    assert (command["is_command"], command["data_state"]) == (True, 0)
+    status = read_idn(bus, "drive", Idn.parse("S-0-0135"), drive=0)
+    assert status["protected_in"] == ["PREOP", "SAFEOP", "OP"]
 
 
 def test_write(bus):
