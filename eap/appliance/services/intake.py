@@ -18,6 +18,14 @@ from eap.pd.link import Origin
 _MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
 
 
+QUICK_NS = 80_000
+"""Frames that come within this time after the last was answered are quick."""
+PATIENCE_NS = 40_000
+"""How long is watched for the next of them."""
+MOST_FRAMES = 16
+"""That are taken so before others have their turn."""
+
+
 class DrainedChannel(Protocol):
     """What services needs of a UDP or an Ethernet channel."""
 
@@ -71,9 +79,40 @@ class FrameIntake:
 
 def watch_channel(channel: DrainedChannel) -> None:
     """Drain *channel* now and whenever something arrives, as long as the running loop lives."""
+    patient = PatientDrain(channel)
+    asyncio.get_running_loop().add_reader(channel.fileno(), patient.drain)
+    patient.drain()
 
-    def drain() -> None:
-        channel.drain(monotonic_ns())
 
-    asyncio.get_running_loop().add_reader(channel.fileno(), drain)
-    drain()
+class PatientDrain:
+    """Drains a channel, and looks again for a while where the next frame is likely to be near.
+
+    Who waits for each answer before asking again does so at once: the next frame is there sooner
+    than a process falls asleep, is woken and finds its way through an event loop, which takes as
+    long as to answer.  So while frames come that quickly the channel is watched, for some
+    microseconds after each and for some frames in all, because others wait for the loop.
+
+    Args:
+        channel: What is drained.
+        clock: The monotonic clock, in nanoseconds.
+    """
+
+    def __init__(self, channel: DrainedChannel, clock: Callable[[], int] = monotonic_ns) -> None:
+        self._channel = channel
+        self._clock = clock
+        self._answered_ns = clock() - QUICK_NS
+
+    def drain(self) -> None:
+        """Take what waits; and what comes, if this came quickly after what was taken last."""
+        channel, clock = self._channel, self._clock
+        now_ns = clock()
+        is_quick = now_ns - self._answered_ns < QUICK_NS
+        taken = channel.drain(now_ns)
+        now_ns = answered_ns = clock()
+        while is_quick and taken < MOST_FRAMES and now_ns - answered_ns < PATIENCE_NS:
+            found = channel.drain(now_ns)
+            now_ns = clock()
+            if found:
+                taken += found
+                answered_ns = now_ns
+        self._answered_ns = answered_ns

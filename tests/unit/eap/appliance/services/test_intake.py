@@ -11,7 +11,14 @@ from time import monotonic_ns
 import pytest
 
 from eap.appliance.discards import DiscardCounters, Refusal
-from eap.appliance.services.intake import FrameIntake, watch_channel
+from eap.appliance.services.intake import (
+    MOST_FRAMES,
+    PATIENCE_NS,
+    QUICK_NS,
+    FrameIntake,
+    PatientDrain,
+    watch_channel,
+)
 from eap.codec.ethercat import EtherCatHeader
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
@@ -52,6 +59,59 @@ def test_what_is_taken_is_not_counted(counters):
     intake.take(UNKNOWN, 2, 100, NOBODY)
     assert taken == [(MAILBOX, 8, 100, NOBODY)]
     assert counters.stats()["a"] == {"stale": 1, "wrong_type": 1}
+
+
+class Line:
+    """A channel whose frames arrive at given times; to look for them takes a microsecond."""
+
+    def __init__(self, *arrivals_ns: int) -> None:
+        self.arrivals_ns = list(arrivals_ns)
+        self.now_ns = 0
+        self.looks = 0
+
+    def clock(self) -> int:
+        return self.now_ns
+
+    def drain(self, now_ns: int) -> int:
+        self.looks += 1
+        self.now_ns += 1000
+        waiting = [at_ns for at_ns in self.arrivals_ns if at_ns <= self.now_ns]
+        del self.arrivals_ns[: len(waiting)]
+        return len(waiting)
+
+    def fileno(self) -> int:
+        return -1
+
+    def wake(self, drain: PatientDrain, at_ns: int) -> int:
+        """Let the channel be drained at a time; return how many looks that took."""
+        before, self.now_ns = self.looks, at_ns
+        drain.drain()
+        return self.looks - before
+
+
+def test_a_frame_now_and_then_is_taken_by_one_look():
+    line = Line(0, 10 * QUICK_NS, 20 * QUICK_NS)
+    drain = PatientDrain(line, line.clock)
+    assert [line.wake(drain, at_ns) for at_ns in line.arrivals_ns[:]] == [1, 1, 1]
+
+
+def test_the_next_of_quick_frames_is_waited_for():
+    line = Line(0, QUICK_NS // 2, QUICK_NS // 2 + PATIENCE_NS // 2)
+    drain = PatientDrain(line, line.clock)
+    assert line.wake(drain, 0) == 1
+    assert line.wake(drain, QUICK_NS // 2) > 2
+    assert not line.arrivals_ns
+    late_ns = line.now_ns - PATIENCE_NS - (QUICK_NS // 2 + PATIENCE_NS // 2)
+    assert 0 <= late_ns < 5000, "given up as long after the last frame as promised"
+
+
+def test_frames_that_never_end_leave_time_for_others():
+    line = Line(*range(0, 1_000_000_000, 2000))
+    drain = PatientDrain(line, line.clock)
+    line.wake(drain, 0)
+    left = len(line.arrivals_ns)
+    line.wake(drain, line.now_ns)
+    assert left - len(line.arrivals_ns) <= MOST_FRAMES
 
 
 @pytest.mark.net
