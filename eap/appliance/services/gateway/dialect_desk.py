@@ -15,7 +15,9 @@ from eap.appliance.services.gateway.slave_book import SlaveBook
 from eap.appliance.services.gateway.slave_link import SlaveLink
 from eap.appliance.services.gateway.slave_session import find_refusal, reason_of
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoHeader
 from eap.errors import EngineGoneError, MalformedError
 from eap.gateway.address import MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.dialect import (
@@ -33,6 +35,9 @@ from eap.gateway.dialect import (
 from eap.gateway.refusal import Reason
 from eap.gateway.rights import idn, sdo
 from eap.ids import NetId
+
+_LONGEST_HEAD = CoeHeader.SIZE + SdoHeader.SIZE
+"""Octets in front of what was read, in any protocol."""
 
 
 class DialectDesk:
@@ -63,7 +68,7 @@ class DialectDesk:
         self._guard = guard
         self._open_master = open_master
         self._net_id = net_id
-        self._room = room
+        self._room = room - _LONGEST_HEAD
         self._answer_s = answer_s
 
     async def answer(

@@ -81,7 +81,7 @@ async def perform(
         task: What is to be done.
         slave: As the engine knows it.
         converse: Leads conversations with it.
-        room: Octets of the longest answer.
+        room: Octets that can be read at most.
         answer_s: How long it may take.
 
     Raises:
@@ -108,7 +108,16 @@ async def perform(
     except MailboxRefusedError as exc:
         raise DialectError(Failure.NOT_SUPPORTED, str(exc)) from None
     data = bytes(content) if isinstance(task, ReadFile) else result
-    return data if isinstance(data, bytes) else b""
+    if not isinstance(data, bytes):
+        return b""
+    if len(data) > room:
+        raise _too_long(room)
+    return data
+
+
+def _too_long(room: int) -> DialectError:
+    text = f"more than {room} octets do not fit one packet of this dialect"
+    return DialectError(Failure.GENERAL, text)
 
 
 def _conversation(
@@ -141,8 +150,7 @@ def _sink(content: bytearray, room: int) -> Callable[[bytes], None]:
     def take(data: bytes) -> None:
         content.extend(data)
         if len(content) > room:
-            text = f"a file of more than {room} octets does not fit one packet of this dialect"
-            raise DialectError(Failure.GENERAL, text)
+            raise _too_long(room)
 
     return take
 

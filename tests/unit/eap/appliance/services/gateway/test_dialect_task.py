@@ -80,8 +80,21 @@ def test_files() -> None:
     first = bytes.fromhex("03 00 01000000") + b"a" * 52
     last = bytes.fromhex("03 00 02000000") + b"b" * 20
     assert read(ReadFile("f"), first, last, b"") == b"a" * 52 + b"b" * 20
-    with pytest.raises(DialectError, match="more than 80 octets does not fit one packet"):
+    with pytest.raises(DialectError, match="more than 80 octets do not fit one packet"):
         read(ReadFile("f"), first, bytes.fromhex("03 00 02000000") + b"b" * 52)
     with pytest.raises(DialectError, match="no file name") as caught:
         read(ReadFile(""))
     assert caught.value.failure is Failure.FILE_NAME
+
+
+def test_what_is_read_has_to_fit_one_packet() -> None:
+    def read(octets: bytes) -> bytes:
+        async def converse(conversation: Conversation[Any]) -> Any:
+            conversation.close()
+            return octets
+
+        return asyncio.run(perform(UPLOAD, SLAVE, converse, 80, 1.0))
+
+    assert read(bytes(80)) == bytes(80)
+    with pytest.raises(DialectError, match="more than 80 octets do not fit one packet"):
+        read(bytes(81))
