@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 
+import msgspec
+
 from devicebus.errors import BusError
 from eap.appliance.bus_request import BusReport, SlaveReport
-from eap.appliance.services.gateway.slave_book import FRESH_S, SlaveBook
+from eap.appliance.services.gateway.slave_book import FRESH_S, REFUSAL_FRESH_S, SlaveBook
 from eap.errors import EngineGoneError
 from eap.gateway.refusal import Reason
 
@@ -22,6 +24,8 @@ def slave(station: int) -> SlaveReport:
         alias=0,
         state=8,
         target=8,
+        to_slave=128,
+        to_master=128,
     )
 
 
@@ -61,6 +65,24 @@ def test_it_asks_again_after_a_moment() -> None:
         assert await book.stations() == (1002, 1001)
         await asyncio.sleep(FRESH_S + 0.01)
         assert await book.stations() == (7,)
+
+    asyncio.run(run())
+
+
+def test_who_is_to_be_refused_is_looked_for_again() -> None:
+    async def run() -> None:
+        in_init = msgspec.structs.replace(slave(1001), state=1, to_slave=0, to_master=0)
+        down = BusReport(is_up=False)
+        engine = Engine(BusReport(is_up=True, slaves=(in_init,)), down, UP)
+        book = SlaveBook(engine.describe)
+        assert await book.find(1001) == in_init
+        assert await book.find(1001) == in_init
+        assert engine.asked == 1
+        for expected in (Reason.BUS_DOWN, slave(1001)):
+            await asyncio.sleep(REFUSAL_FRESH_S + 0.01)
+            assert await book.find(1001) == expected
+        assert await book.find(1001) == slave(1001)
+        assert engine.asked == 3
 
     asyncio.run(run())
 
