@@ -174,8 +174,8 @@ FIXED = (
     _single(0xF002, "Detect modules command", "Scans the bus.",
             _writable(live(1, "Command request", "BLOCK(2)", Live.DETECT_REQUEST, "Writing it "
                            "starts a scan.")),
-            live(2, "Command status", "USINT", Live.DETECT_STATUS, "0 and 1 done, 3 failed, 100 to "
-                 "199 busy with so many percent, 255 busy."),
+            live(2, "Command status", "USINT", Live.DETECT_STATUS, "0 none yet, 1 done, 3 failed, "
+                 "255 busy."),
             live(3, "Command response", "BLOCK(6)", Live.DETECT_RESPONSE, "Status, 0, vendor's "
                  "error, number of slaves.")),
     _single(0xF120, "Master diag data", "Frames of the whole bus.",

@@ -38,7 +38,8 @@ class Detection(NamedTuple):
     slaves: int = 0
 
 
-_BUSY, _DONE, _FAILED = 255, 0, 3
+_BUSY, _DONE, _FAILED = 255, 1, 3
+"""Of a command that has a response; 0 is one that has none (ETG.1000.6, type COMMAND_PAR)."""
 
 
 class MasterView:

@@ -105,7 +105,7 @@ def test_dictionary_of_the_master_is_live():
 
         async def is_found():
             found = await client.read(MASTER, IndexGroup.SDO, 0xF002_0003)
-            return found == bytes((0, 0, 0, 0, 1, 0))
+            return found == bytes((1, 0, 0, 0, 1, 0))
 
         await until(is_found)
 

@@ -86,8 +86,8 @@ def test_a_scan_is_started_by_a_write() -> None:
         view.write_master(Live.DETECT_REQUEST, b"\1\0")
         view.write_master(Live.DETECT_REQUEST, b"\1\0")
         assert view.of_master(Live.DETECT_STATUS) == 255
-        await soon(lambda: view.of_master(Live.DETECT_STATUS) == 0)
-        assert view.of_master(Live.DETECT_RESPONSE) == bytes((0, 0, 0, 0, 4, 0))
+        await soon(lambda: view.of_master(Live.DETECT_STATUS) == 1)
+        assert view.of_master(Live.DETECT_RESPONSE) == bytes((1, 0, 0, 0, 4, 0))
         assert view.of_detected(1001, Live.ADDRESS) == 1001
         assert view.of_detected(1001, Live.PRODUCT) == view.of_configured(1001, Live.PRODUCT)
 
