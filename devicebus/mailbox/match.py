@@ -103,6 +103,8 @@ def _answers_foe(request: bytes, reply: bytes) -> bool:
         # The number before comes twice when a reply is repeated; any other is wrong, not late.
         is_late = number > 1 if asked == FoeOpcode.READ else number == sent
         return found == FoeOpcode.DATA and not is_late
+    if asked == FoeOpcode.BUSY:  # "send that packet once more, later"
+        return found == FoeOpcode.DATA
     if asked == FoeOpcode.WRITE:
         return found == FoeOpcode.ACK and number == 0
     return asked == FoeOpcode.DATA and found == FoeOpcode.ACK and number != sent - 1

@@ -67,6 +67,7 @@ class Transfer:
         self._course = _course(kind, room)
         self._request = b""
         self._is_busy = False
+        self._is_answered = True
 
     @property
     def is_running(self) -> bool:
@@ -79,7 +80,8 @@ class Transfer:
         A slave would refuse it: to a slave every packet has come once.  After BUSY it is none,
         that is how a client asks whether the slave has time now.
         """
-        is_same = body == self._request and bool(self.replies) and not self._is_busy
+        is_done = bool(self.replies) or not self._is_answered
+        is_same = body == self._request and is_done and not self._is_busy
         return is_same and self._course.is_step(body)
 
     def ask(self, body: bytes) -> bool:
@@ -87,7 +89,8 @@ class Transfer:
         self._request = body
         self._is_busy = False
         self.replies = []
-        return self._course.ask(body)
+        self._is_answered = self._course.ask(body)
+        return self._is_answered
 
     def answer(self, body: bytes) -> None:
         """Note a reply to the last request."""
@@ -244,10 +247,10 @@ class _Aoe(_Single):
 
 
 class _Eoe(_Single):
-    """Settings are answered, Ethernet frames are not."""
+    """Settings are answered, and what is no message at all; Ethernet frames are not."""
 
     def ask(self, body: bytes) -> bool:
-        return bool(body) and body[0] & 0x0F in _EOE_REQUESTS
+        return not body or body[0] & 0x0F in _EOE_REQUESTS
 
 
 _EOE_REQUESTS = frozenset(

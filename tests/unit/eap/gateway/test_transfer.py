@@ -176,6 +176,17 @@ def test_a_step_that_comes_twice_is_known(kind, begin, begun, step, reply) -> No
     assert transfer.replies == [bytes.fromhex(reply)]
 
 
+def test_the_last_packet_is_not_confirmed_twice() -> None:
+    transfer = Transfer(MailboxType.FOE, ROOM)
+    transfer.ask(bytes.fromhex("01 00 00000000 66"))
+    transfer.answer(bytes.fromhex("03 00 01000000") + b"the end")
+    assert not transfer.is_repeated(ACK)
+    assert not transfer.ask(ACK)
+    assert not transfer.is_running
+    assert transfer.is_repeated(ACK), "nothing answers it, the second time neither"
+    assert not transfer.is_repeated(bytes.fromhex("04 00 02000000"))
+
+
 def test_after_busy_the_same_packet_is_a_question() -> None:
     transfer = Transfer(MailboxType.FOE, ROOM)
     transfer.ask(bytes.fromhex("02 00 00000000 66"))
@@ -210,7 +221,7 @@ def test_ams_packets() -> None:
     assert not transfer.is_running
 
 
-@pytest.mark.parametrize(("octets", "expected"), [("0600", True), ("0000", False), ("", False)])
+@pytest.mark.parametrize(("octets", "expected"), [("0600", True), ("0000", False), ("", True)])
 def test_ethernet_frames_have_no_answer(octets, expected) -> None:
     assert Transfer(MailboxType.EOE, ROOM).ask(bytes.fromhex(octets)) is expected
 
