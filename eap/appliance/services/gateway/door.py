@@ -58,7 +58,8 @@ class GatewayDoor:
         except TruncatedError:
             return Refusal.TRUNCATED
         except MalformedError:
-            _refuse_type(frame, answer)
+            if not self._gateway.settings.is_silent:
+                _refuse_type(frame, answer)
             return Refusal.MAILBOX
         return None
 

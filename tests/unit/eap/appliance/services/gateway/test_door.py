@@ -8,7 +8,9 @@ from typing import Any
 from eap.aoe.way import Way
 from eap.appliance.discards import Refusal
 from eap.appliance.services.gateway.door import GatewayDoor
+from eap.appliance.services.gateway.gateway import Settings
 from eap.codec.mailbox import decode_frame
+from eap.ids import NetId
 
 UPLOAD = bytes.fromhex("10 50 0a 00 e9 03 00 23 00 20 41 18 10 02 00 00 00 00")
 
@@ -16,6 +18,7 @@ UPLOAD = bytes.fromhex("10 50 0a 00 e9 03 00 23 00 20 41 18 10 02 00 00 00 00")
 class Gateway:
     def __init__(self) -> None:
         self.is_open = True
+        self.settings = Settings(NetId.parse("10.0.0.1.3.1"))
         self.turned_away = 0
         self.heard: list[Any] = []
 
@@ -57,6 +60,16 @@ def test_a_protocol_that_nobody_knows_is_refused_by_a_mailbox_error() -> None:
     frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
     assert door.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
     assert sent == [("me", bytes.fromhex("0a50 0400 e903 00 00 0100 0200"))]
+
+
+def test_a_silent_gateway_does_not_refuse_a_protocol_either() -> None:
+    gateway = Gateway()
+    gateway.settings = gateway.settings._replace(is_silent=True)
+    frame = UPLOAD[:7] + bytes((0x17,)) + UPLOAD[8:]
+    sent = []
+    door = GatewayDoor([(gateway, "udp:a")])
+    assert door.receive(frame, "me", lambda *each: sent.append(each)) is Refusal.MAILBOX
+    assert not sent
 
 
 def test_a_gateway_that_is_stopped_turns_frames_away() -> None:
