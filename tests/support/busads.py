@@ -154,7 +154,6 @@ def play(scene: Callable[[Client, FakeEngine], Awaitable[Any]], name: str = "dri
             async with asyncio.timeout(20):
                 return await scene(Client(service, bus, told), engine)
         finally:
-            service.close()
             link.close()
             engine.close()
             await asyncio.sleep(0)

@@ -103,11 +103,6 @@ class SlaveFiles(SlaveSpace):
             if offset in self._open:
                 self._begin_idle(offset)
 
-    def close(self) -> None:
-        """Close all files, complete or not."""
-        for handle in list(self._open):
-            self._drop(handle)
-
     async def _begin(self, asked: Asked, name: bytes, password: int, *, is_write: bool) -> bytes:
         owner, station = asked.client.net_id, asked.slave.station
         self._check_room(owner)

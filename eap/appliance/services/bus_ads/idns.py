@@ -65,11 +65,6 @@ class SlaveIdns(SlaveSpace):
             return
         await self._write(asked, place, data, place.elements)
 
-    def close(self) -> None:
-        """Watch no command any more."""
-        for task in list(self._commands.values()):
-            task.cancel()
-
     async def _execute(self, asked: Asked, place: SoePlace) -> None:
         key = asked.slave.station, place.drive, place.idn
         task = self._commands.get(key)

@@ -74,11 +74,6 @@ class MasterSide:
         """Act on a WriteControl."""
         self.request_state(al_state_for(request.ads_state))
 
-    def close(self) -> None:
-        """Wait for no slave any more."""
-        for task in list(self._requests.values()):
-            task.cancel()
-
     def _request(self, station: int, state: int) -> None:
         """The last request counts: one before it that is not done is given up."""
         if (before := self._requests.pop(station, None)) is not None:

@@ -47,11 +47,6 @@ class MasterWatch:
         self._task: asyncio.Task[None] | None = None
         table.on_add = self._start
 
-    def close(self) -> None:
-        """Tell nobody any more."""
-        if self._task is not None:
-            self._task.cancel()
-
     def _start(self) -> None:
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._run())

@@ -125,13 +125,6 @@ class BusService:
         """Forget what belongs to a connection that is closed; files stay open for another one."""
         self._device.notifications.forget(way)
 
-    def close(self) -> None:
-        """End what goes on."""
-        self._slaves.close()
-        self._watch.close()
-        self._desk.close()
-        self._master.close()
-
     async def _look(self) -> None:
         self._master.report = await self._bus.describe(self._port)
         for index in self._watched:

@@ -54,11 +54,6 @@ class Slaves:
         ]
         self._passthrough = Passthrough(bus, port, net_id)
 
-    def close(self) -> None:
-        """End what goes on with them."""
-        self._files.close()
-        self._idns.close()
-
     async def perform(self, asked: Asked, operation: Operation) -> OperationOutcome:
         """Do one operation; raises as the methods of a SlaveSpace do."""
         slave = asked.slave

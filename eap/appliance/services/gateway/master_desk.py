@@ -57,7 +57,3 @@ class MasterDesk:
     def open_session(self, room: int) -> MasterSession:
         """Begin a client's session with the dictionary."""
         return MasterSession(self.dictionary, room, self.refresh, self.is_fresh)
-
-    def close(self) -> None:
-        """Wait for nothing any more that was asked for."""
-        self._view.close()

@@ -187,11 +187,6 @@ class MasterView:
         elif any(data):
             self._reset()
 
-    def close(self) -> None:
-        """Wait for nothing any more."""
-        for task in self._tasks:
-            task.cancel()
-
     async def _look(self) -> None:
         try:
             self._report = await self._bus.describe(self._port)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 
 from eap.aoe.ads_master import SlaveState
@@ -54,8 +53,6 @@ def test_last_request_counts():
         found = [(each.station, each.target) for each in engine.of(Bring)]
         assert found == [(1001, 1), (0, 1), (1001, 8)]
         assert len(engine.of(Cancel)) == 1
-        side.close()
-        await asyncio.sleep(0)
 
     play(scene)
 

@@ -28,7 +28,6 @@ def test_a_master_tells_of_its_bus() -> None:
             (reply,) = await session.ask(MailboxType.COE, bytes.fromhex("0020 40 0080 01 00000000"))
             assert reply.body.hex() == "0030" + "4b" + "0080" + "01" + "e9030000"
         finally:
-            desk.close()
             link.close()
             engine.close()
 

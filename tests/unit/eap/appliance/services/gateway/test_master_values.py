@@ -25,7 +25,6 @@ def play(scene: Callable[[MasterView, FakeEngine], Awaitable[None]], bus: str = 
         try:
             await scene(view, engine)
         finally:
-            view.close()
             link.close()
             engine.close()
 
