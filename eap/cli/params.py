@@ -13,6 +13,9 @@ CommandT = TypeVar("CommandT", bound=Callable[..., Any])
 MIN_CYCLE_US = 100
 MAX_CYCLE_US = 60_000_000
 
+ANSWER_MARGIN_S = 5.0
+"""How much longer a command waits for its appliance than that waits for somebody else."""
+
 PLANT_FILE = click.Path(path_type=Path)
 """A plant file; whether it can be read is for the loader to say, in its own words."""
 

@@ -9,14 +9,11 @@ import click
 
 from eap.cli.group import ExitCode, LazyGroup
 from eap.cli.output import write_json, write_tables, write_text
-from eap.cli.params import examples, json_option, plant_option
+from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
 from eap.errors import EnvironmentalError
 
 if TYPE_CHECKING:
     from eap.appliance.control_routes import TestResult
-
-_MARGIN_S = 5.0
-"""Patience beyond the time that a target has for its answer."""
 
 
 @click.group(
@@ -246,7 +243,7 @@ def _names(routes: list[Any]) -> list[str]:
 def _test(station: str, target: str, timeout_ms: int, plant: str | None) -> TestResult:
     from eap.appliance.control_routes import TestResult, read_document
 
-    patience_s = timeout_ms / 1000 + _MARGIN_S
+    patience_s = timeout_ms / 1000 + ANSWER_MARGIN_S
     answer = _ask(station, plant, "routes_test", patience_s, target=target, timeout_ms=timeout_ms)
     return read_document(answer, TestResult)
 

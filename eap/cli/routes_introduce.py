@@ -9,9 +9,7 @@ import click
 
 from eap.cli.group import ExitCode
 from eap.cli.output import write_json, write_text
-from eap.cli.params import examples, json_option, plant_option
-
-_MARGIN_S = 5.0
+from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
 
 
 @click.command(
@@ -66,7 +64,7 @@ def introduce(
 
     with connect_station(station, plant) as client:
         answer: dict[str, Any] = client.request_within(
-            wait_ms / 1000 + _MARGIN_S,
+            wait_ms / 1000 + ANSWER_MARGIN_S,
             "routes_introduce",
             station=station,
             address=address,
@@ -85,5 +83,7 @@ def introduce(
 
 def _password(user: str, file: Path | None) -> str:
     if file is not None:
-        return file.read_text().partition("\n")[0].rstrip("\r")
+        from eap.net.password import read_password_text
+
+        return read_password_text(file)
     return click.prompt("Password", hide_input=True, err=True) if user else ""

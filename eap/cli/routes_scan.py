@@ -5,9 +5,7 @@ from __future__ import annotations
 import click
 
 from eap.cli.output import write_json, write_tables
-from eap.cli.params import examples, json_option, plant_option
-
-_MARGIN_S = 5.0
+from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
 
 
 @click.command(
@@ -46,7 +44,7 @@ def scan(station: str | None, address: str, wait_ms: int, plant: str | None, as_
     try:
         for client in clients:
             answer = client.request_within(
-                wait_ms / 1000 + _MARGIN_S,
+                wait_ms / 1000 + ANSWER_MARGIN_S,
                 "routes_scan",
                 station=station or "",
                 address=address,

@@ -18,6 +18,7 @@ from eap.aoe.mqtt_network import Publish, Subscribe
 from eap.aoe.spec import MqttSpec
 from eap.errors import EnvironmentalError
 from eap.net.backoff import Backoff
+from eap.net.password import read_password_text
 
 if TYPE_CHECKING:
     from eap.net.mqttclient import Client
@@ -123,7 +124,7 @@ class MqttLink:
                 login=self._login(), tls=tls_context(self._spec.tls), will=self._will,
                 keepalive_s=KEEPALIVE_S, is_old=self._is_old,
             )  # fmt: skip
-        except (OSError, UnicodeError) as exc:  # files of password and certificates
+        except (OSError, UnicodeError, EnvironmentalError) as exc:  # what files hold
             return str(exc) or "timed out"
         try:
             async with client:
@@ -208,8 +209,8 @@ class MqttLink:
         spec = self._spec
         if not spec.user:
             return None
-        lines = Path(spec.password_file).read_text().splitlines() if spec.password_file else []
-        return spec.user, lines[0] if lines else ""
+        file = spec.password_file
+        return spec.user, read_password_text(Path(file)) if file else ""
 
 
 def require_mqtt() -> None:

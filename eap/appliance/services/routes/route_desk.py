@@ -26,10 +26,10 @@ from eap.codec.amsdiscovery import TEMPORARY, Discovery, Tag, decode_text
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.errors import ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, NetId, parse_host
+from eap.net.password import read_password
 
 BURST = 10
 """Requests that are looked at, at once; one a second for long.  Passwords take time to guess."""
-_MAX_PASSWORD = 4096
 _SHOWN = 80
 
 logger = logging.getLogger(__name__)
@@ -141,13 +141,12 @@ def _is_known(users: Sequence[AmsUser], question: Discovery) -> bool:
 def _password(user: AmsUser) -> bytes | None:
     """Return the password of *user*, None if there is none, with a warning."""
     try:
-        with Path(user.password_file).open("rb") as file:
-            password = file.readline(_MAX_PASSWORD).rstrip(b"\r\n")
-        reason = "" if password else "its first line is empty"
-    except OSError as exc:
-        password, reason = b"", exc.strerror or str(exc)
+        password = read_password(Path(user.password_file))
+        reason = "" if password else f"{user.password_file}: its first line is empty"
+    except EnvironmentalError as exc:
+        password, reason = b"", str(exc)
     if reason:
-        logger.warning("password of user %s: %s: %s", user.name, user.password_file, reason)
+        logger.warning("password of user %s: %s", user.name, reason)
     return password or None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from contextlib import ExitStack
 
 import pytest
@@ -46,6 +47,16 @@ def test_a_password_comes_from_a_file(run, tmp_path):
     result, (asked,) = run("left", "10.0.0.5", *words, "--json")
     assert json.loads(result.output) == ADDED
     assert (asked["password"], asked["name"]) == ("1", "ours")
+
+
+def test_a_file_that_holds_no_password_is_an_error_in_words(run, tmp_path):
+    (tmp_path / "pw").write_bytes(b"\xff\n")
+    os.mkfifo(tmp_path / "pipe")
+    for name, reason in (("pw", "its first line is not UTF-8"), ("pipe", "in a regular file")):
+        words = ["--user", "x", "--password-file", str(tmp_path / name)]
+        result, asked = run("left", "10.0.0.5", *words)
+        assert (result.exit_code, asked) == (2, [])
+        assert reason in result.stderr
 
 
 def test_a_refusal_fails(run):

@@ -142,7 +142,7 @@ def test_user_and_password_are_asked_for_and_a_wrong_one_is_named(tmp_path, capl
         " trying again"
     ) in caplog.text
     assert f"{name}it wants to know who connects: give 'user' and 'password_file'" in caplog.text
-    assert "No such file or directory: '/nowhere'" in caplog.text
+    assert "/nowhere: No such file or directory" in caplog.text
     assert "secret" not in caplog.text
     assert "guess" not in caplog.text
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 
 import pytest
 
@@ -111,6 +112,10 @@ def test_a_password_that_cannot_be_read_lets_nobody_in(tmp_path, caplog):
     found = routes(users=(AmsUser("Administrator", str(tmp_path / "gone")),))
     assert ask(found, asked(password=b"\0")) == AdsError.ACCESS
     assert "password of user Administrator: " in caplog.text
+    os.mkfifo(tmp_path / "pipe")
+    pipe = routes(users=(AmsUser("Administrator", str(tmp_path / "pipe")),))
+    assert ask(pipe, asked(password=b"\0")) == AdsError.ACCESS
+    assert "pipe: a password is kept in a regular file" in caplog.text
     empty = routes(users=(user(tmp_path, "\n"),))
     assert ask(empty, asked(password=b"\0")) == AdsError.ACCESS
     assert "its first line is empty" in caplog.text
