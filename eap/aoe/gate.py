@@ -59,14 +59,12 @@ class Gate:
 
     Attributes:
         access: The rules, which may become others.
-        missed: Entries of the audit that nobody took in time.
     """
 
     def __init__(self, access: AccessList, record: Record) -> None:
-        self.missed = 0
         self.access = access
         self._record = record
-        self._entries: deque[AuditEntry] = deque()
+        self._entries: deque[AuditEntry] = deque(maxlen=MAX_ENTRIES)
 
     @property
     def has_entries(self) -> bool:
@@ -146,12 +144,8 @@ class Gate:
         return Refusal(AdsError.ACCESS_DENIED, text, outcome=Outcome.DENIED, body=body)
 
     def _enter(self, entry: AuditEntry) -> None:
-        if not entry.operations:
-            return
-        if len(self._entries) >= MAX_ENTRIES:
-            self._entries.popleft()
-            self.missed += 1
-        self._entries.append(entry)
+        if entry.operations:
+            self._entries.append(entry)
 
 
 def exchange_body(data: bytes, body: bytes) -> bytes:

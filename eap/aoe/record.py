@@ -28,7 +28,6 @@ class Record:
         counts: Packets by what became of them.
         connections: What was asked from each, which have not been closed.
         routes: What went by each.
-        missed: Traces that nobody took in time.
     """
 
     def __init__(self) -> None:
@@ -36,8 +35,7 @@ class Record:
         self.counts = dict.fromkeys(Outcome, 0)
         self.connections: TrafficTable[Way] = TrafficTable()
         self.routes: TrafficTable[RouteKey] = TrafficTable()
-        self.missed = 0
-        self._events: deque[Trace] = deque()
+        self._events: deque[Trace] = deque(maxlen=MAX_EVENTS)
 
     @property
     def has_events(self) -> bool:
@@ -56,9 +54,6 @@ class Record:
         self.latest.append(trace)
         if trace.outcome is _ANSWERED and not trace.error_code and not trace.text:
             return
-        if len(self._events) >= MAX_EVENTS:
-            self._events.popleft()
-            self.missed += 1
         self._events.append(trace)
 
 
@@ -71,7 +66,6 @@ class Stats(msgspec.Struct, frozen=True):
         fragment_octets: Kept of packets that are not complete.
         routes: That there are.
         counts: Packets by what became of them.
-        missed_traces: That nobody took in time.
     """
 
     in_flight: int
@@ -79,7 +73,6 @@ class Stats(msgspec.Struct, frozen=True):
     fragment_octets: int
     routes: int
     counts: dict[Outcome, int]
-    missed_traces: int
 
 
 def _is_life(trace: Trace) -> bool:

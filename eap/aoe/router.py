@@ -260,7 +260,6 @@ class Router:
             fragment_octets=self._fragments.octets,
             routes=len(self._table),
             counts=dict(self.record.counts),
-            missed_traces=self.record.missed,
         )
 
     def _receive_fragment(

@@ -196,5 +196,4 @@ def test_the_audit_that_nobody_takes_is_bounded() -> None:
     here = station()
     for _ in range(MAX_ENTRIES + 3):
         here.give(ask(WRITE, SDO_WRITE), LAPTOP)
-    assert here.router.gate.missed == 3
     assert len(list(entries(here))) == MAX_ENTRIES
