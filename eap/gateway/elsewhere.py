@@ -1,16 +1,22 @@
 """Slaves of other stations: mailbox requests as operations of ADS, and refusals the other way.
 
-On the way to another station a whole transfer is one request by AoE (ETG.1020); what comes back of
-a refusal is an error of ADS, which is told in the code of the protocol that comes nearest.
+On the way to another station a whole SDO, IDN or block of a file is one request by AoE (ETG.1020);
+what comes back of a refusal is an error of ADS, which is told in the code of the protocol that
+comes nearest.
 """
 
 from __future__ import annotations
 
 from eap.aoe.ads_operation import Read, ReadWrite, Write
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.coe import CoeService
+from eap.codec.foe import FoeErrorCode, FoeOpcode, encode_message, name_of
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import encode_abort
 from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoHeader, SdoInfoOpcode
-from eap.codec.soe import SoeHeader
+from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.codec.soeerror import SoeErrorCode
+from eap.errors import EapError
 from eap.gateway.refusal import Reason
 from eap.od.abort import AbortCode
 
@@ -22,6 +28,7 @@ _REASONS: dict[int, Reason] = {
     AdsError.TARGET_MACHINE: Reason.NO_SLAVE,
     AdsError.HOST_UNREACHABLE: Reason.BUS_DOWN,
     AdsError.TIMEOUT: Reason.TIMEOUT,
+    AdsError.NOT_READY: Reason.NO_MAILBOX,
     AdsError.BUSY: Reason.BUSY,
     AdsError.ACCESS_DENIED: Reason.DENIED,
 }
@@ -40,6 +47,28 @@ _SOE: dict[int, SoeErrorCode] = {
     AdsError.VALUE: SoeErrorCode.INVALID_VALUE,
     AdsError.STATE: SoeErrorCode.COMMAND_NOT_NOW,
 }
+_FOE: dict[int, FoeErrorCode] = {
+    AdsError.NOT_FOUND: FoeErrorCode.NOT_FOUND,
+    AdsError.SERVICE: FoeErrorCode.ILLEGAL,
+    AdsError.STATE: FoeErrorCode.ILLEGAL,
+    AdsError.ACCESS: FoeErrorCode.ACCESS_DENIED,
+    AdsError.NO_MEMORY: FoeErrorCode.DISK_FULL,
+    AdsError.EXISTS: FoeErrorCode.ALREADY_EXISTS,
+    AdsError.VALUE: FoeErrorCode.CHECKSUM,
+    AdsError.NO_MORE_HANDLES: FoeErrorCode.NO_USER,
+}
+_RESPONSES = {
+    SoeOpcode.READ_REQUEST: SoeOpcode.READ_RESPONSE,
+    SoeOpcode.WRITE_REQUEST: SoeOpcode.WRITE_RESPONSE,
+}
+
+
+class ElsewhereError(EapError):
+    """Who was asked elsewhere refused, or could not be asked; *result* is an error of ADS."""
+
+    def __init__(self, result: int) -> None:
+        super().__init__(AdsError.words_of(result))
+        self.result = result
 
 
 def reason_for(result: int) -> Reason | None:
@@ -52,9 +81,32 @@ def abort_for(result: int) -> AbortCode:
     return _ABORTS.get(result, AbortCode.GENERAL)
 
 
-def soe_error_for(result: int) -> SoeErrorCode:
-    """Return the error of SoE that comes nearest to a refusal by ADS."""
-    return _SOE.get(result, SoeErrorCode.GENERAL)
+def refusal_for(kind: MailboxType, request: bytes, result: int) -> bytes | None:
+    """Return the message by which a slave itself would refuse, as *result* says.
+
+    Args:
+        kind: The protocol.
+        request: What is refused.
+        result: Of ADS, one without a reason.
+
+    Returns:
+        None if there is no such message.
+    """
+    match kind:
+        case MailboxType.COE if len(request) > 5 and request[1] >> 4 == CoeService.SDO_REQUEST:
+            index, subindex = int.from_bytes(request[3:5], "little"), request[5]
+            return encode_abort(index, subindex, abort_for(result))
+        case MailboxType.SOE:
+            head = SoeHeader.decode(request)
+            if head.opcode in _RESPONSES:
+                opcode, code = _RESPONSES[head.opcode], _SOE.get(result, SoeErrorCode.GENERAL)
+                told = SoeHeader(opcode, 0, 1, head.drive, head.elements, head.idn)
+                return told.encode() + code.to_bytes(2, "little")
+        case MailboxType.FOE:
+            error = _FOE.get(result, FoeErrorCode.NOT_DEFINED)
+            text = f"{name_of(error)}: ADS error 0x{result:x} ({AdsError.name_of(result)})"
+            return encode_message(FoeOpcode.ERROR, error, text.encode())
+    return None
 
 
 def sdo_offset(index: int, subindex: int, *, complete: bool) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.eoe import EoeType
@@ -21,6 +22,7 @@ _SDO_DATA = CoeHeader.SIZE + SdoHeader.SIZE
 """Where the data of a normal SDO begins."""
 _SDO_SEGMENTS = frozenset((SdoRequest.DOWNLOAD_SEGMENT, SdoRequest.UPLOAD_SEGMENT))
 _EXPEDITED, _LAST = 0x02, 0x01
+_BEFORE_FOE = DATA_OVERHEAD - FoeHeader.SIZE
 _SOE_INCOMPLETE = 0x08
 _NO_ANSWER = StateFlags.RESPONSE | StateFlags.NO_RETURN
 
@@ -56,13 +58,13 @@ class Transfer:
 
     Args:
         kind: The protocol.
-        room: Of the slave's mailboxes.
+        room: Of the slave's mailboxes; sizes that become others count from then on.
 
     Attributes:
         replies: To the last request, as far as they came.
     """
 
-    def __init__(self, kind: MailboxType, room: Room) -> None:
+    def __init__(self, kind: MailboxType, room: Room | MailboxSizes) -> None:
         self.replies: list[bytes] = []
         self._course = _course(kind, room)
         self._request = b""
@@ -109,7 +111,7 @@ def is_busy(body: bytes) -> bool:
     return body[:1] == bytes((FoeOpcode.BUSY,))
 
 
-def _course(kind: MailboxType, room: Room) -> Course:
+def _course(kind: MailboxType, room: Room | MailboxSizes) -> Course:
     match kind:
         case MailboxType.COE:
             return _Coe()
@@ -187,11 +189,9 @@ class _Coe(_Single):
 class _Foe(_Single):
     """Files; a packet that does not fill the mailbox is the last one."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: Room | MailboxSizes) -> None:
         super().__init__()
-        overhead = DATA_OVERHEAD - FoeHeader.SIZE
-        self._full_to_slave = room.to_slave - overhead
-        self._full_to_master = room.to_master - overhead
+        self._room = room
         self._is_last = False
 
     def ask(self, body: bytes) -> bool:
@@ -202,13 +202,13 @@ class _Foe(_Single):
         if opcode == FoeOpcode.ERROR:
             self.is_running = False
             return False
-        self._is_last = opcode == FoeOpcode.DATA and len(body) < self._full_to_slave
+        self._is_last = opcode == FoeOpcode.DATA and len(body) < self._room.to_slave - _BEFORE_FOE
         return True
 
     def answer(self, body: bytes) -> None:
         opcode = body[0] if body else 0
         if opcode == FoeOpcode.DATA:
-            self._is_last = len(body) < self._full_to_master
+            self._is_last = len(body) < self._room.to_master - _BEFORE_FOE
             self.is_running = True
         elif opcode == FoeOpcode.ACK:
             self.is_running = not self._is_last

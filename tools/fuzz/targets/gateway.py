@@ -17,13 +17,16 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.voe_server import VoeServer
 from eap.aoe.access import AccessList
-from eap.aoe.ads_operation import Operation, OperationOutcome, Read
+from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite
+from eap.aoe.ads_request import take_request
+from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
 from eap.appliance.bus_request import BusReport, Heard, SlaveReport
 from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.codec.mailbox import (
     MailboxHeader,
@@ -138,9 +141,27 @@ async def _nothing(index: int) -> None:
     """What the master shows is never old."""
 
 
-async def _perform(operation: Operation) -> OperationOutcome:
-    """Read long values from another station, and take what is written there."""
-    return OperationOutcome(data=bytes(3000) if isinstance(operation, Read) else b"")
+async def _ask(port: int, command: int, body: bytes, *, timeout_s: float) -> AmsAnswer:
+    """Read long values and a short file from another station, and take what is written there."""
+    del port, timeout_s
+    request = take_request(command, body)
+    if isinstance(request, AmsAnswer):
+        return request
+    outcomes = [OperationOutcome(data=_elsewhere(each)) for each in request.operations]
+    return AmsAnswer(request.encode_answer(outcomes))
+
+
+def _elsewhere(operation: Operation) -> bytes:
+    match operation:
+        case Read(offset=0xF020_0100):  # the slaves there are
+            return b"\1\0" + _STATION.to_bytes(2, "little")
+        case Read(offset=0x8000_0021 | 0x8000_0022):  # their mailboxes
+            return _SIZES.to_slave.to_bytes(2, "little")
+        case Read():
+            return bytes(3000)
+        case ReadWrite(length=length):
+            return bytes(min(length, 100))
+    return b""
 
 
 def _frames(data: bytes) -> Iterator[bytes]:
@@ -157,13 +178,14 @@ async def _serve(data: bytes) -> None:
     dictionary = ObjectDictionary(
         [variable(0x1000, "A", "UDINT"), variable(0, "B", "BLOCK(90)", RW)]
     )
+    link = RemoteLink(_ask, _STATION, answer_s=1)
     gateway = MailboxGateway(
         _Link(dictionary),
         lambda: MasterSession(dictionary, _SETTINGS.room, _nothing, lambda index: bool(index & 1)),
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,
         AddressMap({_VIRTUAL: RemoteSlave(_SETTINGS.net_id, 1001)}),
-        lambda slave, kind: RemoteSession(kind, _perform, room=_SETTINGS.room, answer_s=1),
+        lambda slave, kind: RemoteSession(kind, link, room=_SETTINGS.room),
     )
     door = GatewayDoor([(gateway, "udp:eap0")])
     answered: list[bytes] = []

@@ -2,7 +2,8 @@
 
 A file is opened by its name, read or written in blocks by a handle, and closed; Read and Write do
 as well as the ReadWrite that TwinCAT's clients send.  Own format: what cannot be answered in time
-is answered BUSY, has done nothing, and is to be asked again; and what FOE_PROGRESS answers.
+is answered BUSY, has done nothing, and is to be asked again; what FOE_PROGRESS answers; and that a
+ReadWrite of it with any data gives the file up, where closing it would make it complete.
 Handles belong to the NetID that opened them, through whichever connection it comes.
 """
 
@@ -93,7 +94,7 @@ class SlaveFiles(SlaveSpace):
             return await self._begin(asked, data, offset, is_write=is_write)
         if max(len(data), length) > MAX_BLOCK:
             raise AdsRefusedError(AdsError.SIZE, f"a block has at most {MAX_BLOCK} octets")
-        if data and group != IndexGroup.FOE_WRITE:
+        if data and group not in {IndexGroup.FOE_WRITE, IndexGroup.FOE_PROGRESS}:
             raise AdsRefusedError(AdsError.SIZE, "nothing is written here")
         item = self._find(asked, offset)
         self._end_idle(item)
@@ -132,6 +133,8 @@ class SlaveFiles(SlaveSpace):
     async def _do(self, item: _Open, handle: int, group: int, length: int, data: bytes) -> bytes:
         transfer = item.transfer
         match group:
+            case IndexGroup.FOE_PROGRESS if data:
+                self._drop(handle)
             case IndexGroup.FOE_PROGRESS:
                 return _progress(transfer)[:length]
             case IndexGroup.FOE_READ | IndexGroup.FOE_WRITE:

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from functools import partial
 
 from eap.aoe.access import AccessList
-from eap.aoe.ads_operation import Operation, OperationOutcome
-from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.appliance.handover import Handover, PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_desk import MasterDesk
+from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.slave_link import PortLink
 from eap.appliance.services.routing.station_router import StationRouter
@@ -89,14 +88,11 @@ def _access_of(router: StationRouter) -> AccessList:
 def _open_remote(
     router: StationRouter, settings: Settings, slave: RemoteSlave, kind: MailboxType
 ) -> RemoteSession:
-    async def perform(operation: Operation) -> OperationOutcome:
-        command, body = encode_query(operation)
-        answer = await router.ask(
-            slave.net_id, slave.port, command, body, timeout_s=settings.answer_s
-        )
-        return decode_outcome(command, answer.error_code, answer.data)
+    return RemoteSession(kind, _link(router, settings, slave), room=settings.room)
 
-    return RemoteSession(kind, perform, room=settings.room, answer_s=settings.answer_s)
+
+def _link(router: StationRouter, settings: Settings, slave: RemoteSlave) -> RemoteLink:
+    return RemoteLink(partial(router.ask, slave.net_id), slave.port, settings.answer_s)
 
 
 def _whom(told: GatewayAddress) -> Slave | RemoteSlave | Group:

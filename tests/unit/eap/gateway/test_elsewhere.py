@@ -4,14 +4,16 @@ import pytest
 
 from eap.aoe.ads_operation import Read, Write
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.codec.soe import SoeHeader, SoeOpcode
-from eap.codec.soeerror import SoeErrorCode
 from eap.errors import CodecError
 from eap.gateway import elsewhere
-from eap.gateway.elsewhere import ROOM
+from eap.gateway.elsewhere import ROOM, ElsewhereError
 from eap.gateway.refusal import Reason
 from eap.od.abort import AbortCode
+
+COE, FOE, SOE, VOE = MailboxType.COE, MailboxType.FOE, MailboxType.SOE, MailboxType.VOE
 
 
 def test_who_did_not_answer_is_told_apart_from_who_refused():
@@ -19,8 +21,32 @@ def test_who_did_not_answer_is_told_apart_from_who_refused():
     assert elsewhere.reason_for(AdsError.NOT_FOUND) is None
     assert elsewhere.abort_for(AdsError.NOT_FOUND) is AbortCode.NO_OBJECT
     assert elsewhere.abort_for(0x7FF) is AbortCode.GENERAL
-    assert elsewhere.soe_error_for(AdsError.NOT_FOUND) is SoeErrorCode.NO_IDN
-    assert elsewhere.soe_error_for(0x7FF) is SoeErrorCode.GENERAL
+
+
+@pytest.mark.parametrize(
+    ("kind", "request_", "result", "answer"),
+    [
+        (COE, "0020 40 1810 02 00000000", AdsError.NOT_FOUND, "0020 80 1810 02 00000206"),
+        (COE, "0020 60 00", AdsError.NOT_FOUND, None),
+        (SOE, "a1 40 2000", AdsError.NOT_FOUND, "b2 40 2000 0110"),
+        (SOE, "03 40 2000", 0x7FF, "14 40 2000 0b80"),
+        (SOE, "05 40 2000", AdsError.NOT_FOUND, None),
+        (
+            FOE,
+            "01 00 00000000 61",
+            AdsError.NOT_FOUND,
+            "05 00 01800000" + b"file not found: ADS error 0x70c (NOT_FOUND)".hex(),
+        ),
+        (VOE, "5a0e0000 0100", AdsError.NOT_FOUND, None),
+    ],
+)
+def test_refusals_in_the_protocol_of_the_request(kind, request_, result, answer):
+    told = elsewhere.refusal_for(kind, bytes.fromhex(request_), result)
+    assert told == (None if answer is None else bytes.fromhex(answer))
+
+
+def test_an_error_says_what_it_means():
+    assert str(ElsewhereError(AdsError.TIMEOUT)) == "error 0x719 (no answer in time)"
 
 
 def test_offsets():

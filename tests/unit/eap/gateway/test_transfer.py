@@ -200,6 +200,15 @@ def test_after_busy_the_same_packet_is_a_question() -> None:
     assert not transfer.is_repeated(packet)
 
 
+def test_sizes_may_become_others_between_two_files() -> None:
+    sizes = MailboxSizes(16, 16)
+    transfer = Transfer(MailboxType.FOE, sizes)
+    transfer.ask(bytes.fromhex("01 00 00000000 66"))
+    sizes.set(16, 18)
+    transfer.answer(bytes.fromhex("03 00 01000000 61626364"))
+    assert not transfer.ask(bytes.fromhex("04 00 01000000")), "that was the last packet"
+
+
 def ams(command: int, flags: int, body: bytes = b"") -> bytes:
     header = AmsHeader(
         NetId.parse("1.2.3.4.5.6"), 1001, NetId.parse("6.5.4.3.2.1"), 1, command, flags

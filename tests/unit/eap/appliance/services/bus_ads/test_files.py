@@ -161,6 +161,17 @@ def test_file_that_nobody_asks_for_is_closed(monkeypatch):
     play(scene, "files")
 
 
+def test_file_that_is_given_up_keeps_its_content():
+    async def scene(client, engine):
+        handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
+        await client.ask(DISK, WRITE, handle, b"lost", 0)
+        await client.ask(DISK, IndexGroup.FOE_PROGRESS, handle, b"\1", 0)
+        handle = await client.open_file(DISK, OPEN_READ, b"a.bin")
+        assert await client.read_file(DISK, handle, 100) == b"first file"
+
+    play(scene, "files")
+
+
 def test_slow_slave_is_waited_for_by_asking_again(monkeypatch):
     monkeypatch.setattr(files, "ANSWER_S", 0.05)
 

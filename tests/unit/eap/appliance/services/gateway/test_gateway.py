@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from eap.aoe.access import AccessList
-from eap.aoe.ads_operation import Operation, OperationOutcome, Read
+from eap.aoe.ads_operation import Read
 from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
 from eap.aoe.way import Way
@@ -35,6 +35,7 @@ from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, array, variable
+from tests.support.elsewhere import Station
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 from tests.support.vectors import load
@@ -70,7 +71,8 @@ class Desk:
     """
 
     def __init__(self, bus: str, rules: tuple[AccessRule, ...], settings: Settings) -> None:
-        self.asked: list[tuple[RemoteSlave, Operation]] = []
+        self.asked: list[RemoteSlave] = []
+        self.station = Station(b"\7\0\0\0")
         self.engine = FakeEngine(FakeBus(LoopBus(bus)))
         self._link = EngineLink(self.engine.services)
         turns = itertools.cycle((False, True))  # has to be waited for, and has not
@@ -84,11 +86,8 @@ class Desk:
         )
 
     def _open_remote(self, slave: RemoteSlave, kind: MailboxType) -> RemoteSession:
-        async def perform(operation: Operation) -> OperationOutcome:
-            self.asked.append((slave, operation))
-            return OperationOutcome(data=b"\7\0\0\0")
-
-        return RemoteSession(kind, perform, room=1000, answer_s=1)
+        self.asked.append(slave)
+        return RemoteSession(kind, self.station.link(), room=1000)
 
     async def ask(
         self, kind: MailboxType, address: int, octets: str | bytes, way: Way = HERE
@@ -429,8 +428,8 @@ def test_virtual_addresses_stand_for_slaves_here_and_elsewhere() -> None:
     async def scene(desk: Desk) -> None:
         assert await desk.one(COE, 0x9000, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
         assert await desk.one(COE, 0x9001, VENDOR) == "00 30 43 18 10 01 07 00 00 00"
-        ((slave, operation),) = desk.asked
-        assert slave == RemoteSlave(ELSEWHERE_BUS, 1003)
+        assert desk.asked == [RemoteSlave(ELSEWHERE_BUS, 1003)]
+        (operation,) = desk.station.asked
         assert operation == Read(IndexGroup.SDO, 0x1018_0001, ROOM)
 
     rule = AccessRule("no", targets=(AccessTarget(str(ELSEWHERE_BUS), 1003),), allow=False)

@@ -1,0 +1,103 @@
+"""What goes to the other station for a file, and when; packets are in test_remote_files.py."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+from devicebus.mailbox.foe_server import NotReadyError
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.aoe.ads_operation import Read, ReadWrite
+from eap.appliance.services.gateway.remote_file import BLOCK, RemoteFile, Wanted
+from eap.codec.ads import IndexGroup
+from tests.support import busads
+from tests.support.elsewhere import Bus
+
+T = TypeVar("T")
+CONTENT = bytes(range(250)) * 300
+DISK = 256 - 12
+"""Octets of a file in a packet of the slave."""
+
+
+async def ready(step: Callable[[], T], file: RemoteFile) -> T:
+    """Do a step as soon as it can be done."""
+    while True:
+        try:
+            return step()
+        except NotReadyError:
+            await file.wait_change()
+
+
+def play(scene: Callable[[Bus], Awaitable[None]]) -> None:
+    async def run(client: busads.Client, engine: object) -> None:
+        await scene(Bus(client))
+
+    busads.play(run, "files")
+
+
+def opened(bus: Bus, *, is_write: bool) -> RemoteFile:
+    return RemoteFile(bus.link(), Wanted("a.bin", 0, is_write), MailboxSizes())
+
+
+async def write(bus: Bus, content: bytes) -> None:
+    file = opened(bus, is_write=True)
+    await ready(file.check_open, file)
+    await ready(lambda: file.write(content), file)
+    await ready(file.commit, file)
+
+
+def groups(bus: Bus) -> list[int]:
+    return [each.group for each in bus.asked if isinstance(each, Read | ReadWrite)]
+
+
+def test_blocks_are_longer_and_longer() -> None:
+    async def scene(bus: Bus) -> None:
+        await write(bus, CONTENT)
+        file = opened(bus, is_write=False)
+        await ready(file.check_open, file)
+        got = b""
+        while part := await ready(lambda: file.read(1000), file):
+            got += part
+        assert got == CONTENT
+        blocks = [
+            each.length
+            for each in bus.asked
+            if isinstance(each, ReadWrite) and each.group == IndexGroup.FOE_READ
+        ]
+        assert blocks[:3] == [DISK, 2 * DISK, 4 * DISK]
+        assert max(blocks) == BLOCK
+
+    play(scene)
+
+
+def test_a_file_that_is_written_is_closed_once() -> None:
+    async def scene(bus: Bus) -> None:
+        await write(bus, CONTENT)
+        assert groups(bus)[-1] == IndexGroup.FOE_CLOSE
+        assert IndexGroup.FOE_PROGRESS not in groups(bus)
+
+    play(scene)
+
+
+def test_who_gives_up_before_the_file_is_open() -> None:
+    async def scene(bus: Bus) -> None:
+        file = opened(bus, is_write=True)
+        file.close()
+        while not groups(bus) or groups(bus)[-1] != IndexGroup.FOE_PROGRESS:
+            await file.wait_change()
+            await asyncio.sleep(0)
+
+    play(scene)
+
+
+def test_who_gives_up_a_file_closes_it_there() -> None:
+    async def scene(bus: Bus) -> None:
+        await write(bus, CONTENT)
+        file = opened(bus, is_write=False)
+        await ready(file.check_open, file)
+        file.close()
+        await asyncio.sleep(0.05)
+        assert groups(bus)[-1] == IndexGroup.FOE_CLOSE
+
+    play(scene)
