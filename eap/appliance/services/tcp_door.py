@@ -22,9 +22,9 @@ from eap.codec.ethercat import EtherCatHeader, FrameType
 
 FIRST_FRAME_S = 5.0
 """How long a connection may stay silent before its first frame header."""
-MAX_WAITING = 32
+MAX_WAITING = 64
 """Connections of one listener whose first frame has not come yet."""
-MAX_STREAMS = 32
+MAX_STREAMS = 64
 """Connections of one listener that carry type 5."""
 _PEEK_PAUSE_S = 0.02
 

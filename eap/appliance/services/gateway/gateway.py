@@ -15,6 +15,7 @@ from typing import NamedTuple, TypeAlias
 
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation
+from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
 from eap.appliance.services.gateway.answering import Answering, Request, Send, refusals
@@ -114,6 +115,7 @@ class MailboxGateway:
         self._masters: Sessions[MasterSession] = Sessions()
         self._remotes: Sessions[RemoteSession] = Sessions()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._count = 0
         self._listeners = EoeListeners()
         bus.listen(self._take_unasked)
 
@@ -143,17 +145,21 @@ class MailboxGateway:
             MalformedError: nobody knows its protocol.
         """
         header, body = decode_frame(frame)
+        key = frame
+        if way.kind == DoorKind.TCP:  # what comes twice there was asked twice
+            self._count += 1
+            key += self._count.to_bytes(8)
         now_ns = monotonic_ns()
-        admission = self.ledger.admit(way, frame, now_ns)
+        admission = self.ledger.admit(way, key, now_ns)
         if admission is Admission.REPEATED:
             return None
         request = Request(header, bytes(body), way, send)
         if admission is not Admission.TAKEN:
             self._answering.refuse(request, _NOT_TAKEN[admission])
             return None
-        if self._answer_at_once(request, frame, now_ns):
+        if self._answer_at_once(request, key, now_ns):
             return None
-        request = request._replace(ticket=Ticket(self.ledger, way, frame))
+        request = request._replace(ticket=Ticket(self.ledger, way, key))
         task = asyncio.get_running_loop().create_task(self._serve(request))
         self._tasks.add(task)
         task.add_done_callback(partial(self._done, request))
@@ -210,7 +216,7 @@ class MailboxGateway:
                 *(self._ask(request, one, address, is_group=True) for one, address in members)
             )
 
-    def _answer_at_once(self, request: Request, frame: bytes, start_ns: int) -> bool:
+    def _answer_at_once(self, request: Request, key: bytes, start_ns: int) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
         header, body, way, _, _ = request
         if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
@@ -218,11 +224,11 @@ class MailboxGateway:
         if self.ledger.waiting(way) > 1:
             return False  # what came first is answered first
         operation = operation_of(MailboxType.COE, body)
-        key = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
-        master = self._masters.take(key, self._open_master)
+        whose = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
+        master = self._masters.take(whose, self._open_master)
         if not master.is_ready(operation):
             return False
-        self.ledger.answered(way, frame)
+        self.ledger.answered(way, key)
         judged = self._judge(way, MASTER_ADDRESS, self._master, operation)
         replies = (
             master.ask_now(body)

@@ -233,6 +233,21 @@ def test_an_engine_that_is_gone_is_answered_for_too() -> None:
     play(scene)
 
 
+def test_what_is_asked_twice_at_once_is_answered_twice_on_a_connection() -> None:
+    request = encode_frame(
+        MailboxHeader(0, 1001, type=COE, counter=3), bytes.fromhex("0020 40 1810 01 00000000")
+    )
+
+    async def answers(desk: Desk, way: Way) -> int:
+        return sum(map(len, await asyncio.gather(*(desk.ask_frame(request, way) for _ in "123"))))
+
+    async def scene(desk: Desk) -> None:
+        assert await answers(desk, HERE) == 1
+        assert await answers(desk, Way("tcp:eap0", "127.0.0.1:1")) == 3
+
+    play(scene)
+
+
 def test_a_repeated_step_of_a_transfer_is_answered_and_counted() -> None:
     async def scene(desk: Desk) -> None:
         await desk.one(FOE, 1001, "02 00 00000000" + FILE)
