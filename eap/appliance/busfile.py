@@ -191,6 +191,8 @@ def _check_slave(slave: SlaveSpec, bus: Bus, report: Report, at: str) -> None:
 
 
 def _check_faults(bus: Bus, report: Report) -> None:
+    if not bus.spec.faults:
+        return
     segment = FaultySegment(build_segment(bus.spec, bus.resources))
     for number, fault in enumerate(bus.spec.faults):
         try:

@@ -7,6 +7,7 @@ A key with a typing error is reported and then read as the one that was meant.
 
 from __future__ import annotations
 
+from functools import cache
 from math import isfinite
 from typing import Any, TypeVar
 
@@ -45,10 +46,17 @@ def convert_to(kind: type[T], root: Node, report: Report, what: str) -> T | None
     """
     report.lines[""] = root.line
     try:
-        found: T = _Converter(report).value(root, inspect.type_info(kind), "", what)
+        described = _describe_type(kind)  # type: ignore[arg-type]  # classes are hashable
+        found: T = _Converter(report).value(root, described, "", what)
     except _BrokenError:
         return None
     return found
+
+
+@cache
+def _describe_type(kind: type) -> inspect.Type:
+    """Return what msgspec knows of *kind*; finding out takes longer than reading most files."""
+    return inspect.type_info(kind)
 
 
 class _Converter:
