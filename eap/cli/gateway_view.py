@@ -10,7 +10,12 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from eap.cli.words import count
+
 Row: TypeAlias = dict[str, Any]
+
+_SHOWN_CLIENTS = 10
+"""Each command is a client of its own, so there are soon hundreds."""
 
 
 def gateway_tables(row: Row) -> Iterator[RenderableType]:
@@ -18,12 +23,16 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
     settings = row["settings"]
     served = ", ".join(row["served"]) or "nowhere"
     silent = ", silent" if settings["silent"] else ""
-    turned_away = f", {row['turned_away']} frames turned away" if row["turned_away"] else ""
+    turned_away = (
+        f", {count(row['turned_away'], 'frame')} turned away" if row["turned_away"] else ""
+    )
     yield Text(
         f"{row['station']}/{row['port']}: {row['state']} at {served};"
         f" answers within {settings['answer_ms']} ms{silent}{turned_away}"
     )
     if row["clients"]:
+        latest = row["clients"][::-1]
+        shown = [each for at, each in enumerate(latest) if at < _SHOWN_CLIENTS or each["transfers"]]
         yield _table(
             ("Client", "Door", "Requests", "Repeated", "Errors", "Transfers"),
             (
@@ -35,9 +44,11 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
                     each["errors"],
                     ", ".join(f"{one['protocol']} {one['address']}" for one in each["transfers"]),
                 )
-                for each in row["clients"]
+                for each in shown
             ),
         )
+        if left := len(latest) - len(shown):
+            yield Text(f"  {count(left, 'client')} more asked before these; --json shows all")
     if row["slaves"]:
         yield _table(
             ("Slave", "Protocol", "Requests", "Replies", "Errors", "Mean", "Slowest", "Last error"),

@@ -101,8 +101,13 @@ def put_file(
 def _writing(target: Path | None) -> Iterator[BinaryIO]:
     """Open what is to be written; a regular file is replaced when the block is through."""
     if target is None:
-        yield sys.stdout.buffer
-        sys.stdout.flush()
+        try:
+            yield sys.stdout.buffer
+            sys.stdout.buffer.flush()
+        except BrokenPipeError:
+            raise  # who reads it has seen enough
+        except OSError as exc:
+            raise EnvironmentalError(f"stdout cannot be written: {exc.strerror}") from None
         return
     whole = target.resolve()
     partial = whole.with_name(f".{whole.name}.{os.getpid()}")

@@ -54,6 +54,15 @@ def test_what_a_gateway_does():
     assert "there is no such slave" in text
 
 
+def test_of_many_clients_the_latest_are_shown_and_those_with_transfers():
+    (busy,) = ROW["clients"]
+    idle = [busy | {"address": f"10.0.0.9:{port}", "transfers": []} for port in range(6000, 6020)]
+    text = shown(ROW | {"clients": [busy, *idle]})
+    ports = [line.split()[0][-4:] for line in text.splitlines() if "10.0.0.9:" in line]
+    assert ports == [*(str(port) for port in range(6019, 6009, -1)), "5000"]
+    assert "10 clients more asked before these; --json shows all" in text
+
+
 def test_one_that_is_stopped_and_silent():
     quiet = ROW | {"state": "stopped", "turned_away": 3, "served": [], "clients": [], "slaves": []}
     quiet["settings"] = ROW["settings"] | {"silent": True}
