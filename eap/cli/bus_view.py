@@ -21,8 +21,8 @@ _COUNTERS = ("invalid_frames", "physical", "forwarded", "lost_links")
 
 def scan_tables(rows: Iterable[Row]) -> Iterator[Table | Text]:
     """Yield the table of a scan, and in words what is wrong with slaves."""
-    table = _table("Slave", "Name", "Vendor", "Product", "Revision", "Serial", "Alias", "State",
-                   "Mailbox")  # fmt: skip
+    table = make_table("Slave", "Name", "Vendor", "Product", "Revision", "Serial", "Alias", "State",
+                       "Mailbox")  # fmt: skip
     faults = []
     for row in rows:
         numbers = (f"0x{row[key]:X}" for key in ("vendor", "product", "revision"))
@@ -43,7 +43,7 @@ def scan_tables(rows: Iterable[Row]) -> Iterator[Table | Text]:
 
 def state_table(rows: Iterable[Row]) -> Table:
     """Return the table of the slaves' states."""
-    table = _table("Slave", "Name", "State", "Reason")
+    table = make_table("Slave", "Name", "State", "Reason")
     for row in rows:
         table.add_row(str(row["address"]), row["name"], _state(row["state"]), _reason(row))
     return table
@@ -51,7 +51,9 @@ def state_table(rows: Iterable[Row]) -> Table:
 
 def diagnosis_tables(found: Row) -> Iterator[Table | Text]:
     """Yield the table of all ports, and in words where trouble starts."""
-    table = _table("Slave", "Name", "State", "Port", "Open", "CRC", "RX", "Forwarded", "Lost link")
+    table = make_table(
+        "Slave", "Name", "State", "Port", "Open", "CRC", "RX", "Forwarded", "Lost link"
+    )
     for row in found["slaves"]:
         state = row["state"] if row["answers"] else None
         first = (str(row["address"]), row["name"], _state(state))
@@ -107,7 +109,7 @@ def entry_name(row: Row) -> str:
 
 def object_table(rows: Iterable[Row]) -> Table:
     """Return the table of objects."""
-    table = _table("Index", "Name", "Kind", "Subindexes")
+    table = make_table("Index", "Name", "Kind", "Subindexes")
     for row in rows:
         top = str(row["max_subindex"] or "")
         table.add_row(f"0x{row['index']:04X}", row["name"], row["code"], top)
@@ -116,7 +118,7 @@ def object_table(rows: Iterable[Row]) -> Table:
 
 def dump_table(rows: Iterable[Row]) -> Table:
     """Return the table of all entries with their values."""
-    table = _table("Entry", "Name", "Type", "Access", "Value")
+    table = make_table("Entry", "Name", "Type", "Access", "Value")
     for row in rows:
         own, whole = row["name"], row["object"]
         name = own if own == whole or not own else f"{whole}: {own}"
@@ -151,13 +153,14 @@ def idn_lines(row: Row) -> Iterator[str]:
 
 def idn_table(rows: Iterable[Row]) -> Table:
     """Return the table of IDNs."""
-    table = _table("IDN", "Name")
+    table = make_table("IDN", "Name")
     for row in rows:
         table.add_row(row["idn"], row["name"])
     return table
 
 
-def _table(*columns: str) -> Table:
+def make_table(*columns: str) -> Table:
+    """Return a table without rows, whose cells are folded where a terminal is narrow."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in columns:
         table.add_column(heading, overflow="fold", vertical="top")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
-from rich import box
 from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from eap.cli.bus_view import make_table
 from eap.cli.words import count
 
 Row: TypeAlias = dict[str, Any]
@@ -23,9 +23,8 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
     settings = row["settings"]
     served = ", ".join(row["served"]) or "nowhere"
     silent = ", silent" if settings["silent"] else ""
-    turned_away = (
-        f", {count(row['turned_away'], 'frame')} turned away" if row["turned_away"] else ""
-    )
+    frames = count(row["turned_away"], "frame")
+    turned_away = f", {frames} turned away" if row["turned_away"] else ""
     yield Text(
         f"{row['station']}/{row['port']}: {row['state']} at {served};"
         f" answers within {settings['answer_ms']} ms{silent}{turned_away}"
@@ -69,9 +68,7 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
 
 
 def _table(titles: tuple[str, ...], rows: Iterator[tuple[object, ...]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    for title in titles:
-        table.add_column(title)
+    table = make_table(*titles)
     for row in rows:
         table.add_row(*(Text(str(each)) for each in row))
     return table
