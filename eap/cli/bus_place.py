@@ -34,6 +34,8 @@ class GatewayPlace(NamedTuple):
     host: str
     port: int
     tcp: bool = False
+    mailbox: int = 128
+    """Octets of mailboxes behind virtual addresses."""
 
 
 Place: TypeAlias = BusPort | InterfaceUri | GatewayPlace
@@ -147,7 +149,7 @@ def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
     if isinstance(bus, GatewayPlace):
         from eap.appliance.commands.bus_gateway import open_gateway
 
-        return open_gateway(bus.host, bus.port, tcp=bus.tcp)
+        return open_gateway(bus.host, bus.port, tcp=bus.tcp, mailbox=bus.mailbox)
     from eap.appliance.commands import bus_session
 
     return bus_session.open_bus(bus)

@@ -84,12 +84,20 @@ def _call(command: click.Command, **values: Any) -> Any:
 @click.option(
     _TCP, is_flag=True, help="Connect by TCP, else datagrams are sent (UDP); anywhere on the line."
 )
+@click.option(
+    "--mailbox",
+    type=click.IntRange(16, 1492),
+    default=128,
+    metavar="OCTETS",
+    help="How large a slave's mailbox is behind a virtual address (0x8000 and above); the master"
+    " tells only of its own slaves. 128 if left out.",
+)
 @click.argument("place", metavar="HOST[:PORT]", callback=_parse_place)
 @click.pass_context
-def gw(ctx: click.Context, place: GatewayPlace, tcp: bool) -> None:
+def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int) -> None:
     """Talk to a master and its slaves through a mailbox gateway, any vendor's.
 
     SLAVE is a station address (1001 is the first slave) or the slave's name as the master knows it;
     0 is the master itself.  The port is 34980 if it is left out.
     """
-    ctx.obj = place._replace(tcp=tcp)
+    ctx.obj = place._replace(tcp=tcp, mailbox=mailbox)

@@ -31,11 +31,15 @@ class AsyncGatewayClient:
         port: Its port.
         timeout_s: How long an answer may take before the request is sent again.
         tries: How often it is sent.
+
+    Attributes:
+        mailboxes: As :class:`GatewayClient` has them.
     """
 
     def __init__(
         self, host: str, port: int = PORT, *, timeout_s: float = TIMEOUT_S, tries: int = TRIES
     ) -> None:
+        self.mailboxes: dict[int, MailboxSizes] = {}
         self._place = host, port
         self._timeout_s = timeout_s
         self._tries = tries
@@ -99,7 +103,8 @@ class AsyncGatewayClient:
 
     async def sizes_of(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave; raises as :meth:`GatewayClient.sizes_of`."""
-        return sizes_of(await self.slaves(), address)
+        known = self.mailboxes.get(address)
+        return known or sizes_of(await self.slaves(), address)
 
     async def converse(self, address: int, conversation: Conversation[T]) -> T:
         """Lead any conversation."""

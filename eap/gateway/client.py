@@ -59,6 +59,10 @@ class GatewayClient:
         timeout_s: How long an answer may take before the request is sent again.
         tries: How often a datagram is sent; by TCP the client waits as long in all.
 
+    Attributes:
+        mailboxes: Sizes that need not be asked for, by address; a master's dictionary has none of
+            virtual addresses.
+
     Raises:
         EnvironmentalError: the host has no address, or no way leads there.
         BusError: nobody takes the connection.
@@ -73,6 +77,7 @@ class GatewayClient:
         timeout_s: float = TIMEOUT_S,
         tries: int = TRIES,
     ) -> None:
+        self.mailboxes: dict[int, MailboxSizes] = {}
         self._tries = 1 if tcp else tries
         self._timeout_s = timeout_s * tries if tcp else timeout_s
         self._is_stream = tcp
@@ -199,7 +204,8 @@ class GatewayClient:
         Raises:
             BusError: the master knows no such slave, or the slave has no mailbox.
         """
-        return sizes_of(self.slaves(), address)
+        known = self.mailboxes.get(address)
+        return known or sizes_of(self.slaves(), address)
 
     def converse(
         self,

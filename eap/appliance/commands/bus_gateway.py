@@ -26,16 +26,22 @@ from eap.od.abort import SdoAbortError
 T = TypeVar("T")
 
 _MASTER_SIZE = 1480
+_VIRTUAL_SIZE = 128
 
 
 class GatewayBus:
     """A bus behind a gateway; fits :class:`eap.appliance.commands.bus_slave.SlaveBus`.
 
     Slave 0 is the master itself, with its dictionary.
+
+    Args:
+        client: Of the gateway.
+        mailbox: Octets of the mailboxes behind a virtual address, which no dictionary tells.
     """
 
-    def __init__(self, client: GatewayClient) -> None:
+    def __init__(self, client: GatewayClient, mailbox: int = _VIRTUAL_SIZE) -> None:
         self._client = client
+        self._virtual = MailboxSizes(mailbox, mailbox)
         self._slaves: list[MasterSlave] | None = None
 
     def scan(self) -> Sequence[Slave]:
@@ -94,7 +100,7 @@ class GatewayBus:
             if each.station == slave.station and each.to_slave:
                 return MailboxSizes(each.to_slave, each.to_master)
         if self._slaves is None or slave.station >= VIRTUAL_BIT:
-            return MailboxSizes()
+            return self._virtual
         raise no_mailbox(slave, state_name(slave.status.state))
 
 
@@ -130,11 +136,13 @@ def _refuse(what: str) -> NoReturn:
 
 
 @contextmanager
-def open_gateway(host: str, port: int, *, tcp: bool) -> Iterator[GatewayBus]:
-    """Talk to a gateway for the length of a block.
+def open_gateway(
+    host: str, port: int, *, tcp: bool, mailbox: int = _VIRTUAL_SIZE
+) -> Iterator[GatewayBus]:
+    """Talk to a gateway for the length of a block; *mailbox* as GatewayBus has it.
 
     Raises:
         EnvironmentalError: it has no address, or takes no connection.
     """
     with GatewayClient(host, port, tcp=tcp) as client:
-        yield GatewayBus(client)
+        yield GatewayBus(client, mailbox)

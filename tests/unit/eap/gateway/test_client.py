@@ -10,6 +10,7 @@ import pytest
 from devicebus.errors import BusError, FoeError, MailboxRefusedError, MailboxTimeoutError, SoeError
 from devicebus.mailbox import foe_client
 from devicebus.mailbox.conversation import Progress
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.soe import Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.client import GatewayClient, cut_frame
@@ -78,6 +79,8 @@ def test_slaves(client) -> None:
         client.sizes_of(7)
     with pytest.raises(MailboxRefusedError):
         client.sdo_read(7, 0x1018)
+    client.mailboxes[7] = MailboxSizes(64, 80)
+    assert client.sizes_of(7).to_slave == 64
 
 
 def test_a_datagram_that_got_lost_is_sent_again(gateway) -> None:

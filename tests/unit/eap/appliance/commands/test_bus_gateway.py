@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
-from devicebus.errors import BusError
-from devicebus.mailbox import coe_client
+from devicebus.errors import BusError, MailboxSizeError
+from devicebus.mailbox import coe_client, foe_client
 from devicebus.master.diagnosis import diagnose
 from devicebus.wire.alstatus import AlState
 from eap.appliance.commands.bus_gateway import open_gateway
@@ -51,6 +53,13 @@ def test_virtual_addresses_are_the_gateways_business(bus) -> None:
     assert slave.station == 0x9001
     with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL"):
         bus.converse(slave, lambda _: coe_client.upload(0x2000, 0), "x")
+
+
+def test_mailboxes_behind_virtual_addresses_are_as_large_as_it_is_said(gateway) -> None:
+    with open_gateway("127.0.0.1", gateway.port, tcp=False, mailbox=16) as bus:
+        begin = partial(foe_client.read, "firmware.bin", bytearray().extend)
+        with pytest.raises(MailboxSizeError, match="room for 4"):
+            bus.converse(bus.find("0x9001"), begin, "x")
 
 
 def test_objects(bus) -> None:
