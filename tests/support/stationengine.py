@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from typing import Any
 
 from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.services.device.station_keeper import StationKeeper
@@ -68,16 +66,3 @@ def make_device(
     engine = engine or StationEngine(spec, state)
     keeper = StationKeeper(spec, state, Store("demo"), engine)
     return StationDevice(keeper, NothingRuns(), Identity(device_name="test")), engine
-
-
-def while_serving(device: StationDevice, script: Callable[[], Awaitable[Any]]) -> Any:
-    """Run *script* while *device* serves, and return what it does."""
-
-    async def run() -> Any:
-        serving = asyncio.ensure_future(device.serve())
-        try:
-            return await script()
-        finally:
-            serving.cancel()
-
-    return asyncio.run(run())

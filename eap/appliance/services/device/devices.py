@@ -82,8 +82,6 @@ class Devices:
             ExceptionGroup: a source cannot be played, as ``play_sources`` says.
         """
         async with asyncio.TaskGroup() as group:
-            for device in self.by_station.values():
-                group.create_task(device.serve())
             for router in self.routers.values():
                 group.create_task(router.serve())
             for ads in self.ads.values():

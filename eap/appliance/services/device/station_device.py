@@ -17,8 +17,8 @@ from eap.appliance.configuration import Configuration
 from eap.appliance.device_change import Plan, dump_all, eap_ports, fill_all, make_plan
 from eap.appliance.device_change import plan_rollback as make_rollback
 from eap.appliance.device_plan import find_refusals
-from eap.appliance.services.device.jobs import Jobs
 from eap.appliance.services.device.station_keeper import StationKeeper
+from eap.appliance.services.jobs import Jobs
 from eap.device import stored
 from eap.device.eap_content import Identity
 from eap.device.eap_dictionary import EapDictionary
@@ -97,10 +97,6 @@ class StationDevice:
     def od_state(self) -> OdState:
         """Return the rights with which clients reach the dictionaries."""
         return self._machine.od_state or OdState.PREOP
-
-    async def serve(self) -> None:
-        """Do what changes something, until cancelled."""
-        await self._jobs.serve()
 
     async def tell_again(self) -> None:
         """Tell the engine what it is to run, which it may have missed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import struct
 
 import pytest
@@ -19,7 +20,7 @@ from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.pd.device import DeviceState
 from tests.support import aoe
-from tests.support.stationengine import make_device, while_serving
+from tests.support.stationengine import make_device
 
 ONE, OTHER = 300, 301
 WAY, OTHER_WAY = Way("ams-tcp", "1"), Way("ams-tcp", "2")
@@ -50,7 +51,7 @@ class Bench:
         answer = self.service.answer(LocalRequest(header, body, way))
         if isinstance(answer, AmsAnswer):
             return answer.data
-        return while_serving(self.device, lambda: answer).data
+        return asyncio.run(answer).data
 
     def watchers(self):
         return [len(self.service.notifications[port]) for port in (ONE, OTHER)]

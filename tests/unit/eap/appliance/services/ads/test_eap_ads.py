@@ -12,7 +12,7 @@ from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.services.ads.eap_ads import EapAds, device_info
 from eap.appliance.services.ads.image_variables import StationSymbols
-from eap.appliance.services.device.jobs import MAX_WAITING
+from eap.appliance.services.jobs import MAX_WAITING
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
@@ -24,7 +24,7 @@ from eap.od.profiles.eap1000keys import Tx
 from eap.pd.device import DeviceState
 from eap.pd.words import StationWord
 from tests.support import aoe
-from tests.support.stationengine import make_device, while_serving
+from tests.support.stationengine import make_device
 
 TXPD, CONTROL = 0xD000, 0xF200
 OK = bytes(4)
@@ -58,7 +58,7 @@ class Bench:
         return struct.unpack("<IHH", (await self.ask(AmsCommand.READ_STATE)).data)
 
     def run(self, script):
-        return while_serving(self.device, script)
+        return asyncio.run(script())
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from eap.ids import NetId
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortKind, PortSpec
 from tests.support import aoe
-from tests.support.stationengine import make_device, while_serving
+from tests.support.stationengine import make_device
 
 IO, DEVICE = 300, 0xFFFF
 WAY = Way("ams-tcp", "1")
@@ -49,7 +49,7 @@ class Bench:
         answer = self.ads.answer(LocalRequest(header, body, WAY))
         if isinstance(answer, AmsAnswer):
             return answer
-        return while_serving(self.device, lambda: answer)
+        return asyncio.run(answer)
 
     def read(self, port, group, offset):
         answer = self.ask(port, AmsCommand.READ, aoe.read_body(offset, group=group))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from eap.aoe.ads_operation import OperationOutcome, WriteControl
@@ -9,11 +11,11 @@ from eap.appliance.services.ads.state_control import control_state
 from eap.codec.ads import AdsError, AdsState
 from eap.errors import EngineRefusedError
 from eap.pd.device import DeviceState
-from tests.support.stationengine import make_device, while_serving
+from tests.support.stationengine import make_device
 
 
 def control(device, ads_state):
-    return while_serving(device, lambda: control_state(device, WriteControl(ads_state, 0, b"")))
+    return asyncio.run(control_state(device, WriteControl(ads_state, 0, b"")))
 
 
 @pytest.mark.parametrize(

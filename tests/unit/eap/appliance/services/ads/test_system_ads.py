@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import struct
 
 import pytest
@@ -17,7 +18,7 @@ from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from eap.pd.device import DeviceState
 from tests.support import aoe
-from tests.support.stationengine import make_device, while_serving
+from tests.support.stationengine import make_device
 
 WAY = Way("ams-tcp", "1")
 HERE = NetId.parse("1.2.3.4.1.1")
@@ -41,7 +42,7 @@ def ask(system, device):
         answer = system.answer(LocalRequest(header, body, WAY))
         if isinstance(answer, AmsAnswer):
             return answer.data
-        return while_serving(device[0], lambda: answer).data
+        return asyncio.run(answer).data
 
     return ask
 

@@ -41,15 +41,11 @@ def methods(device, stations):
 
 
 @pytest.fixture
-def call(methods, device):
+def call(methods):
     def call(method, **params):
         async def run():
-            serving = asyncio.ensure_future(device[0].serve())
-            try:
-                result = methods[method](params)
-                return await result if isawaitable(result) else result
-            finally:
-                serving.cancel()
+            result = methods[method](params)
+            return await result if isawaitable(result) else result
 
         return msgspec.json.decode(msgspec.json.encode(asyncio.run(run())))
 

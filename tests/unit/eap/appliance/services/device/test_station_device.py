@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 from msgspec.structs import replace
 
@@ -13,7 +15,7 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000keys import Tx
 from eap.pd.device import DeviceState
 from eap.pd.spec import TriggerSpec, TxFrameSpec, TxPdSpec, VariableSpec
-from tests.support.stationengine import make_device, while_serving
+from tests.support.stationengine import make_device
 
 TXPD, FRAME, CONTROL, STATUS = 0xD000, 0x8000, 0xF200, 0xF100
 
@@ -61,7 +63,7 @@ def test_walk_through_the_states(spec):
             assert await device.request_state(state) == (state, None)
             assert engine.state == state == word(device, STATUS, 1)
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert not any(call.startswith("configure") for call in engine.calls)
 
 
@@ -77,7 +79,7 @@ def test_downloads_in_preop_run_from_safeop_on(spec):
         assert engine.spec == device.spec == spec
         await write(device, CONTROL, 1, 8)
 
-    while_serving(device, script)
+    asyncio.run(script())
     (frame,) = engine.spec.frames
     assert [pd.pd_id for pd in frame.pds] == [77]
     assert device.spec == engine.spec
@@ -93,7 +95,7 @@ def test_next_services_find_the_same_dictionary(spec):
         await write(device, 0x6010, 4, int.from_bytes(b"UINT", "little"), 4)  # used by nothing
         await write(device, CONTROL, 1, 4)
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert 0x6010 in device.dictionaries["eap0"]
     again, _ = make_device(engine.spec, DeviceState.SAFEOP)
     assert dump(again.dictionaries["eap0"]) == dump(device.dictionaries["eap0"])
@@ -114,7 +116,7 @@ def test_refused_state_says_why_and_by_which_object(spec):
         await write(device, TXPD, Tx.PDO_INDEX, 0x1A00)
         assert await device.request_state(8) == (8, None)
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.calls == ["left PREOP", "left OP"]
 
 
@@ -123,7 +125,7 @@ def test_refused_state_says_why_and_by_which_object(spec):
 )
 def test_state_that_cannot_be_requested(spec, wanted, code):
     device, engine = make_device(spec)
-    refused = while_serving(device, lambda: device.request_state(wanted))
+    refused = asyncio.run(device.request_state(wanted))
     assert (refused.state, refused.fault.code) == (DeviceState.OP, code)
     assert engine.calls == []
 
@@ -142,7 +144,7 @@ def test_engine_that_does_not_take_it_leaves_the_device_in_preop(spec):
         assert word(device, TXPD, Tx.PD_ID) == 77  # to be tried again
         assert await device.request_state(8) == (8, None)
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.spec.frames[0].pds[0].pd_id == 77
 
 
@@ -158,7 +160,7 @@ def test_engine_that_does_not_change_its_state(spec):
         engine.calls.clear()
         await device.tell_again()
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.calls == ["configure left", "left PREOP"]
 
 
@@ -171,7 +173,7 @@ def test_port_that_the_supervisor_opened_cannot_be_changed_by_downloads(spec):
         assert refused.fault.code == FaultCode.PORT
         assert "port eap0: tcp False -> True" in refused.fault.text
 
-    while_serving(device, script)
+    asyncio.run(script())
 
 
 @pytest.mark.parametrize("state", [DeviceState.PREOP, DeviceState.OP])
@@ -189,7 +191,7 @@ def test_apply_changes_a_running_station(spec, state):
         assert again.is_empty
         assert fault is None
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.spec == device.spec == wanted
     assert engine.calls == ["configure left"]
     assert engine.state is state
@@ -202,7 +204,7 @@ def test_apply_keeps_the_indexes_of_what_stays(spec):
     (frame,) = spec.frames
     first = TxPdSpec("first", 6, ("ticks",), trigger=TriggerSpec(divider=2))
     wanted = replace(spec, frames=(replace(frame, pds=(first, *frame.pds)),))
-    while_serving(device, lambda: device.apply(wanted))
+    asyncio.run(device.apply(wanted))
     assert engine.spec == wanted
     names = [device.upload("eap0", index, Tx.NAME) for index in (TXPD, TXPD + 1)]
     assert names == [b"state", b"first"]
@@ -210,12 +212,12 @@ def test_apply_keeps_the_indexes_of_what_stays(spec):
 
 def test_plan_changes_nothing(spec):
     device, engine = make_device(spec)
-    plan = while_serving(device, lambda: device.plan(with_more(spec)))
+    plan = asyncio.run(device.plan(with_more(spec)))
     assert plan.changes
     assert not plan.is_empty
     assert device.spec == spec
     assert engine.calls == []
-    assert while_serving(device, lambda: device.plan(spec)).is_empty
+    assert asyncio.run(device.plan(spec)).is_empty
 
 
 def test_apply_of_what_cannot_be_is_refused_whole(spec):
@@ -230,7 +232,7 @@ def test_apply_of_what_cannot_be_is_refused_whole(spec):
         plan, fault = await device.apply(unknown)
         assert (len(plan.refused), fault) == (1, None)
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.calls == []
     assert device.spec == spec
     assert Store("demo").load("left") is None
@@ -246,7 +248,7 @@ def test_apply_that_the_engine_refuses_changes_nothing(spec):
         assert plan.changes
         assert "no memory" in fault.text
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert device.spec == engine.spec == spec
     assert dump(device.dictionaries["eap0"]) == before
     assert effective("demo", (spec,)) == ((spec, DeviceState.OP),)
@@ -271,9 +273,9 @@ def test_rollback_goes_back_and_forth(spec):
         assert device.spec == engine.spec == wanted
         assert dump(device.dictionaries["eap0"]) == after
 
-    while_serving(device, script)
+    asyncio.run(script())
     again, engine = make_device(wanted)
-    while_serving(again, again.roll_back)
+    asyncio.run(again.roll_back())
     assert engine.spec == spec
 
 
@@ -297,7 +299,7 @@ def test_what_does_not_fit_into_dictionaries_runs_but_is_not_changed_by_download
         await device.apply(spec)
         assert await device.request_state(8) == (8, None)
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.spec == spec
 
 
@@ -323,7 +325,7 @@ def test_entry_that_may_be_changed_while_it_runs(spec):
             await write(device, TXPD, Tx.VERSION, 1)
         assert caught.value.code == AbortCode.DEVICE_STATE
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.spec.frames[0].pds[0].pd_id == 77
     assert effective("demo", (changeable(spec),))[0].spec == engine.spec
 
@@ -342,5 +344,5 @@ def test_change_while_it_runs_that_cannot_be_is_refused_by_the_dictionary(spec):
         assert caught.value.code == AbortCode.PARAMETER
         assert word(device, TXPD, Tx.PD_ID) == 7
 
-    while_serving(device, script)
+    asyncio.run(script())
     assert engine.calls == []

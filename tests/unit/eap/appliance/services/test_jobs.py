@@ -7,19 +7,14 @@ import asyncio
 import pytest
 
 from eap.appliance.control import ErrorCode
-from eap.appliance.services.device import jobs as module
-from eap.appliance.services.device.jobs import Jobs
+from eap.appliance.services import jobs as module
+from eap.appliance.services.jobs import Jobs
 from eap.errors import ControlError
 
 
 def play(script):
     async def run():
-        jobs = Jobs("station a")
-        serving = asyncio.ensure_future(jobs.serve())
-        try:
-            return await script(jobs)
-        finally:
-            serving.cancel()
+        return await script(Jobs("station a"))
 
     return asyncio.run(run())
 
@@ -98,13 +93,15 @@ def test_what_has_not_begun_is_left_out_when_nobody_waits():
 def test_there_is_a_limit(monkeypatch):
     monkeypatch.setattr(module, "MAX_WAITING", 1)
 
-    async def run():
-        jobs = Jobs("station a")  # that nobody serves
+    async def script(jobs):
+        begun = asyncio.ensure_future(jobs.do(lambda: asyncio.sleep(60)))
+        await asyncio.sleep(0)
         waiting = asyncio.ensure_future(jobs.do(lambda: asyncio.sleep(0)))
         await asyncio.sleep(0)
         with pytest.raises(ControlError, match="station a: 1 requests wait") as caught:
             await jobs.do(lambda: asyncio.sleep(0))
         assert caught.value.code == ErrorCode.BUSY
-        waiting.cancel()
+        for each in (begun, waiting):
+            each.cancel()
 
-    asyncio.run(run())
+    play(script)
