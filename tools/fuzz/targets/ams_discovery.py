@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import socket
 from collections.abc import Callable, Collection, Sequence
@@ -76,10 +77,10 @@ def fuzz_one(data: bytes) -> None:
             if decode_text(encode_text(text)) != text:
                 raise AssertionError(f"{text!r} is read as another text")
     for users in ((), (AmsUser("Administrator", _PASSWORD),)):
-        _answer(data, users)
+        asyncio.run(_answer(data, users))
 
 
-def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
+async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     """Answer *data* as who is on this host, twice: the second time changes nothing any more."""
     routes = StationRoutes(_Router(), RoutingSpec(users=users), _Store())
     refused: list[Refusal] = []
@@ -90,9 +91,10 @@ def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
             raise AssertionError("the answer to a question that was not asked")
         routers = [RouterName("left", OWN)]
         discovery = AmsDiscovery(sock, routers, desk, questions, refused.append)
-        answers = discovery.answers_to(data, "127.0.0.1")
+        answers = await discovery.answers_to(data, "127.0.0.1")
         added = routes.added
-        if discovery.answers_to(data, "127.0.0.1") != answers or routes.added != added:
+        again = await discovery.answers_to(data, "127.0.0.1")
+        if again != answers or routes.added != added:
             raise AssertionError("the same datagram does another thing the second time")
     if any(len(each) > _MAX_ANSWER for each in answers):
         raise AssertionError(f"an answer of {max(map(len, answers))} octets")

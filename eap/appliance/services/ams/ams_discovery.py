@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from importlib.metadata import version
 from ipaddress import IPv4Address
 from typing import NamedTuple
@@ -74,6 +74,7 @@ class AmsDiscovery:
         self._desk = desk
         self._questions = questions
         self._refuse = refuse
+        self._tasks: set[asyncio.Task[None]] = set()
 
     def watch(self, sock: socket.socket | None = None) -> None:
         """Answer whenever something arrives, as long as the running loop lives.
@@ -84,15 +85,15 @@ class AmsDiscovery:
         watched.setblocking(False)
         asyncio.get_running_loop().add_reader(watched.fileno(), self._drain, watched)
 
-    def answers_to(self, data: bytes, sender: str) -> list[bytes]:
+    async def answers_to(self, data: bytes, sender: str) -> list[bytes]:
         """Return the datagrams that go back to the *sender* of *data*: one a router, or none."""
         try:
             question = decode_discovery(data)
         except CodecError:
             return []
-        return list(self._answers(question, sender))
+        return [each async for each in self._answers(question, sender)]
 
-    def _answers(self, question: Discovery, sender: str) -> Iterator[bytes]:
+    async def _answers(self, question: Discovery, sender: str) -> AsyncIterator[bytes]:
         service, number = question.header.service, question.header.invoke_id
         if service == DiscoveryService.SERVER_INFO:
             for router in self._routers:
@@ -101,12 +102,13 @@ class AmsDiscovery:
                 yield _answer(router, service, number, [name, (Tag.VERSION, _VERSION)])
         elif service == DiscoveryService.ADD_ROUTE:
             is_this_host = sender == self._own or IPv4Address(sender).is_loopback
-            result = self._desk.take(question, sender, is_this_host=is_this_host)
+            result = await self._desk.take(question, sender, is_this_host=is_this_host)
             if result is not None:
                 tag = Tag.RESULT, result.to_bytes(4, "little")
                 yield _answer(self._routers[0], service, number, [tag])
 
     def _drain(self, sock: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
         for _ in range(_DATAGRAMS_PER_TURN):
             try:
                 data, sender = sock.recvfrom(_LONGEST)
@@ -116,14 +118,19 @@ class AmsDiscovery:
                 continue  # what ICMP says of an answer that went before
             if self._questions.take(data, sender[0]):
                 continue
-            answers = self.answers_to(data, sender[0])
-            if not answers:
-                self._refuse(Refusal.AMS_DISCOVERY)
-            for answer in answers:
-                try:
-                    self._sock.sendto(answer, sender)
-                except OSError as exc:
-                    logger.debug("AMS router of %s: %s", sender[0], exc.strerror)
+            task = loop.create_task(self._answer(data, sender))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def _answer(self, data: bytes, sender: tuple[str, int]) -> None:
+        answers = await self.answers_to(data, sender[0])
+        if not answers:
+            self._refuse(Refusal.AMS_DISCOVERY)
+        for answer in answers:
+            try:
+                self._sock.sendto(answer, sender)
+            except OSError as exc:
+                logger.debug("AMS router of %s: %s", sender[0], exc.strerror)
 
 
 def _answer(

@@ -58,7 +58,9 @@ class RouteDesk:
         self._clock = clock
         self._allowance = Allowance(BURST, BURST / 10, clock())
 
-    def take(self, question: Discovery, sender: str, *, is_this_host: bool) -> AdsError | None:
+    async def take(
+        self, question: Discovery, sender: str, *, is_this_host: bool
+    ) -> AdsError | None:
         """Add the route that *question* asks for, and return the result for its sender.
 
         None says nothing: too many ask.
@@ -73,7 +75,7 @@ class RouteDesk:
         name = decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN]
         results = []
         for station in self._stations:
-            result, why = _decide(station, question, sender, is_this_host=is_this_host)
+            result, why = await _decide(station, question, sender, is_this_host=is_this_host)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
             logger.log(level, "route %r asked for by %s: %s", name, sender, why)
             entry = _audited(station.router.net_id, question, sender, result, why)
@@ -100,7 +102,7 @@ def _audited(
     return AuditEntry(Way("ams-udp", sender), header, "", (done,))
 
 
-def _decide(
+async def _decide(
     station: StationRoutes, question: Discovery, sender: str, *, is_this_host: bool
 ) -> tuple[AdsError, str]:
     """Return the result for the sender, and what was done in words."""
@@ -111,7 +113,7 @@ def _decide(
         written = _written(station.router.table, wanted.net_id)
         if written:
             return AdsError.NONE, f"route {written!r} of the plant file leads there"
-        _add(station, wanted)
+        await _add(station, wanted)
     except (ValueError, ControlError) as exc:
         return AdsError.VALUE, f"refused: {exc}"
     except EnvironmentalError as exc:
@@ -169,7 +171,7 @@ def _written(table: RouteTable, net_id: NetId) -> str:
     return found[0].name if found is not None and is_written else ""
 
 
-def _add(station: StationRoutes, wanted: _Request) -> None:
+async def _add(station: StationRoutes, wanted: _Request) -> None:
     """Add a route for all NetIDs that begin as the wanted one, or for that alone."""
     hop = HopSpec(DoorKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
     is_here = station.has(wanted.net_id.station)
@@ -180,4 +182,4 @@ def _add(station: StationRoutes, wanted: _Request) -> None:
         octets=len(wanted.net_id) if is_here else STATION_OCTETS,
         is_probed=False,  # most tools answer nobody
     )
-    station.add(spec, is_kept=wanted.is_kept)
+    await station.add(spec, is_kept=wanted.is_kept)

@@ -80,18 +80,18 @@ class RouteMethods:
         views = [self._view(wanted.station)] if wanted.station else self._views.values()
         return [view.row(wanted) for view in views]
 
-    def _add(self, params: dict[str, Any]) -> dict[str, Any]:
+    async def _add(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, RoutesAddParameters)
         view = self._view(wanted.station)
-        row = self._take(view, wanted)
+        row = await self._take(view, wanted)
         warnings = [text for text in view.warnings() if f"route {row.name} " in text]
         return {"route": row, "warnings": warnings}
 
-    def _remove(self, params: dict[str, Any]) -> dict[str, RouteRow]:
+    async def _remove(self, params: dict[str, Any]) -> dict[str, RouteRow]:
         wanted = parameters(params, RoutesRemoveParameters)
         routes = self._view(wanted.station).routes
         with unless_unavailable():
-            spec = routes.remove(wanted.route, door=wanted.door, address=wanted.address)
+            spec = await routes.remove(wanted.route, door=wanted.door, address=wanted.address)
         return {"route": _removed(spec)}
 
     async def _test(self, params: dict[str, Any]) -> TestResult:
@@ -140,8 +140,8 @@ class RouteMethods:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
         rows = []
         for route in found:
-            rows.append(self._import_one(view, route, dry_run=wanted.dry_run))
-            await asyncio.sleep(0)  # each is written to disk: others have their turns between
+            rows.append(await self._import_one(view, route, dry_run=wanted.dry_run))
+            await asyncio.sleep(0)  # others have their turns between
         return rows
 
     def _export(self, params: dict[str, Any]) -> Export:
@@ -158,7 +158,9 @@ class RouteMethods:
         xml = staticroutes.dump(router.name, str(router.net_id), routes, tcp_port=AMS_TCP_PORT)
         return Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
 
-    def _import_one(self, view: RouterView, route: StaticRoute, *, dry_run: bool) -> ImportRow:
+    async def _import_one(
+        self, view: RouterView, route: StaticRoute, *, dry_run: bool
+    ) -> ImportRow:
         via, reason = f"{DoorKind.AMS_TCP}:{route.address}", ""
         wanted = RoutesAddParameters(
             station=view.router.name, name=route.name, net_id=route.net_id, via=via
@@ -172,15 +174,15 @@ class RouteMethods:
                 if dry_run:
                     view.routes.check(self._spec(wanted))
                 else:
-                    self._take(view, wanted)
+                    await self._take(view, wanted)
             except ControlError as exc:
                 reason = str(exc)
         return ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
 
-    def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
+    async def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
         spec = self._spec(wanted)
         with unless_unavailable():
-            route = view.routes.add(spec, replaces=wanted.replaces)
+            route = await view.routes.add(spec, replaces=wanted.replaces)
         return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
 
     def _spec(self, wanted: RoutesAddParameters) -> RouteSpec:

@@ -45,21 +45,20 @@ class RoutingMethods:
         plan = self._station(wanted.station).plan(wanted.routing)
         return RoutingDifference(changes=plan.changes, refused=plan.refused)
 
-    def _apply(self, params: dict[str, Any]) -> RoutingDifference:
+    async def _apply(self, params: dict[str, Any]) -> RoutingDifference:
         wanted = parameters(params, RoutingApplyParameters)
         station = self._station(wanted.station)
         plan = station.plan(wanted.routing)
         if plan.refused:
             return RoutingDifference(changes=[], refused=plan.refused)
         with unless_unavailable():
-            return RoutingDifference(
-                changes=station.apply(wanted.routing, wanted.cause), refused=[]
-            )
+            changes = await station.apply(wanted.routing, wanted.cause)
+        return RoutingDifference(changes=changes, refused=[])
 
-    def _roll_back(self, params: dict[str, Any]) -> RoutingDifference:
+    async def _roll_back(self, params: dict[str, Any]) -> RoutingDifference:
         station = self._station(parameters(params, RoutingExportParameters).station)
         with unless_unavailable():
-            return RoutingDifference(changes=station.roll_back(), refused=[])
+            return RoutingDifference(changes=await station.roll_back(), refused=[])
 
     def _station(self, name: str) -> StationRouting:
         return of_station(name, self._stations)

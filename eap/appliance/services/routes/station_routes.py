@@ -2,12 +2,16 @@
 
 Rule: what the plant file says goes before everything else; what was added is kept over restarts,
 what was learned is not.
+Rule: what is added or removed is on the disk before it is in force, and whoever asked is told after
+that.  Packets do not wait for the disk, which takes milliseconds, but the next change does.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Protocol
 
 from msgspec.structs import replace
@@ -17,6 +21,7 @@ from eap.aoe.routes import Origin, Route, RouteTable
 from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.route_store import RouteStore
+from eap.appliance.services.jobs import Jobs
 from eap.appliance.services.routes.neighbours import Scanner
 from eap.appliance.services.routing.planned import to_route, to_way
 from eap.codec.amstcp import AMS_TCP_PORT
@@ -87,6 +92,7 @@ class StationRoutes:
         self._added: dict[RouteSpec, bool] = {}
         """With whether it is kept over restarts."""
         self._written: dict[tuple[NetId, Way], RouteSpec] = {}
+        self._jobs = Jobs("routes")
 
     @property
     def spec(self) -> RoutingSpec:
@@ -126,7 +132,7 @@ class StationRoutes:
         """Say whether a route could be added; raise ControlError with the reason if not."""
         self._checked(spec, "")
 
-    def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> Route:
+    async def add(self, spec: RouteSpec, *, replaces: str = "", is_kept: bool = True) -> Route:
         """Add a route, in place of the added one of its name, or to its NetID.
 
         Args:
@@ -135,17 +141,11 @@ class StationRoutes:
             is_kept: Whether it is there again after a new start.
 
         Raises:
-            ControlError: there cannot be such a route, or a route of the plant file is before it.
+            ControlError: there cannot be such a route, a route of the plant file is before it, or
+                too many changes wait already.
             EnvironmentalError: it cannot be kept.
         """
-        spec, old = self._checked(spec, replaces)
-        route = self._route(spec, Origin.ADDED)
-        if route.key in self._written:
-            raise ControlError(_hidden_by(self._written[route.key].name))
-        left = {each: kept for each, kept in self._added.items() if each not in old}
-        self._change({**left, spec: is_kept}, gone=old)
-        self.router.add_route(route)
-        return route
+        return await self._jobs.do(partial(self._add, spec, replaces, is_kept=is_kept))
 
     def learn(self, net_id: NetId, name: str, address: str, now_ns: int) -> bool:
         """Take a route to a router that answered, by AMS/TCP; tell whether it was taken.
@@ -170,15 +170,28 @@ class StationRoutes:
         )
         return self.router.add_route(route)
 
-    def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
+    async def remove(self, text: str, *, door: str = "", address: str = "") -> RouteSpec:
         """Remove an added route by its name or NetID, and return it.
 
         *door* and *address* choose where there are several.
 
         Raises:
-            ControlError: there is none that can be removed.
+            ControlError: there is none that can be removed, or too many changes wait already.
             EnvironmentalError: that cannot be kept.
         """
+        return await self._jobs.do(partial(self._remove, text, door, address))
+
+    async def _add(self, spec: RouteSpec, replaces: str, *, is_kept: bool) -> Route:
+        spec, old = self._checked(spec, replaces)
+        route = self._route(spec, Origin.ADDED)
+        if route.key in self._written:
+            raise ControlError(_hidden_by(self._written[route.key].name))
+        left = {each: kept for each, kept in self._added.items() if each not in old}
+        await self._change({**left, spec: is_kept}, gone=old)
+        self.router.add_route(route)
+        return route
+
+    async def _remove(self, text: str, door: str, address: str) -> RouteSpec:
         found = [
             spec
             for spec in self._added
@@ -187,7 +200,7 @@ class StationRoutes:
         if not found:
             raise ControlError(self._why_not_removed(text))
         left = {each: kept for each, kept in self._added.items() if each != found[0]}
-        self._change(left, gone=found[:1])
+        await self._change(left, gone=found[:1])
         return found[0]
 
     def _checked(self, spec: RouteSpec, replaces: str) -> tuple[RouteSpec, list[RouteSpec]]:
@@ -198,8 +211,9 @@ class StationRoutes:
         self._check(spec, len(self._added) - len(old))
         return spec, old
 
-    def _change(self, added: dict[RouteSpec, bool], gone: Sequence[RouteSpec]) -> None:
-        self._store.save(tuple(each for each, is_kept in added.items() if is_kept))
+    async def _change(self, added: dict[RouteSpec, bool], gone: Sequence[RouteSpec]) -> None:
+        kept = tuple(each for each, is_kept in added.items() if is_kept)
+        await asyncio.to_thread(self._store.save, kept)
         self._added = added
         for each in gone:
             self._forget(each)

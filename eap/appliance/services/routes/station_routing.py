@@ -6,8 +6,10 @@ appliance is started with.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -16,6 +18,7 @@ from eap.aoe.routing_change import describe_routing, routing_needs_new_start
 from eap.aoe.spec import RoutingSpec
 from eap.appliance.configuration import digest_of
 from eap.appliance.route_store import AppliedRouting, RoutingStore
+from eap.appliance.services.jobs import Jobs
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.errors import ControlError
 
@@ -52,6 +55,7 @@ class StationRouting:
         self._set_access = set_access
         self._base = digest_of(routes.spec)
         self._applied = self._usable(store.read())
+        self._jobs = Jobs(f"routing of station {name}")
 
     @property
     def applied(self) -> AppliedRouting | None:
@@ -77,13 +81,25 @@ class StationRouting:
         now = self.routes.spec
         return RoutingPlan(describe_routing(now, spec), routing_needs_new_start(now, spec))
 
-    def apply(self, spec: RoutingSpec, cause: str) -> list[str]:
-        """Go on with *spec*, and keep it; return what that changed.
+    async def apply(self, spec: RoutingSpec, cause: str) -> list[str]:
+        """Keep *spec*, then go on with it; return what that changed.
 
         Raises:
-            ControlError: it cannot be while the station runs.
+            ControlError: it cannot be while the station runs, or too many changes wait already.
             EnvironmentalError: it cannot be kept.
         """
+        return await self._jobs.do(partial(self._apply, spec, cause))
+
+    async def roll_back(self) -> list[str]:
+        """Take the last change back, or make it again; return what that changed.
+
+        Raises:
+            ControlError: there was none, or too many changes wait already.
+            EnvironmentalError: it cannot be kept.
+        """
+        return await self._jobs.do(self._roll_back)
+
+    async def _apply(self, spec: RoutingSpec, cause: str) -> list[str]:
         plan = self.plan(spec)
         if plan.refused:
             raise ControlError("; ".join(plan.refused))
@@ -91,21 +107,19 @@ class StationRouting:
             before = self.routes.spec
             if self._applied is not None and self._applied.cause == cause:
                 before = self._applied.previous  # another step of the same change
-            self._change(AppliedRouting(base=self._base, spec=spec, previous=before, cause=cause))
+            await self._change(
+                AppliedRouting(base=self._base, spec=spec, previous=before, cause=cause)
+            )
         return plan.changes
 
-    def roll_back(self) -> list[str]:
-        """Take the last change back, or make it again; return what that changed.
-
-        Raises:
-            ControlError: there was none.
-            EnvironmentalError: it cannot be kept.
-        """
+    async def _roll_back(self) -> list[str]:
         now = self._applied
         if now is None:
             raise ControlError("routes and access rules were not changed while the station ran")
         changes = describe_routing(now.spec, now.previous)
-        self._change(replace(now, spec=now.previous, previous=now.spec, undone=not now.undone))
+        await self._change(
+            replace(now, spec=now.previous, previous=now.spec, undone=not now.undone)
+        )
         return changes
 
     def _usable(self, kept: AppliedRouting | None) -> AppliedRouting | None:
@@ -121,8 +135,8 @@ class StationRouting:
         self._store.set_aside()
         return None
 
-    def _change(self, applied: AppliedRouting) -> None:
-        self._store.save(applied)
+    async def _change(self, applied: AppliedRouting) -> None:
+        await asyncio.to_thread(self._store.save, applied)  # packets do not wait for the disk
         self._applied = applied
         self.routes.replace_spec(applied.spec)
         self._set_access(applied.spec)

@@ -44,7 +44,7 @@ class Desk:
         self.result = result
         self.asked = []
 
-    def take(self, question, sender, *, is_this_host):
+    async def take(self, question, sender, *, is_this_host):
         self.asked.append((question.find(Tag.ROUTE_NAME), sender, is_this_host))
         return self.result
 
@@ -56,7 +56,7 @@ def discovery(sock, *routers, desk=None, refused=None):
 
 
 def test_every_router_of_the_address_names_itself(sock):
-    answers = discovery(sock, LEFT, RIGHT).answers_to(SERVER_INFO, "10.0.0.5")
+    answers = asyncio.run(discovery(sock, LEFT, RIGHT).answers_to(SERVER_INFO, "10.0.0.5"))
     release = encode_version(version("eap-appliance")).hex()
     assert answers[0].hex() == (
         "03661471" + "00000000" + "01000080" + "010101010101" + "1027" + "02000000"
@@ -70,7 +70,7 @@ def test_every_router_of_the_address_names_itself(sock):
 
 def test_the_number_of_the_question_comes_back(sock):
     header = DiscoveryHeader(0, 0xDEADBEEF, 1, NOTHING, 0)
-    (answer,) = discovery(sock).answers_to(encode_discovery(header), "10.0.0.5")
+    (answer,) = asyncio.run(discovery(sock).answers_to(encode_discovery(header), "10.0.0.5"))
     assert decode_discovery(answer).header.invoke_id == 0xDEADBEEF
 
 
@@ -79,7 +79,7 @@ def test_the_number_of_the_question_comes_back(sock):
 )
 def test_a_route_is_decided_on_and_answered_once(sock, sender, is_this_host):
     desk = Desk(AdsError.ACCESS)
-    (answer,) = discovery(sock, LEFT, RIGHT, desk=desk).answers_to(ADD_ROUTE, sender)
+    (answer,) = asyncio.run(discovery(sock, LEFT, RIGHT, desk=desk).answers_to(ADD_ROUTE, sender))
     read = decode_discovery(answer)
     assert read.header.service == 0x8000_0006
     assert read.find(Tag.RESULT) == b"\4\7\0\0"
@@ -87,7 +87,7 @@ def test_a_route_is_decided_on_and_answered_once(sock, sender, is_this_host):
 
 
 def test_too_many_routes_are_not_answered(sock):
-    assert discovery(sock, desk=Desk(None)).answers_to(ADD_ROUTE, "10.0.0.5") == []
+    assert asyncio.run(discovery(sock, desk=Desk(None)).answers_to(ADD_ROUTE, "10.0.0.5")) == []
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_too_many_routes_are_not_answered(sock):
     ],
 )
 def test_nothing_is_said_to_what_is_no_question(sock, data):
-    assert discovery(sock).answers_to(data, "10.0.0.5") == []
+    assert asyncio.run(discovery(sock).answers_to(data, "10.0.0.5")) == []
 
 
 def test_datagrams_are_answered_to_their_senders(sock):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 
@@ -49,7 +50,7 @@ def routes(name="left", **told) -> StationRoutes:
 
 def ask(found, question=ADD_ROUTE, sender="10.0.0.5", *, is_this_host=False):
     desk = RouteDesk([found], clock=lambda: 0.0)
-    return desk.take(question, sender, is_this_host=is_this_host)
+    return asyncio.run(desk.take(question, sender, is_this_host=is_this_host))
 
 
 def asked(**tags) -> Discovery:
@@ -180,7 +181,8 @@ def test_a_route_that_cannot_be_kept_is_not_added(monkeypatch, caplog):
 
 def test_all_stations_of_an_address_get_the_route():
     both = [routes(), routes("right")]
-    assert RouteDesk(both).take(ADD_ROUTE, "127.0.0.1", is_this_host=True) == AdsError.NONE
+    taking = RouteDesk(both).take(ADD_ROUTE, "127.0.0.1", is_this_host=True)
+    assert asyncio.run(taking) == AdsError.NONE
     assert [each.added for each in both] == [(ADDED,), (ADDED,)]
 
 
@@ -202,7 +204,8 @@ def test_passwords_are_not_tried_faster_than_they_may():
     desk = RouteDesk([routes()], clock=lambda: now)
 
     def results(count):
-        return [desk.take(ADD_ROUTE, "10.0.0.5", is_this_host=False) for _ in range(count)]
+        takings = [desk.take(ADD_ROUTE, "10.0.0.5", is_this_host=False) for _ in range(count)]
+        return [asyncio.run(each) for each in takings]
 
     assert results(BURST + 2) == [AdsError.ACCESS] * BURST + [None] * 2
     now = 2.0

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+from inspect import isawaitable
 from ipaddress import IPv4Address
 from typing import Any
 
@@ -25,9 +26,17 @@ def left():
 
 
 @pytest.fixture
-def ask(left):
-    methods = RouteMethods({"left": left.view}, DIRECTORY).table()
-    return lambda method, **params: methods[f"routes_{method}"](params)
+def methods(left):
+    return RouteMethods({"left": left.view}, DIRECTORY).table()
+
+
+@pytest.fixture
+def ask(methods):
+    def ask(method, **params):
+        result = methods[f"routes_{method}"](params)
+        return asyncio.run(result) if isawaitable(result) else result
+
+    return ask
 
 
 def names(left: Left) -> list[str]:
@@ -125,10 +134,9 @@ def test_virtual_routes_are_told_by_their_net_ids_here(ask):
     assert (removed.net_id, removed.real) == ("9.9.9.9.1.1", "5.1.2.3.1.1")
 
 
-def test_test_asks(ask, left):
-    found = asyncio.run(
-        while_serving(ask("test", station="left", target="left", timeout_ms=200), left.router)
-    )
+def test_test_asks(methods, left):
+    testing = methods["routes_test"]({"station": "left", "target": "left", "timeout_ms": 200})
+    found = asyncio.run(while_serving(testing, left.router))
     assert (found.ok, found.state) == (True, "RUN")
 
 
@@ -141,9 +149,9 @@ def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
         StaticRoute("self", "127.0.9.1.1.1", "10.0.0.7"),
     ]
     xml = dump("x", "1.1.1.1.1.1", file, tcp_port=48898)
-    dry = asyncio.run(ask("import", station="left", xml=xml, dry_run=True))
+    dry = ask("import", station="left", xml=xml, dry_run=True)
     assert names(left) == ["right"]
-    rows = asyncio.run(ask("import", station="left", xml=xml))
+    rows = ask("import", station="left", xml=xml)
     assert rows == dry
     assert [(row.name, bool(row.reason)) for row in rows] == [
         ("plc", False), ("old", True), ("bare", True), ("wrong", True), ("self", True)
@@ -152,7 +160,7 @@ def test_import_takes_what_can_be_and_tells_of_the_rest(ask, left):
     assert rows[1].reason == "its type is 'PROFIBUS', expected TCP_IP"
     assert names(left) == ["right", "plc"]
     with pytest.raises(ControlError) as caught:
-        asyncio.run(ask("import", station="left", xml="<a/>"))
+        ask("import", station="left", xml="<a/>")
     code, text = caught.value.code, str(caught.value)
     assert (code, text) == ("value", "it begins with 'a', expected TcConfig")
 
@@ -167,7 +175,7 @@ def test_export_holds_ams_tcp_and_names_the_rest(ask):
         StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5"),
         StaticRoute("behind", "5.1.2.4.1.1", "plc:1000"),
     ]
-    assert asyncio.run(ask("import", station="left", xml=found.xml))[1].reason == ""
+    assert ask("import", station="left", xml=found.xml)[1].reason == ""
 
 
 class Scanner:
@@ -186,29 +194,29 @@ class Scanner:
 
 def test_scan_tells_who_is_there_and_learns(ask, left):
     left.routes.scanners.append(scanner := Scanner())
-    known, new = asyncio.run(ask("scan", station="left", address="10.0.0.255", wait_ms=20))
+    known, new = ask("scan", station="left", address="10.0.0.255", wait_ms=20)
     assert scanner.asked == [("10.0.0.255", 0.02)]
     assert (known.name, known.route, known.is_learned) == ("right", "right", False)
     assert (new.station, new.net_id, new.address) == ("left", "5.1.2.3.1.1", "10.0.0.5")
     assert (new.route, new.is_learned) == ("cx", True)
-    assert asyncio.run(ask("scan"))[1].is_learned  # again, which makes it younger
+    assert ask("scan")[1].is_learned  # again, which makes it younger
 
 
 def test_scan_from_a_default_route_knows_no_route(ask, left):
     left.routes.scanners.append(Scanner())
     ask("add", station="left", name="others", via="right/eap0", octets=0)
-    row = asyncio.run(ask("scan"))[1]
+    row = ask("scan")[1]
     assert (row.route, row.is_learned) == ("cx", True)
 
 
 def test_scan_that_cannot_be(ask):
-    assert asyncio.run(ask("scan")) == []  # nobody here has an address
+    assert ask("scan") == []  # nobody here has an address
     for params, code, text in (
         ({"station": "left"}, "unavailable", "no IP address at which it serves AMS"),
         ({"address": "plc"}, "value", "address: Expected 4 octets in 'plc'"),
     ):
         with pytest.raises(ControlError, match=text) as caught:
-            asyncio.run(ask("scan", **params))
+            ask("scan", **params)
         assert caught.value.code == code
 
 
@@ -237,7 +245,7 @@ class Introducer:
 def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
     left.routes.scanners.append(other := Introducer(result))
     login = {"user": "Administrator", "password": "1"}
-    row = asyncio.run(ask("introduce", station="left", address="10.0.0.5", **login, wait_ms=20))
+    row = ask("introduce", station="left", address="10.0.0.5", **login, wait_ms=20)
     assert (row.ok, row.result, row.text) == (ok, result, text)
     net_id = NetId.parse("127.0.9.1.1.1")
     assert other.asked == [("left", net_id, "Administrator", "1", "10.0.0.5", 0.02)]
@@ -253,4 +261,4 @@ def test_another_router_is_asked_for_a_route(ask, left, result, ok, text):
 )
 def test_introduction_that_cannot_be(ask, params, text):
     with pytest.raises(ControlError, match=text):
-        asyncio.run(ask("introduce", station="left", **params))
+        ask("introduce", station="left", **params)

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import asyncio
+from inspect import isawaitable
+
 import msgspec
 import pytest
 
@@ -27,7 +30,8 @@ def ask(tmp_path, monkeypatch):
 
     def call(method, **params):
         plain = {name: msgspec.to_builtins(value) for name, value in params.items()}
-        return methods[f"routing_{method}"]({"station": "left", **plain})
+        result = methods[f"routing_{method}"]({"station": "left", **plain})
+        return asyncio.run(result) if isawaitable(result) else result
 
     return call
 

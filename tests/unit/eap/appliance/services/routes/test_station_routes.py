@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import asyncio
+import threading
+
 import pytest
 from msgspec.structs import replace
 
@@ -57,12 +60,12 @@ def state(tmp_path, monkeypatch):
 
 def test_an_added_route_is_there_again_after_a_new_start():
     house = House()
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     assert house.names() == {"mill": Origin.STATIC, "plc": Origin.ADDED}
     again = House()
     assert again.names() == house.names()
     assert again.routes.added == (PLC,)
-    again.routes.remove("plc")
+    asyncio.run(again.routes.remove("plc"))
     assert House().names() == {"mill": Origin.STATIC}
 
 
@@ -78,9 +81,9 @@ def test_an_added_route_is_there_again_after_a_new_start():
 )
 def test_a_route_takes_the_place_of_the_one_of_its_name_or_net_id(change, replaces):
     house = House()
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     new = replace(PLC, **change)
-    house.routes.add(new, replaces=replaces)
+    asyncio.run(house.routes.add(new, replaces=replaces))
     assert house.routes.added == (new,)
     assert len(house.router.table) == 2
     assert House().routes.added == (new,)
@@ -101,10 +104,10 @@ def test_a_route_takes_the_place_of_the_one_of_its_name_or_net_id(change, replac
 )
 def test_a_route_that_cannot_be_changes_nothing(change, reason):
     house = House()
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     before = list(house.router.table)
     with pytest.raises(ControlError) as caught:
-        house.routes.add(replace(PLC, **{"name": "x", **change}))
+        asyncio.run(house.routes.add(replace(PLC, **{"name": "x", **change})))
     assert reason in str(caught.value)
     assert list(house.router.table) == before
     assert House().routes.added == (PLC,)
@@ -112,24 +115,24 @@ def test_a_route_that_cannot_be_changes_nothing(change, reason):
 
 def test_a_default_route_can_be_added():
     house = House()
-    house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0))
+    asyncio.run(house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0)))
     assert house.router.table.find(NetId.parse("10.0.0.2.1.1"))[0].name == "mill"
     assert house.router.table.find(NetId.parse("99.0.0.2.1.1"))[0].name == "default"
 
 
 def test_there_are_not_more_than_so_many(monkeypatch):
     house = House()
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     monkeypatch.setattr("eap.appliance.services.routes.station_routes.MAX_ADDED", 1)
     with pytest.raises(ControlError, match="1 routes were added already; remove some"):
-        house.routes.add(replace(PLC, name="b", net_id="6.1.2.3.1.1"))
-    house.routes.add(replace(PLC, name="b"))  # in place of the first
+        asyncio.run(house.routes.add(replace(PLC, name="b", net_id="6.1.2.3.1.1")))
+    asyncio.run(house.routes.add(replace(PLC, name="b")))  # in place of the first
     assert MAX_ADDED > 1
 
 
 def test_a_name_is_text_that_can_be_shown():
     house = House()
-    house.routes.add(replace(PLC, name=f" a\x1b[2J\n{'b' * 200}"))
+    asyncio.run(house.routes.add(replace(PLC, name=f" a\x1b[2J\n{'b' * 200}")))
     assert house.routes.added[0].name == "a[2J" + "b" * 76
 
 
@@ -146,28 +149,28 @@ def test_a_name_is_text_that_can_be_shown():
 def test_only_added_routes_are_removed(text, reason):
     written = replace(STATIC, name="written", net_id="7.1.1.1.1.1", is_derived=False)
     house = House(RoutingSpec(routes=(STATIC, written)))
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     seen = Route(NetId.parse("8.1.1.1.1.1"), "seen", Way("mqtt:n", "8"), Origin.LEARNED)
     house.router.table.add(seen)
     with pytest.raises(ControlError) as caught:
-        house.routes.remove(text)
+        asyncio.run(house.routes.remove(text))
     assert str(caught.value) == reason
     assert len(house.router.table) == 4
 
 
 def test_a_door_and_an_address_choose_what_is_removed():
     house = House()
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     with pytest.raises(ControlError, match="no route 'plc' was added"):
-        house.routes.remove("plc", address="elsewhere:48898")
+        asyncio.run(house.routes.remove("plc", address="elsewhere:48898"))
     with pytest.raises(ControlError, match="no route 'plc' was added"):
-        house.routes.remove("plc", door="udp:eap0")
-    assert house.routes.remove("plc", door="ams-tcp:", address="plc:48898") == PLC
+        asyncio.run(house.routes.remove("plc", door="udp:eap0"))
+    assert asyncio.run(house.routes.remove("plc", door="ams-tcp:", address="plc:48898")) == PLC
 
 
 def test_another_plant_file_takes_over_and_added_routes_stay():
     house = House()
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     other = replace(STATIC, name="saw", net_id="10.0.0.3.1.1", is_derived=False)
     house.routes.replace_spec(RoutingSpec(routes=(other,)))
     assert house.names() == {"saw": Origin.STATIC, "plc": Origin.ADDED}
@@ -221,7 +224,7 @@ def test_who_answered_has_a_route_for_ten_minutes():
 @pytest.mark.parametrize("net_id", ["10.0.0.1.7.7", "10.0.0.2.7.7", "5.1.2.3.9.9"])
 def test_nobody_makes_a_route_in_place_of_another_by_an_answer(net_id):
     house = House()
-    house.routes.add(PLC)
+    asyncio.run(house.routes.add(PLC))
     assert not learned(house, net_id)
     assert len(house.router.table) == 2
 
@@ -232,6 +235,42 @@ def test_nothing_is_learned_where_that_is_switched_off():
 
 def test_a_default_route_is_no_reason_not_to_learn():
     house = House()
-    house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0))
+    asyncio.run(house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0)))
     assert learned(house, name="")
     assert house.router.table.find(NetId.parse("8.1.1.1.5.5"))[0].name == "10.0.0.9"
+
+
+class SlowStore(RouteStore):
+    """A disk that takes its time; *written* is what came there, in that order."""
+
+    def __init__(self):
+        super().__init__("demo", "left")
+        self.go_on = threading.Event()
+        self.written = []
+
+    def save(self, value):
+        assert self.go_on.wait(10)
+        super().save(value)
+        self.written.append([each.name for each in value])
+
+
+def test_packets_do_not_wait_for_the_disk_but_changes_and_who_asked_do():
+    house = House()
+    house.store = house.routes._store = SlowStore()
+
+    async def script():
+        changes = [
+            asyncio.ensure_future(house.routes.add(PLC)),
+            asyncio.ensure_future(house.routes.add(replace(PLC, name="b", net_id="6.1.2.3.1.1"))),
+            asyncio.ensure_future(house.routes.remove("plc")),
+        ]
+        await asyncio.sleep(0.02)  # others have their turns
+        assert not any(each.done() for each in changes)
+        assert house.names() == {"mill": Origin.STATIC}
+        changes[0].cancel()  # who asked has gone: what was begun is finished
+        house.store.go_on.set()
+        await asyncio.wait(changes)
+
+    asyncio.run(script())
+    assert house.store.written == [["plc"], ["plc", "b"], ["b"]]
+    assert house.names() == House().names() == {"mill": Origin.STATIC, "b": Origin.ADDED}

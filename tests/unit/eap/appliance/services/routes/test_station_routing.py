@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 from msgspec.structs import replace
 
@@ -42,7 +44,7 @@ def test_what_is_applied_is_in_force_at_once_and_after_a_new_start(caplog):
     assert house.routing.applied is None
     changes = ["route mill: removed", "route saw: added", "access rule a: added"]
     assert house.routing.plan(OTHER).changes == changes
-    assert house.routing.apply(OTHER, "1") == changes
+    assert asyncio.run(house.routing.apply(OTHER, "1")) == changes
     assert (house.names(), house.access) == (["saw"], [FILE, OTHER])
     again = House()
     assert (again.names(), again.access) == (["saw"], [OTHER])
@@ -50,7 +52,7 @@ def test_what_is_applied_is_in_force_at_once_and_after_a_new_start(caplog):
 
 
 def test_who_edits_the_plant_file_has_the_last_word(caplog):
-    House().routing.apply(OTHER, "1")
+    asyncio.run(House().routing.apply(OTHER, "1"))
     edited = House(RoutingSpec())
     assert edited.names() == []
     assert edited.routing.applied is None
@@ -61,47 +63,47 @@ def test_who_edits_the_plant_file_has_the_last_word(caplog):
 
 
 def test_a_file_that_says_what_was_applied_is_nothing_to_speak_of(caplog):
-    House().routing.apply(OTHER, "1")
+    asyncio.run(House().routing.apply(OTHER, "1"))
     assert House(OTHER).names() == ["saw"]
     assert caplog.text == ""
 
 
 def test_a_change_is_taken_back_and_made_again():
     house = House()
-    house.routing.apply(OTHER, "1")
-    assert house.routing.roll_back() == [
+    asyncio.run(house.routing.apply(OTHER, "1"))
+    assert asyncio.run(house.routing.roll_back()) == [
         "route saw: removed",
         "route mill: added",
         "access rule a: removed",
     ]
     assert house.names() == ["mill"]
     assert house.routing.applied.undone
-    house.routing.roll_back()
+    asyncio.run(house.routing.roll_back())
     assert House().names() == ["saw"]
     assert not house.routing.applied.undone
 
 
 def test_steps_of_one_change_are_taken_back_together():
     house = House()
-    house.routing.apply(OTHER, "1")
-    house.routing.apply(RoutingSpec(), "1")
-    house.routing.roll_back()
+    asyncio.run(house.routing.apply(OTHER, "1"))
+    asyncio.run(house.routing.apply(RoutingSpec(), "1"))
+    asyncio.run(house.routing.roll_back())
     assert house.names() == ["mill"]
 
 
 def test_what_is_the_same_is_no_change():
     house = House()
-    assert house.routing.apply(FILE, "1") == []
+    assert asyncio.run(house.routing.apply(FILE, "1")) == []
     assert house.routing.applied is None
     with pytest.raises(ControlError, match="were not changed while the station ran"):
-        house.routing.roll_back()
+        asyncio.run(house.routing.roll_back())
 
 
 def test_a_broker_does_not_change_while_it_runs():
     broker = replace(FILE, mqtt=(MqttSpec(network="n", host="broker"),))
     house = House()
     with pytest.raises(ControlError, match="MQTT network n: added: this needs a new start"):
-        house.routing.apply(broker, "1")
+        asyncio.run(house.routing.apply(broker, "1"))
     assert house.routing.plan(broker).refused
     assert house.routing.applied is None
 
@@ -110,5 +112,5 @@ def test_what_cannot_be_kept_is_not_in_force(monkeypatch):
     monkeypatch.setenv("EAP_STATE_DIR", "/dev/null/x")
     house = House()
     with pytest.raises(EnvironmentalError, match="routes and access rules cannot be kept"):
-        house.routing.apply(OTHER, "1")
+        asyncio.run(house.routing.apply(OTHER, "1"))
     assert house.names() == ["mill"]
