@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from eap.appliance.handover import Handover, SegmentHandover, decode_report
+from eap.appliance.supervisor.output import STDERR
 
 FIRST_BACKOFF_NS = 100_000_000
 LONGEST_BACKOFF_NS = 5_000_000_000
@@ -118,8 +119,7 @@ class Child:
             self.error_fd = -1
         for line in lines:
             self._last_lines.append(line.decode("utf-8", "replace"))
-            sys.stderr.write(self._last_lines[-1] + "\n")
-        sys.stderr.flush()
+            STDERR.write(self._last_lines[-1])
         return bool(data)
 
     def ask_to_end(self, number: signal.Signals) -> None:

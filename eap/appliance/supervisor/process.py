@@ -28,6 +28,7 @@ from eap.appliance.signals import catch_end_signals
 from eap.appliance.store import Store, effective, settle
 from eap.appliance.supervisor.bus_sockets import segments
 from eap.appliance.supervisor.child import Child, describe_end
+from eap.appliance.supervisor.output import OutputHandler
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.appliance.supervisor.what_runs import what_runs_now
 from eap.config.load import Plant
@@ -93,7 +94,9 @@ def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> 
 
 
 def _claim(folder: str) -> ApplianceFolder:
-    logging.basicConfig(format="supervisor: %(message)s", level=logging.INFO)
+    logging.basicConfig(
+        format="supervisor: %(message)s", level=logging.INFO, handlers=[OutputHandler()]
+    )
     return ApplianceFolder.claim(folder)
 
 

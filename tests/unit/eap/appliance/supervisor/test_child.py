@@ -61,7 +61,7 @@ def wait(fd: int) -> None:
 
 
 @pytest.mark.net
-def test_from_start_to_end(tmp_path, monkeypatch, capsys):
+def test_from_start_to_end(tmp_path, monkeypatch, capfd):
     child = make(tmp_path, monkeypatch, READS_ITS_HANDOVER)
     assert child.pid == 0
     child.start(HANDOVER, [], monotonic_ns())
@@ -73,7 +73,7 @@ def test_from_start_to_end(tmp_path, monkeypatch, capsys):
     wait(child.pid_fd)
     assert child.reap() == (3, "no newline")
     assert (child.pid, child.pid_fd, child.error_fd) == (0, -1, -1)
-    assert capsys.readouterr().err == "first line\nno newline\n"
+    assert capfd.readouterr().err == "first line\nno newline\n"
 
 
 @pytest.mark.net
