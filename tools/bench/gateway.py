@@ -41,9 +41,8 @@ def run(settings: Settings) -> list[Figure]:
             rounds = _rounds(settings)
             found = [*read_figures(rounds), _crowd(settings), *_files(settings)]
             del environment
-        idle = _lateness(settings, path, is_busy=False)
-        busy = _lateness(settings, path, is_busy=True)
-    return [*found, *late_figures(idle, busy)]
+        late = {asked: _lateness(settings, path, asked) for asked in ("nobody", "echo", "gateway")}
+    return [*found, *late_figures(**late)]
 
 
 class Round(NamedTuple):
@@ -88,16 +87,27 @@ def file_figures(way: str, rounds: Sequence[dict[str, float]]) -> list[Figure]:
     ]
 
 
-def late_figures(idle: dict[str, int], busy: dict[str, int]) -> list[Figure]:
-    """Say how late cycles were, without clients and with a crowd."""
-    return [
-        report(
-            f"lateness of the engine, {key}: with {CLIENTS} clients, and idle",
-            f"{busy[key]} and {idle[key]} µs",
-            busy[key],
+def late_figures(
+    nobody: dict[str, int], echo: dict[str, int], gateway: dict[str, int]
+) -> list[Figure]:
+    """Compare how late cycles were while a crowd asked the gateway, a bare echo, and nobody.
+
+    What the echo adds, a machine adds that has no idle core any more, whoever keeps it busy.
+    """
+    name = f"lateness of the engine, {{}}: {CLIENTS} clients at the gateway, of those at an echo"
+    detail = "{}, {} µs; {} µs while nobody is asked"
+    figures = [
+        at_most(
+            name.format(key),
+            gateway[key] / max(echo[key], 1),
+            1.3,
+            "",
+            detail.format(gateway[key], echo[key], nobody[key]),
         )
-        for key in ("p50", "p99", "max")
+        for key in ("p50", "p99")
     ]
+    longest = f"{gateway['max']}, {echo['max']} and {nobody['max']} µs"
+    return [*figures, report("the same, max: gateway, echo and nobody", longest, gateway["max"])]
 
 
 def plant() -> str:
@@ -137,13 +147,14 @@ def _rounds(settings: Settings) -> list[Round]:
 def _crowd(settings: Settings) -> Figure:
     settings.tell(f"{CLIENTS} clients of a gateway at once")
     seconds = settings.latency_s
-    with _clients(seconds) as clients:
+    with _clients(GATEWAY, PORT, seconds) as clients:
         return crowd_figure(clients.answer(seconds)["counts"], seconds)
 
 
 @contextmanager
-def _clients(seconds: float) -> Iterator[Worker]:
-    job = {"address": GATEWAY, "station": MASTER, "clients": CLIENTS, "seconds": seconds}
+def _clients(address: str, port: int, seconds: float) -> Iterator[Worker]:
+    job = {"address": address, "port": port, "station": MASTER}
+    job |= {"clients": CLIENTS, "seconds": seconds}
     with _worker("crowd", job, machine.cores()[0]) as clients:
         clients.answer()
         yield clients
@@ -162,17 +173,22 @@ def _files(settings: Settings) -> list[Figure]:
     return figures
 
 
-def _lateness(settings: Settings, path: Path, *, is_busy: bool) -> dict[str, int]:
+def _lateness(settings: Settings, path: Path, asked: str) -> dict[str, int]:
     """Run a plant of its own, for figures go from its start on; return how late its cycles were."""
-    settings.tell(f"the engine beside a gateway that is {'busy' if is_busy else 'idle'}")
+    settings.tell(f"the engine while {CLIENTS} clients ask: {asked}")
     seconds = settings.lateness_s
     with ExitStack() as stack:
         environment = stack.enter_context(_appliance(path))
-        if is_busy:
-            clients = stack.enter_context(_clients(seconds))
-            clients.answer(seconds)
-        else:
+        if asked == "nobody":
             wait(seconds)
+        else:
+            address, port = GATEWAY, PORT
+            if asked == "echo":  # where services have their core too
+                job = {"address": ECHO}
+                echo = stack.enter_context(_worker("echo", job, machine.cores()[1]))
+                address, port = ECHO, echo.answer()["port"]
+            clients = stack.enter_context(_clients(address, port, seconds))
+            clients.answer(seconds)
         (station,) = status(None, environment)["stations"]
         return dict(station["lateness_us"])
 

@@ -62,7 +62,7 @@ def crowd(job: dict[str, Any]) -> None:
     with selectors.DefaultSelector() as selector:
         for number in range(len(counts)):
             sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            sock.connect((job["address"], PORT))
+            sock.connect((job["address"], job["port"]))
             selector.register(sock, selectors.EVENT_READ, number)
             sock.send(octets)
         answer({"ready": True})

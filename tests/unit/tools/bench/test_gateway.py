@@ -32,11 +32,18 @@ def test_slowest_client_is_compared_with_the_quickest() -> None:
     assert crowd_figure([0, 0], 2.0).value == 0
 
 
-def test_files_and_lateness_are_reported() -> None:
+def test_files_are_reported() -> None:
     stored, fetched = file_figures("UDP", [{"stored": 0.5, "fetched": 1.0}] * 2)
     assert (stored.measured, fetched.measured) == ("2.00 MB/s", "1.00 MB/s")
-    late = late_figures({"p50": 5, "p99": 9, "max": 90}, {"p50": 6, "p99": 8, "max": 70})
-    assert [each.measured for each in late] == ["6 and 5 µs", "8 and 9 µs", "70 and 90 µs"]
+
+
+def test_lateness_is_compared_with_that_beside_an_echo() -> None:
+    nobody, echo, gateway = ({"p50": us, "p99": 9 * us, "max": 20 * us} for us in (5, 10, 13))
+    p50, p99, longest = late_figures(nobody, echo, gateway)
+    assert p50.measured == "1.30 (13, 10 µs; 5 µs while nobody is asked)"
+    assert (p50.verdict, p99.verdict) == (Verdict.OK, Verdict.OK)
+    assert longest.measured == "260, 200 and 100 µs"
+    assert late_figures(nobody, nobody, gateway)[0].verdict is Verdict.MISSED
 
 
 def test_plant_and_request_are_what_they_should_be(tmp_path: Path) -> None:
