@@ -24,6 +24,8 @@ PATIENCE_NS = 40_000
 """How long is watched for the next of them."""
 MOST_FRAMES = 16
 """That are taken so before others have their turn."""
+AFTER_A_MISS = 4
+"""Frames that are not waited for, once one was waited for in vain."""
 
 
 class DrainedChannel(Protocol):
@@ -101,6 +103,7 @@ class PatientDrain:
         self._channel = channel
         self._clock = clock
         self._answered_ns = clock() - QUICK_NS
+        self._resting = 0
 
     def drain(self) -> None:
         """Take what waits; and what comes, if this came quickly after what was taken last."""
@@ -108,11 +111,21 @@ class PatientDrain:
         now_ns = clock()
         is_quick = now_ns - self._answered_ns < QUICK_NS
         taken = channel.drain(now_ns)
-        now_ns = answered_ns = clock()
-        while is_quick and taken < MOST_FRAMES and now_ns - answered_ns < PATIENCE_NS:
+        self._answered_ns = now_ns = clock()
+        if self._resting:
+            self._resting -= 1
+        elif is_quick:
+            self._watch(taken, now_ns)
+
+    def _watch(self, taken: int, now_ns: int) -> None:
+        """Look for more, after *taken* frames."""
+        channel, clock = self._channel, self._clock
+        while taken < MOST_FRAMES:
+            if now_ns - self._answered_ns > PATIENCE_NS:
+                self._resting = AFTER_A_MISS
+                return
             found = channel.drain(now_ns)
             now_ns = clock()
             if found:
                 taken += found
-                answered_ns = now_ns
-        self._answered_ns = answered_ns
+                self._answered_ns = now_ns

@@ -12,6 +12,7 @@ import pytest
 
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.services.intake import (
+    AFTER_A_MISS,
     MOST_FRAMES,
     PATIENCE_NS,
     QUICK_NS,
@@ -103,6 +104,15 @@ def test_the_next_of_quick_frames_is_waited_for():
     assert not line.arrivals_ns
     late_ns = line.now_ns - PATIENCE_NS - (QUICK_NS // 2 + PATIENCE_NS // 2)
     assert 0 <= late_ns < 5000, "given up as long after the last frame as promised"
+
+
+def test_after_a_frame_that_did_not_come_some_are_not_waited_for():
+    line = Line()
+    drain = PatientDrain(line, line.clock)
+    line.wake(drain, 0)
+    looks = [line.wake(drain, line.now_ns + QUICK_NS // 2) for _ in range(AFTER_A_MISS + 2)]
+    assert looks[1:-1] == [1] * AFTER_A_MISS
+    assert min(looks[0], looks[-1]) > 2
 
 
 def test_frames_that_never_end_leave_time_for_others():
