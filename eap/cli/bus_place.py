@@ -34,8 +34,8 @@ class GatewayPlace(NamedTuple):
     host: str
     port: int
     tcp: bool = False
-    mailbox: int = 128
-    """Octets of mailboxes behind virtual addresses."""
+    mailbox: int | None = None
+    """Octets of the slave's mailboxes, in place of what the master tells."""
 
 
 Place: TypeAlias = BusPort | InterfaceUri | GatewayPlace

@@ -12,7 +12,7 @@ from eap.cli.group import LazyGroup
 from eap.cli.params import examples
 
 _PORT = 34980
-_TCP = "--tcp"
+_TCP, _MAILBOX = "--tcp", "--mailbox"
 
 
 def _parse_place(ctx: click.Context, param: click.Parameter, text: str) -> GatewayPlace:
@@ -29,11 +29,19 @@ class GatewayGroup(LazyGroup):
     """Commands of ``eapctl bus``, whose bus is the gateway."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Take ``--tcp`` wherever it stands: behind HOST it would be taken for a command."""
-        words = args[: args.index("--")] if "--" in args else args
-        others = [word for word in words if word != _TCP]
-        first = [_TCP] if len(others) < len(words) else []
-        return super().parse_args(ctx, [*first, *others, *args[len(words) :]])
+        """Take own options wherever they stand: behind HOST they would be taken for commands."""
+        rest = iter(args)
+        first: list[str] = []
+        others: list[str] = []
+        for word in rest:
+            if word == "--":
+                others.append(word)
+                break
+            is_own = word.partition("=")[0] in {_TCP, _MAILBOX}
+            (first if is_own else others).append(word)
+            if word == _MAILBOX:
+                first += [each for each in (next(rest, None),) if each is not None]
+        return super().parse_args(ctx, [*first, *others, *rest])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import one subcommand, and give it the gateway in the place of a bus."""
@@ -85,16 +93,15 @@ def _call(command: click.Command, **values: Any) -> Any:
     _TCP, is_flag=True, help="Connect by TCP, else datagrams are sent (UDP); anywhere on the line."
 )
 @click.option(
-    "--mailbox",
+    _MAILBOX,
     type=click.IntRange(16, 1492),
-    default=128,
     metavar="OCTETS",
-    help="How large a slave's mailbox is behind a virtual address (0x8000 and above); the master"
-    " tells only of its own slaves. 128 if left out.",
+    help="How large the slave's mailbox is where the master does not tell, as of virtual addresses;"
+    " files need it. Anywhere on the line.",
 )
 @click.argument("place", metavar="HOST[:PORT]", callback=_parse_place)
 @click.pass_context
-def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int) -> None:
+def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) -> None:
     """Talk to a master and its slaves through a mailbox gateway, any vendor's.
 
     SLAVE is a station address (1001 is the first slave) or the slave's name as the master knows it;

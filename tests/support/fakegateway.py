@@ -30,7 +30,7 @@ from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.od.profiles.master1100 import Live
 
-SIZES = MailboxSizes(128, 128)
+SIZES = MailboxSizes(140, 132)
 FILE = bytes(range(256)) * 4
 
 
@@ -44,7 +44,7 @@ class _OneSlave:
 
     def of_configured(self, station: int, key: Live) -> int | str:
         texts = {Live.NAME: "drive", Live.TYPE: "D1"}
-        return {Live.ADDRESS: 1001, Live.VENDOR: 5, Live.MAILBOX_OUT: 128, Live.MAILBOX_IN: 128,
+        return {Live.ADDRESS: 1001, Live.VENDOR: 5, Live.MAILBOX_OUT: 140, Live.MAILBOX_IN: 132,
                 Live.PROTOCOLS: 0x0C, **texts}.get(key, 0)  # fmt: skip
 
     of_detected = of_configured

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
-from devicebus.errors import MailboxSizeError
+from devicebus.errors import BusError, MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
 from devicebus.mailbox.conversation import Progress
 from eap.appliance.commands.bus_slave import Begin, Slave, SlaveBus
@@ -35,7 +35,7 @@ def get_file(
         ConfigError: the slave's mailbox is too small for *name*.
         EnvironmentalError: *target* cannot be written.
     """
-    unit = bus.find(slave)
+    unit = _find(bus, slave)
     progress = Progress()
     digest = hashlib.sha256()
     start = time.monotonic()
@@ -69,7 +69,7 @@ def put_file(
         ConfigError: the slave's mailbox is too small for *name*.
         EnvironmentalError: *source* cannot be read.
     """
-    unit = bus.find(slave)
+    unit = _find(bus, slave)
     digest = hashlib.sha256()
     start = time.monotonic()
     with _reading(source) as file:
@@ -164,6 +164,16 @@ def _converse(
         bus.converse(unit, begin, name, meanwhile)
     except MailboxSizeError as exc:
         raise ConfigError(str(exc)) from None
+
+
+def _find(bus: SlaveBus, slave: str) -> Slave:
+    unit = bus.find(slave)
+    if not unit.is_mailbox_known and unit.station:
+        raise BusError(
+            f"slave {slave}: the master does not tell how long its mailbox is, and in packets of"
+            " another length a file would be cut off; say it (--mailbox OCTETS)"
+        )
+    return unit
 
 
 def exchange(

@@ -18,7 +18,8 @@ from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import AlStatus
 from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
-from eap.gateway.address import MASTER_ADDRESS, VIRTUAL_BIT
+from eap.errors import ConfigError, EapError
+from eap.gateway.address import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.client import GatewayClient
 from eap.gateway.slaves import MasterSlave
 from eap.od.abort import SdoAbortError
@@ -26,7 +27,6 @@ from eap.od.abort import SdoAbortError
 T = TypeVar("T")
 
 _MASTER_SIZE = 1480
-_VIRTUAL_SIZE = 128
 
 
 class GatewayBus:
@@ -36,12 +36,12 @@ class GatewayBus:
 
     Args:
         client: Of the gateway.
-        mailbox: Octets of the mailboxes behind a virtual address, which no dictionary tells.
+        mailbox: Octets of the slave's mailboxes, in place of what the master tells.
     """
 
-    def __init__(self, client: GatewayClient, mailbox: int = _VIRTUAL_SIZE) -> None:
+    def __init__(self, client: GatewayClient, mailbox: int | None = None) -> None:
         self._client = client
-        self._virtual = MailboxSizes(mailbox, mailbox)
+        self._mailbox = None if mailbox is None else MailboxSizes(mailbox, mailbox)
         self._slaves: list[MasterSlave] | None = None
 
     def scan(self) -> Sequence[Slave]:
@@ -52,20 +52,23 @@ class GatewayBus:
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name, the master for 0.
 
-        Virtual addresses, from 0x8000 on, are for the gateway to know.
+        Other addresses are for the gateway to know: it may have virtual ones.
         """
         if name in {"0", "master"}:
-            return msgspec.structs.replace(_unknown(MASTER_ADDRESS), name="master")
+            return msgspec.structs.replace(self._unknown(MASTER_ADDRESS), name="master")
         number = _number(name)
-        if number >= VIRTUAL_BIT:
-            return _unknown(number)  # the gateway knows whom it means
+        if number == ALL_SLAVES:
+            raise ConfigError(f"{name} is all slaves, each of which answers for itself: name one")
         try:
             slaves = self.scan()
-        except (SdoAbortError, MailboxRefusedError):
+        except (SdoAbortError, MailboxRefusedError):  # of a master without a dictionary
             if number < 0:
                 raise
-            slaves = [_unknown(number)]  # of a master without a dictionary
-        return choose(slaves, name)
+            return self._unknown(number)
+        for slave in slaves:
+            if slave.station == number & ~VIRTUAL_BIT and number > 0:
+                return msgspec.structs.replace(slave, station=number)
+        return choose(slaves, name) if number < 0 else self._unknown(number)
 
     def converse(
         self,
@@ -77,7 +80,15 @@ class GatewayBus:
         """Talk to a slave's mailbox, or to the master; return the result or raise."""
         del name
         conversation = begin(self._sizes(slave))
-        return self._client.converse(slave.station, conversation, meanwhile)
+        try:
+            return self._client.converse(slave.station, conversation, meanwhile)
+        except EapError as exc:
+            if slave.station and self._slaves is not None and self._told_of(slave) is None:
+                known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
+                exc.add_note(
+                    f"the master knows no slave {slave.station}; it knows {known or 'none'}"
+                )
+            raise
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
         """Refuse: states are asked for by the master's dictionary, 0xAnnn:02."""
@@ -96,12 +107,23 @@ class GatewayBus:
     def _sizes(self, slave: Slave) -> MailboxSizes:
         if slave.station == MASTER_ADDRESS:
             return MailboxSizes(_MASTER_SIZE, _MASTER_SIZE)
-        for each in self._slaves or ():
-            if each.station == slave.station and each.to_slave:
-                return MailboxSizes(each.to_slave, each.to_master)
-        if self._slaves is None or slave.station >= VIRTUAL_BIT:
-            return self._virtual
-        raise no_mailbox(slave, state_name(slave.status.state))
+        if self._mailbox is not None:
+            return self._mailbox
+        told = self._told_of(slave)
+        if told is None:
+            return MailboxSizes()
+        if not told.to_slave:
+            raise no_mailbox(slave, state_name(slave.status.state))
+        return MailboxSizes(told.to_slave, told.to_master)
+
+    def _told_of(self, slave: Slave) -> MasterSlave | None:
+        """Return what the master tells of a slave, None if it has not told anything."""
+        station = slave.station & ~VIRTUAL_BIT
+        return next((each for each in self._slaves or () if each.station == station), None)
+
+    def _unknown(self, station: int) -> Slave:
+        found = _slave(MasterSlave(station, "", 0, 0, 0, 0, 0, 0, 0))
+        return msgspec.structs.replace(found, is_mailbox_known=self._mailbox is not None)
 
 
 def _number(text: str) -> int:
@@ -109,10 +131,6 @@ def _number(text: str) -> int:
         return int(text, 0)
     except ValueError:
         return -1
-
-
-def _unknown(station: int) -> Slave:
-    return _slave(MasterSlave(station, "", 0, 0, 0, 0, 0, 0, 0))
 
 
 def _slave(slave: MasterSlave) -> Slave:
@@ -137,7 +155,7 @@ def _refuse(what: str) -> NoReturn:
 
 @contextmanager
 def open_gateway(
-    host: str, port: int, *, tcp: bool, mailbox: int = _VIRTUAL_SIZE
+    host: str, port: int, *, tcp: bool, mailbox: int | None = None
 ) -> Iterator[GatewayBus]:
     """Talk to a gateway for the length of a block; *mailbox* as GatewayBus has it.
 

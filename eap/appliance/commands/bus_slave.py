@@ -39,6 +39,8 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """Position of the slave that it is wired to; None for the master."""
     ports: tuple[int, ...]
     """Open ports."""
+    is_mailbox_known: bool = True
+    """Whether somebody tells how long its mailbox is; no file passes without."""
     fault: str = ""
     """Why not all is known of it, or why it is not where it belongs."""
 

@@ -74,7 +74,7 @@ def test_vendors_protocols(client) -> None:
 def test_slaves(client) -> None:
     (slave,) = client.slaves()
     assert (slave.station, slave.name, slave.vendor, slave.al_status) == (1001, "drive", 5, 8)
-    assert client.sizes_of(0x8000 | 1001).to_slave == 128
+    assert client.sizes_of(0x8000 | 1001).to_slave == 140
     with pytest.raises(BusError, match=r"knows no slave 7; it knows 1001 \(drive\)"):
         client.sizes_of(7)
     with pytest.raises(MailboxRefusedError):

@@ -10,10 +10,12 @@ from devicebus.errors import BusError, MailboxSizeError
 from devicebus.mailbox import coe_client, foe_client
 from devicebus.master.diagnosis import diagnose
 from devicebus.wire.alstatus import AlState
+from eap.appliance.commands.bus_foe import put_file
 from eap.appliance.commands.bus_gateway import open_gateway
 from eap.appliance.commands.bus_info import scan_rows
 from eap.appliance.commands.bus_sdo import dump_entries, read_entry, write_entry
-from tests.support.fakegateway import FakeGateway
+from eap.errors import ConfigError
+from tests.support.fakegateway import FILE, SIZES, FakeGateway
 
 pytestmark = pytest.mark.net
 
@@ -36,8 +38,10 @@ def test_slaves_and_the_master(bus) -> None:
     assert row["mailbox"] is None, "the usual dictionary ends before them"
     assert bus.find("drive").station == bus.find("1001").station == 1001
     assert bus.find("master").station == bus.find("0").station == 0
-    with pytest.raises(BusError, match=r"no slave '7'; there are 1001 \(drive\)"):
-        bus.find("7")
+    with pytest.raises(BusError, match=r"no slave 'x'; there are 1001 \(drive\)"):
+        bus.find("x")
+    with pytest.raises(ConfigError, match="65535 is all slaves"):
+        bus.find("65535")
 
 
 def test_a_dictionary_with_all_entries_tells_the_protocols() -> None:
@@ -51,8 +55,22 @@ def test_a_dictionary_with_all_entries_tells_the_protocols() -> None:
 def test_virtual_addresses_are_the_gateways_business(bus) -> None:
     slave = bus.find("0x9001")
     assert slave.station == 0x9001
-    with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL"):
+    with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL") as caught:
         bus.converse(slave, lambda _: coe_client.upload(0x2000, 0), "x")
+    assert caught.value.__notes__ == ["the master knows no slave 36865; it knows 1001 (drive)"]
+
+
+def test_files_go_in_packets_that_fill_the_mailbox(bus, tmp_path) -> None:
+    source = tmp_path / "a"
+    source.write_bytes(FILE)
+    drive = bus.find(str(0x8000 | 1001))
+    assert (drive.station, drive.name) == (0x8000 | 1001, "drive")
+    seen = []
+    with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL"):  # this gateway knows no bit 15
+        bus.converse(drive, lambda sizes: seen.append(sizes) or coe_client.upload(0x2000, 0), "x")
+    assert (seen[0].to_slave, seen[0].to_master) == (SIZES.to_slave, SIZES.to_master)
+    with pytest.raises(BusError, match="0x9001: the master does not tell how long its mailbox is"):
+        put_file(bus, "0x9001", source, "f", password=0, report=lambda *_: None)
 
 
 def test_mailboxes_behind_virtual_addresses_are_as_large_as_it_is_said(gateway) -> None:
