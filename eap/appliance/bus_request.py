@@ -105,6 +105,21 @@ class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
     """Octets of the mailboxes, 0 while it has none."""
     protocols: int = 0
     """As in its EEPROM."""
+    order: str = ""
+    """Order code in its EEPROM."""
+    usual_to_slave: int = 0
+    usual_to_master: int = 0
+    """Octets of the mailboxes in its EEPROM, whatever its state."""
+    port_physics: int = 0
+    """As in its EEPROM: four bits a port, 0 none, 1 MII, 3 E-bus."""
+    link_preset: int = 0
+    """Bits 0 to 2: ports 1 to 3 led to a slave when it was found; bits 4 to 6: they had a link."""
+    losses: int = 0
+    """How often it has stopped answering."""
+    departures: int = 0
+    """How often it has left its state by itself."""
+    al_code: int = 0
+    """AL status code when it last did."""
     fault: str = ""
     """Why it is not where it belongs."""
 

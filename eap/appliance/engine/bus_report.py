@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from devicebus.master.bus import Unit
 from eap.appliance.bus_request import BusReport, SlaveReport
 from eap.appliance.engine.engine_bus import EngineBus
@@ -12,8 +14,9 @@ def report_bus(bus: EngineBus) -> BusReport:
     """Return what *bus* knows now; before its slaves are known, those that are expected."""
     stats = bus.master.stats()
     units = bus.master.units.values()
+    presets = _link_presets(units)
     slaves = (
-        [_found(unit, bus.faults.of(unit.station)) for unit in units]
+        [_found(bus, unit, presets.get(unit.found.position, 0)) for unit in units]
         if units
         else [_expected(slave) for slave in bus.spec.slaves]
     )
@@ -35,8 +38,23 @@ def report_bus(bus: EngineBus) -> BusReport:
     )
 
 
-def _found(unit: Unit, fault: str) -> SlaveReport:
-    identity = unit.found.identity
+def _link_presets(units: Collection[Unit]) -> dict[int, int]:
+    """Return by position which ports led to other slaves when these were found (ETG.1510)."""
+    presets: dict[int, int] = {}
+    for unit in units:
+        joint = unit.found.joint
+        ends = [(unit.found.position, joint.entry_port)]
+        if joint.parent is not None:
+            ends.append((joint.parent, joint.parent_port))
+        for position, port in ends:
+            if port:  # it is not asked for port 0
+                presets[position] = presets.get(position, 0) | 0x11 << port - 1
+    return presets
+
+
+def _found(bus: EngineBus, unit: Unit, link_preset: int) -> SlaveReport:
+    identity, sii = unit.found.identity, unit.found.sii
+    past = bus.faults.past(unit.station)
     sizes = unit.mailbox.sizes if unit.mailbox is not None else None
     return SlaveReport(
         station=unit.station,
@@ -50,8 +68,16 @@ def _found(unit: Unit, fault: str) -> SlaveReport:
         target=int(unit.target),
         to_slave=sizes.to_slave if sizes else 0,
         to_master=sizes.to_master if sizes else 0,
-        protocols=int(unit.found.sii.fixed.protocols),
-        fault=fault,
+        protocols=int(sii.fixed.protocols),
+        order=sii.string(sii.general.order) if sii.general else "",
+        usual_to_slave=sii.fixed.receive_size,
+        usual_to_master=sii.fixed.send_size,
+        port_physics=sii.general.port_physics if sii.general else 0,
+        link_preset=link_preset,
+        losses=past.losses,
+        departures=past.departures,
+        al_code=past.al_code,
+        fault=bus.faults.of(unit.station),
     )
 
 

@@ -10,9 +10,12 @@ from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.master_values import MasterView
 from eap.device.eap_content import Identity
 from eap.device.master_dictionary import MasterDictionary
+from eap.od.profiles.master1100 import CONFIGURED
 
-_OF_REGISTERS = range(0x9000, 0xB000)
+_OF_REGISTERS = range(0x8000, 0xB000)
 """Objects that show registers of slaves."""
+_OF_CONFIGURED = range(CONFIGURED.first, CONFIGURED.last + 1)
+"""Objects that repeat what slaves say of themselves."""
 
 
 class MasterDesk:
@@ -48,12 +51,16 @@ class MasterDesk:
 
     async def refresh(self, index: int) -> None:
         """See to it that what the object at *index* shows is not old."""
-        await self._view.refresh(with_registers=index in _OF_REGISTERS)
+        await self._view.refresh(with_registers=index in _OF_REGISTERS, place=_place(index))
 
     def is_fresh(self, index: int) -> bool:
         """Say whether what the object at *index* shows may be read at once."""
-        return self._view.is_fresh(with_registers=index in _OF_REGISTERS)
+        return self._view.is_fresh(with_registers=index in _OF_REGISTERS, place=_place(index))
 
     def open_session(self, room: int) -> MasterSession:
         """Begin a client's session with the dictionary."""
         return MasterSession(self.dictionary, room, self.refresh, self.is_fresh)
+
+
+def _place(index: int) -> int | None:
+    return index - CONFIGURED.first if index in _OF_CONFIGURED else None

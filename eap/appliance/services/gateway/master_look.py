@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from devicebus.master.access import fprd
 from devicebus.master.procedure import Procedure
 from devicebus.master.scan import Identity, count_slaves, read_identity, read_stations
+from devicebus.master.topology import find_joints
 from devicebus.wire.register import AlStatus, DlStatus, Register
 
 PORTS = 4
@@ -31,6 +32,37 @@ class Found(NamedTuple):
     station: int
     identity: Identity
     dl_word: int
+
+
+def communicating(status: DlStatus) -> int:
+    """Return the ports with communication, bit n for port n."""
+    alive = (
+        status.communication0,
+        status.communication1,
+        status.communication2,
+        status.communication3,
+    )
+    return sum(bool(bit) << port for port, bit in enumerate(alive))
+
+
+def neighbour(seen: Mapping[int, Seen], order: Sequence[int], station: int, port: int) -> int:
+    """Return who is connected to a port of a slave, 0 if that is the master or nobody.
+
+    Args:
+        seen: Slaves that answered.
+        order: Station addresses in the order of the bus.
+        station: Whose port it is.
+        port: Of that slave.
+    """
+    stations = [each for each in order if each in seen]
+    joints = find_joints([seen[each].dl for each in stations])
+    for position, joint in enumerate(joints):
+        there = None if joint.parent is None else stations[joint.parent]
+        if stations[position] == station and joint.entry_port == port:
+            return there or 0
+        if there == station and joint.parent_port == port:
+            return stations[position]
+    return 0
 
 
 def look_at(stations: Sequence[int]) -> Procedure[dict[int, Seen]]:

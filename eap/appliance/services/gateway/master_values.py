@@ -12,14 +12,24 @@ import logging
 from collections.abc import Awaitable, Coroutine, Sequence
 from typing import Any, NamedTuple
 
+from devicebus.errors import AlStatusError
 from devicebus.master.access import fpwr
-from devicebus.master.topology import find_joints
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.register import DlStatus
 from eap.appliance.bus_request import BusReport, SlaveReport
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.gateway.master_look import LOOPS, PORTS, Found, Seen, detect, look_at
+from eap.appliance.services.gateway.configured_values import configured_value
+from eap.appliance.services.gateway.master_look import (
+    LOOPS,
+    PORTS,
+    Found,
+    Seen,
+    communicating,
+    detect,
+    look_at,
+    neighbour,
+)
+from eap.appliance.services.gateway.slave_facts import SlaveFacts
 from eap.errors import EapError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.master1100 import Live
@@ -56,22 +66,26 @@ class MasterView:
         self._report = BusReport(is_up=False)
         self._slaves: dict[int, SlaveReport] = {}
         self._seen: dict[int, Seen] = {}
+        self._facts = SlaveFacts(bus, port)
         self._found: tuple[Found, ...] | None = None
         self._detection = Detection()
         self._codes: dict[int, int] = {}
         self._wanted: dict[int, int] = {}
         self._fixed: set[int] = set()
-        self._away: set[int] = set()
-        self._absences: dict[int, int] = {}
         self._base: dict[tuple[int, Live], int] = {}
         self._rates = (0.0, 0, 0, 0, 0)
         self._until_s = self._registers_until_s = 0.0
         self._turn = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def refresh(self, *, with_registers: bool) -> None:
-        """See to it that what is shown is not old; a bus that is down shows no slaves."""
-        if self.is_fresh(with_registers=with_registers):
+    async def refresh(self, *, with_registers: bool, place: int | None = None) -> None:
+        """See to it that what is shown is not old; a bus that is down shows no slaves.
+
+        Args:
+            with_registers: Whether registers of slaves are shown.
+            place: Of the slave whose configuration is shown, in the order of the bus.
+        """
+        if self.is_fresh(with_registers=with_registers, place=place):
             return
         loop = asyncio.get_running_loop()
         async with self._turn:
@@ -81,11 +95,16 @@ class MasterView:
             if with_registers and loop.time() >= self._registers_until_s:
                 await self._look_closely()
                 self._registers_until_s = loop.time() + FRESH_S
+            slave = self._at(place)
+            if slave is not None:
+                await self._facts.ask(slave)
 
-    def is_fresh(self, *, with_registers: bool) -> bool:
+    def is_fresh(self, *, with_registers: bool, place: int | None = None) -> bool:
         """Say whether :meth:`refresh` has nothing to do."""
         until_s = self._registers_until_s if with_registers else self._until_s
-        return asyncio.get_running_loop().time() < until_s
+        slave = self._at(place)
+        is_known = slave is None or self._facts.is_known(slave)
+        return is_known and asyncio.get_running_loop().time() < until_s
 
     def configured(self) -> Sequence[int]:
         """Return the station addresses of the configuration."""
@@ -102,19 +121,8 @@ class MasterView:
         slave = self._slaves.get(station)
         if slave is None:
             return "" if key in _TEXTS else 0
-        return {
-            Live.ADDRESS: station,
-            Live.TYPE: slave.name,
-            Live.NAME: slave.name,
-            Live.VENDOR: slave.vendor,
-            Live.PRODUCT: slave.product,
-            Live.REVISION: slave.revision,
-            Live.SERIAL: slave.serial,
-            Live.MAILBOX_OUT: slave.to_slave,
-            Live.MAILBOX_IN: slave.to_master,
-            Live.LINK_STATUS: 0 if slave.state else 1,
-            Live.PROTOCOLS: slave.protocols,
-        }.get(key, 0)
+        dl = self._seen.get(station, Seen()).dl
+        return configured_value(slave, dl, self._facts.of(station), key)
 
     def of_detected(self, station: int, key: Live) -> Any:
         """Return what *key* stands for, of a slave that was found."""
@@ -129,18 +137,17 @@ class MasterView:
         """Return what *key* stands for, of how a configured slave is."""
         seen = self._seen.get(station, Seen())
         if key in _NEIGHBOURS:
-            return self._neighbour(station, _NEIGHBOURS.index(key))
-        if key in _CRCS:
+            return neighbour(self._seen, tuple(self._slaves), station, _NEIGHBOURS.index(key))
+        if key in _COUNTED:
             return self._since_reset(station, key)
         slave = self._slaves.get(station)
         return {
             Live.AL_STATUS: int.from_bytes(seen.al.encode()[:2], "little"),
             Live.AL_CONTROL: self._wanted.get(station, slave.target if slave else 0),
-            Live.AL_STATUS_CODE: self._codes.get(station, 0),
-            Live.LINK_CONNECTION: _connection(seen.dl),
+            Live.AL_STATUS_CODE: self._last_code(station),
+            Live.LINK_CONNECTION: seen.dl.link << PORTS | communicating(seen.dl),
             Live.LINK_CONTROL: seen.loops,
             Live.WKC_ERRORS: self._since_reset(0, Live.WKC_ERRORS),
-            Live.ABSENCES: self._absences.get(station, 0),
             Live.FIXED_LINKS: station in self._fixed,
             Live.HAS_NEW_DIAGNOSIS: False,
         }.get(key, 0)
@@ -168,7 +175,7 @@ class MasterView:
             if target not in _STATES:
                 raise SdoAbortError(AbortCode.VALUE, 0xA000, 2, f"there is no AL state {target}")
             self._wanted[station] = value
-            self._start(self._bus.bring(self._port, station, AlState(target)))
+            self._start(self._bring(station, AlState(target)))
         elif key is Live.LINK_CONTROL:
             access = [fpwr(station, LOOPS, bytes((value,)))]
             self._start(self._bus.transfer(self._port, access))
@@ -187,6 +194,10 @@ class MasterView:
         elif any(data):
             self._reset()
 
+    def _at(self, place: int | None) -> SlaveReport | None:
+        slaves = self._report.slaves if place is not None else ()
+        return slaves[place] if place is not None and place < len(slaves) else None
+
     async def _look(self) -> None:
         try:
             self._report = await self._bus.describe(self._port)
@@ -194,10 +205,7 @@ class MasterView:
             self._report = BusReport(is_up=False)
         slaves = self._report.slaves if self._report.is_up else ()
         self._slaves = {slave.station: slave for slave in slaves}
-        away = {station for station, slave in self._slaves.items() if not slave.state}
-        for station in away - self._away:
-            self._absences[station] = self._absences.get(station, 0) + 1
-        self._away = away
+        self._facts.forget(at for at, slave in self._slaves.items() if not slave.state)
         self._measure()
 
     def _measure(self) -> None:
@@ -221,6 +229,13 @@ class MasterView:
             if seen.al.code:
                 self._codes[station] = seen.al.code
 
+    async def _bring(self, station: int, target: AlState) -> None:
+        try:
+            await self._bus.bring(self._port, station, target)
+        except AlStatusError as exc:
+            self._codes[station] = exc.code
+            raise
+
     async def _detect(self) -> None:
         try:
             self._found = await self._bus.run(self._port, detect())
@@ -232,32 +247,27 @@ class MasterView:
     def _counter(self, station: int, key: Live) -> int:
         if key in _CRCS:
             return self._seen.get(station, Seen()).errors[_CRCS.index(key)]
-        report = self._report
+        report, slave = self._report, self._slaves.get(station)
+        if slave is not None:
+            return slave.losses if key is Live.ABSENCES else slave.departures
         if key is Live.WKC_ERRORS:
             return report.wkc_errors
         return report.cycles_lost if key is Live.LOST_CYCLIC else report.frames_lost
+
+    def _last_code(self, station: int) -> int:
+        """Return the AL status code of when a slave last left its state, or that was seen last."""
+        slave = self._slaves.get(station)
+        has_left = self._since_reset(station, Live.ABNORMAL_CHANGES)
+        return (has_left and slave and slave.al_code) or self._codes.get(station, 0)
 
     def _since_reset(self, station: int, key: Live) -> int:
         return max(0, self._counter(station, key) - self._base.get((station, key), 0))
 
     def _reset(self) -> None:
         self._codes.clear()
-        self._absences.clear()
         keys = [(0, key) for key in (Live.WKC_ERRORS, Live.LOST_CYCLIC, Live.LOST_ACYCLIC)]
-        keys += [(station, key) for station in self._seen for key in _CRCS]
+        keys += [(station, key) for station in self._slaves for key in _COUNTED]
         self._base = {key: self._counter(*key) for key in keys}
-
-    def _neighbour(self, station: int, port: int) -> int:
-        """Return who is connected to a port, 0 if that is the master or nobody."""
-        stations = [each for each in self._slaves if each in self._seen]
-        joints = find_joints([self._seen[each].dl for each in stations])
-        for position, joint in enumerate(joints):
-            there = None if joint.parent is None else stations[joint.parent]
-            if stations[position] == station and joint.entry_port == port:
-                return there or 0
-            if there == station and joint.parent_port == port:
-                return stations[position]
-        return 0
 
     def _start(self, work: Coroutine[Any, Any, Any]) -> None:
         task = asyncio.get_running_loop().create_task(self._finish(work))
@@ -273,17 +283,9 @@ class MasterView:
 
 _NEIGHBOURS = (Live.NEIGHBOUR_0, Live.NEIGHBOUR_1, Live.NEIGHBOUR_2, Live.NEIGHBOUR_3)
 _CRCS = (Live.CRC_0, Live.CRC_1, Live.CRC_2, Live.CRC_3)
+_COUNTED = (*_CRCS, Live.ABSENCES, Live.ABNORMAL_CHANGES)
+"""Of each slave."""
 _TEXTS = frozenset((Live.TYPE, Live.NAME))
-
-
-def _connection(status: DlStatus) -> int:
-    alive = (
-        status.communication0,
-        status.communication1,
-        status.communication2,
-        status.communication3,
-    )
-    return status.link << PORTS | sum(bool(bit) << port for port, bit in enumerate(alive))
 
 
 def _of_found(found: Found, key: Live) -> int:

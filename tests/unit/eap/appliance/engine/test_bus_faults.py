@@ -4,7 +4,7 @@ import pytest
 
 from devicebus.master.event import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
 from devicebus.master.mailboxes import Unsolicited
-from eap.appliance.engine.bus_faults import SlaveFaults
+from eap.appliance.engine.bus_faults import Past, SlaveFaults
 from eap.codec.mailbox import MailboxType
 
 
@@ -42,6 +42,22 @@ def test_the_last_counts_until_the_slave_is_back():
     assert (faults.of(1001), faults.of(1002)) == ("x", "it does not answer")
     faults.take_events(Master(SlaveBack(1001, 1, 3)))
     assert (faults.of(1001), faults.of(1002)) == ("", "it does not answer")
+
+
+def test_what_is_over_is_counted():
+    faults = SlaveFaults()
+    faults.take_events(
+        Master(
+            SlaveLost(1001, 1),
+            SlaveBack(1001, 1, 2),
+            SlaveLeft(1001, 0x14, 0x1B, 3),
+            SlaveLeft(1001, 0x01, 0, 4),
+            SlaveLost(1001, 5),
+            BusLost(6),
+        )
+    )
+    assert faults.past(1001) == Past(losses=2, departures=2, al_code=0x1B)
+    assert faults.past(1002) == Past()
 
 
 def test_what_slaves_send_unasked_is_told_on():

@@ -48,7 +48,13 @@ def test_a_bus_that_runs(tmp_path):
         to_slave=256,
         to_master=256,
         protocols=4,
+        order="io",
+        usual_to_slave=256,
+        usual_to_master=256,
+        port_physics=0x11,
+        link_preset=0x11,
     )
+    assert [each.link_preset for each in report.slaves] == [0x11, 0x11, 0]
     assert report.slaves[2].to_slave == report.slaves[2].protocols == 0
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+import msgspec
 import pytest
 
-from eap.appliance.bus_request import Bring, Transfer
+from eap.appliance.bus_request import AskMailbox, Bring, Transfer
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.master_values import FRESH_S, MasterView
@@ -130,6 +131,50 @@ def test_counters_begin_again_at_a_reset() -> None:
         assert total() == 0
 
     play(scene)
+
+
+def test_what_the_master_counts_is_shown_since_a_reset() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        past = (Live.ABSENCES, Live.ABNORMAL_CHANGES, Live.AL_STATUS_CODE)
+
+        async def shown() -> list[int]:
+            await asyncio.sleep(FRESH_S + 0.01)
+            await view.refresh(with_registers=True)
+            return [view.of_diagnosis(1002, key) for key in past]
+
+        report = engine.buses[0].report()
+
+        def happens(**what: int) -> None:
+            slaves = [
+                msgspec.structs.replace(slave, **what) if slave.station == 1002 else slave
+                for slave in report.slaves
+            ]
+            engine.buses[0].report = lambda: msgspec.structs.replace(report, slaves=tuple(slaves))
+
+        happens(losses=2, departures=1, al_code=0x1B)
+        assert await shown() == [2, 1, 0x1B]
+        view.write_master(Live.RESET, b"\1")
+        assert await shown() == [0, 0, 0]
+        happens(losses=2, departures=2, al_code=0x1E)
+        assert await shown() == [0, 1, 0x1E]
+
+    play(scene)
+
+
+def test_slaves_are_asked_for_their_device_type_once() -> None:
+    async def scene(view: MasterView, engine: FakeEngine) -> None:
+        assert not view.is_fresh(with_registers=False, place=0)
+        await asyncio.gather(*(view.refresh(with_registers=False, place=0) for _ in range(3)))
+        assert view.of_configured(1001, Live.DEVICE_TYPE) == 0x0002_0192
+        assert view.of_configured(1001, Live.TYPE) == "drive"
+        asked = len(engine.of(AskMailbox))
+        await asyncio.sleep(FRESH_S + 0.01)
+        await view.refresh(with_registers=False, place=0)
+        assert view.is_fresh(with_registers=False, place=0)
+        assert view.is_fresh(with_registers=False, place=9), "there is none that could be asked"
+        assert len(engine.of(AskMailbox)) == asked
+
+    play(scene, "drive")
 
 
 def test_a_bus_that_is_down_shows_nothing() -> None:
