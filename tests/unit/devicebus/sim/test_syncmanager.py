@@ -8,6 +8,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from devicebus.sim.syncmanager import SyncChannel
 from devicebus.wire.register import Register, SyncManager
+from tests.support.examples import FEW
 
 START, SIZE = 0x1000, 16
 
@@ -167,3 +168,4 @@ class MailboxMachine(RuleBasedStateMachine):
 
 
 TestMailboxMachine = MailboxMachine.TestCase
+TestMailboxMachine.settings = FEW

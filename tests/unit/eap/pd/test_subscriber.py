@@ -279,11 +279,14 @@ def test_a_restarted_engine_keeps_every_counter_and_sees_the_gap():
 
 def test_made_up_layouts_cost_bounded_memory_and_do_not_disturb_real_ones():
     r = receiver()
+    made_up = [
+        octets([((n * 97 + k) & 0xFFFF, b"", n & 0xFFFF) for k in range(100 + n % 80)])
+        for n in range(400)
+    ]
     tracemalloc.start()
     try:
-        for n in range(400):
-            made_up = [((n * 97 + k) & 0xFFFF, b"", n & 0xFFFF) for k in range(100 + n % 80)]
-            r.give(octets(made_up), 0)
+        for n, frame in enumerate(made_up):
+            r.give(frame, 0)
             r.give(octets([(7, b"ab", 3)], cycle=n), n * MS)
         assert tracemalloc.get_traced_memory()[1] < 4_000_000
     finally:
