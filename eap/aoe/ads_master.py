@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, Protocol
 
 from eap.aoe.ads_operation import AdsRefusedError
-from eap.aoe.ads_space import AdsSpace, Source
+from eap.aoe.ads_space import AdsSpace, Source, steady
 from eap.aoe.ads_state import BOOT, INIT, OP, PREOP, SAFEOP
 from eap.codec.ads import AdsError, IndexGroup
 
@@ -90,15 +90,7 @@ class MasterSpace(AdsSpace):
 
     def watch(self, group: int, offset: int, length: int) -> Source:
         """Return what gives states; a list that gets shorter ends it."""
-
-        def source() -> bytes:
-            octets = self.read(group, offset, length)
-            if len(octets) != length:
-                raise AdsRefusedError(AdsError.SIZE)
-            return octets
-
-        source()
-        return source
+        return steady(lambda: self.read(group, offset, length), length)
 
     def _slave(self, address: int) -> SlaveState:
         for slave in self._master.slaves():

@@ -15,6 +15,23 @@ It raises AdsRefusedError: BUSY and NOT_READY for now, anything else for good.
 """
 
 
+def steady(read: Callable[[], bytes], length: int) -> Source:
+    """Return what gives *length* octets whenever it is called; what gets longer or shorter ends it.
+
+    Raises:
+        AdsRefusedError: there are not as many even now, or what *read* raises.
+    """
+
+    def source() -> bytes:
+        octets = read()
+        if len(octets) != length:
+            raise AdsRefusedError(AdsError.SIZE)
+        return octets
+
+    source()
+    return source
+
+
 class AdsSpace:
     """A family of index groups; what a space does not override is refused.
 

@@ -15,11 +15,11 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from time import monotonic_ns, time_ns
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from eap.appliance.runtime import find_running, runtime_root
 from eap.appliance.station_image import StationImage
+from eap.closing import Closing
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.near import near
 from eap.pd.image import Image
@@ -34,7 +34,7 @@ _GONE_AFTER_S = 2.0
 _GONE_AFTER_CYCLES = 10
 
 
-class AttachedStation:
+class AttachedStation(Closing):
     """The variables of one running station; made by :func:`attach`."""
 
     def __init__(self, path: Path) -> None:
@@ -42,17 +42,6 @@ class AttachedStation:
         self._file = self._station.file
         self._opened_ns = monotonic_ns()
         self._writes = False
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Detach, and let others write."""

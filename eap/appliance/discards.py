@@ -7,9 +7,8 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum, auto
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from eap.closing import Closing
 from eap.errors import EnvironmentalError
 
 
@@ -64,7 +63,7 @@ _REFUSALS = tuple(Refusal)
 _COLUMN = {reason: index for index, reason in enumerate(_REFUSALS)}
 
 
-class DiscardCounters:
+class DiscardCounters(Closing):
     """One 64-bit word for each station and reason; each process has its own file.
 
     Raises:
@@ -104,17 +103,6 @@ class DiscardCounters:
         """Let go of the file."""
         self._words.release()
         self._map.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class Tally:

@@ -13,11 +13,11 @@ import shutil
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
 
+from eap.closing import Closing
 from eap.errors import EnvironmentalError
 
 VARIABLE = "EAP_RUNTIME_DIR"
@@ -72,7 +72,7 @@ def folder_name(plant: str, subset: Sequence[str] = ()) -> str:
     return f"{safe[:_MAX_NAME].lstrip('.')}-{digest}"
 
 
-class ApplianceFolder:
+class ApplianceFolder(Closing):
     """The paths of one appliance's folder; whoever claims it holds its lock until ``close``."""
 
     def __init__(self, path: Path, lock_fd: int = -1) -> None:
@@ -157,17 +157,6 @@ class ApplianceFolder:
         shutil.rmtree(self.path, ignore_errors=True)
         os.close(self._lock_fd)
         self._lock_fd = -1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _empty(self) -> None:
         for entry in self.path.iterdir():

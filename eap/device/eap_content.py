@@ -36,6 +36,18 @@ class Identity(NamedTuple):
     revision: int = 0
     serial: int = 0
 
+    def entries(self) -> dict[tuple[int, int], str | int]:
+        """Return what devices of any profile show: values by index and subindex."""
+        return {
+            (0x1008, 0): self.device_name,
+            (0x1009, 0): self.hardware_version,
+            (0x100A, 0): self.software_version,
+            (0x1018, 1): self.vendor,
+            (0x1018, 2): self.product,
+            (0x1018, 3): self.revision,
+            (0x1018, 4): self.serial,
+        }
+
 
 class EapContent(EapObjects):
     """What one EAP port of a station is and does, as objects.
@@ -65,13 +77,7 @@ class EapContent(EapObjects):
         who, uri = self.identity, self.uri
         fixed = {
             (0x1000, 0): who.module_profile << 16 | (self.port.profile or profile.PROFILE),
-            (0x1008, 0): who.device_name,
-            (0x1009, 0): who.hardware_version,
-            (0x100A, 0): who.software_version,
-            (0x1018, 1): who.vendor,
-            (0x1018, 2): who.product,
-            (0x1018, 3): who.revision,
-            (0x1018, 4): who.serial,
+            **who.entries(),
             (PORT, Port.NAME): self.port.name,
             (PORT, Port.TRANSPORT): TRANSPORTS.index(uri.scheme),
             (PORT, Port.INTERFACE): self.port.interface,

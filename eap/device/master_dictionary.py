@@ -75,15 +75,7 @@ class MasterDictionary(ObjectDictionary):
         self._padded = padded
         for row in profile.FIXED:
             self.add(make_object(row, row.first, self._read, write=self._write))
-        for index, subindex, value in (
-            (0x1008, 0, identity.device_name),
-            (0x1009, 0, identity.hardware_version),
-            (0x100A, 0, identity.software_version),
-            (0x1018, 1, identity.vendor),
-            (0x1018, 2, identity.product),
-            (0x1018, 3, identity.revision),
-            (0x1018, 4, identity.serial),
-        ):
+        for (index, subindex), value in identity.entries().items():
             self[index].entries[subindex].value = value
 
     def __contains__(self, index: int) -> bool:

@@ -110,13 +110,7 @@ class RouterDictionary(ObjectDictionary):
 
     def _set_fixed(self, station: StationSpec, identity: Identity) -> None:
         fixed: dict[tuple[int, int], Any] = {
-            (0x1008, 0): identity.device_name,
-            (0x1009, 0): identity.hardware_version,
-            (0x100A, 0): identity.software_version,
-            (0x1018, 1): identity.vendor,
-            (0x1018, 2): identity.product,
-            (0x1018, 3): identity.revision,
-            (0x1018, 4): identity.serial,
+            **identity.entries(),
             (0xF920, 1): NetId.parse(station.net_id),
         }
         for number, port in enumerate(station.ports):

@@ -16,8 +16,7 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 from time import monotonic
-from types import TracebackType
-from typing import Self, TypeVar
+from typing import TypeVar
 
 from devicebus.errors import BusError
 from devicebus.mailbox import (
@@ -31,6 +30,7 @@ from devicebus.mailbox import (
 from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_browse import IdnDescription
+from eap.closing import Closing
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.sdo import EXPEDITED_SIZE
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
@@ -49,7 +49,7 @@ _LARGEST = 4096
 _DEFAULT_SIZES = MailboxSizes(128, 128)
 
 
-class GatewayClient:
+class GatewayClient(Closing):
     """A blocking client.
 
     Args:
@@ -99,17 +99,6 @@ class GatewayClient:
         except TypeError:  # as sockets put it
             self._socket.close()
             raise EnvironmentalError(f"{self._place}: it is no name of a host") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Let go of the socket."""

@@ -17,9 +17,8 @@ import struct
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from eap.closing import Closing
 from eap.errors import EnvironmentalError, ImageError, WriterConflictError
 from eap.pd.image import Image, format_image, read_generation, read_header
 from eap.pd.layout import WORDS_OFFSET, ImageLayout
@@ -41,7 +40,7 @@ _PID_WORD = {
 }
 
 
-class ImageFile:
+class ImageFile(Closing):
     """A mapped process image; use it as a context manager or :meth:`close` it.
 
     Attributes:
@@ -61,17 +60,6 @@ class ImageFile:
             self.generation = read_generation(self._view)
         self.image = Image(self._view, layout, pause=_pause)
         self._futex = ctypes.c_uint32.from_buffer(self._map, WORDS_OFFSET + 8 * StationWord.FUTEX)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the descriptor, which also gives up the right to write.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from eap.appliance.bus_failure import to_error
 from eap.appliance.bus_request import Failure
 from eap.appliance.control import MAX_LINE, ErrorCode, Reply, decode_reply, encode_request
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_running, runtime_root
+from eap.closing import Closing
 from eap.errors import ControlError
 from eap.near import near
 
@@ -19,7 +19,7 @@ TIMEOUT_S = 10.0
 """Patience for one answer: services may be on their way back from a restart."""
 
 
-class Client:
+class Client(Closing):
     """One connection to one running appliance."""
 
     def __init__(self, connection: socket.socket, info: ApplianceInfo) -> None:
@@ -79,17 +79,6 @@ class Client:
             self._socket.shutdown(socket.SHUT_RDWR)
         self._reader.close()
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _next_reply(self) -> Reply:
         try:

@@ -5,18 +5,15 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 
-from msgspec.structs import replace
-
 from eap.aoe.ads_operation import Read, Write
 from eap.appliance.commands.ams_device import AmsDevice, AmsRefusedError
-from eap.appliance.commands.bus_sdo import kind_of
+from eap.appliance.commands.od_described import entry_info, object_info, read_all, with_entries
 from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.errors import CodecError, ControlError
 from eap.od.abort import entry_name
 from eap.od.info import ListType, ValueInfo
-from eap.od.model import Access, ObjectCode
 
 _ROOM = 0x20002
 """Octets of the longest description: a list of all indexes there can be."""
@@ -46,9 +43,7 @@ class AdsOd:
 
     def describe(self, index: int) -> ObjectInfo:
         """Return one object with its entries."""
-        found = self._object(index)
-        known = (self.entry(index, subindex) for subindex in range(found.max_subindex + 1))
-        return replace(found, entries=tuple(each for each in known if each is not None))
+        return with_entries(self, self._object(index))
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
         """Return what the device says of an entry; None if it says nothing."""
@@ -63,9 +58,7 @@ class AdsOd:
             raise
         except CodecError:
             return None
-        reads = "r" if found.access & Access.READ_ANY else ""
-        writes = "w" if found.access & Access.WRITE_ANY else ""
-        return EntryInfo(subindex, found.name, kind_of(found), reads + writes)
+        return entry_info(subindex, found)
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Return the octets of an entry or of an object."""
@@ -84,10 +77,8 @@ class AdsOd:
         self._device.demand(Write(IndexGroup.SDO, offset, octets), name)
 
     def contents(self) -> Iterator[Content]:
-        """Yield all entries of all objects, as they come in."""
-        for found in self.objects():
-            for entry in self.describe(found.index).entries:
-                yield self._content(found, entry)
+        """Return all entries of all objects, as they come in."""
+        return read_all(self, AmsRefusedError)
 
     def _object(self, index: int) -> ObjectInfo:
         name = f"0x{index:04X}"
@@ -96,17 +87,7 @@ class AdsOd:
             found = ObjectDescription.decode(body)
         except CodecError as exc:
             raise ControlError(f"{name}: its description cannot be read: {exc}") from None
-        known = found.code in ObjectCode._value2member_map_
-        code = ObjectCode(found.code).name if known else str(found.code)
-        return ObjectInfo(index, found.name, code, found.max_subindex)
-
-    def _content(self, found: ObjectInfo, entry: EntryInfo) -> Content:
-        if "r" not in entry.access:
-            return Content(found, entry, None)
-        try:
-            return Content(found, entry, self.read(found.index, entry.subindex))
-        except AmsRefusedError as exc:
-            return Content(found, entry, None, str(exc))
+        return object_info(index, found)
 
     def _read(self, group: int, offset: int, what: str) -> bytes:
         return self._device.demand(Read(group, offset, _ROOM), what)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from msgspec.structs import replace
-
 from devicebus.errors import MailboxProtocolError, MailboxRefusedError
 from devicebus.mailbox import coe_client, coeinfo_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.appliance.commands.bus_sdo import kind_of
 from eap.appliance.commands.bus_slave import SlaveBus
+from eap.appliance.commands.od_described import entry_info, object_info, read_all, with_entries
 from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
 from eap.od.abort import AbortCode, SdoAbortError, entry_name
-from eap.od.model import Access, ObjectCode
 
 _NOT_THERE = {AbortCode.NO_SUBINDEX, AbortCode.NO_OBJECT, AbortCode.NOT_STORED}
 
@@ -39,9 +36,7 @@ class SlaveOd:
 
     def describe(self, index: int) -> ObjectInfo:
         """Return one object with its entries."""
-        found = self._object(index)
-        known = (self.entry(index, subindex) for subindex in range(found.max_subindex + 1))
-        return replace(found, entries=tuple(each for each in known if each is not None))
+        return with_entries(self, self._object(index))
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
         """Return what the slave says of an entry; None if it says nothing."""
@@ -56,9 +51,7 @@ class SlaveOd:
             if exc.code in _NOT_THERE:
                 return None
             raise
-        reads = "r" if found.access & Access.READ_ANY else ""
-        writes = "w" if found.access & Access.WRITE_ANY else ""
-        return EntryInfo(subindex, found.name, kind_of(found), reads + writes)
+        return entry_info(subindex, found)
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Return the octets of an entry or of an object."""
@@ -77,10 +70,8 @@ class SlaveOd:
         self._bus.converse(self._slave, begin, entry_name(index, subindex))
 
     def contents(self) -> Iterator[Content]:
-        """Yield all entries of all objects, as they come in."""
-        for found in self.objects():
-            for entry in self.describe(found.index).entries:
-                yield self._content(found, entry)
+        """Return all entries of all objects, as they come in."""
+        return read_all(self, SdoAbortError, MailboxProtocolError)
 
     def _object(self, index: int) -> ObjectInfo:
         found = self._bus.converse(
@@ -88,14 +79,4 @@ class SlaveOd:
             lambda _: coeinfo_client.object_description(index),
             f"0x{index:04X}",
         )
-        known = found.code in ObjectCode._value2member_map_
-        code = ObjectCode(found.code).name if known else str(found.code)
-        return ObjectInfo(index, found.name, code, found.max_subindex)
-
-    def _content(self, found: ObjectInfo, entry: EntryInfo) -> Content:
-        if "r" not in entry.access:
-            return Content(found, entry, None)
-        try:
-            return Content(found, entry, self.read(found.index, entry.subindex))
-        except (SdoAbortError, MailboxProtocolError) as exc:
-            return Content(found, entry, None, str(exc))
+        return object_info(index, found)

@@ -11,13 +11,12 @@ import socket
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import msgspec
 
 from eap.appliance.handover import NO_DESCRIPTOR, PortName, SharedSocket, SocketKind
 from eap.appliance.supervisor.bus_sockets import open_buses, open_message_pair
+from eap.closing import Closing
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
@@ -98,7 +97,7 @@ def _ams_address(port: PortSpec) -> str:
     return uri.host if port.ams and uri.scheme in {"udp", "tcp"} else ""
 
 
-class SharedSockets:
+class SharedSockets(Closing):
     """All open descriptors of an appliance; whoever opened them closes them at its very end.
 
     Attributes:
@@ -138,17 +137,6 @@ class SharedSockets:
     def close(self) -> None:
         """Close all."""
         self._opened.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def _existing(*descriptors: int) -> list[int]:

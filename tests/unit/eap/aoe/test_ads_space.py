@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from eap.aoe.ads_operation import AdsRefusedError
-from eap.aoe.ads_space import AdsSpace
+from eap.aoe.ads_space import AdsSpace, steady
 
 
 @pytest.mark.parametrize(
@@ -20,3 +20,14 @@ from eap.aoe.ads_space import AdsSpace
 def test_what_is_not_overridden_is_refused(attempt: Callable[[AdsSpace], object]) -> None:
     with pytest.raises(AdsRefusedError, match="ACCESS"):
         attempt(AdsSpace())
+
+
+def test_what_gets_longer_or_shorter_ends() -> None:
+    octets = [b"four", b"more", b"five!", b"two", b"two"]
+    source = steady(lambda: octets.pop(0), 4)
+    assert source() == b"more"
+    for _ in range(2):
+        with pytest.raises(AdsRefusedError, match="SIZE"):
+            source()
+    with pytest.raises(AdsRefusedError, match="SIZE"):
+        steady(lambda: octets.pop(0), 4)

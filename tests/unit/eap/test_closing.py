@@ -1,0 +1,22 @@
+from __future__ import annotations
+
+import pytest
+
+from eap.closing import Closing
+
+
+class Door(Closing):
+    def __init__(self) -> None:
+        self.is_open = True
+
+    def close(self) -> None:
+        self.is_open = False
+
+
+def test_it_is_closed_at_the_end_whatever_happens() -> None:
+    with Door() as door:
+        assert door.is_open
+    assert not door.is_open
+    with pytest.raises(ValueError, match="oh"), Door() as door:
+        raise ValueError("oh")
+    assert not door.is_open
