@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from devicebus.mailbox.protocol import MailboxSizes, refuse
+from devicebus.mailbox.protocol import MailboxSizes, refuse, refuse_unreadable
 from devicebus.mailbox.sdo_server import SdoServer
 from devicebus.mailbox.sdoinfo_server import SdoInfoServer
 from eap.codec.coe import CoeHeader, CoeService, Emergency, encode_message
 from eap.codec.mailbox import MailboxError
-from eap.errors import MalformedError, TruncatedError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 
@@ -60,12 +59,8 @@ class CoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answers."""
         del now_ns
-        try:
+        with refuse_unreadable():
             header = CoeHeader.decode(data)
-        except TruncatedError as exc:
-            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
-        except MalformedError as exc:
-            refuse(MailboxError.SERVICE_NOT_SUPPORTED, str(exc))
         body = data[CoeHeader.SIZE :]
         if header.service is CoeService.SDO_REQUEST:
             return self._sdo.receive_request(body)

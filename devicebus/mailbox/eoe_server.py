@@ -8,7 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from devicebus.mailbox.eoe_fragment import Assembler, iter_fragments
-from devicebus.mailbox.protocol import MailboxSizes, refuse
+from devicebus.mailbox.protocol import MailboxSizes, refuse, refuse_unreadable
 from eap.codec.eoe import (
     DATA_OVERHEAD,
     EoeHeader,
@@ -19,7 +19,7 @@ from eap.codec.eoe import (
     encode_message,
 )
 from eap.codec.mailbox import MailboxError
-from eap.errors import CodecError, MalformedError, TruncatedError
+from eap.errors import CodecError
 
 MAX_PENDING = 64
 """Fragments that wait for the master; a frame that would exceed them is dropped and counted."""
@@ -67,15 +67,11 @@ class EoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer, if it has one."""
         del now_ns
-        try:
+        with refuse_unreadable():
             header, _, body = decode_message(data)
             if header.type is EoeType.FRAGMENT:
                 self._take_fragment(data)
                 return []
-        except TruncatedError as exc:
-            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
-        except MalformedError as exc:
-            refuse(MailboxError.SERVICE_NOT_SUPPORTED, str(exc))
         if header.type not in _RESPONSE:
             refuse(MailboxError.SERVICE_NOT_SUPPORTED, f"type {header.type.name}")
         return [self._answer(header, bytes(body))]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn, Protocol
 
 from devicebus.errors import MailboxRefusedError
 from eap.codec.mailbox import MailboxError, MailboxHeader
+from eap.errors import MalformedError, TruncatedError
 
 MINIMUM_SIZE = 16
 """Octets of the smallest mailbox that holds the header of every protocol but AoE."""
@@ -56,3 +59,14 @@ class ProtocolServer(Protocol):
 def refuse(detail: MailboxError, reason: str) -> NoReturn:
     """Raise the MailboxRefusedError that answers a request with a mailbox error."""
     raise MailboxRefusedError(f"{detail.name}: {reason}", detail=detail)
+
+
+@contextmanager
+def refuse_unreadable() -> Iterator[None]:
+    """Answer what cannot be decoded in a block with a mailbox error."""
+    try:
+        yield
+    except TruncatedError as exc:
+        refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
+    except MalformedError as exc:
+        refuse(MailboxError.SERVICE_NOT_SUPPORTED, str(exc))

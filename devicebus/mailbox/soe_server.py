@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 
 from devicebus.errors import SoeError
-from devicebus.mailbox.protocol import MailboxSizes, refuse
+from devicebus.mailbox.protocol import MailboxSizes, refuse, refuse_unreadable
 from devicebus.mailbox.soe_parameter import MAX_LENGTH, SoeParameter
 from eap.codec.coe import Emergency
 from eap.codec.mailbox import MailboxError
@@ -25,7 +25,6 @@ from eap.codec.soe import (
     encode_message,
 )
 from eap.codec.soeerror import SoeErrorCode, name_of
-from eap.errors import MalformedError, TruncatedError
 from eap.od.model import OdState
 
 MAX_PENDING = 16
@@ -94,12 +93,8 @@ class SoeServer:
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer in its fragments."""
-        try:
+        with refuse_unreadable():
             header = SoeHeader.decode(data)
-        except TruncatedError as exc:
-            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
-        except MalformedError as exc:
-            refuse(MailboxError.SERVICE_NOT_SUPPORTED, str(exc))
         if header.opcode not in _RESPONSE:
             refuse(MailboxError.SERVICE_NOT_SUPPORTED, f"opcode {header.opcode.name}")
         body = data[SoeHeader.SIZE :]

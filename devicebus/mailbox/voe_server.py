@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from devicebus.mailbox.protocol import refuse
-from eap.codec.mailbox import MailboxError
+from devicebus.mailbox.protocol import refuse_unreadable
 from eap.codec.voe import VoeHeader
-from eap.errors import TruncatedError
 
 
 class VoeServer:
@@ -24,10 +22,8 @@ class VoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer, if it has one."""
         del now_ns
-        try:
+        with refuse_unreadable():
             header = VoeHeader.decode(data)
-        except TruncatedError as exc:
-            refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
         if self._handler is None:
             return [data]
         answer = self._handler(header.vendor_id, header.vendor_type, data[VoeHeader.SIZE :])
