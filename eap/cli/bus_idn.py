@@ -54,7 +54,7 @@ def idn() -> None:
 @_drive_option
 @json_option("Print one object.")
 def read(slave: str, number: Idn, drive: int, bus: Place, as_json: bool) -> None:
-    """Read an IDN with its name, unit and limits."""
+    """Read an IDN with all elements that it has."""
     from eap.appliance.commands.bus_idn import read_idn
 
     with open_session(bus) as session:

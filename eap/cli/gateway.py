@@ -37,7 +37,7 @@ def start(target: str, plant: str | None, as_json: bool) -> None:
     _tell(_ask("gateway_start", target, plant), as_json=as_json)
 
 
-@gateway.command()
+@gateway.command(short_help="Let a gateway answer nothing more; the bus runs on.")
 @_TARGET
 @plant_option
 @_JSON
@@ -46,7 +46,7 @@ def stop(target: str, plant: str | None, as_json: bool) -> None:
     _tell(_ask("gateway_stop", target, plant), as_json=as_json)
 
 
-@gateway.command()
+@gateway.command(short_help="Show sockets, clients, and what was asked of whom.")
 @_TARGET
 @plant_option
 @_JSON

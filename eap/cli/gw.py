@@ -13,6 +13,8 @@ from eap.cli.params import examples
 
 _PORT = 34980
 _TCP, _MAILBOX = "--tcp", "--mailbox"
+_FIRST_OF_COMMAND = 2
+"""Words until the options of a command may come: HOST and its name."""
 
 
 def _parse_place(ctx: click.Context, param: click.Parameter, text: str) -> GatewayPlace:
@@ -37,7 +39,8 @@ class GatewayGroup(LazyGroup):
             if word == "--":
                 others.append(word)
                 break
-            is_own = word.partition("=")[0] in {_TCP, _MAILBOX}
+            is_help = word in ctx.help_option_names and len(others) < _FIRST_OF_COMMAND
+            is_own = is_help or word.partition("=")[0] in {_TCP, _MAILBOX}
             (first if is_own else others).append(word)
             if word == _MAILBOX:
                 first += [each for each in (next(rest, None),) if each is not None]
@@ -63,6 +66,7 @@ def _behind_gateway(command: click.Command) -> click.Command:
         callback=partial(_call, command),
         params=params,
         help=command.help,
+        short_help=command.short_help,
     )
 
 

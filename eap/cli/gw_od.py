@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.tree import Tree
 
 
-@click.command(cls=BusCommand)
+@click.command(cls=BusCommand, short_help="Show all objects of the master or a slave as a tree.")
 @bus_options
 @click.argument("slave", default="0", metavar="[SLAVE]")
 @json_option("Print one object a line.")

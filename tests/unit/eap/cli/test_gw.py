@@ -82,6 +82,12 @@ def test_help_names_the_gateway_and_no_bus(gateway) -> None:
     assert "--plant" not in text
 
 
+def test_help_behind_the_host_is_that_of_all_commands(gateway) -> None:
+    text = run(gateway, "--help").output
+    assert "HOST[:PORT] COMMAND [ARGS]..." in text
+    assert "Show all objects of the master or a slave as a tree." in text
+
+
 @pytest.mark.parametrize("place", ["a:b", ":5", "a:0", "a:70000"])
 def test_places_that_are_none(place) -> None:
     found = CliRunner().invoke(main, ["gw", place, "scan"])
