@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from eap.aoe.ads_operation import Operation, Read, ReadWrite, Write
+from eap.aoe.ads_operation import AdsRefusedError, Operation, Read, ReadWrite, Write
+from eap.aoe.ads_request import parse_request
 from eap.codec.ads import IndexGroup
+from eap.codec.ams import StateFlags, decode_packet
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.eoe import EoeType
 from eap.codec.foe import FoeOpcode
@@ -17,6 +19,7 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SdoHeader, SdoRequest
 from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.codec.soe import SoeHeader, SoeOpcode
+from eap.errors import CodecError
 
 _COMPLETE = 0x100
 _RAW = ReadWrite(IndexGroup.VOE, 0, 0, b"")
@@ -29,10 +32,7 @@ _EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
 
 
 def operation_of(kind: MailboxType, body: bytes) -> Operation | None:
-    """Return what a request does; None for a step of a transfer that was judged at its start.
-
-    AoE is for the router, which judges it itself.
-    """
+    """Return what a request does; None for a step of a transfer that was judged at its start."""
     find = _BY_KIND.get(kind)
     return find(body) if find is not None else _RAW
 
@@ -114,9 +114,21 @@ def _of_eoe(body: bytes) -> Operation:
     return Read(IndexGroup.OBJECT_LIST, 0, 0) if is_read else _RAW
 
 
+def _of_aoe(body: bytes) -> Operation:
+    """Return the only operation of a packet in one piece; others cannot be looked into."""
+    try:
+        header, data = decode_packet(body)
+        operations = parse_request(header.command, bytes(data)).operations
+    except (CodecError, AdsRefusedError):
+        return _RAW
+    is_answer = header.state_flags & StateFlags.RESPONSE
+    return operations[0] if len(operations) == 1 and not is_answer else _RAW
+
+
 _BY_KIND: dict[MailboxType, Callable[[bytes], Operation | None]] = {
     MailboxType.COE: _of_coe,
     MailboxType.SOE: _of_soe,
     MailboxType.FOE: _of_foe,
     MailboxType.EOE: _of_eoe,
+    MailboxType.AOE: _of_aoe,
 }

@@ -9,8 +9,11 @@ from eap.aoe.spec import AccessService, ObjectRange
 from eap.codec.mailbox import MailboxType
 from eap.gateway.rights import operation_of
 
-COE, FOE, SOE, VOE, EOE = (MailboxType[name] for name in ("COE", "FOE", "SOE", "VOE", "EOE"))
-READ, WRITE, FILES, RAW = (AccessService[name] for name in ("READ", "WRITE", "FILES", "RAW"))
+COE, FOE, SOE = (MailboxType[name] for name in ("COE", "FOE", "SOE"))
+VOE, EOE, AOE = (MailboxType[name] for name in ("VOE", "EOE", "AOE"))
+READ, WRITE, FILES = (AccessService[name] for name in ("READ", "WRITE", "FILES"))
+RAW, CONTROL = (AccessService[name] for name in ("RAW", "CONTROL"))
+AMS, REST = "c0a800010201 e903 c0a800320101 0080", "00000000 01000000"
 
 
 @pytest.mark.parametrize(
@@ -35,6 +38,14 @@ READ, WRITE, FILES, RAW = (AccessService[name] for name in ("READ", "WRITE", "FI
         (FOE, "01 00 00000000 66", READ),
         (FOE, "02 00 00000000 66", FILES),
         (VOE, "", RAW),
+        (AOE, AMS + "0200 0400 0c000000" + REST + "02f30000 01001810 04000000", READ),
+        (AOE, AMS + "0300 0400 0e000000" + REST + "02f30000 01001810 02000000 0102", WRITE),
+        (AOE, AMS + "0400 0400 00000000" + REST, READ),
+        (AOE, AMS + "0500 0400 08000000" + REST + "0500 0000 00000000", CONTROL),
+        (AOE, AMS + "0200 0500 0c000000" + REST + "02f30000 01001810 04000000", RAW),
+        (AOE, AMS + "0209 0400 00000000" + REST, RAW),
+        (AOE, AMS + "0200 0400 00000000" + REST, RAW),
+        (AOE, AMS, RAW),
         (EOE, "0600", READ),
         (EOE, "0200", RAW),
         (EOE, "0000", RAW),
