@@ -69,6 +69,13 @@ def test_unit_test_without_its_module(tmp_path):
     ]
 
 
+def test_long_unit_test_is_parted_by_subject(tmp_path):
+    grow(tmp_path, "eap/router.py", "tests/unit/eap/test_router.py")
+    grow(tmp_path, "tests/unit/eap/test_router_in_any_order.py", "tests/unit/eap/test_routers.py")
+    (violation,) = found(tmp_path)
+    assert violation.startswith("tests/unit/eap/test_routers.py:1: a unit test file of no module")
+
+
 def test_helper_in_the_mirror(tmp_path):
     grow(tmp_path, "tests/unit/eap/helper.py")
     assert found(tmp_path) == [

@@ -10,8 +10,7 @@ import pytest
 
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Read
-from eap.aoe.judged import AuditEntry
-from eap.aoe.spec import AccessRule, AccessService, AccessTarget, ObjectRange
+from eap.aoe.spec import AccessRule, AccessTarget
 from eap.aoe.way import Way
 from eap.appliance.bus_request import Heard
 from eap.appliance.services.bus.bus_client import BusClient
@@ -27,11 +26,9 @@ from eap.codec.mailbox import (
     MailboxType,
     decode_frame,
     encode_frame,
-    encode_plain_frame,
 )
 from eap.gateway.address import AddressMap, RemoteSlave, Slave
 from eap.gateway.elsewhere import ROOM
-from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, array, variable
@@ -233,43 +230,6 @@ def test_an_engine_that_is_gone_is_answered_for_too() -> None:
     play(scene)
 
 
-def test_what_is_asked_twice_at_once_is_answered_twice_on_a_connection() -> None:
-    request = encode_frame(
-        MailboxHeader(0, 1001, type=COE, counter=3), bytes.fromhex("0020 40 1810 01 00000000")
-    )
-
-    async def answers(desk: Desk, way: Way) -> int:
-        return sum(map(len, await asyncio.gather(*(desk.ask_frame(request, way) for _ in "123"))))
-
-    async def scene(desk: Desk) -> None:
-        assert await answers(desk, HERE) == 1
-        assert await answers(desk, Way("tcp:eap0", "127.0.0.1:1")) == 3
-
-    play(scene)
-
-
-def test_a_repeated_step_of_a_transfer_is_answered_and_counted() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
-        packet = "03 00 01000000" + "61" * 1012
-        first = await desk.one(FOE, 1001, packet)
-        assert await desk.one(FOE, 1001, packet) == first
-        counts = desk.gateway.ledger.counts_of(HERE)
-        assert (counts.requests, counts.repeated) == (3, 1)
-        await desk.one(FOE, 1001, "03 00 02000000")
-
-    play(scene)
-
-
-def test_who_is_too_fast_is_told_so() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(COE, 1001, VENDOR)
-        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
-        assert desk.gateway.tally.report()[0]["errors"] == {"too_fast": 1}
-
-    play(scene, settings=Settings(NET_ID, limits=ClientLimits(rate=1)))
-
-
 def test_the_masters_dictionary() -> None:
     async def scene(desk: Desk) -> None:
         assert await desk.one(COE, 0, "0020 40 0010 00 00000000") == "00 30 43 00 10 00 00 51 00 00"
@@ -283,82 +243,6 @@ def test_the_masters_dictionary() -> None:
     play(scene)
 
 
-def test_two_clients_transfers_do_not_mix() -> None:
-    first, second = b"a" * 3000, b"b" * 2500
-
-    async def write(desk: Desk, name: bytes, data: bytes, way: Way) -> None:
-        body = bytes.fromhex("02 00 00000000") + name
-        while (await desk.one(FOE, 1001, body, way))[:2] == "06":
-            pass
-        room = 1024 - 12
-        for number, at in enumerate(range(0, len(data) + 1, room), 1):
-            packet = bytes((3, 0)) + number.to_bytes(4, "little") + data[at : at + room]
-            answer = await desk.one(FOE, 1001, packet, way)
-            assert answer == (bytes((4, 0)) + number.to_bytes(4, "little")).hex(" ")
-
-    async def read(desk: Desk, name: bytes) -> bytes:
-        content = b""
-        body = bytes.fromhex("01 00 00000000") + name
-        while True:
-            ((_, packet),) = await desk.ask(FOE, 1001, body)
-            content += packet[6:]
-            body = bytes((4, 0)) + packet[2:6]
-            if len(packet) < 1024 - 6:
-                await desk.ask(FOE, 1001, body)
-                return content
-
-    async def scene(desk: Desk) -> None:
-        await asyncio.gather(
-            write(desk, b"firmware.bin", first, HERE),
-            write(desk, b"parameters.bin", second, ALSO_HERE),
-        )
-        assert await read(desk, b"firmware.bin") == first
-        assert await read(desk, b"parameters.bin") == second
-
-    play(scene, settings=Settings(NET_ID, answer_s=0.2))
-
-
-def test_who_has_to_wait_too_long_is_told_that_the_slave_is_busy() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
-        answer = await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
-        assert answer.startswith("06 00 00 00 64 00")
-        await desk.ask(FOE, 1001, "05 00 00800000")
-        assert not (await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)).startswith("06")
-
-    play(scene, settings=Settings(NET_ID, answer_s=0.05))
-
-
-def test_a_step_that_comes_twice_gets_the_same_answer_and_goes_no_further() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
-        packet = bytes.fromhex("03 00 01000000") + bytes(1024 - 12)
-        answers = [await desk.one(FOE, 1001, packet) for _ in range(2)]
-        assert answers == ["04 00 01 00 00 00"] * 2
-        assert (await desk.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
-        assert (await desk.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
-
-    play(scene)
-
-
-def test_a_step_of_no_transfer_does_not_reach_the_slave() -> None:
-    async def scene(desk: Desk) -> None:
-        assert (await desk.one(FOE, 1001, "03 00 01000000 01"))[:2] == "05"
-        answer = await desk.one(COE, 1001, "0020 60 00000000000000")
-        assert answer.startswith("00 20 80")
-
-    play(scene)
-
-
-def test_a_client_that_leaves_leaves_no_transfer_behind() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
-        desk.gateway.connection_closed(HERE)
-        assert not (await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)).startswith("06")
-
-    play(scene, settings=Settings(NET_ID, answer_s=0.05))
-
-
 def test_all_slaves_answer_for_themselves() -> None:
     async def scene(desk: Desk) -> None:
         answers = {
@@ -368,75 +252,6 @@ def test_all_slaves_answer_for_themselves() -> None:
         assert all(each.startswith("003043181001") for each in answers.values())
 
     play(scene, bus="coe")
-
-
-WRITE = "0020 2b 4060 00 06000000"
-
-
-def test_writing_to_all_takes_a_rule() -> None:
-    async def scene(desk: Desk) -> None:
-        for header, body in await desk.ask(COE, 0xFFFF, WRITE):
-            assert header.address == 1001
-            assert body.hex().startswith("002080406000000001")
-
-    async def allowed(desk: Desk) -> None:
-        ((_, body),) = await desk.ask(COE, 0xFFFF, WRITE)
-        assert body.hex().startswith("0030604060")
-
-    play(scene)
-    play(allowed, AccessRule("group", services=(AccessService.WRITE,)))
-
-
-def test_other_hosts_only_read() -> None:
-    async def scene(desk: Desk) -> None:
-        assert (await desk.one(COE, 1001, VENDOR, ELSEWHERE)).startswith("00 30 43")
-        write = "0020 2b 4060 00 06000000"
-        assert (await desk.one(COE, 1001, write, ELSEWHERE)).startswith(
-            "00 20 80 40 60 00 00 00 01 06"
-        )
-        assert (await desk.one(FOE, 1001, "02 00 00000000" + FILE, ELSEWHERE)).startswith(
-            "05 00 0a 80"
-        )
-        assert (await desk.one(SOE, 1001, "03 40 2000 01020304", ELSEWHERE)).startswith("14")
-        assert (await desk.one(COE, 1001, WRITE)).startswith("00 30 60")
-
-    play(scene)
-
-
-def test_a_rule_opens_one_object() -> None:
-    rule = AccessRule(
-        "control word",
-        networks=("10.0.0.0/24",),
-        services=(AccessService.WRITE,),
-        objects=(ObjectRange(0x6040, 0x6040),),
-    )
-
-    async def scene(desk: Desk) -> None:
-        assert (await desk.one(COE, 1001, "0020 2b 4060 00 06000000", ELSEWHERE)).startswith(
-            "00 30 60"
-        )
-        other = "0020 23 0080 01 06000000"
-        assert (await desk.one(COE, 1001, other, ELSEWHERE)).startswith("00 20 80")
-
-    play(scene, rule)
-
-
-def test_changes_and_refusals_are_audited() -> None:
-    async def scene(desk: Desk) -> None:
-        entries: list[AuditEntry] = []
-        desk.gateway.guard.on_audit.append(entries.append)
-        await desk.one(COE, 1001, VENDOR, ELSEWHERE)
-        assert not entries
-        await desk.one(COE, 1001, WRITE, ELSEWHERE)
-        await desk.one(COE, 1001, WRITE)
-        await desk.ask(COE, 0xFFFF, WRITE)
-        told = [(each.way, each.header.target_port, each.operations[0].result) for each in entries]
-        assert told == [(ELSEWHERE, 1001, 0x723), (HERE, 1001, 0), (HERE, 1001, 0x723)]
-        assert entries[2].operations[0].verdict.why == (
-            "only a rule allows it for several slaves at once"
-        )
-
-    play(scene)
 
 
 def test_virtual_addresses_stand_for_slaves_here_and_elsewhere() -> None:
@@ -457,37 +272,6 @@ def test_virtual_addresses_stand_for_slaves_here_and_elsewhere() -> None:
     play(refused, rule)
 
 
-def test_the_audit_tells_how_a_change_came_out() -> None:
-    async def scene(desk: Desk) -> None:
-        entries: list[AuditEntry] = []
-        desk.gateway.guard.on_audit.append(entries.append)
-        await desk.one(COE, 1001, "0020 2b 5555 00 06000000")
-        await desk.ask(COE, 1009, WRITE)
-        await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 4060 00 0600"))
-        await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 5555 00 0600"))
-        operations = [each.operations[0] for each in entries]
-        assert [each.result for each in operations] == [0x70C, 6, 0, 0x700]
-        assert [each.operation.data for each in operations[:2]] == [b"\6\0", b"\6\0"]
-
-    play(scene)
-
-
-def test_who_is_stopped_lets_go_of_everything() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "01 00 00000000" + FILE)
-        (running,) = desk.gateway.transfers()
-        assert (running.way, running.address, running.kind) == (HERE, 1001, FOE)
-        await desk.gateway.stop()
-        assert not desk.gateway.is_open
-        assert not desk.gateway.transfers()
-        assert not desk.gateway.ledger.table()
-        desk.gateway.start()
-        assert desk.gateway.is_open
-        assert (await desk.one(FOE, 1001, "01 00 00000000" + FILE)).startswith("03")
-
-    play(scene)
-
-
 def test_errors_are_counted_for_their_client() -> None:
     async def scene(desk: Desk) -> None:
         await desk.ask(COE, 1009, VENDOR)
@@ -496,32 +280,6 @@ def test_errors_are_counted_for_their_client() -> None:
         assert (counts.requests, counts.errors) == (2, 1)
 
     play(scene)
-
-
-def test_the_same_request_is_answered_once_until_then() -> None:
-    async def scene(desk: Desk) -> None:
-        frame = encode_frame(MailboxHeader(0, 1001, type=COE, counter=1), bytes.fromhex(VENDOR))
-        answers: list[bytes] = []
-        for _ in range(3):
-            desk.gateway.receive(frame, HERE, answers.append)
-        await desk.gateway.wait_below(HERE, 1)
-        assert len(answers) == 1
-        assert len(await desk.ask_frame(frame)) == 1
-
-    play(scene)
-
-
-def test_who_asks_too_much_at_once_is_told() -> None:
-    async def scene(desk: Desk) -> None:
-        answers: list[bytes] = []
-        for index in range(4):
-            body = b"\0\x20\x40" + bytes((index, 0x60)) + bytes(5)
-            desk.gateway.receive(encode_plain_frame(COE, 1001, 0, body), HERE, answers.append)
-        assert [decoded(each)[1][-4:].hex() for each in answers] == ["05000405"] * 2
-        await desk.gateway.wait_below(HERE, 1)
-        assert len(answers) == 4
-
-    play(scene, settings=Settings(NET_ID, limits=ClientLimits(in_flight=2)))
 
 
 def test_a_mailbox_error_is_no_request() -> None:
@@ -585,24 +343,5 @@ def test_the_dialect_of_who_may_only_read() -> None:
     async def scene(desk: Desk) -> None:
         (frame,) = await desk.ask_frame(write.frame, ELSEWHERE)
         assert frame[8:] == bytes.fromhex("0020 80 4060 00 02000106")
-
-    play(scene)
-
-
-@pytest.mark.parametrize("address", [0, 1001])
-def test_the_same_octets_right_behind_the_answer_are_a_new_request(address: int) -> None:
-    async def scene(desk: Desk) -> None:
-        answers: list[bytes] = []
-        frame = encode_plain_frame(COE, address, 3, bytes.fromhex(VENDOR))
-
-        def ask_again(octets: bytes) -> None:
-            answers.append(octets)
-            if len(answers) < 6:
-                desk.gateway.receive(frame, HERE, ask_again)
-
-        desk.gateway.receive(frame, HERE, ask_again)
-        await desk.gateway.wait_below(HERE, 1)
-        assert len(answers) == 6
-        assert desk.gateway.ledger.waiting(HERE) == 0
 
     play(scene)
