@@ -27,7 +27,6 @@ from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import RemoteLink
-from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.codec.mailbox import (
     MailboxHeader,
     MailboxType,
@@ -185,7 +184,7 @@ async def _serve(data: bytes) -> None:
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,
         AddressMap({_VIRTUAL: RemoteSlave(_SETTINGS.net_id, 1001)}),
-        lambda slave, kind: RemoteSession(kind, link, room=_SETTINGS.room),
+        lambda slave: link,
     )
     door = GatewayDoor([(gateway, "udp:eap0")])
     answered: list[bytes] = []

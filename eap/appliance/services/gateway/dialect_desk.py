@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import TypeAlias
 
 from devicebus.errors import BusError
 from eap.aoe.ads_operation import Operation, ReadWrite
 from eap.aoe.way import Way
+from eap.appliance.services.gateway.dialect_elsewhere import perform_elsewhere
 from eap.appliance.services.gateway.dialect_task import FAILURES, DialectError, perform
-from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Target
+from eap.appliance.services.gateway.guard import Guard, Target
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.remote_link import LinkTo
 from eap.appliance.services.gateway.slave_book import SlaveBook
 from eap.appliance.services.gateway.slave_link import SlaveLink
 from eap.appliance.services.gateway.slave_session import find_refusal, reason_of
@@ -19,7 +22,7 @@ from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SdoHeader
 from eap.errors import EngineGoneError, MalformedError
-from eap.gateway.address import MASTER_ADDRESS, VIRTUAL_BIT
+from eap.gateway.address import Master, RemoteSlave, Slave
 from eap.gateway.dialect import (
     Failure,
     ReadFile,
@@ -34,7 +37,8 @@ from eap.gateway.dialect import (
 )
 from eap.gateway.refusal import Reason
 from eap.gateway.rights import idn, sdo
-from eap.ids import NetId
+
+Whom: TypeAlias = Master | Slave | RemoteSlave
 
 _LONGEST_HEAD = CoeHeader.SIZE + SdoHeader.SIZE
 """Octets in front of what was read, in any protocol."""
@@ -48,7 +52,7 @@ class DialectDesk:
         book: What is known of them.
         guard: Says whether a client may have something done.
         open_master: Begins a session with the master's dictionary.
-        net_id: Of the bus, for rules.
+        link_to: Returns the way to a slave of another station.
         room: Octets of the longest answer.
         answer_s: How long an answer may take.
     """
@@ -59,7 +63,7 @@ class DialectDesk:
         book: SlaveBook,
         guard: Guard,
         open_master: Callable[[], MasterSession],
-        net_id: NetId,
+        link_to: LinkTo,
         room: int,
         answer_s: float,
     ) -> None:
@@ -67,18 +71,26 @@ class DialectDesk:
         self._book = book
         self._guard = guard
         self._open_master = open_master
-        self._net_id = net_id
+        self._link_to = link_to
         self._room = room - _LONGEST_HEAD
         self._answer_s = answer_s
 
     async def answer(
-        self, kind: MailboxType, address: int, body: bytes, way: Way
+        self, kind: MailboxType, whom: Whom, target: Target, body: bytes, way: Way
     ) -> tuple[bytes, Reason | None]:
-        """Return what answers a request, and why it is an error if it is one."""
+        """Return what answers a request, and why it is an error if it is one.
+
+        Args:
+            kind: The protocol.
+            whom: Who is to do it.
+            target: By what rules name him.
+            body: What stands behind the mailbox header.
+            way: Connection, or address, of the client.
+        """
         code: int | None = None
         try:
             task = decode(kind, body)
-            return await self._judge(kind, task, address & ~VIRTUAL_BIT, body, way), None
+            return await self._judge(kind, task, whom, target, body, way), None
         except MalformedError as exc:
             failure, reason, text = Failure.COMMAND, Reason.SERVICE, str(exc)
         except DialectError as exc:
@@ -89,33 +101,31 @@ class DialectDesk:
         return encode_failure(kind, body, failure, code=code, text=text), reason
 
     async def _judge(
-        self, kind: MailboxType, task: Task, station: int, body: bytes, way: Way
+        self, kind: MailboxType, task: Task, whom: Whom, target: Target, body: bytes, way: Way
     ) -> bytes:
-        operation, target = operation_of(task), Target(self._net_id, station or MASTER_PORT)
+        operation = operation_of(task)
         verdict = self._guard.judge(way, target, operation)
         result: int | None = AdsError.GENERAL
         try:
             if not verdict.is_allowed:
                 raise _refusal(Reason.DENIED)
-            answer = await self._perform(kind, task, station, body, way)
+            data = await self._perform(kind, task, whom, way)
             result = 0
         finally:
             self._guard.tell(way, target, operation, verdict, result)
-        return answer
+        return encode_done(body, task, data)
 
-    async def _perform(
-        self, kind: MailboxType, task: Task, station: int, body: bytes, way: Way
-    ) -> bytes:
-        if station == MASTER_ADDRESS:
-            return encode_done(body, task, await self._open_master().perform(task))
-        slave = await self._book.find(station)
+    async def _perform(self, kind: MailboxType, task: Task, whom: Whom, way: Way) -> bytes:
+        if isinstance(whom, Master):
+            return await self._open_master().perform(task)
+        if isinstance(whom, RemoteSlave):
+            return await perform_elsewhere(task, self._link_to(whom), self._room)
+        slave = await self._book.find(whom.station)
         reason = slave if isinstance(slave, Reason) else find_refusal(kind, b"", slave)
         if isinstance(slave, Reason) or reason is not None:
             raise _refusal(reason or Reason.NO_SLAVE)
-        converse = partial(self._bus.converse, station, requester=way)
-        return encode_done(
-            body, task, await perform(task, slave, converse, self._room, self._answer_s)
-        )
+        converse = partial(self._bus.converse, whom.station, requester=way)
+        return await perform(task, slave, converse, self._room, self._answer_s)
 
 
 def _refusal(reason: Reason) -> DialectError:

@@ -111,11 +111,12 @@ async def perform(
     if not isinstance(data, bytes):
         return b""
     if len(data) > room:
-        raise _too_long(room)
+        raise too_long(room)
     return data
 
 
-def _too_long(room: int) -> DialectError:
+def too_long(room: int) -> DialectError:
+    """Return the error for what is longer than a packet of *room* octets."""
     text = f"more than {room} octets do not fit one packet of this dialect"
     return DialectError(Failure.GENERAL, text)
 
@@ -150,7 +151,7 @@ def _sink(content: bytearray, room: int) -> Callable[[bytes], None]:
     def take(data: bytes) -> None:
         content.extend(data)
         if len(content) > room:
-            raise _too_long(room)
+            raise too_long(room)
 
     return take
 

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic_ns
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation
@@ -23,6 +23,7 @@ from eap.appliance.services.gateway.dialect_desk import DialectDesk
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
 from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Judged, Target, result_of
 from eap.appliance.services.gateway.master_session import MasterSession
+from eap.appliance.services.gateway.remote_link import LinkTo
 from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.sessions import SessionKey, Sessions
 from eap.appliance.services.gateway.slave_book import SlaveBook
@@ -44,8 +45,6 @@ ANSWER_S = 0.9
 """How long an answer may take: before a usual client gives up."""
 
 _NOT_TAKEN = {Admission.CROWDED: Reason.CROWDED, Admission.TOO_FAST: Reason.TOO_FAST}
-
-OpenRemote: TypeAlias = Callable[[RemoteSlave, MailboxType], RemoteSession]
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +73,7 @@ class MailboxGateway:
         access: Returns the rules by which is judged who may do what.
         settings: How it behaves.
         addresses: Beside those of the standard.
-        open_remote: Begins a session with a slave of another station, in one protocol.
+        link_to: Returns the way to a slave of another station.
 
     Attributes:
         tally: What it did, by slave and protocol.
@@ -92,7 +91,7 @@ class MailboxGateway:
         access: Callable[[], AccessList],
         settings: Settings,
         addresses: AddressMap,
-        open_remote: OpenRemote,
+        link_to: LinkTo,
     ) -> None:
         self.ledger = Ledger(settings.limits)
         self._answering = Answering(self.ledger, settings.name, is_silent=settings.is_silent)
@@ -105,10 +104,10 @@ class MailboxGateway:
         self._master = Target(settings.net_id, MASTER_PORT)
         self._open_master = open_master
         self._addresses = addresses
-        self._open_remote = open_remote
+        self._link_to = link_to
         self._book = SlaveBook(bus.describe)
         self._dialect = DialectDesk(
-            bus, self._book, self.guard, open_master, settings.net_id, settings.room,
+            bus, self._book, self.guard, open_master, link_to, settings.room,
             settings.answer_s,
         )  # fmt: skip
         self._slaves: Sessions[SlaveSession] = Sessions()
@@ -261,7 +260,8 @@ class MailboxGateway:
             master = self._masters.take(SessionKey(way, station, kind), self._open_master)
             replies = await master.ask(kind, body)
         elif isinstance(found, RemoteSlave):
-            begin = partial(self._open_remote, found, kind)
+            link, room = self._link_to(found), self.settings.room
+            begin = partial(RemoteSession, kind, link, room=room)
             replies = await self._remotes.take(SessionKey(way, station, kind), begin).ask(body)
         else:  # a group within a group
             replies = refusals(kind, body, Reason.NO_SLAVE)
@@ -333,7 +333,9 @@ class MailboxGateway:
     async def _serve_dialect(self, request: Request, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()
         found = self._addresses.resolve(address, ())
-        station = found.station if isinstance(found, Slave) else address
-        answer, reason = await self._dialect.answer(kind, station, request.body, request.way)
+        whom = Slave(address) if isinstance(found, Group) else found  # nobody has that address
+        answer, reason = await self._dialect.answer(
+            kind, whom, self._target(whom), request.body, request.way
+        )
         took_ns = monotonic_ns() - start_ns
         self._answering.answer_dialect(request, kind, answer, reason, took_ns)

@@ -11,10 +11,8 @@ from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.gateway.remote_link import RemoteLink
-from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.slave_link import PortLink
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.codec.mailbox import MailboxType
 from eap.gateway.address import AddressMap, Group, RemoteSlave, Slave
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
@@ -70,7 +68,7 @@ def open_gateways(
             partial(_access_of, router),
             settings,
             AddressMap({each.address: _whom(each) for each in told.addresses}),
-            partial(_open_remote, router, settings),
+            partial(_link, router, settings),
         )
         gateway.is_open = told.enabled
         gateways[bus.owner] = gateway
@@ -83,12 +81,6 @@ def _told(handover: Handover, owner: PortName) -> GatewaySpec:
 
 def _access_of(router: StationRouter) -> AccessList:
     return router.access
-
-
-def _open_remote(
-    router: StationRouter, settings: Settings, slave: RemoteSlave, kind: MailboxType
-) -> RemoteSession:
-    return RemoteSession(kind, _link(router, settings, slave), room=settings.room)
 
 
 def _link(router: StationRouter, settings: Settings, slave: RemoteSlave) -> RemoteLink:

@@ -50,7 +50,8 @@ class RemoteFiles:
         """
         if body[:1] == _DATA and len(body) + MailboxHeader.SIZE > self.sizes.to_slave:
             raise ElsewhereError(Reason.TOO_LONG.value.ads)
-        end_s = asyncio.get_running_loop().time() + self._link.answer_s / 2
+        # The rest of the time is for the question whether anybody is there.
+        end_s = asyncio.get_running_loop().time() + self._link.answer_s / 3
         answers = self._server.receive_message(body, 0)
         while self._file is not None and answers and is_busy(answers[0]):
             try:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Protocol, TypeAlias
 
 from eap.aoe.ads_operation import Operation, Read
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT
+from eap.gateway.address import RemoteSlave
 from eap.gateway.elsewhere import ElsewhereError, reason_for, sdo_offset
 
 _ADDRESSES, _SLAVES = 0xF020, 0x8000
@@ -100,3 +102,7 @@ class RemoteLink:
         offset = sdo_offset(index, subindex, complete=False)
         read = Read(IndexGroup.SDO, offset, 2)
         return int.from_bytes(await self.perform(read, port=DEVICE_PORT), "little")
+
+
+LinkTo: TypeAlias = Callable[[RemoteSlave], RemoteLink]
+"""Returns the way to somebody elsewhere."""

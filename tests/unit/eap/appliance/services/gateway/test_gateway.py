@@ -17,7 +17,7 @@ from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.remote_session import RemoteSession
+from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.appliance.services.gateway.slave_link import PortLink
 from eap.codec.ads import IndexGroup
 from eap.codec.ethercat import EtherCatHeader
@@ -79,12 +79,12 @@ class Desk:
             lambda: AccessList(rules),
             settings,
             AddressMap({0x9000: Slave(1001), 0x9001: RemoteSlave(ELSEWHERE_BUS, 1003)}),
-            self._open_remote,
+            self._link_to,
         )
 
-    def _open_remote(self, slave: RemoteSlave, kind: MailboxType) -> RemoteSession:
+    def _link_to(self, slave: RemoteSlave) -> RemoteLink:
         self.asked.append(slave)
-        return RemoteSession(kind, self.station.link(), room=1000)
+        return self.station.link()
 
     async def ask(
         self, kind: MailboxType, address: int, octets: str | bytes, way: Way = HERE
