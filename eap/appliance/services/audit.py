@@ -25,7 +25,6 @@ from eap.aoe.access import host_of, place_of
 from eap.aoe.ads_operation import Operation, WriteControl
 from eap.aoe.directory import Directory
 from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
-from eap.aoe.way import Way
 from eap.appliance.services.allowance import Allowance
 from eap.codec.ads import AdsError, IndexGroup
 from eap.od.abort import entry_name
@@ -38,6 +37,8 @@ BURST, PER_S = 500, 50
 """Lines that a client may cause at once, and in each second for long."""
 DOOR_BURST, DOOR_PER_S = 5000, 500
 """Likewise, of all clients of a door, whose addresses may be made up."""
+CONTROL = "control"
+"""Stands for a door in lines about clients of the control socket."""
 _MAX_CLIENTS = 1024
 _PLAIN = 8
 """Octets of a value that is written as it is; of longer ones there is a digest."""
@@ -84,7 +85,7 @@ class Audit:
 
     def write(self, station: str, entry: AuditEntry) -> None:
         """Write down what a station did, or refused."""
-        client = self._client(station, entry.way)
+        client = self._client(station, entry.way.door, host_of(entry.way))
         door = self._door(station, entry.way.door)
         head = self._head(station, entry)
         now = self._clock()
@@ -97,6 +98,16 @@ class Audit:
         if lines:
             self._append(lines)
 
+    def write_request(self, who: str, station: str, words: dict[str, Any]) -> None:
+        """Write down what a client of the control socket did, or was refused."""
+        client = self._client(station, CONTROL, who)
+        now = self._clock()
+        if client.take(now) and self._door(station, CONTROL).take(now):
+            head = {"time": self._time(), "station": station, "door": CONTROL, "from": who}
+            self._append([head | words])
+        else:
+            client.skipped += 1
+
     def tell_skipped(self) -> None:
         """Write how many lines were left out, for each client that had some."""
         lines = []
@@ -108,8 +119,8 @@ class Audit:
         if lines:
             self._append(lines)
 
-    def _client(self, station: str, way: Way) -> Allowance:
-        key = station, way.door, host_of(way)
+    def _client(self, station: str, door: str, address: str) -> Allowance:
+        key = station, door, address
         client = self._clients.pop(key, None) or Allowance(BURST, PER_S, self._clock())
         if len(self._clients) >= _MAX_CLIENTS:
             self.tell_skipped()
@@ -179,7 +190,7 @@ class Audit:
 
 def _words(each: AuditedOperation) -> dict[str, Any]:
     verdict, result = each.verdict, each.result
-    return dict(_what(each.operation)) | {
+    return dict(operation_words(each.operation)) | {
         "service": verdict.service,
         "allowed": verdict.is_allowed,
         "why": verdict.why,
@@ -188,7 +199,7 @@ def _words(each: AuditedOperation) -> dict[str, Any]:
     }
 
 
-def _what(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]]:
+def operation_words(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]]:
     """Yield what was to be done."""
     yield "operation", type(operation).__name__
     if isinstance(operation, AddRoute):

@@ -11,8 +11,9 @@ import asyncio
 import logging
 import select
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 from devicebus.errors import BusError
@@ -37,8 +38,9 @@ from eap.appliance.control import (
 from eap.appliance.control_bus import BUS_METHODS
 from eap.appliance.services.accepting import accept_connections
 from eap.appliance.services.bus.bus_methods import BusConnection, Buses
+from eap.appliance.services.control_audit import TellChange, change_of, peer_of, refusal_in
 from eap.appliance.services.methods import Methods, Watch
-from eap.errors import ControlError, ImageError
+from eap.errors import ControlError, EapError, ImageError
 from eap.od.abort import SdoAbortError
 
 logger = logging.getLogger(__name__)
@@ -48,10 +50,16 @@ class ControlServer:
     """Serve *methods*, and those on *buses*, on a listening Unix socket."""
 
     def __init__(
-        self, methods: Methods, buses: Buses, *, slow_reader_s: float = SLOW_READER_S
+        self,
+        methods: Methods,
+        buses: Buses,
+        tell: TellChange | None = None,
+        *,
+        slow_reader_s: float = SLOW_READER_S,
     ) -> None:
         self._methods = methods
         self._buses = buses
+        self._tell = tell
         self._slow_reader_s = slow_reader_s
         self._clients = 0
 
@@ -72,7 +80,8 @@ class ControlServer:
         self._clients += 1
         bus = BusConnection(self._buses)
         try:
-            client = _Client(self._methods, bus, writer, self._slow_reader_s)
+            tell = self._tell and partial(self._tell, peer_of(connection))
+            client = _Client(self._methods, bus, writer, self._slow_reader_s, tell)
             if self._clients > MAX_CLIENTS:
                 reason = f"{MAX_CLIENTS} clients are connected, which is all there is room for"
                 await client.send(encode_error(None, ControlError(reason, code=ErrorCode.BUSY)))
@@ -132,8 +141,10 @@ class _Client:
         bus: BusConnection,
         writer: asyncio.StreamWriter,
         slow_reader_s: float,
+        tell: Callable[[str, dict[str, Any]], None] | None,
     ) -> None:
         self._methods = methods
+        self._tell = tell
         self._bus = bus
         self._writer = writer
         self._slow_reader_s = slow_reader_s
@@ -174,7 +185,7 @@ class _Client:
                 await self._subscribe(number, request.params, group)
                 return
             async with reader.while_there():
-                result = await self._call(request)
+                result = await self._call_and_tell(request)
         except TimeoutError:
             raise
         except ControlError as exc:
@@ -195,6 +206,26 @@ class _Client:
             await self.send(encode_error(number, error))
         else:
             await self.send(encode_result(number, result))
+
+    async def _call_and_tell(self, request: Request) -> Any:
+        """Have a change written down when it is known how it came out, before it is answered."""
+        change = None if self._tell is None else change_of(request, self._bus.opened)
+        if change is None or self._tell is None:
+            return await self._call(request)
+        station, words = change
+        talk = None
+        if request.method == "bus_ask":
+            talk = self._bus.opened(request.params["conversation"])
+        error: str | None = None  # as long as nobody knows
+        try:
+            result = await self._call(request)
+            error = refusal_in(result, talk)
+        except EapError as exc:
+            error = str(exc)
+            raise
+        finally:
+            self._tell(station, words | {"error": error})
+        return result
 
     async def _call(self, request: Request) -> Any:
         if request.method == "unsubscribe":

@@ -109,7 +109,7 @@ class Services:
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(client, devices, desks)
         methods = self._methods(images, buses, devices, gateways)
-        server = ControlServer(methods, buses)
+        server = ControlServer(methods, buses, audit.write_request)
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(server.serve(self._listener))]
             tasks += [group.create_task(door.serve()) for door in (*doors, *brokers)]

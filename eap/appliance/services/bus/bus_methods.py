@@ -87,9 +87,12 @@ class Buses:
 class _Held:
     """A conversation that a connection has open."""
 
-    def __init__(self, talk: Talk, kind: MailboxType) -> None:
+    def __init__(
+        self, talk: Talk, kind: MailboxType, opened: control_bus.BusOpenParameters
+    ) -> None:
         self.talk = talk
         self.kind = kind
+        self.opened = opened
         self.idle: asyncio.TimerHandle | None = None
 
 
@@ -120,6 +123,11 @@ class BusConnection:
         """
         return await self._methods[method](params)
 
+    def opened(self, number: int) -> control_bus.BusOpenParameters | None:
+        """Return how a conversation was opened, None if it is not open."""
+        held = self._held.get(number)
+        return held.opened if held is not None else None
+
     def close(self) -> None:
         """End what is open."""
         for number in list(self._held):
@@ -145,7 +153,7 @@ class BusConnection:
             reason = f"slave {wanted.slave}: others talk {kind.name} with it all the while"
             raise ControlError(reason, code=ErrorCode.BUSY) from None
         self._last += 1
-        self._held[self._last] = _Held(talk, kind)
+        self._held[self._last] = _Held(talk, kind, wanted)
         self._begin_idle(self._last)
         return {"conversation": self._last}
 

@@ -120,12 +120,12 @@ def result_of(replies: Sequence[Reply]) -> int | None:
     if not replies:
         return None
     reply = replies[-1]
-    return _result(reply) if reply.reason is None else reply.reason.value.ads
+    return error_in(reply.type, reply.body) if reply.reason is None else reply.reason.value.ads
 
 
-def _result(reply: Reply) -> int:
-    body = reply.body
-    match reply.type:
+def error_in(kind: MailboxType, body: bytes) -> int:
+    """Return the error that a slave answered with, as one of ADS; 0 for none."""
+    match kind:
         case MailboxType.ERR:
             return AdsError.SERVICE
         case MailboxType.COE if len(body) >= CoeHeader.SIZE + SdoHeader.SIZE:

@@ -70,6 +70,21 @@ def lines(audit: Audit) -> list[dict[str, Any]]:
     return [json.loads(line) for line in audit.path.read_text().splitlines()]
 
 
+def test_clients_of_the_control_socket_have_lines_and_limits(audit: Audit, clock: Clock) -> None:
+    words = {"operation": "od_write", "error": ""}
+    for _ in range(BURST + 2):
+        audit.write_request("uid 0, pid 7", "island-01", words)
+    audit.write_request("uid 0, pid 8", "island-01", words)
+    clock.now += 1
+    audit.tell_skipped()
+    told = lines(audit)
+    head = {"time": "2023-11-14T22:13:20.250+00:00", "station": "island-01", "door": "control"}
+    assert told[0] == head | {"from": "uid 0, pid 7"} | words
+    assert [each["from"] for each in told].count("uid 0, pid 7") == BURST + 1
+    assert told[-2] == told[0] | {"from": "uid 0, pid 8"}
+    assert told[-1] == head | {"from": "uid 0, pid 7", "skipped": 2}
+
+
 def test_a_line_says_who_what_where_and_how_it_came_out(audit: Audit) -> None:
     audit.write("island-01", entry(result=0x706))
     assert lines(audit) == [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
 
 import pytest
@@ -87,6 +88,31 @@ def test_refusals_keep_the_connection(methods):
             assert (await client.ask("hello"))["result"]["plant"] == "demo"
 
     asyncio.run(talk())
+
+
+def test_changes_are_told_before_they_are_answered(images):
+    def refuse(params):
+        raise SdoAbortError(AbortCode.NO_OBJECT, 0x2000, 1)
+
+    more = {"od_write": refuse, "request_state": lambda params: {"error": None}}
+    methods = Methods({}, images, status=torn, stop=lambda: None, more=more)
+    told = []
+
+    async def talk():
+        server = ControlServer(methods, NO_BUSES, lambda *line: told.append(line))
+        async with Talk(server) as client:
+            await client.ask("hello")
+            await client.ask("od_write", target="left")
+            (first,) = told
+            await client.ask("request_state", target="left", state="OP")
+            return first, told[1]
+
+    first, second = asyncio.run(talk())
+    assert first[:2] == second[:2] == (f"uid {os.getuid()}, pid {os.getpid()}", "left")
+    assert "object does not exist" in first[2]["error"]
+    assert second[2] == {
+        "operation": "request_state", "asked": {"target": "left", "state": "OP"}, "error": "",
+    }  # fmt: skip
 
 
 def test_refusals_of_dictionaries_carry_their_abort_code(images):
