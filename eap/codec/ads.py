@@ -78,7 +78,7 @@ _WORDS: dict[int, str] = {
     AdsError.TARGET_MACHINE: "no route to that NetID",
     AdsError.HOST_UNREACHABLE: "the link is down",
     AdsError.SERVICE: "it does not know that service",
-    AdsError.ACCESS: "user or password is wrong",
+    AdsError.ACCESS: "not permitted: read only, protected, or a wrong user or password",
     AdsError.TIMEOUT: "no answer in time",
     AdsError.ACCESS_DENIED: "access rules forbid it",
 }

@@ -17,7 +17,11 @@ from eap.appliance.control_bus import BusOpenParameters, kind_of
 from eap.appliance.services.audit import operation_words
 from eap.appliance.services.gateway.guard import error_in
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.coe import CoeHeader
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import SdoHeader
 from eap.gateway.rights import operation_of
+from eap.od.abort import SdoAbortError
 
 TellChange: TypeAlias = Callable[[str, str, dict[str, Any]], None]
 """Called with who it was, station, and what is told of the change."""
@@ -77,7 +81,11 @@ def refusal_in(result: Any, talk: BusOpenParameters | None = None) -> str:
     if not isinstance(result, Mapping):
         return ""
     if talk is not None:
-        code = error_in(kind_of(talk.protocol), bytes.fromhex(result["data"]))
+        kind, answer = kind_of(talk.protocol), bytes.fromhex(result["data"])
+        code = error_in(kind, answer)
+        if code and kind is MailboxType.COE:
+            head = SdoHeader.decode(answer, CoeHeader.SIZE)
+            return str(SdoAbortError(head.value, head.index, head.subindex))
         return AdsError.words_of(code) if code else ""
     error = result.get("error")
     text = error.get("text", "") if isinstance(error, Mapping) else error

@@ -238,7 +238,11 @@ class Introducer:
     ("result", "ok", "text"),
     [
         (0, True, "added"),
-        (0x704, False, "error 0x704 (user or password is wrong)"),
+        (
+            0x704,
+            False,
+            "error 0x704 (not permitted: read only, protected, or a wrong user or password)",
+        ),
         (None, False, "no answer by UDP 48899"),
     ],
 )
