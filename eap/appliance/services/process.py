@@ -38,8 +38,8 @@ from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.control_server import ControlServer
 from eap.appliance.services.device.device_methods import DeviceMethods
-from eap.appliance.services.device.devices import Devices
 from eap.appliance.services.device.engine_client import EngineClient
+from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.gateway.gateway_methods import GatewayMethods

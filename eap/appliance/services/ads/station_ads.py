@@ -10,8 +10,8 @@ from eap.appliance.services.ads.router_ads import RouterAds
 from eap.appliance.services.ads.router_values import LiveRouter
 from eap.appliance.services.ads.system_ads import SystemAds
 from eap.appliance.services.device.station_device import StationDevice
+from eap.appliance.services.routes.whereabouts import Whereabouts
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.appliance.station_image import StationImage
 from eap.device.eap_content import Identity
 from eap.device.router_dictionary import RouterDictionary

@@ -11,8 +11,8 @@ from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryStation
 from eap.aoe.way import Way
 from eap.appliance.services.routes.ams_methods import AmsMethods
+from eap.appliance.services.routes.whereabouts import Whereabouts
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.errors import ControlError
 from eap.ids import NetId
 from tests.support.routing import StubService

@@ -8,7 +8,7 @@ from time import monotonic_ns
 import pytest
 from msgspec.structs import replace
 
-from eap.appliance.services.device.devices import Devices
+from eap.appliance.services.devices import Devices
 from eap.codec.ams import AmsCommand
 from eap.errors import EngineGoneError
 from eap.ids import NetId

@@ -10,8 +10,8 @@ from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.hop_report import HopQuestion, decode_report
 from eap.aoe.way import Way
+from eap.appliance.services.routes.whereabouts import Whereabouts
 from eap.appliance.services.routing.service import LocalRequest
-from eap.appliance.services.routing.whereabouts import Whereabouts
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
