@@ -79,7 +79,7 @@ class Dialogue(Generic[T]):
             return False
         data = bytes(body)
         if header.type is MailboxType.ERR:
-            self._throw(_refusal(data))
+            self._throw(_refusal(self._address, data))
             return True
         is_reply = header.type is self._ask.type and answers(header.type, self._ask.request, data)
         if is_reply:
@@ -156,9 +156,12 @@ def patience(timeout_s: float, tries: int, transport: str) -> str:
     )
 
 
-def _refusal(data: bytes) -> MailboxRefusedError:
+def _refusal(address: int, data: bytes) -> MailboxRefusedError:
+    who = f"slave {address}" if address else "the master"
     try:
         detail = MailboxErrorReply.decode(data).detail
     except CodecError:
-        return MailboxRefusedError("mailbox error without a reason", detail=0)
-    return MailboxRefusedError(f"mailbox error {MailboxError.text_of(detail)}", detail=detail)
+        return MailboxRefusedError(f"{who}: mailbox error without a reason", detail=0)
+    return MailboxRefusedError(
+        f"{who}: mailbox error {MailboxError.text_of(detail)}", detail=detail
+    )

@@ -46,7 +46,7 @@ def test_what_is_no_reply_is_passed_over(frame) -> None:
 def test_errors_end_it() -> None:
     one = dialogue()
     assert one.receive(bytes.fromhex("0a50 0400 e903 00 00 0100 0200"))
-    with pytest.raises(MailboxRefusedError, match="UNSUPPORTED_PROTOCOL"):
+    with pytest.raises(MailboxRefusedError, match="slave 1001: mailbox error UNSUPPORTED_PROTOCOL"):
         one.result()
     one = dialogue()
     assert one.receive(bytes.fromhex("0650 0000 e903 00 00"))
