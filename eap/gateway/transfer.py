@@ -7,7 +7,7 @@ octets of requests and replies, so any client and any slave can be followed.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
@@ -25,13 +25,6 @@ _EXPEDITED, _LAST = 0x02, 0x01
 _BEFORE_FOE = DATA_OVERHEAD - FoeHeader.SIZE
 _SOE_INCOMPLETE = 0x08
 _NO_ANSWER = StateFlags.RESPONSE | StateFlags.NO_RETURN
-
-
-class Room(NamedTuple):
-    """Octets of a slave's mailboxes, header included."""
-
-    to_slave: int
-    to_master: int
 
 
 class Course(Protocol):
@@ -58,18 +51,13 @@ class Transfer:
 
     Args:
         kind: The protocol.
-        room: Of the slave's mailboxes; sizes that become others count from then on.
-
-    Attributes:
-        replies: To the last request, as far as they came.
+        sizes: Of the slave's mailboxes; those count that are in force when a message comes.
     """
 
-    def __init__(self, kind: MailboxType, room: Room | MailboxSizes) -> None:
-        self.replies: list[bytes] = []
-        self._course = _course(kind, room)
+    def __init__(self, kind: MailboxType, sizes: MailboxSizes) -> None:
+        self._course = _course(kind, sizes)
         self._request = b""
-        self._is_busy = False
-        self._is_answered = True
+        self._is_done = self._is_busy = False
 
     @property
     def is_running(self) -> bool:
@@ -82,27 +70,26 @@ class Transfer:
         A slave would refuse it: to a slave every packet has come once.  After BUSY it is none,
         that is how a client asks whether the slave has time now.
         """
-        is_done = bool(self.replies) or not self._is_answered
-        is_same = body == self._request and is_done and not self._is_busy
+        is_same = body == self._request and self._is_done and not self._is_busy
         return is_same and self._course.is_step(body)
 
     def ask(self, body: bytes) -> bool:
         """Begin or go on with a request; return whether the slave answers it at all."""
         self._request = body
         self._is_busy = False
-        self.replies = []
-        self._is_answered = self._course.ask(body)
-        return self._is_answered
+        is_answered = self._course.ask(body)
+        self._is_done = not is_answered
+        return is_answered
 
     def answer(self, body: bytes) -> None:
         """Note a reply to the last request."""
-        self.replies.append(body)
+        self._is_done = True
         self._is_busy = is_busy(body) if isinstance(self._course, _Foe) else False
         self._course.answer(body)
 
     def end(self) -> None:
         """Note that nothing is under way any more, whatever was."""
-        self.replies = []
+        self._is_done = False
         self._course.is_running = False
 
 
@@ -111,12 +98,12 @@ def is_busy(body: bytes) -> bool:
     return body[:1] == bytes((FoeOpcode.BUSY,))
 
 
-def _course(kind: MailboxType, room: Room | MailboxSizes) -> Course:
+def _course(kind: MailboxType, sizes: MailboxSizes) -> Course:
     match kind:
         case MailboxType.COE:
             return _Coe()
         case MailboxType.FOE:
-            return _Foe(room)
+            return _Foe(sizes)
         case MailboxType.SOE:
             return _Soe()
         case MailboxType.AOE:
@@ -189,9 +176,9 @@ class _Coe(_Single):
 class _Foe(_Single):
     """Files; a packet that does not fill the mailbox is the last one."""
 
-    def __init__(self, room: Room | MailboxSizes) -> None:
+    def __init__(self, sizes: MailboxSizes) -> None:
         super().__init__()
-        self._room = room
+        self._sizes = sizes
         self._is_last = False
 
     def ask(self, body: bytes) -> bool:
@@ -202,13 +189,13 @@ class _Foe(_Single):
         if opcode == FoeOpcode.ERROR:
             self.is_running = False
             return False
-        self._is_last = opcode == FoeOpcode.DATA and len(body) < self._room.to_slave - _BEFORE_FOE
+        self._is_last = opcode == FoeOpcode.DATA and len(body) < self._sizes.to_slave - _BEFORE_FOE
         return True
 
     def answer(self, body: bytes) -> None:
         opcode = body[0] if body else 0
         if opcode == FoeOpcode.DATA:
-            self._is_last = len(body) < self._room.to_master - _BEFORE_FOE
+            self._is_last = len(body) < self._sizes.to_master - _BEFORE_FOE
             self.is_running = True
         elif opcode == FoeOpcode.ACK:
             self.is_running = not self._is_last

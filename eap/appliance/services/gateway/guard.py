@@ -134,6 +134,8 @@ def error_in(kind: MailboxType, body: bytes) -> int:
                 return ads_result(SdoAbortError(head.value, head.index, head.subindex))
         case MailboxType.SOE if len(body) >= SoeHeader.SIZE and body[0] & _SOE_ERROR:
             return AdsError.GENERAL
+        case MailboxType.FOE if body[:1] == bytes((FoeOpcode.BUSY,)):
+            return AdsError.BUSY
         case MailboxType.FOE if body[:1] == bytes((FoeOpcode.ERROR,)):
             return AdsError.GENERAL
     return 0

@@ -16,7 +16,7 @@ from eap.appliance.services.gateway.remote_files import RemoteFiles
 from eap.appliance.services.gateway.remote_idns import RemoteIdns, RemoteVendor
 from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.appliance.services.gateway.remote_objects import RemoteObjects
-from eap.appliance.services.gateway.slave_session import IDLE_S, Reply, again
+from eap.appliance.services.gateway.slave_session import IDLE_S, NoTurnError, Reply, again, turn_of
 from eap.codec.mailbox import MailboxType
 from eap.errors import CodecError, TruncatedError
 from eap.gateway.elsewhere import ElsewhereError, reason_for, refusal_for
@@ -76,18 +76,25 @@ class RemoteSession:
 
     async def ask(self, body: bytes) -> list[Reply]:
         """Return the answers to a request, which may be none."""
-        async with self._turn:
-            if self._transfer.is_repeated(body):
-                return again(self._last)
-            self._stop_timer()
-            self._transfer.ask(body)
-            self._last = await self._answer(body)
-            for reply in self._last:
-                self._transfer.answer(reply.body)
-            if self.is_running:
-                loop = asyncio.get_running_loop()
-                self._timer = loop.call_later(self._idle_s, self.close)
-            return self._last
+        deadline_s = asyncio.get_running_loop().time() + self._answer_s
+        try:
+            async with turn_of(self._turn, deadline_s):
+                return await self._ask(body, deadline_s)
+        except NoTurnError:
+            return self._refuse(body, Reason.TIMEOUT)
+
+    async def _ask(self, body: bytes, deadline_s: float) -> list[Reply]:
+        if self._transfer.is_repeated(body):
+            return again(self._last)
+        self._stop_timer()
+        self._transfer.ask(body)
+        self._last = await self._answer(body, deadline_s)
+        for reply in self._last:
+            self._transfer.answer(reply.body)
+        if self.is_running:
+            loop = asyncio.get_running_loop()
+            self._timer = loop.call_later(self._idle_s, self.close)
+        return self._last
 
     def close(self) -> None:
         """End what is under way."""
@@ -96,11 +103,11 @@ class RemoteSession:
             self._speaker.reset()
         self._transfer.end()
 
-    async def _answer(self, body: bytes) -> list[Reply]:
+    async def _answer(self, body: bytes, deadline_s: float) -> list[Reply]:
         if self._speaker is None:
             return self._refuse(body, Reason.NO_PROTOCOL)
         try:
-            async with asyncio.timeout(self._answer_s):
+            async with asyncio.timeout_at(deadline_s):
                 answers = await self._speaker.answer(body)
         except TimeoutError:
             self.close()

@@ -9,7 +9,8 @@ Rule 3: a transfer that nobody goes on with is ended, and the slave is told.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import asynccontextmanager
 from typing import NamedTuple
 
 from devicebus.errors import (
@@ -20,6 +21,7 @@ from devicebus.errors import (
 )
 from devicebus.mailbox.conversation import Ask, Message
 from devicebus.mailbox.match import has_more
+from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import SiiProtocol
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.services.bus.bus_talk import Talk
@@ -28,7 +30,7 @@ from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.codec.sdoinfo import SdoInfoHeader
 from eap.errors import EapError, EngineGoneError
 from eap.gateway.refusal import Reason, mailbox_error, refuse
-from eap.gateway.transfer import Room, Transfer
+from eap.gateway.transfer import Transfer
 
 IDLE_S = 5.0
 """How long a transfer waits for its client's next step."""
@@ -60,7 +62,21 @@ def again(replies: Iterable[Reply]) -> list[Reply]:
 
 
 class NoTurnError(EapError):
-    """The slave's server was busy all the time that there was."""
+    """Others had their turns all the time that there was."""
+
+
+@asynccontextmanager
+async def turn_of(lock: asyncio.Lock, deadline_s: float) -> AsyncIterator[None]:
+    """Wait for a turn, in which a session does one request; raise NoTurnError at the deadline."""
+    try:
+        async with asyncio.timeout_at(deadline_s):
+            await lock.acquire()
+    except TimeoutError:
+        raise NoTurnError from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class SlaveSession:
@@ -87,7 +103,7 @@ class SlaveSession:
         self._open_talk = open_talk
         self._answer_s = answer_s
         self._idle_s = idle_s
-        self._transfer = Transfer(kind, Room(slave.to_slave, slave.to_master))
+        self._transfer = Transfer(kind, MailboxSizes(slave.to_slave, slave.to_master))
         self._last: list[Reply] = []
         self._talk: Talk | None = None
         self._turn = asyncio.Lock()
@@ -107,14 +123,10 @@ class SlaveSession:
         """
         deadline_s = asyncio.get_running_loop().time() + self._answer_s
         try:
-            async with asyncio.timeout_at(deadline_s):
-                await self._turn.acquire()
-        except TimeoutError:
+            async with turn_of(self._turn, deadline_s):
+                return await self._ask(body, deadline_s, is_step=is_step)
+        except NoTurnError:
             return self._refuse(body, Reason.TIMEOUT)
-        try:
-            return await self._ask(body, deadline_s, is_step=is_step)
-        finally:
-            self._turn.release()
 
     async def _ask(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[Reply]:
         if self._transfer.is_repeated(body):

@@ -55,6 +55,7 @@ def test_the_audit_is_told_of_changes_and_refusals() -> None:
         (MailboxType.SOE, "14 40 2000 0110", AdsError.GENERAL),
         (MailboxType.FOE, "04 00 00000000", 0),
         (MailboxType.FOE, "05 00 01800000", AdsError.GENERAL),
+        (MailboxType.FOE, "06 00 00006400", AdsError.BUSY),
         (MailboxType.ERR, "0100 0200", AdsError.SERVICE),
     ],
 )

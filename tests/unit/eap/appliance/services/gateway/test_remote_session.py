@@ -124,3 +124,16 @@ def test_a_station_that_does_not_answer(kind, body):
         assert not session.is_running
 
     play(kind, station, scene)
+
+
+def test_who_waits_for_a_turn_is_answered_in_time_too():
+    station = Station()
+    station.hangs = True
+
+    async def scene(ask, session) -> None:
+        async with asyncio.timeout(0.4):  # not ten times as long as an answer may take
+            asked = [session.ask(bytes.fromhex(UPLOAD)) for _ in range(10)]
+            answers = await asyncio.gather(*asked)
+        assert {reply.reason for (reply,) in answers} == {Reason.TIMEOUT}
+
+    play(COE, station, scene)
