@@ -7,9 +7,19 @@ import io
 from types import TracebackType
 from typing import Self, TypeVar, cast
 
-from devicebus.mailbox import coe_client, foe_client, soe_client, voe_client
-from devicebus.mailbox.conversation import Conversation
+from devicebus.mailbox import (
+    coe_client,
+    coeinfo_client,
+    foe_client,
+    soe_browse,
+    soe_client,
+    voe_client,
+)
+from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.soe_browse import IdnDescription
+from eap.codec.sdo import EXPEDITED_SIZE
+from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.dialogue import Dialogue, patience
@@ -69,29 +79,74 @@ class AsyncGatewayClient:
         """Read an entry, or with *complete* a whole object."""
         return await self.converse(address, coe_client.upload(index, subindex, complete=complete))
 
-    async def sdo_write(self, address: int, index: int, subindex: int, data: bytes) -> None:
-        """Write an entry."""
-        sizes = await self.sizes_of(address)
-        await self.converse(address, coe_client.download(index, subindex, data, sizes))
+    async def sdo_write(
+        self, address: int, index: int, subindex: int, data: bytes, *, complete: bool = False
+    ) -> None:
+        """Write an entry, or with *complete* a whole object."""
+        sizes = await self.sizes_of(address) if len(data) > EXPEDITED_SIZE else MailboxSizes()
+        talk = coe_client.download(index, subindex, data, sizes, complete=complete)
+        await self.converse(address, talk)
 
-    async def foe_read(self, address: int, name: str, *, password: int = 0) -> bytes:
+    async def od_list(self, address: int) -> list[int]:
+        """Read the indexes of all objects."""
+        return await self.converse(address, coeinfo_client.object_list())
+
+    async def od_object(self, address: int, index: int) -> ObjectDescription:
+        """Read what is said of an object."""
+        return await self.converse(address, coeinfo_client.object_description(index))
+
+    async def od_entry(self, address: int, index: int, subindex: int) -> EntryDescription:
+        """Read what is said of an entry."""
+        return await self.converse(address, coeinfo_client.entry_description(index, subindex))
+
+    async def foe_read(
+        self, address: int, name: str, *, password: int = 0, progress: Progress | None = None
+    ) -> bytes:
         """Read a file."""
         content = io.BytesIO()
         sizes = await self.sizes_of(address)
-        await self.converse(address, foe_client.read(name, content.write, sizes, password=password))
+        talk = foe_client.read(name, content.write, sizes, password=password, progress=progress)
+        await self.converse(address, talk)
         return content.getvalue()
 
-    async def foe_write(self, address: int, name: str, data: bytes, *, password: int = 0) -> None:
+    async def foe_write(
+        self,
+        address: int,
+        name: str,
+        data: bytes,
+        *,
+        password: int = 0,
+        progress: Progress | None = None,
+    ) -> None:
         """Write a file."""
         sizes = await self.sizes_of(address)
         source = io.BytesIO(data).read
-        await self.converse(address, foe_client.write(name, source, sizes, password=password))
+        talk = foe_client.write(name, source, sizes, password=password, progress=progress)
+        await self.converse(address, talk)
 
     async def idn_read(
         self, address: int, idn: Idn, elements: int = Element.VALUE, *, drive: int = 0
     ) -> bytes:
         """Read elements of an IDN, one behind the other."""
         return await self.converse(address, soe_client.read(idn, elements, drive=drive))
+
+    async def idn_describe(self, address: int, idn: Idn, *, drive: int = 0) -> IdnDescription:
+        """Read all elements of an IDN in one view."""
+        return await self.converse(address, soe_browse.describe(idn, drive=drive))
+
+    async def idn_write(
+        self,
+        address: int,
+        idn: Idn,
+        data: bytes,
+        *,
+        element: int = Element.VALUE,
+        drive: int = 0,
+    ) -> None:
+        """Write an element of an IDN; a list or text with its head."""
+        sizes = await self.sizes_of(address)
+        talk = soe_client.write(idn, data, sizes, elements=element, drive=drive)
+        await self.converse(address, talk)
 
     async def voe(self, address: int, vendor_id: int, vendor_type: int, data: bytes) -> bytes:
         """Send data of a vendor's protocol; return the data of its answer."""

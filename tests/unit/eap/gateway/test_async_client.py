@@ -7,10 +7,13 @@ import asyncio
 import pytest
 
 from devicebus.errors import MailboxTimeoutError
+from devicebus.mailbox.conversation import Progress
 from eap.codec.soe import Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.client import AsyncGatewayClient
 from tests.support.fakegateway import FILE, FakeGateway
+
+MODE = Idn.parse("S-0-0032")
 
 pytestmark = pytest.mark.net
 
@@ -26,10 +29,19 @@ def test_all_services(gateway) -> None:
         async with AsyncGatewayClient("127.0.0.1", gateway.port) as client:
             await client.sdo_write(1001, 0x2000, 0, b"1234")
             assert await client.sdo_read(1001, 0x2000) == b"1234"
-            await client.foe_write(1001, "f", FILE)
+            await client.sdo_write(1001, 0x1008, 0, b"y" * 400)
+            assert await client.sdo_read(1001, 0x1008) == b"y" * 400
+            assert await client.od_list(1001) == [0x1008, 0x2000]
+            assert (await client.od_object(1001, 0x2000)).name == "A"
+            assert (await client.od_entry(1001, 0x2000, 0)).bit_length == 32
+            progress = Progress()
+            await client.foe_write(1001, "f", FILE, progress=progress)
+            assert progress.done == len(FILE)
             assert await client.foe_read(1001, "f") == FILE
+            await client.idn_write(1001, MODE, bytes((7, 0, 0, 0)))
+            assert (await client.idn_describe(1001, MODE)).name == "Mode"
             assert await client.voe(1001, 0x1164, 1, b"\1") == b"\1"
-            assert await client.idn_read(1001, Idn.parse("S-0-0032")) == bytes((7, 0, 0, 0))
+            assert await client.idn_read(1001, MODE) == bytes((7, 0, 0, 0))
             assert [slave.name for slave in await client.slaves()] == ["drive"]
 
     asyncio.run(run())
