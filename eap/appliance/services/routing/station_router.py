@@ -34,7 +34,8 @@ from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
 from eap.appliance.services.routing.lanes import Lanes
 from eap.appliance.services.routing.local_client import LOCAL_DOOR, LocalClient
-from eap.appliance.services.routing.service import AnswerNow, Carrier, LocalRequest, Service
+from eap.appliance.services.routing.service import Carrier, LocalRequest, Service
+from eap.appliance.services.routing.service_table import ServiceTable
 from eap.appliance.services.routing.timer import RouterTimer
 from eap.appliance.services.routing.trace_log import TraceLog
 from eap.codec.ams import AmsHeader
@@ -87,10 +88,9 @@ class StationRouter:
             answer_now=self._answer_now,
         )
         self._carriers: dict[str, Carrier] = {}
-        self._services: dict[NetId, list[Service]] = {}
-        for each in (net_id, *net_ids):
-            self._services[each] = []
-            self._router.add_device(each, _Ports(self._services[each]))
+        self._services = ServiceTable((net_id, *net_ids))
+        for each in self._services.net_ids:
+            self._router.add_device(each, self._services.ports(each))
         self._lanes = Lanes(self._finish)
         self._client = LocalClient(self)
         self.add_door(LOCAL_DOOR, self._client)
@@ -100,7 +100,7 @@ class StationRouter:
     @property
     def net_ids(self) -> Collection[NetId]:
         """All NetIDs of the station; none of them is routed."""
-        return self._services.keys()
+        return self._services.net_ids
 
     @property
     def record(self) -> Record:
@@ -153,7 +153,7 @@ class StationRouter:
         Raises:
             KeyError: the station has no such NetID.
         """
-        self._services[net_id].append(service)
+        self._services.add(net_id, service)
 
     def add_route(self, route: Route) -> bool:
         """Take *route* into the table; return whether it was taken."""
@@ -213,9 +213,7 @@ class StationRouter:
         """Forget whom nobody can answer any more, and tell the services."""
         way = Way(door, connection)
         self._lanes.forget(way)
-        for services in self._services.values():
-            for service in services:
-                service.client_gone(way)
+        self._services.client_gone(way)
         self._act(self._router.connection_closed(door, connection, monotonic_ns()))
 
     def hop_down(self, door: str, address: str | None, text: str) -> None:
@@ -299,24 +297,12 @@ class StationRouter:
         """Return what a service has at hand, unless its client waits there for something else."""
         if self._lanes.has_work(way, header):
             return None
-        for service in self._services[header.target]:
-            if header.target_port in service.ports:
-                answer_now: AnswerNow | None = getattr(service, "answer_now", None)
-                if answer_now is None:
-                    return None
-                began_ns = monotonic_ns()
-                try:
-                    answer = answer_now(header, body)
-                except Exception:  # noqa: BLE001  it is logged when it fails again, in its lane
-                    return None
-                return None if answer is None else (answer, monotonic_ns() - began_ns)
-        return None
+        return self._services.answer_now(header, body)
 
     def _deliver(self, ticket: int, header: AmsHeader, body: bytes, way: Way) -> None:
-        for service in self._services[header.target]:
-            if header.target_port in service.ports:
-                self._lanes.put(ticket, service, LocalRequest(header, body, way))
-                return
+        service = self._services.find(header)
+        if service is not None:
+            self._lanes.put(ticket, service, LocalRequest(header, body, way))
 
     def _finish(self, ticket: int, answer: AmsAnswer) -> None:
         self._act(self._router.receive_answer(ticket, answer, monotonic_ns()))
@@ -327,16 +313,3 @@ class StationRouter:
             self._act(actions)
         else:
             self._timer.set()
-
-
-class _Ports:
-    """The AMS ports that some services have now."""
-
-    def __init__(self, services: Collection[Service]) -> None:
-        self._services = services
-
-    def __contains__(self, port: object) -> bool:
-        for service in self._services:  # noqa: SIM110  any() takes twice as long
-            if port in service.ports:
-                return True
-        return False

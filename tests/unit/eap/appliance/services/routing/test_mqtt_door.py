@@ -123,7 +123,7 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
         asked = []
         async with running(two), running(one):
             await until(lambda: one.knows(TWO))
-            (service,) = two.router._services[TWO]
+            (service,) = two.router._services._services[TWO]
             service._reply = lambda request: (
                 asked.append(request)
                 or AmsAnswer((0).to_bytes(4, "little") + (77).to_bytes(4, "little"))
