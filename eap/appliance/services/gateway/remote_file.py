@@ -133,6 +133,8 @@ class RemoteFile:
         if min(to_slave, to_master) < MINIMUM_SIZE:
             raise ElsewhereError(AdsError.NOT_READY)
         self._sizes.set(to_slave, to_master)
+        if self.is_over:
+            return  # a slave may forget its old file as soon as a new one is begun
         name, password, is_write = self.wanted
         group = IndexGroup.FOE_OPEN_WRITE if is_write else IndexGroup.FOE_OPEN_READ
         opened = await self._ask(group, password, _HANDLE_SIZE, name.encode())

@@ -75,6 +75,8 @@ class RemoteLink:
         Raises:
             ElsewhereError: its master does not tell.
         """
+        if self._port == DEVICE_PORT:
+            raise ElsewhereError(AdsError.SERVICE)  # a master has none
         try:
             index = _SLAVES + await self._number()
             return await self._word(index, _TO_SLAVE), await self._word(index, _TO_MASTER)

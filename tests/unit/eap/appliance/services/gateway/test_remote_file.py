@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
@@ -51,6 +50,13 @@ def groups(bus: Bus) -> list[int]:
     return [each.group for each in bus.asked if isinstance(each, Read | ReadWrite)]
 
 
+def asked(bus: Bus, group: int) -> Callable[[], Awaitable[bool]]:
+    async def look() -> bool:
+        return group in groups(bus)
+
+    return look
+
+
 def test_blocks_are_longer_and_longer() -> None:
     async def scene(bus: Bus) -> None:
         await write(bus, CONTENT)
@@ -80,13 +86,22 @@ def test_a_file_that_is_written_is_closed_once() -> None:
     play(scene)
 
 
-def test_who_gives_up_before_the_file_is_open() -> None:
+def test_who_gives_up_before_the_file_is_opened() -> None:
     async def scene(bus: Bus) -> None:
         file = opened(bus, is_write=True)
         file.close()
-        while not groups(bus) or groups(bus)[-1] != IndexGroup.FOE_PROGRESS:
-            await file.wait_change()
-            await asyncio.sleep(0)
+        await file.wait_change()
+        assert set(groups(bus)) == {IndexGroup.SDO}
+
+    play(scene)
+
+
+def test_who_gives_up_while_the_file_is_opened() -> None:
+    async def scene(bus: Bus) -> None:
+        file = opened(bus, is_write=True)
+        await busads.until(asked(bus, IndexGroup.FOE_OPEN_WRITE))
+        file.close()
+        await busads.until(asked(bus, IndexGroup.FOE_PROGRESS))
 
     play(scene)
 
@@ -96,8 +111,8 @@ def test_who_gives_up_a_file_closes_it_there() -> None:
         await write(bus, CONTENT)
         file = opened(bus, is_write=False)
         await ready(file.check_open, file)
+        bus.asked.clear()
         file.close()
-        await asyncio.sleep(0.05)
-        assert groups(bus)[-1] == IndexGroup.FOE_CLOSE
+        await busads.until(asked(bus, IndexGroup.FOE_CLOSE))
 
     play(scene)

@@ -33,6 +33,9 @@ def test_sizes_come_from_the_master() -> None:
     with pytest.raises(ElsewhereError) as caught:
         mailboxes("files", 1003)
     assert caught.value.result == AdsError.TARGET_PORT
+    with pytest.raises(ElsewhereError) as caught:
+        mailboxes("files", 0xFFFF)
+    assert caught.value.result == AdsError.SERVICE
 
 
 def test_a_slave_behind_the_first_list() -> None:
