@@ -11,7 +11,7 @@ from eap.aoe.access import place_of
 from eap.aoe.ads_operation import Operation
 from eap.appliance.services.gateway.dialect_task import DialectError
 from eap.appliance.services.gateway.slave_session import Reply
-from eap.codec.mailbox import MailboxHeader, MailboxType
+from eap.codec.mailbox import MailboxError, MailboxHeader, MailboxType
 from eap.gateway.dialect import Failure, ReadSdo, Task, WriteSdo
 from eap.gateway.refusal import Reason, mailbox_error, refuse
 from eap.gateway.rights import operation_of
@@ -62,6 +62,8 @@ class MasterSession:
         try:
             answers = self._server.receive_message(body, 0)
         except MailboxRefusedError as exc:
+            if exc.detail == MailboxError.SIZE_TOO_SHORT:
+                return [Reply(*refuse(MailboxType.COE, body, Reason.TOO_SHORT))]
             return [Reply(*mailbox_error(exc.detail))]
         return [Reply(MailboxType.COE, answer) for answer in answers]
 

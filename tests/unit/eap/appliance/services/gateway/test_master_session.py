@@ -47,6 +47,8 @@ def test_refusals() -> None:
     assert (reply.type, reply.reason) == (MailboxType.ERR, Reason.NO_PROTOCOL)
     (reply,) = asyncio.run(session().ask(COE, b"\0"))
     assert (reply.type, reply.body) == (MailboxType.ERR, bytes.fromhex("0100 0600"))
+    (reply,) = asyncio.run(session().ask(COE, bytes.fromhex("0020 40 0020 01 0000")))
+    assert (reply.type, reply.body) == (COE, bytes.fromhex("0020 80 0020 01 01000405"))
 
 
 def test_tasks_of_the_dialect() -> None:
