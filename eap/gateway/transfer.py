@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from devicebus.mailbox.match import has_more
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.codec.ams import AmsCommand, AmsHeader, StateFlags
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.eoe import EoeType
 from eap.codec.foe import DATA_OVERHEAD, FoeHeader, FoeOpcode
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SdoHeader, SdoRequest, SdoResponse
 from eap.codec.soe import SoeHeader, SoeOpcode
+from eap.gateway.aoe_course import AoeCourse
 
 _SDO_DATA = CoeHeader.SIZE + SdoHeader.SIZE
 """Where the data of a normal SDO begins."""
@@ -24,7 +25,6 @@ _SDO_SEGMENTS = frozenset((SdoRequest.DOWNLOAD_SEGMENT, SdoRequest.UPLOAD_SEGMEN
 _EXPEDITED, _LAST = 0x02, 0x01
 _BEFORE_FOE = DATA_OVERHEAD - FoeHeader.SIZE
 _SOE_INCOMPLETE = 0x08
-_NO_ANSWER = StateFlags.RESPONSE | StateFlags.NO_RETURN
 
 
 class Course(Protocol):
@@ -55,6 +55,7 @@ class Transfer:
     """
 
     def __init__(self, kind: MailboxType, sizes: MailboxSizes) -> None:
+        self._kind = kind
         self._course = _course(kind, sizes)
         self._request = b""
         self._is_done = self._is_busy = False
@@ -87,6 +88,17 @@ class Transfer:
         self._is_busy = is_busy(body) if isinstance(self._course, _Foe) else False
         self._course.answer(body)
 
+    def has_more(self, reply: bytes) -> bool:
+        """Say whether the slave sends more behind its last reply, by itself."""
+        if isinstance(self._course, AoeCourse):
+            return self._course.has_more
+        return has_more(self._kind, reply)
+
+    @property
+    def whole(self) -> bytes:
+        """By what the answer to the fragments that came is known, the last one now; or nothing."""
+        return self._course.whole if isinstance(self._course, AoeCourse) else b""
+
     def end(self) -> None:
         """Note that nothing is under way any more, whatever was."""
         self._is_done = False
@@ -107,7 +119,7 @@ def _course(kind: MailboxType, sizes: MailboxSizes) -> Course:
         case MailboxType.SOE:
             return _Soe()
         case MailboxType.AOE:
-            return _Aoe()
+            return AoeCourse()
         case MailboxType.EOE:
             return _Eoe()
     return _Single()
@@ -216,21 +228,6 @@ class _Soe(_Single):
 
     def answer(self, body: bytes) -> None:
         self.is_running = False
-
-
-class _Aoe(_Single):
-    """Packets in fragments, each of which is acknowledged unless its sender wants nothing."""
-
-    def ask(self, body: bytes) -> bool:
-        if len(body) < AmsHeader.SIZE:
-            self.is_running = False
-            return True
-        self.is_running = int.from_bytes(body[16:18], "little") == AmsCommand.FRAGMENT
-        return not int.from_bytes(body[18:20], "little") & _NO_ANSWER
-
-    def answer(self, body: bytes) -> None:
-        is_fragment = int.from_bytes(body[16:18], "little") == AmsCommand.FRAGMENT
-        self.is_running = self.is_running and is_fragment
 
 
 class _Eoe(_Single):

@@ -20,7 +20,6 @@ from devicebus.errors import (
     MailboxTimeoutError,
 )
 from devicebus.mailbox.conversation import Ask, Message
-from devicebus.mailbox.match import has_more
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import SiiProtocol
 from eap.appliance.bus_request import SlaveReport
@@ -178,13 +177,16 @@ class SlaveSession:
 
     async def _pass_on(self, talk: Talk, body: bytes, deadline_s: float) -> list[Reply]:
         expects_reply = self._transfer.ask(body)
-        ask = Ask(self._kind, body, expects_reply=expects_reply)
+        whole = self._transfer.whole
+        ask = Ask(self._kind, body, expects_reply=expects_reply and not whole)
         message = await self._step(talk, ask, deadline_s)
         if not expects_reply:
             return []
+        named = whole or body[: _NAMED.get(self._kind, len(body))]
+        if whole:  # its answer does not name the fragment that was last
+            message = await self._step(talk, Ask(self._kind, named, listen=True), deadline_s)
         replies = [self._note(message)]
-        named = body[: _NAMED.get(self._kind, len(body))]
-        while has_more(self._kind, message.data):
+        while self._transfer.has_more(message.data):
             message = await self._step(talk, Ask(self._kind, named, listen=True), deadline_s)
             replies.append(self._note(message))
         return replies

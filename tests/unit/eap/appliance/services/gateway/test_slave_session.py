@@ -13,11 +13,15 @@ from devicebus.errors import (
     MailboxTimeoutError,
 )
 from devicebus.mailbox.conversation import Ask, Message
+from eap.aoe.answer import AmsAnswer, response_to
+from eap.aoe.fragment import iter_fragments
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.services.gateway.slave_session import SlaveSession, find_refusal, reason_of
+from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.errors import EngineGoneError
 from eap.gateway.refusal import Reason
+from eap.ids import NetId
 
 COE, FOE = MailboxType.COE, MailboxType.FOE
 SLAVE = SlaveReport(
@@ -81,6 +85,34 @@ def test_fragments_of_an_answer_are_waited_for() -> None:
         first, second = talk.asked
         assert (first.listen, first.request) == (False, asked)
         assert (second.listen, second.request) == (True, asked[:6])
+
+    asyncio.run(run())
+
+
+def test_a_packet_in_fragments_is_answered_as_a_whole_one() -> None:
+    header = AmsHeader(
+        NetId.parse("1.2.3.4.5.6"), 1001, NetId.parse("6.5.4.3.2.1"), 1, AmsCommand.READ,
+        StateFlags.ADS, invoke_id=7,
+    )  # fmt: skip
+    request, answer = encode_packet(header, bytes(12)), response_to(header, AmsAnswer(bytes(20)))
+
+    async def run() -> None:
+        parts = list(iter_fragments(answer, 3, 20))
+        talk = Talk(*parts)
+        one = session(MailboxType.AOE, talk)
+        first, last = iter_fragments(request, 5, 20)
+        assert await one.ask(first, is_step=False) == []
+        assert one.is_running
+        replies = await one.ask(last, is_step=False)
+        assert [reply.body for reply in replies] == parts
+        assert not one.is_running
+        whole = request[: AmsHeader.SIZE]
+        assert [(each.listen, each.request) for each in talk.asked] == [
+            (False, first),
+            (False, last),
+            (True, whole),
+            (True, whole),
+        ]
 
     asyncio.run(run())
 
