@@ -6,6 +6,7 @@ Nothing here sends or waits, so a blocking and an asynchronous client share it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
@@ -54,7 +55,7 @@ class Dialogue(Generic[T]):
         self._ask: Ask | None = None
         self._result: list[T] = []
         self._error: BaseException | None = None
-        self._advance(None)
+        self._go_on(lambda: next(conversation))
 
     @property
     def delay_ns(self) -> int:
@@ -107,9 +108,16 @@ class Dialogue(Generic[T]):
         farewell = None if was_done or ask is None else FAREWELLS.get(ask.type)
         return None if farewell is None else self._frame_of(farewell)
 
-    def _advance(self, message: Message | None) -> None:
+    def _advance(self, message: Message) -> None:
+        self._go_on(lambda: self._conversation.send(message))
+
+    def _throw(self, error: Exception) -> None:
+        self._go_on(lambda: self._conversation.throw(error))
+
+    def _go_on(self, step: Callable[[], Ask]) -> None:
+        """Have the conversation do its next step, and keep what it says."""
         try:
-            ask = next(self._conversation) if message is None else self._conversation.send(message)
+            ask = step()
         except StopIteration as end:
             self._result.append(end.value)
             self._end()
@@ -117,26 +125,8 @@ class Dialogue(Generic[T]):
             self._error = exc
             self._end()
         else:
-            self._set(ask)
-
-    def _throw(self, error: Exception) -> None:
-        try:
-            ask = self._conversation.throw(error)
-        except StopIteration as end:
-            self._result.append(end.value)
-            self._end()
-        except BaseException as exc:  # noqa: BLE001
-            self._error = exc
-            self._end()
-        else:
-            self._set(ask)
-
-    def _set(self, ask: Ask) -> None:
-        self._ask = ask
-        if ask.listen:
-            self.frame = None
-            return
-        self.frame = self._frame_of(ask)
+            self._ask = ask
+            self.frame = None if ask.listen else self._frame_of(ask)
 
     def _frame_of(self, ask: Ask) -> bytes:
         self.counter = next_counter(self.counter)
