@@ -73,10 +73,21 @@ def encode_value(
 
 def encode_scalar(attribute: SoeAttribute, value: object) -> bytes:
     """Return the octets of one number; raise ValueError if it is none that fits."""
+    code = _code(attribute)
     try:
-        return struct.pack(_code(attribute), value)
-    except struct.error as exc:
-        raise ValueError(f"{value!r} is no value of {attribute.size} octets: {exc}") from None
+        return struct.pack(code, value)
+    except (struct.error, OverflowError):
+        size = attribute.size
+        raise ValueError(
+            f"{value!r} is no value of {size} octets: expected {_expected(code, 8 * size)}"
+        ) from None
+
+
+def _expected(code: str, bits: int) -> str:
+    if code[-1] in _FLOAT.values():
+        return "a number"
+    low, high = (0, 2**bits) if code[-1].isupper() else (-(2 ** (bits - 1)), 2 ** (bits - 1))
+    return f"a whole number from {low} to {high - 1}"
 
 
 def _code(attribute: SoeAttribute) -> str:

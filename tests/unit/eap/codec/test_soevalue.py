@@ -46,8 +46,19 @@ def test_list_and_text() -> None:
 
 @pytest.mark.parametrize("value", [-1, 1 << 32, "5", 1.5, None])
 def test_what_is_no_value_is_refused(value: object) -> None:
-    with pytest.raises(ValueError, match="is no value of 4 octets"):
+    expected = "is no value of 4 octets: expected a whole number from 0 to 4294967295"
+    with pytest.raises(ValueError, match=expected):
         encode_scalar(UNSIGNED, value)
+
+
+def test_what_is_expected_instead_is_said() -> None:
+    signed = SoeAttribute(length=0, display=Display.SIGNED)
+    with pytest.raises(ValueError, match="expected a whole number from -128 to 127"):
+        encode_scalar(signed, 128)
+    single = SoeAttribute(length=2, display=Display.FLOAT)
+    for value in ("5", 1e300):
+        with pytest.raises(ValueError, match="expected a number"):
+            encode_scalar(single, value)
 
 
 def test_value_that_is_cut_is_truncated() -> None:
