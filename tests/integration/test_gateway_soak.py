@@ -9,6 +9,7 @@ import os
 import random
 import select
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -75,17 +76,40 @@ def _is_dangerous(octets: bytes) -> bool:
 VECTORS = [each.octets for stem in ("type5_gateway", "high_nibble_dialect") for each in load(stem)]
 
 
-def ask_batch(client: Wire, dice: random.Random) -> int:
-    """Send some, and take what comes until it is quiet; return how many answers there were."""
-    for _ in range(BATCH):
-        octets = soak_frames(dice)
-        if octets:
-            client.send(octets)
-    found = 0
-    while select.select([client.sock], [], [], 0.004)[0]:
-        client.sock.recv(4096)
-        found += 1
-    return found
+class Crowd:
+    """Clients one after the other, each from another address, a third of them by TCP.
+
+    Attributes:
+        sent: Requests.
+        answers: Datagrams that came back, and pieces of streams.
+    """
+
+    def __init__(self, dice: random.Random) -> None:
+        self.sent = self.answers = 0
+        self._dice = dice
+
+    def send_client(self) -> None:
+        """Be a client; one by TCP is sent away at what is no frame, and some never read."""
+        is_stream = self._dice.random() < 1 / 3
+        is_deaf = is_stream and self._dice.random() < 1 / 5
+        with wire(HOST, tcp=is_stream) as client, suppress(ConnectionError):
+            for _ in range(25):
+                self._send_batch(client)
+                if not is_deaf:
+                    self._take_answers(client)
+
+    def _send_batch(self, client: Wire) -> None:
+        for _ in range(BATCH):
+            octets = soak_frames(self._dice)
+            if octets:
+                client.send(octets)
+                self.sent += 1
+
+    def _take_answers(self, client: Wire) -> None:
+        while select.select([client.sock], [], [], 0.004)[0]:
+            if not client.sock.recv(4096) and client.is_stream:
+                raise ConnectionError("it has closed the connection")
+            self.answers += 1
 
 
 def memory_kib(appliance: Appliance) -> int:
@@ -95,18 +119,14 @@ def memory_kib(appliance: Appliance) -> int:
 
 @pytest.mark.timeout(REQUESTS // 200 + 120)
 def test_after_all_of_it_everything_works() -> None:
-    dice = random.Random(86)
     with gateway_plant(HOST) as appliance:
         pids = [appliance.pid(name) for name in ("engine", "services", "supervisor")]
-        before, answers, sent = 0, 0, 0
-        while sent < REQUESTS:
-            with wire(HOST) as client:  # another address each time
-                for _ in range(25):
-                    answers += ask_batch(client, dice)
-            sent += 25 * BATCH
-            if not before and sent >= REQUESTS // 4:
+        before, crowd = 0, Crowd(random.Random(86))
+        while crowd.sent < REQUESTS:
+            crowd.send_client()
+            if not before and crowd.sent >= REQUESTS // 4:
                 before = memory_kib(appliance)
-        assert answers > sent // 4
+        assert crowd.answers > crowd.sent // 4
         _check_slaves()
         assert [appliance.pid(name) for name in ("engine", "services", "supervisor")] == pids
         assert memory_kib(appliance) < before + GROWTH_KIB
