@@ -13,8 +13,16 @@ from itertools import count
 import pytest
 
 from eap.gateway.client import GatewayClient
-from tests.support.appliance import Appliance
-from tests.support.gatewayplant import COUPLER, DRIVE, LAST, MUTE, SENSOR, gateway_plant
+from tests.support.appliance import Appliance, wait_until
+from tests.support.gatewayplant import (
+    COUPLER,
+    DRIVE,
+    LAST,
+    MUTE,
+    SENSOR,
+    gateway_plant,
+    state_of,
+)
 from tests.support.gatewaywire import COE, frame, wire
 
 pytestmark = pytest.mark.net
@@ -29,9 +37,16 @@ COUNTER = count()
 
 
 @pytest.fixture(scope="module")
-def plant() -> Iterator[Appliance]:
+def running() -> Iterator[Appliance]:
     with gateway_plant(HOST) as appliance:
         yield appliance
+
+
+@pytest.fixture
+def plant(running: Appliance) -> Appliance:
+    """The plant with its bus in OP, which a busy machine may have cost it for a moment."""
+    wait_until(lambda: state_of(running) == 8)
+    return running
 
 
 def ask(body: bytes) -> bytes:

@@ -133,14 +133,14 @@ def test_flood_leaves_memory_and_engine_alone(halls):
             peer.publish(f"9.9.{number >> 8 & 0xFF}.{number & 0xFF}.1.1", "info", told)
             if number % 100 == 0:
                 assert read(NORTH, NORTH) == VENDOR_OF_DRIVE
-                if time.monotonic() > end:
+                if number >= 200 and time.monotonic() > end:
                     break
     after = north.status()["processes"]
     assert after["services"]["rss"] - before["services"]["rss"] < 48 << 20
     assert [after[each]["restarts"] for each in ("engine", "services")] == [
         before[each]["restarts"] for each in ("engine", "services")
     ]
-    assert north.station("north")["discarded"]["mqtt_topic"] > 100
+    wait_until(lambda: north.station("north")["discarded"]["mqtt_topic"] > 100)
     until_read(SOUTH, by=NORTH)
 
 

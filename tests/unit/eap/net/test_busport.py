@@ -12,7 +12,7 @@ from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
 from eap.net.packetsocket import open_type1
 from eap.net.segmentsocket import SegmentSocket, open_segment
-from tests.unit.eap.net.conftest import ip
+from tests.unit.eap.net.conftest import ip, wait_for_links
 
 pytestmark = pytest.mark.net
 
@@ -187,6 +187,7 @@ def test_interface_that_is_taken_away_and_made_again(cable):
         ip(f"link add {near} type veth peer name {distant}")
         for name in (near, distant):
             ip(f"link set {name} up")
+        wait_for_links(near, distant)
         far = open_segment(InterfaceUri.parse(f"ethernet://{distant}"))
         try:
             with pytest.raises(EnvironmentalError, match="cannot be reached"):
