@@ -147,7 +147,9 @@ def test_user_and_password_are_asked_for_and_a_wrong_one_is_named(tmp_path, capl
     assert "guess" not in caplog.text
 
 
-def test_tls_names_the_broker_and_shows_who_connects(tmp_path, caplog):
+def test_tls_names_the_broker_and_shows_who_connects(tmp_path, caplog, monkeypatch):
+    # aiomqtt waits that long for an answer, although the connection is gone.
+    monkeypatch.setattr(mqttclient, "ANSWER_S", 1.0)
     files = write_certificates(tmp_path, ADDRESS)
     mine = TlsSpec(str(files["ca"]), str(files["client"]), str(files["client_key"]))
     settings = (
