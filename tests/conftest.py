@@ -84,7 +84,11 @@ def state_dir(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what this machine cannot do, and put the ``net`` tests last."""
+    """Skip what this machine cannot do, and put the ``net`` tests last.
+
+    Those of the tools are first: their files take longest, and a worker that has the last one would
+    keep the others waiting.
+    """
     missing = {
         "root": _lacks_root(),
         "tshark": _lacks_program("tshark", package="tshark"),
@@ -95,7 +99,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for marker, reason in missing.items():
             if reason is not None and item.get_closest_marker(marker) is not None:
                 item.add_marker(pytest.mark.skip(reason=reason))
-    items.sort(key=_is_net)
+    items.sort(key=lambda item: (_is_net(item), "tools" not in item.path.parts))
 
 
 def pytest_collection_finish() -> None:

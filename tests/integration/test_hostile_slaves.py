@@ -85,6 +85,7 @@ def line() -> Paced:
     mailbox = MailboxSpec(foe=True, soe=True, eoe=True, voe=True, aoe=True)
     evil = slave("evil", mailbox=mailbox)
     line = Paced(Master(), segment(slave("good"), evil, slave("other")))
+    line.period_ns = 4 * MS  # seconds of time-outs pass sooner
     line.wait(line.core.bring_up(line.now_ns))
     device = line.segment.slaves[1].device
     device.mailbox = line.evil = Evil(device.mailbox)

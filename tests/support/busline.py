@@ -205,14 +205,15 @@ def open_mailbox(line: Line, station: int = 1001, *, slow: bool = False) -> Mail
 
 
 class Paced(Line):
-    """A line whose core, a master, starts a cycle every millisecond."""
+    """A line whose core, a master, starts a cycle every *period_ns*."""
 
     next_cycle_ns = 0
+    period_ns = MS
 
     def step(self, until_ns):
         if self.now_ns >= self.next_cycle_ns:
             self.core.start_cycle(self.now_ns)
-            self.next_cycle_ns = self.now_ns + MS
+            self.next_cycle_ns = self.now_ns + self.period_ns
         super().step(min(until_ns, self.next_cycle_ns))
 
     def events(self):
