@@ -53,12 +53,14 @@ class RemoteAds:
     async def answer(self, body: bytes) -> list[bytes]:
         """Return the answers to a packet, or to a fragment of one."""
         header, data = decode_packet(body)
+        if header.state_flags & StateFlags.RESPONSE:
+            return []  # to our fragments, which nobody has to acknowledge
         if header.command == AmsCommand.FRAGMENT:
             packet, acknowledgement = self._assembler.receive(header, bytes(data), monotonic_ns())
             if packet is None:
                 return [acknowledgement] if acknowledgement else []
             header, data = decode_packet(packet)
-        if header.command not in _PASSED or header.state_flags & StateFlags.RESPONSE:
+        if header.command not in _PASSED:
             raise ElsewhereError(Reason.SERVICE.value.ads)
         answer = await self._link.pass_on(header.command, bytes(data))
         if header.state_flags & StateFlags.NO_RETURN:

@@ -85,6 +85,19 @@ def test_changes_and_refusals_are_audited() -> None:
     play(scene)
 
 
+def test_a_file_elsewhere_is_judged_when_it_is_opened() -> None:
+    async def scene(desk: Desk) -> None:
+        refused = await desk.one(FOE, 0x9001, "02 00 00000000" + FILE, ELSEWHERE)
+        assert refused.startswith("05 00 0a 80 00 00")
+        step = await desk.one(FOE, 0x9001, "03 00 01000000 61", ELSEWHERE)
+        assert step.startswith("05 00 04 80 00 00")
+        assert not desk.station.asked
+        await desk.one(FOE, 0x9001, "01 00 00000000" + FILE, ELSEWHERE)
+        assert desk.station.asked, "reading takes no rule"
+
+    play(scene)
+
+
 def test_the_audit_tells_how_a_change_came_out() -> None:
     async def scene(desk: Desk) -> None:
         entries: list[AuditEntry] = []

@@ -86,16 +86,18 @@ def test_who_wants_no_answer_gets_none() -> None:
     assert station.asked == [Write(1, 2, b"x")]
 
 
-@pytest.mark.parametrize(
-    ("command", "flags"),
-    [
-        (AmsCommand.ADD_NOTIFICATION, StateFlags.ADS),
-        (AmsCommand.READ_STATE, StateFlags.ADS | StateFlags.RESPONSE),
-        (0x7777, StateFlags.ADS),
-    ],
-)
-def test_what_is_not_passed(command: int, flags: StateFlags) -> None:
+@pytest.mark.parametrize("command", [AmsCommand.FRAGMENT, AmsCommand.READ_STATE])
+def test_answers_are_not_answered(command: AmsCommand) -> None:
+    flags = StateFlags.ADS | StateFlags.RESPONSE
     header = AmsHeader(SLAVE, 1001, CLIENT, 800, command, flags, invoke_id=1)
+    station = Station()
+    assert answer(RemoteAds(station.link(), ROOM), encode_packet(header, b"")) == []
+    assert not station.asked
+
+
+@pytest.mark.parametrize("command", [AmsCommand.ADD_NOTIFICATION, 0x7777])
+def test_what_is_not_passed(command: int) -> None:
+    header = AmsHeader(SLAVE, 1001, CLIENT, 800, command, StateFlags.ADS, invoke_id=1)
     with pytest.raises(ElsewhereError) as caught:
         answer(RemoteAds(Station().link(), ROOM), encode_packet(header, b""))
     assert caught.value.result == AdsError.SERVICE
