@@ -23,7 +23,7 @@ from tests.support.gatewayplant import (
     gateway_plant,
     state_of,
 )
-from tests.support.gatewaywire import COE, frame, wire
+from tests.support.gatewaywire import COE, Wire, frame, wire
 
 pytestmark = pytest.mark.net
 
@@ -43,32 +43,35 @@ def running() -> Iterator[Appliance]:
 
 
 @pytest.fixture
-def plant(running: Appliance) -> Appliance:
-    """The plant with its bus in OP, which a busy machine may have cost it for a moment."""
+def client(running: Appliance) -> Iterator[Wire]:
+    """A client that gets one answer to each request; at first the bus is in OP.
+
+    A busy machine may have cost it that for a moment.
+    """
     wait_until(lambda: state_of(running) == 8)
-    return running
-
-
-def ask(body: bytes) -> bytes:
-    """Return what answers a message to the master."""
     with wire(HOST) as client:
-        answer = client.ask(frame(COE, 0, body, next(COUNTER) % 7 + 1))
+        yield client
         assert not client.rest()
+
+
+def ask(client: Wire, body: bytes) -> bytes:
+    """Return what answers a message to the master."""
+    answer = client.ask(frame(COE, 0, body, next(COUNTER) % 7 + 1))
     assert len(answer) == 2 + (int.from_bytes(answer[:2], "little") & 0x7FF) <= 1472
     return answer[8:]
 
 
-def info(opcode: int, body: bytes) -> bytes:
-    answer = ask(struct.pack("<HBBH", 8 << 12, opcode, 0, 0) + body)
+def info(client: Wire, opcode: int, body: bytes) -> bytes:
+    answer = ask(client, struct.pack("<HBBH", 8 << 12, opcode, 0, 0) + body)
     assert answer[2] == opcode + 1, answer.hex()
     assert answer[4:6] == bytes(2)
     return answer[6:]
 
 
-def upload(index: int, *, complete: bool) -> bytes:
+def upload(client: Wire, index: int, *, complete: bool) -> bytes:
     command = 0x50 if complete else 0x40
     request = struct.pack("<HBHBI", 2 << 12, command, index, 0, 0)
-    answer = ask(request + bytes(8))
+    answer = ask(client, request + bytes(8))
     assert answer[3:6] == request[3:6]
     if answer[2] & 2:
         return answer[6 : 10 - (answer[2] >> 2 & 3)]
@@ -77,55 +80,55 @@ def upload(index: int, *, complete: bool) -> bytes:
     return answer[10:]
 
 
-def test_objects_and_descriptions(plant: Appliance) -> None:
-    indexes = [each[0] for each in struct.iter_unpack("<H", info(1, b"\1\0"))]
+def test_objects_and_descriptions(client: Wire) -> None:
+    indexes = [each[0] for each in struct.iter_unpack("<H", info(client, 1, b"\1\0"))]
     assert indexes[0] == 1
     assert set(indexes[1:]) >= {*FIXED, *SLAVES, 0xF000, 0xF002, 0xF020, 0xF040, 0xF120, 0xF200}
     for index in (0x1018, 0x8000, 0x9004, 0xA000, 0xF120):
-        described = info(3, struct.pack("<H", index))
+        described = info(client, 3, struct.pack("<H", index))
         last = described[4]
         assert struct.unpack_from("<H", described) == (index,)
         subindexes = {0x8000: CONFIGURED, 0xA000: DIAGNOSIS}.get(index, (0, last))
         assert last == max(subindexes)
         for subindex in subindexes:
-            entry = info(5, struct.pack("<HBB", index, subindex, 0x7F))
+            entry = info(client, 5, struct.pack("<HBB", index, subindex, 0x7F))
             assert entry[:3] == struct.pack("<HB", index, subindex)
             assert entry[3] == 7, "only what has a fixed place"
             assert entry[10:].decode("ascii").isprintable()
 
 
-def test_gaps_are_errors_of_sdo_information(plant: Appliance) -> None:
+def test_gaps_are_errors_of_sdo_information(client: Wire) -> None:
     for subindex in (9, 32, 38):
         request = struct.pack("<HBBHHBB", 8 << 12, 5, 0, 0, 0x8000, subindex, 0x7F)
-        answer = ask(request)
+        answer = ask(client, request)
         assert answer[2] == 7
         assert len(answer) == 10
 
 
-def test_whole_objects(plant: Appliance) -> None:
-    with GatewayClient(HOST) as client:
-        known = {each.station: each for each in client.slaves()}
+def test_whole_objects(client: Wire) -> None:
+    with GatewayClient(HOST) as tool:
+        known = {each.station: each for each in tool.slaves()}
     assert tuple(known) == STATIONS
     for number, station in enumerate(STATIONS):
         slave = known[station]
-        told = struct.unpack("<BxH16s32s5I2H3B", upload(0x8000 + number, complete=True))
+        told = struct.unpack("<BxH16s32s5I2H3B", upload(client, 0x8000 + number, complete=True))
         assert told[:2] == (37, station)
         assert told[3].rstrip(b"\0").decode() == slave.name
         assert told[5:9] == (slave.vendor, slave.product, slave.revision, slave.serial)
         assert told[9:11] == (slave.to_slave, slave.to_master)
-        found = struct.unpack("<BxH4IH", upload(0x9000 + number, complete=True))
+        found = struct.unpack("<BxH4IH", upload(client, 0x9000 + number, complete=True))
         assert found[:6] == (32, station, slave.vendor, slave.product, slave.revision, slave.serial)
-        how = struct.unpack("<BxHHHBB4H4I3I?", upload(0xA000 + number, complete=True))
+        how = struct.unpack("<BxHHHBB4H4I3I?", upload(client, 0xA000 + number, complete=True))
         assert how[:2] == (17, 8)
 
 
-def test_lists_figures_and_the_command(plant: Appliance) -> None:
-    assert struct.unpack("<Bx5H", upload(0xF020, complete=True)) == (5, *STATIONS)
-    figures = struct.unpack("<Bx4IH", upload(0xF120, complete=True))
+def test_lists_figures_and_the_command(client: Wire) -> None:
+    assert struct.unpack("<Bx5H", upload(client, 0xF020, complete=True)) == (5, *STATIONS)
+    figures = struct.unpack("<Bx4IH", upload(client, 0xF120, complete=True))
     assert (figures[0], figures[5] & 0x0F) == (16, 8)
-    assert upload(0xF200, complete=True)[0] == 16
-    assert upload(0x1000, complete=False)
-    assert upload(0x1008, complete=False) == b"EtherCAT master mill/bus0"
-    assert struct.unpack("<Bx4I", upload(0x1018, complete=True))[0] == 4
-    refused = ask(struct.pack("<HBHBI", 2 << 12, 0x50, 0xF002, 0, 0) + bytes(8))
+    assert upload(client, 0xF200, complete=True)[0] == 16
+    assert upload(client, 0x1000, complete=False)
+    assert upload(client, 0x1008, complete=False) == b"EtherCAT master mill/bus0"
+    assert struct.unpack("<Bx4I", upload(client, 0x1018, complete=True))[0] == 4
+    refused = ask(client, struct.pack("<HBHBI", 2 << 12, 0x50, 0xF002, 0, 0) + bytes(8))
     assert (refused[2], refused[6:10].hex()) == (0x80, "43000406")
