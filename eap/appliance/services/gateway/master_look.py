@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from devicebus.master.access import fprd
+from devicebus.master.access import Access, fprd
 from devicebus.master.procedure import Procedure
 from devicebus.master.scan import Identity, count_slaves, read_identity, read_stations
 from devicebus.master.topology import find_joints
@@ -14,6 +14,8 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 PORTS = 4
 LOOPS = Register.DL_CONTROL + 1
 """Where the loop control of the four ports stands, two bits each."""
+_EACH, _AT_ONCE = 4, 15
+"""Registers of a slave, and slaves that are read at a time: every step takes a cycle."""
 
 
 class Seen(NamedTuple):
@@ -68,23 +70,29 @@ def neighbour(seen: Mapping[int, Seen], order: Sequence[int], station: int, port
 def look_at(stations: Sequence[int]) -> Procedure[dict[int, Seen]]:
     """Read the registers that diagnosis shows."""
     found: dict[int, Seen] = {}
-    for station in stations:
-        replies, _ = yield [
-            fprd(station, Register.AL_STATUS, AlStatus.SIZE),
-            fprd(station, Register.DL_STATUS, DlStatus.SIZE),
-            fprd(station, LOOPS, 1),
-            fprd(station, Register.RX_ERROR, 2 * PORTS),
-        ]
-        al, dl, loops, errors = replies
-        if all(reply.wkc for reply in replies):
-            found[station] = Seen(
-                AlStatus.decode(al.data),
-                DlStatus.decode(dl.data),
-                int.from_bytes(dl.data, "little"),
-                loops.data[0],
-                tuple(errors.data[::2]),
-            )
+    for start in range(0, len(stations), _AT_ONCE):
+        part = stations[start : start + _AT_ONCE]
+        replies, _ = yield [access for station in part for access in _accesses(station)]
+        for number, station in enumerate(part):
+            al, dl, loops, errors = own = replies[number * _EACH : (number + 1) * _EACH]
+            if all(reply.wkc for reply in own):
+                found[station] = Seen(
+                    AlStatus.decode(al.data),
+                    DlStatus.decode(dl.data),
+                    int.from_bytes(dl.data, "little"),
+                    loops.data[0],
+                    tuple(errors.data[::2]),
+                )
     return found
+
+
+def _accesses(station: int) -> list[Access]:
+    return [
+        fprd(station, Register.AL_STATUS, AlStatus.SIZE),
+        fprd(station, Register.DL_STATUS, DlStatus.SIZE),
+        fprd(station, LOOPS, 1),
+        fprd(station, Register.RX_ERROR, 2 * PORTS),
+    ]
 
 
 def detect() -> Procedure[tuple[Found, ...]]:

@@ -36,6 +36,8 @@ from eap.od.profiles.master1100 import Live
 
 FRESH_S = 0.1
 """How long a look at the bus is good for."""
+LINKS_FRESH_S = 1.0
+"""How long more a look at registers is good for the configuration, which shows links only."""
 _STATES = frozenset((AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT))
 
 logger = logging.getLogger(__name__)
@@ -92,7 +94,7 @@ class MasterView:
             if loop.time() >= self._until_s:
                 await self._look()
                 self._until_s = loop.time() + FRESH_S
-            if with_registers and loop.time() >= self._registers_until_s:
+            if with_registers and self._is_blind(loop.time(), place):
                 await self._look_closely()
                 self._registers_until_s = loop.time() + FRESH_S
             slave = self._at(place)
@@ -101,10 +103,11 @@ class MasterView:
 
     def is_fresh(self, *, with_registers: bool, place: int | None = None) -> bool:
         """Say whether :meth:`refresh` has nothing to do."""
-        until_s = self._registers_until_s if with_registers else self._until_s
         slave = self._at(place)
-        is_known = slave is None or self._facts.is_known(slave)
-        return is_known and asyncio.get_running_loop().time() < until_s
+        if slave is not None and not self._facts.is_known(slave):
+            return False
+        now_s = asyncio.get_running_loop().time()
+        return now_s < self._until_s and not (with_registers and self._is_blind(now_s, place))
 
     def configured(self) -> Sequence[int]:
         """Return the station addresses of the configuration."""
@@ -193,6 +196,10 @@ class MasterView:
                 self._start(self._detect())
         elif any(data):
             self._reset()
+
+    def _is_blind(self, now_s: float, place: int | None) -> bool:
+        """Say whether what is known of registers is too old, where it matters."""
+        return now_s >= self._registers_until_s + (0 if place is None else LINKS_FRESH_S)
 
     def _at(self, place: int | None) -> SlaveReport | None:
         slaves = self._report.slaves if place is not None else ()

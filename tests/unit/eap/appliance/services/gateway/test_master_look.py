@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from devicebus.master.access import Access, Reply
 from devicebus.wire.alstatus import AlState
 from eap.appliance.services.gateway.master_look import LOOPS, Seen, detect, look_at
 from tests.support.fakeengine import FakeBus
@@ -18,6 +21,27 @@ def test_slaves_are_looked_at_and_who_does_not_answer_is_left_out() -> None:
     assert seen[1001].dl_word
     assert Seen().errors == (0, 0, 0, 0)
     assert LOOPS == 0x0101
+
+
+def test_many_slaves_are_looked_at_in_few_steps() -> None:
+    stations = range(1001, 1041)
+    look, steps = look_at(stations), 0
+
+    def answered(asked: Sequence[Access]) -> tuple[list[Reply], int]:
+        nonlocal steps
+        steps += 1
+        return [Reply(access.data, 1) for access in asked], 0
+
+    def run() -> dict[int, Seen]:
+        asked = next(look)
+        while True:
+            try:
+                asked = look.send(answered(asked))
+            except StopIteration as end:
+                return end.value
+
+    assert list(run()) == list(stations)
+    assert steps == 3
 
 
 def test_a_scan_finds_who_is_there() -> None:

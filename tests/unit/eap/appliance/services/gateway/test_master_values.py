@@ -75,7 +75,10 @@ def test_one_look_serves_all_who_ask_at_once() -> None:
         assert len(engine.of(Transfer)) == looks
         await asyncio.sleep(FRESH_S + 0.01)
         await view.refresh(with_registers=False)
+        await view.refresh(with_registers=True, place=0)  # links of the configuration
         assert len(engine.of(Transfer)) == looks
+        await view.refresh(with_registers=True)
+        assert len(engine.of(Transfer)) > looks
 
     play(scene)
 
