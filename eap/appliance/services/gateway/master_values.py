@@ -39,6 +39,8 @@ FRESH_S = 0.1
 LINKS_FRESH_S = 1.0
 """How long more a look at registers is good for the configuration, which shows links only."""
 _STATES = frozenset((AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT))
+_AL_CONTROL_BITS = 6
+"""State, acknowledgement, request for an id: what stands above them is nothing."""
 
 logger = logging.getLogger(__name__)
 
@@ -175,8 +177,8 @@ class MasterView:
         """Ask for a state, or set the loops of ports; what goes wrong later is logged."""
         if key is Live.AL_CONTROL:
             target = value & 0x0F
-            if target not in _STATES:
-                raise SdoAbortError(AbortCode.VALUE, 0xA000, 2, f"there is no AL state {target}")
+            if target not in _STATES or value >> _AL_CONTROL_BITS:
+                raise SdoAbortError(AbortCode.VALUE, 0xA000, 2, f"{value:#x} asks for no AL state")
             self._wanted[station] = value
             self._start(self._bring(station, AlState(target)))
         elif key is Live.LINK_CONTROL:

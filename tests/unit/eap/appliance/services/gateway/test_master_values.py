@@ -104,8 +104,9 @@ def test_states_and_loops_are_written() -> None:
         await soon(lambda: bool(engine.of(Bring)))
         assert engine.of(Bring)[0].target == 1
         assert view.of_diagnosis(1001, Live.AL_CONTROL) == 1
-        with pytest.raises(SdoAbortError, match="no AL state 5"):
-            view.write_slave(1001, Live.AL_CONTROL, 5)
+        for value in (0, 5, 99):
+            with pytest.raises(SdoAbortError, match=f"{value:#x} asks for no AL state"):
+                view.write_slave(1001, Live.AL_CONTROL, value)
         view.write_slave(1004, Live.LINK_CONTROL, 0x0C)
         await asyncio.sleep(0.01)
         await view.refresh(with_registers=True)
