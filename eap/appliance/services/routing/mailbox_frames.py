@@ -6,6 +6,8 @@ That is AoE to address 0; every other mailbox belongs to a bus, whose gateway pa
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
+from typing import Protocol
 
 from devicebus.mailbox.counter import next_counter
 from eap.appliance.discards import Refusal
@@ -23,6 +25,25 @@ from eap.errors import CodecError, MalformedError
 
 FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
 _MAX_PEERS = 1024
+
+
+class FrameTaker(Protocol):
+    """Takes frames that are no AoE to a station: a gateway, if there is one."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is any gateway."""
+
+    def receive(
+        self, frame: bytes, connection: str, send: Callable[[str, bytes], object]
+    ) -> Refusal | None:
+        """Act on a frame of *connection*, to which *send* sends; return why not if not taken."""
+
+    def connection_closed(self, connection: str) -> None:
+        """Forget who is gone."""
+
+    async def wait_below(self, connection: str, count: int) -> None:
+        """Wait until fewer than *count* requests of a connection wait."""
 
 
 def aoe_packet(data: Buffer) -> bytes | None:

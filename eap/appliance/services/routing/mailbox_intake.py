@@ -7,8 +7,12 @@ from time import monotonic_ns
 from typing import Protocol
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.gateway.door import GatewayDoor
-from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet, refusal_of
+from eap.appliance.services.routing.mailbox_frames import (
+    FrameTaker,
+    MailboxCounters,
+    aoe_packet,
+    refusal_of,
+)
 from eap.pd.link import Channel, Origin, OutFrame
 
 
@@ -33,7 +37,7 @@ class MailboxIntake:
     def __init__(
         self,
         entrance: WayIn,
-        gateway: GatewayDoor,
+        gateway: FrameTaker,
         carrier: ChannelCarrier,
         is_for_many: Callable[[memoryview], bool],
         *,

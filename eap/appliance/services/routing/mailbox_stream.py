@@ -8,9 +8,8 @@ from collections.abc import Callable
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.accepting import connection_name
-from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing.entrance import Entrance
-from eap.appliance.services.routing.mailbox_frames import MailboxCounters, aoe_packet
+from eap.appliance.services.routing.mailbox_frames import FrameTaker, MailboxCounters, aoe_packet
 from eap.appliance.services.routing.uplink import Uplinks
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxHeader
@@ -41,7 +40,7 @@ class MailboxStreams:
     def __init__(
         self,
         entrance: Entrance,
-        gateway: GatewayDoor,
+        gateway: FrameTaker,
         refuse: Callable[[Refusal], None],
         source: str = "",
         *,
