@@ -12,8 +12,17 @@ from contextlib import suppress
 import pytest
 
 from eap.gateway.client import GatewayClient
-from tests.support.appliance import Appliance
-from tests.support.gatewayplant import COUPLER, DRIVE, FILE, LAST, MUTE, SENSOR, gateway_plant
+from tests.support.appliance import Appliance, wait_until
+from tests.support.gatewayplant import (
+    COUPLER,
+    DRIVE,
+    FILE,
+    LAST,
+    MUTE,
+    SENSOR,
+    gateway_plant,
+    state_of,
+)
 from tests.support.gatewaywire import AOE, COE, EOE, ERR, FOE, SOE, VENDOR, VOE, Wire, frame, wire
 from tests.support.vectors import load
 
@@ -47,9 +56,16 @@ DIALECT = {
 
 
 @pytest.fixture(scope="module")
-def plant() -> Iterator[Appliance]:
+def running() -> Iterator[Appliance]:
     with gateway_plant(HOST) as appliance:
         yield appliance
+
+
+@pytest.fixture
+def plant(running: Appliance) -> Appliance:
+    """The plant with its bus in OP, which a busy machine may have cost it for a moment."""
+    wait_until(lambda: state_of(running) == 8)
+    return running
 
 
 @pytest.fixture(params=["udp", "tcp"])
