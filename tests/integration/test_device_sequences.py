@@ -133,7 +133,6 @@ class Sequences(RuleBasedStateMachine):
         self.device: StationDevice | None = None
 
     def teardown(self) -> None:
-        self.stop()
         self.loop.run_until_complete(self.loop.shutdown_default_executor())
         self.loop.close()
         self.patch.undo()
@@ -149,12 +148,6 @@ class Sequences(RuleBasedStateMachine):
     def start_services(self) -> None:
         ((spec, state),) = effective("demo", (PLANT_FILE,))
         self.device, _ = make_device(spec, state, engine=self.engine)
-        self.serving = self.loop.create_task(self.device.serve())
-
-    def stop(self) -> None:
-        if self.device is not None:
-            self.serving.cancel()
-            self.loop.run_until_complete(asyncio.wait([self.serving]))
 
     def run(self, job: Callable[[], Awaitable[Any]]) -> Any:
         """Do *job*; an engine that has died meanwhile is started again, and told."""
@@ -202,12 +195,10 @@ class Sequences(RuleBasedStateMachine):
 
     @rule()
     def restart_services(self) -> None:
-        self.stop()
         self.start_services()
 
     @rule()
     def restart_appliance(self) -> None:
-        self.stop()
         self.start()
 
     def arrange(self, trouble: Any) -> None:
