@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from devicebus.mailbox.protocol import MailboxSizes, refuse, refuse_unreadable
+from devicebus.mailbox.protocol import MailboxSizes, readable, refuse
 from devicebus.mailbox.sdo_server import SdoServer
 from devicebus.mailbox.sdoinfo_server import SdoInfoServer
 from eap.codec.coe import CoeHeader, CoeService, Emergency, encode_message
@@ -59,8 +59,7 @@ class CoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answers."""
         del now_ns
-        with refuse_unreadable():
-            header = CoeHeader.decode(data)
+        header = readable(CoeHeader.decode, data)
         body = data[CoeHeader.SIZE :]
         if header.service is CoeService.SDO_REQUEST:
             return self._sdo.receive_request(body)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from devicebus.mailbox.eoe_fragment import Assembler, iter_fragments
-from devicebus.mailbox.protocol import MailboxSizes, refuse, refuse_unreadable
+from devicebus.mailbox.protocol import MailboxSizes, readable, refuse
 from eap.codec.eoe import (
     DATA_OVERHEAD,
     EoeHeader,
@@ -67,11 +67,10 @@ class EoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer, if it has one."""
         del now_ns
-        with refuse_unreadable():
-            header, _, body = decode_message(data)
-            if header.type is EoeType.FRAGMENT:
-                self._take_fragment(data)
-                return []
+        header, _, body = readable(decode_message, data)
+        if header.type is EoeType.FRAGMENT:
+            readable(self._take_fragment, data)
+            return []
         if header.type not in _RESPONSE:
             refuse(MailboxError.SERVICE_NOT_SUPPORTED, f"type {header.type.name}")
         return [self._answer(header, bytes(body))]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import NoReturn, Protocol
+from collections.abc import Callable
+from typing import NoReturn, Protocol, TypeVar
 
 from devicebus.errors import MailboxRefusedError
 from eap.codec.mailbox import MailboxError, MailboxHeader
 from eap.errors import MalformedError, TruncatedError
+
+T = TypeVar("T")
 
 MINIMUM_SIZE = 16
 """Octets of the smallest mailbox that holds the header of every protocol but AoE."""
@@ -61,11 +62,10 @@ def refuse(detail: MailboxError, reason: str) -> NoReturn:
     raise MailboxRefusedError(f"{detail.name}: {reason}", detail=detail)
 
 
-@contextmanager
-def refuse_unreadable() -> Iterator[None]:
-    """Answer what cannot be decoded in a block with a mailbox error."""
+def readable(decode: Callable[[bytes], T], data: bytes) -> T:
+    """Return what *decode* makes of a message; what it cannot read gets a mailbox error."""
     try:
-        yield
+        return decode(data)
     except TruncatedError as exc:
         refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
     except MalformedError as exc:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 
 from devicebus.errors import SoeError
-from devicebus.mailbox.protocol import MailboxSizes, refuse, refuse_unreadable
+from devicebus.mailbox.protocol import MailboxSizes, readable, refuse
 from devicebus.mailbox.soe_parameter import MAX_LENGTH, SoeParameter
 from eap.codec.coe import Emergency
 from eap.codec.mailbox import MailboxError
@@ -93,8 +93,7 @@ class SoeServer:
 
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer in its fragments."""
-        with refuse_unreadable():
-            header = SoeHeader.decode(data)
+        header = readable(SoeHeader.decode, data)
         if header.opcode not in _RESPONSE:
             refuse(MailboxError.SERVICE_NOT_SUPPORTED, f"opcode {header.opcode.name}")
         body = data[SoeHeader.SIZE :]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from devicebus.mailbox.protocol import refuse_unreadable
+from devicebus.mailbox.protocol import readable
 from eap.codec.voe import VoeHeader
 
 
@@ -22,8 +22,7 @@ class VoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Act on a message behind its mailbox header and return the answer, if it has one."""
         del now_ns
-        with refuse_unreadable():
-            header = VoeHeader.decode(data)
+        header = readable(VoeHeader.decode, data)
         if self._handler is None:
             return [data]
         answer = self._handler(header.vendor_id, header.vendor_type, data[VoeHeader.SIZE :])

@@ -18,9 +18,9 @@ from eap.pd.link import Origin
 _MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
 
 
-QUICK_NS = 80_000
+QUICK_NS = 120_000
 """Frames that come within this time after the last was answered are quick."""
-PATIENCE_NS = 40_000
+PATIENCE_NS = 60_000
 """How long is watched for the next of them."""
 MOST_FRAMES = 16
 """That are taken so before others have their turn."""

@@ -46,6 +46,9 @@ ANSWER_S = 0.9
 
 _NOT_TAKEN = {Admission.CROWDED: Reason.CROWDED, Admission.TOO_FAST: Reason.TOO_FAST}
 
+_BY_TCP = f"{DoorKind.TCP}:"
+"""How the names of such doors begin."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -145,7 +148,7 @@ class MailboxGateway:
         """
         header, body = decode_frame(frame)
         key = frame
-        if way.kind == DoorKind.TCP:  # what comes twice there was asked twice
+        if way.door.startswith(_BY_TCP):  # what comes twice there was asked twice
             self._count += 1
             key += self._count.to_bytes(8)
         now_ns = monotonic_ns()
