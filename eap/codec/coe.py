@@ -24,8 +24,6 @@ class CoeService(IntEnum):
     RX_PDO_REMOTE_REQUEST = 7
     SDO_INFORMATION = 8
 
-    __hash__ = int.__hash__  # that of enums is slow
-
 
 class CoeHeader(WireStruct, frozen=True):
     """ETG.1000.6: the two octets behind the mailbox header; *number* is that of a PDO, else 0."""
@@ -59,4 +57,5 @@ def encode_message(service: CoeService, body: Buffer, *, number: int = 0) -> byt
     return head + body
 
 
-_PLAIN_HEADERS = {service: CoeHeader(service=service).encode() for service in CoeService}
+_PLAIN_HEADERS = [bytes((0, number << 4)) for number in range(16)]
+"""By service, without a number."""

@@ -6,6 +6,7 @@ An SDO goes *expedited* (up to 4 octets, within the header), *normal* (all data 
 
 from __future__ import annotations
 
+import struct
 from enum import IntEnum
 
 from eap.codec.coe import CoeService, encode_message
@@ -64,6 +65,12 @@ class SdoHeader(WireStruct, frozen=True):
         return self.value.to_bytes(EXPEDITED_SIZE, "little")[:size]
 
 
+_HEAD = struct.Struct("<BHB")
+"""The octets of a header in front of its value, for what is sent most, in one step."""
+_EXPEDITED = 0b11
+"""With data in the header, of which the size is said."""
+
+
 class SdoSegmentHeader(WireStruct, frozen=True):
     """ETG.1000.6, SDO segment: *unused* counts only where fewer than 7 octets of data follow."""
 
@@ -88,8 +95,11 @@ def encode_initiate(
     """
     size = len(data)
     if 0 < size <= EXPEDITED_SIZE:
-        value = int.from_bytes(data, "little")
         unused = EXPEDITED_SIZE - size
+        if index <= 0xFFFF and subindex <= 0xFF:  # the usual one in one step
+            command = _EXPEDITED | unused << 2 | complete << 4 | specifier << 5
+            return _HEAD.pack(command, index, subindex) + bytes(data).ljust(EXPEDITED_SIZE, b"\0")
+        value = int.from_bytes(data, "little")
         return SdoHeader(1, 1, unused, complete, specifier, index, subindex, value).encode()
     head = SdoHeader(1, 0, 0, complete, specifier, index, subindex, size)
     return head.encode() + bytes(data[:room])

@@ -7,6 +7,7 @@ protocols become the operations that an ADS client would ask for to have the sam
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 from eap.aoe.ads_operation import AdsRefusedError, Operation, Read, ReadWrite, Write
 from eap.aoe.ads_request import parse_request
@@ -31,6 +32,7 @@ _UPLOAD, _DOWNLOAD = SdoRequest.UPLOAD, SdoRequest.DOWNLOAD
 _EOE_READS = frozenset((EoeType.GET_IP_REQUEST, EoeType.GET_FILTER_REQUEST))
 
 
+@lru_cache(1024)  # clients ask for the same again and again
 def operation_of(kind: MailboxType, body: bytes) -> Operation | None:
     """Return what a request does; None for a step of a transfer that was judged at its start."""
     find = _BY_KIND.get(kind)

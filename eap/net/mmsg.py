@@ -144,12 +144,12 @@ class ReceiveBatch:
             return 0
         return next((n for n, known in enumerate(views) if known is view), None)
 
-    def sender(self, view: memoryview) -> tuple[str, int]:
-        """Return IPv4 address and port of who sent *view*, as long as the batch holds it."""
+    def sender(self, view: memoryview) -> tuple[int, bytes]:
+        """Return port and IPv4 address of who sent *view*, as long as the batch holds it."""
         position = self.position(view)
         assert position is not None  # noqa: S101  only what was just handed over is asked for
-        port, host = _SENDER(self._senders, position * _SOCKADDR_SIZE)
-        return socket.inet_ntoa(host), port
+        port, address = _SENDER(self._senders, position * _SOCKADDR_SIZE)
+        return port, address
 
     def _read_clocks(self) -> int:
         """Return the monotonic time and see how far the wall clock, which stamps, is from it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 
 from eap.codec.ethercat import EAP_PORT
 from eap.ids import Destination
@@ -62,7 +63,7 @@ class UdpChannel:
 
     def sender_of(self, data: memoryview) -> str:
         """Return ``address:port`` of who sent *data*; nothing for who has no address yet."""
-        return _destination(*self._batch.sender(data))
+        return _destination(self._batch.sender(data))
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* to their destinations; return those that the kernel refused."""
@@ -93,7 +94,10 @@ def _socket_address(destination: str) -> tuple[bytes, tuple[str, int]]:
     ), address
 
 
-def _destination(host: str, port: int) -> str:
+@lru_cache(1024)  # the same ones send again and again
+def _destination(sender: tuple[int, bytes]) -> str:
+    port, octets = sender
+    host = socket.inet_ntoa(octets)
     if host == _NO_ADDRESS:
         return ""
     return f"{host}:{port}" if port else host

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
+
+import msgspec
 
 from devicebus.mailbox.counter import next_counter
 from eap.aoe.way import Way
@@ -19,7 +21,7 @@ Send: TypeAlias = Callable[[bytes], None]
 """Sends a frame back to who sent a request, now or later."""
 
 
-class Request(NamedTuple):
+class Request(msgspec.Struct, frozen=True):
     """A message of a client; *send* takes whole frames."""
 
     header: MailboxHeader

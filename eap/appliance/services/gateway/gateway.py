@@ -13,6 +13,8 @@ from functools import partial
 from time import monotonic_ns
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation
 from eap.aoe.spec import DoorKind
@@ -161,7 +163,7 @@ class MailboxGateway:
             return None
         if self._answer_at_once(request, key, now_ns):
             return None
-        request = request._replace(ticket=Ticket(self.ledger, way, key))
+        request = replace(request, ticket=Ticket(self.ledger, way, key))
         task = asyncio.get_running_loop().create_task(self._serve(request))
         self._tasks.add(task)
         task.add_done_callback(partial(self._done, request))
@@ -220,7 +222,7 @@ class MailboxGateway:
 
     def _answer_at_once(self, request: Request, key: bytes, start_ns: int) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
-        header, body, way, _, _ = request
+        header, body, way = request.header, request.body, request.way
         if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
             return False
         if self.ledger.waiting(way) > 1:
@@ -293,11 +295,11 @@ class MailboxGateway:
         start_ns: int,
     ) -> None:
         """Tell the audit, count, and answer from *address*."""
-        station, target, operation, verdict = judged
+        operation, verdict = judged.operation, judged.verdict
         if operation is not None and verdict is not None:
-            self.guard.tell(request.way, target, operation, verdict, result_of(replies))
+            self.guard.tell(request.way, judged.target, operation, verdict, result_of(replies))
         took_ns = monotonic_ns() - start_ns
-        self._answering.answer(request, station, address, replies, took_ns)
+        self._answering.answer(request, judged.station, address, replies, took_ns)
 
     def _target(self, found: object) -> Target:
         """Return by what rules name somebody."""

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import msgspec
+
 from eap.aoe.access import AccessList, Verdict
 from eap.aoe.ads_operation import Operation, Read
 from eap.aoe.judged import AuditedOperation, AuditEntry
@@ -42,7 +44,7 @@ class Target(NamedTuple):
     port: int
 
 
-class Judged(NamedTuple):
+class Judged(msgspec.Struct, frozen=True):
     """What a request does, to whom, and whether it may.
 
     Attributes:

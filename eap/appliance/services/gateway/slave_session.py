@@ -11,7 +11,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
-from typing import NamedTuple
+
+import msgspec
+from msgspec.structs import replace
 
 from devicebus.errors import (
     BusError,
@@ -43,7 +45,7 @@ _GRACE_S = 0.03
 _S = 1_000_000_000
 
 
-class Reply(NamedTuple):
+class Reply(msgspec.Struct, frozen=True):
     """A message that goes back to the client; *counter* is the slave's, 0 if it is our own."""
 
     type: MailboxType
@@ -57,7 +59,7 @@ class Reply(NamedTuple):
 
 def again(replies: Iterable[Reply]) -> list[Reply]:
     """Return replies as what answers a step that is repeated."""
-    return [each._replace(is_again=True) for each in replies]
+    return [replace(each, is_again=True) for each in replies]
 
 
 class NoTurnError(EapError):

@@ -130,4 +130,4 @@ def test_an_answer_goes_to_the_address_and_port_that_asked(channels):
     [("10.0.0.1", 34980, "10.0.0.1:34980"), ("10.0.0.1", 0, "10.0.0.1"), ("0.0.0.0", 9, "")],
 )
 def test_who_has_no_address_or_no_port_of_its_own(host, port, destination):
-    assert _destination(host, port) == destination
+    assert _destination((port, socket.inet_aton(host))) == destination

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 
 import pytest
+from msgspec.structs import replace
 
 from eap.aoe.ads_operation import Read, Write
 from eap.appliance.services.gateway.remote_session import RemoteSession
@@ -47,7 +48,7 @@ def test_a_repeated_segment_is_answered_once_more():
         got = bytes.fromhex(first)[10:]
         (part,) = await session.ask(bytes.fromhex("0020 60 00000000000000"))
         (again,) = await session.ask(bytes.fromhex("0020 60 00000000000000"))
-        assert (part.is_again, again) == (False, part._replace(is_again=True))
+        assert (part.is_again, again) == (False, replace(part, is_again=True))
         got += part.body[3:]
         (last,) = await ask("0020 70 00000000000000")
         got += bytes.fromhex(last)[3:]
