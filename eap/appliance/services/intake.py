@@ -24,8 +24,8 @@ PATIENCE_NS = 60_000
 """How long is watched for the next of them."""
 MOST_FRAMES = 16
 """That are taken so before others have their turn."""
-AFTER_A_MISS = 4
-"""Frames that are not waited for, once one was waited for in vain."""
+MOST_REST = 1024
+"""Frames that are not waited for, once many were waited for in vain."""
 
 
 class DrainedChannel(Protocol):
@@ -94,6 +94,9 @@ class PatientDrain:
     long as to answer.  So while frames come that quickly the channel is watched, for some
     microseconds after each and for some frames in all, because others wait for the loop.
 
+    Where the sender shares the processor he cannot go on before this gives up.  So each time in
+    vain the channel is not watched for twice as many frames.
+
     Args:
         channel: What is drained.
         clock: The monotonic clock, in nanoseconds.
@@ -104,6 +107,7 @@ class PatientDrain:
         self._clock = clock
         self._answered_ns = clock() - QUICK_NS
         self._resting = 0
+        self._rest = 1
 
     def drain(self) -> None:
         """Take what waits; and what comes, if this came quickly after what was taken last."""
@@ -122,10 +126,11 @@ class PatientDrain:
         channel, clock = self._channel, self._clock
         while taken < MOST_FRAMES:
             if now_ns - self._answered_ns > PATIENCE_NS:
-                self._resting = AFTER_A_MISS
+                self._resting = self._rest
+                self._rest = min(2 * self._rest, MOST_REST)
                 return
             found = channel.drain(now_ns)
             now_ns = clock()
             if found:
                 taken += found
-                self._answered_ns = now_ns
+                self._answered_ns, self._rest = now_ns, 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import select
 import socket
 import time
@@ -12,8 +13,8 @@ import pytest
 
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.services.intake import (
-    AFTER_A_MISS,
     MOST_FRAMES,
+    MOST_REST,
     PATIENCE_NS,
     QUICK_NS,
     FrameIntake,
@@ -106,13 +107,32 @@ def test_the_next_of_quick_frames_is_waited_for():
     assert 0 <= late_ns < 5000, "given up as long after the last frame as promised"
 
 
-def test_after_a_frame_that_did_not_come_some_are_not_waited_for():
+def test_each_time_in_vain_more_frames_are_not_waited_for():
     line = Line()
     drain = PatientDrain(line, line.clock)
     line.wake(drain, 0)
-    looks = [line.wake(drain, line.now_ns + QUICK_NS // 2) for _ in range(AFTER_A_MISS + 2)]
-    assert looks[1:-1] == [1] * AFTER_A_MISS
-    assert min(looks[0], looks[-1]) > 2
+    looks = [line.wake(drain, line.now_ns + QUICK_NS // 2) for _ in range(4 * MOST_REST)]
+    vain = [number for number, count in enumerate(looks) if count > 2]
+    rests = [after - before - 1 for before, after in itertools.pairwise(vain)]
+    assert rests[:4] == [1, 2, 4, 8]
+    assert max(rests) == MOST_REST
+
+
+def test_a_frame_that_came_is_a_reason_to_wait_for_the_next_again():
+    line = Line()
+    drain = PatientDrain(line, line.clock)
+    line.wake(drain, 0)
+    while True:  # until it rests for long
+        begin = line.looks
+        for _ in range(100):
+            line.wake(drain, line.now_ns + QUICK_NS // 2)
+        if line.looks == begin + 100:
+            break
+    while line.wake(drain, line.now_ns + QUICK_NS // 2) == 1:
+        line.arrivals_ns = [line.now_ns + QUICK_NS // 2 + PATIENCE_NS // 2]
+    line.arrivals_ns = []
+    assert line.wake(drain, line.now_ns + QUICK_NS // 2) == 1
+    assert line.wake(drain, line.now_ns + QUICK_NS // 2) > 2, "the rest is short again"
 
 
 def test_frames_that_never_end_leave_time_for_others():
