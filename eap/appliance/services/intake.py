@@ -22,8 +22,10 @@ QUICK_NS = 120_000
 """Frames that come within this time after the last was answered are quick."""
 PATIENCE_NS = 60_000
 """How long is watched for the next of them."""
-MOST_FRAMES = 16
+MOST_FRAMES = 32
 """That are taken so before others have their turn."""
+TRUST = 2
+"""How often in a row that may be in vain: who was quick may have been interrupted."""
 MOST_REST = 1024
 """Frames that are not waited for, once many were waited for in vain."""
 
@@ -106,6 +108,7 @@ class PatientDrain:
         self._channel = channel
         self._clock = clock
         self._answered_ns = clock() - QUICK_NS
+        self._trust = 0
         self._resting = 0
         self._rest = 1
 
@@ -118,7 +121,7 @@ class PatientDrain:
         self._answered_ns = now_ns = clock()
         if self._resting:
             self._resting -= 1
-        elif is_quick:
+        elif is_quick or self._trust:
             self._watch(taken, now_ns)
 
     def _watch(self, taken: int, now_ns: int) -> None:
@@ -126,11 +129,17 @@ class PatientDrain:
         channel, clock = self._channel, self._clock
         while taken < MOST_FRAMES:
             if now_ns - self._answered_ns > PATIENCE_NS:
-                self._resting = self._rest
-                self._rest = min(2 * self._rest, MOST_REST)
+                self._note_vain()
                 return
             found = channel.drain(now_ns)
             now_ns = clock()
             if found:
                 taken += found
-                self._answered_ns, self._rest = now_ns, 1
+                self._answered_ns, self._trust, self._rest = now_ns, TRUST, 1
+
+    def _note_vain(self) -> None:
+        """Remember that nothing came; of somebody who was quick until now that says little."""
+        if self._trust:
+            self._trust -= 1
+        else:
+            self._resting, self._rest = self._rest, min(2 * self._rest, MOST_REST)
