@@ -5,8 +5,7 @@ EapError
 │   ├── TruncatedError      ran out of bytes
 │   └── MalformedError      enough bytes, illegal value
 ├── ProtocolError           the peer or the caller broke a rule
-│   ├── LocalProtocolError
-│   └── RemoteProtocolError
+│   └── LocalProtocolError
 ├── ConfigError             the plant file does not describe a plant
 ├── EnvironmentalError      this machine lacks something: a port, a capability, an interface
 ├── ImageError              the process image cannot be used as asked
@@ -47,10 +46,6 @@ class ProtocolError(EapError):
 
 class LocalProtocolError(ProtocolError):
     """Our caller asked for something the current state forbids."""
-
-
-class RemoteProtocolError(ProtocolError):
-    """The peer sent something the current state forbids."""
 
 
 class ConfigError(EapError):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NoReturn, Protocol, TypeVar
+from typing import NoReturn, Protocol, Self, TypeVar
 
 from devicebus.errors import MailboxRefusedError
 from eap.codec.mailbox import MailboxError, MailboxHeader
@@ -25,6 +25,11 @@ class MailboxSizes:
 
     def __init__(self, to_slave: int = 128, to_master: int = 128) -> None:
         self.set(to_slave, to_master)
+
+    @classmethod
+    def of_data(cls, size: int) -> Self:
+        """Return mailboxes that hold *size* octets behind their headers, both ways."""
+        return cls(size + MailboxHeader.SIZE, size + MailboxHeader.SIZE)
 
     def set(self, to_slave: int, to_master: int) -> None:
         """Change both; raise ValueError if one is too small for a message."""

@@ -15,7 +15,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.gateway.master_desk import MasterDesk
+from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader

@@ -43,8 +43,8 @@ from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.gateway.gateway_methods import GatewayMethods
-from eap.appliance.services.gateway.master_desk import MasterDesk
 from eap.appliance.services.gateway.opening import open_desks, open_gateways
+from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch

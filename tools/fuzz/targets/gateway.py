@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Iterator
 from itertools import cycle
 from typing import TypeVar, cast
 
-from devicebus.errors import BusError, MailboxTimeoutError
+from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.foe_server import FoeServer
@@ -22,7 +22,7 @@ from eap.aoe.ads_request import take_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
 from eap.appliance.bus_request import BusReport, Heard, SlaveReport
-from eap.appliance.services.bus.bus_talk import Talk
+from eap.appliance.services.bus.bus_talk import Talk, lead
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
@@ -118,19 +118,7 @@ class _Link:
         return cast("Talk", _Talk(self._box))
 
     async def converse(self, station: int, conversation: Conversation[T], requester: Hashable) -> T:
-        talk = _Talk(self._box)
-        try:
-            ask = next(conversation)
-            while True:
-                try:
-                    message = await talk.ask(ask)
-                except BusError as exc:
-                    ask = conversation.throw(exc)
-                else:
-                    ask = conversation.send(message)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+        return await lead(conversation, cast("Talk", _Talk(self._box)), next(conversation))
 
     def listen(self, heard: Callable[[Heard], None]) -> None:
         """It says nothing unasked."""

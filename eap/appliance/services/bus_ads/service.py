@@ -41,7 +41,7 @@ from eap.appliance.services.bus_ads.raw_command import RawCommands
 from eap.appliance.services.bus_ads.results import refusal
 from eap.appliance.services.bus_ads.slave_space import Asked
 from eap.appliance.services.bus_ads.slaves import Slaves
-from eap.appliance.services.gateway.master_desk import MasterDesk
+from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification

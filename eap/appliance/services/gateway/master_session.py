@@ -11,7 +11,7 @@ from eap.aoe.access import place_of
 from eap.aoe.ads_operation import Operation
 from eap.appliance.services.gateway.dialect_task import DialectError
 from eap.appliance.services.gateway.slave_session import Reply
-from eap.codec.mailbox import MailboxError, MailboxHeader, MailboxType
+from eap.codec.mailbox import MailboxError, MailboxType
 from eap.gateway.dialect import Failure, ReadSdo, Task, WriteSdo
 from eap.gateway.refusal import Reason, mailbox_error, refuse
 from eap.gateway.rights import operation_of
@@ -42,8 +42,7 @@ class MasterSession:
         self._dictionary = dictionary
         self._refresh = refresh
         self._is_fresh = is_fresh
-        size = room + MailboxHeader.SIZE
-        self._server = CoeServer(dictionary, _op, MailboxSizes(size, size))
+        self._server = CoeServer(dictionary, _op, MailboxSizes.of_data(room))
 
     async def ask(self, kind: MailboxType, body: bytes) -> list[Reply]:
         """Return the answers to a request."""

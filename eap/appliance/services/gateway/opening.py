@@ -9,9 +9,10 @@ from eap.aoe.access import AccessList
 from eap.appliance.handover import Handover, PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
-from eap.appliance.services.gateway.master_desk import MasterDesk
+from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.appliance.services.gateway.slave_link import PortLink
+from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.gateway.address import AddressMap, Group, RemoteSlave, Slave
 from eap.gateway.ledger import ClientLimits
@@ -55,6 +56,7 @@ def open_gateways(
     gateways = {}
     for bus in handover.buses:
         told, router = _told(handover, bus.owner), routers[bus.owner.station]
+        desk = desks[bus.owner]
         settings = Settings(
             NetId.parse(handover.port(bus.owner).net_id),
             answer_s=told.answer_ms / _MS,
@@ -64,7 +66,7 @@ def open_gateways(
         )
         gateway = MailboxGateway(
             PortLink(client, bus.owner),
-            partial(desks[bus.owner].open_session, settings.room),
+            partial(MasterSession, desk.dictionary, settings.room, desk.refresh, desk.is_fresh),
             partial(_access_of, router),
             settings,
             AddressMap({each.address: _whom(each) for each in told.addresses}),

@@ -13,7 +13,6 @@ from eap.aoe.answer import response_to
 from eap.aoe.fragment import Assembler, iter_fragments
 from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet
-from eap.codec.mailbox import MailboxHeader
 from eap.gateway.elsewhere import ElsewhereError
 from eap.gateway.refusal import Reason
 
@@ -35,14 +34,12 @@ class RemoteAds:
 
     Args:
         link: Leads to the slave.
-        room: Octets of the longest answer behind its mailbox header.
+        sizes: Of mailboxes, as the client is to know them.
     """
 
-    def __init__(self, link: RemoteLink, room: int) -> None:
-        size = room + MailboxHeader.SIZE
-        self.sizes = MailboxSizes(size, size)
+    def __init__(self, link: RemoteLink, sizes: MailboxSizes) -> None:
+        self.sizes = sizes
         self._link = link
-        self._room = room
         self._assembler = Assembler()
         self._number = 0
 
@@ -65,8 +62,8 @@ class RemoteAds:
         answer = await self._link.pass_on(header.command, bytes(data))
         if header.state_flags & StateFlags.NO_RETURN:
             return []
-        packet = response_to(header, answer)
-        if len(packet) <= self._room:
+        packet, room = response_to(header, answer), self.sizes.data_to_master
+        if len(packet) <= room:
             return [packet]
         self._number += 1
-        return list(iter_fragments(packet, self._number, self._room - AmsHeader.SIZE))
+        return list(iter_fragments(packet, self._number, room - AmsHeader.SIZE))

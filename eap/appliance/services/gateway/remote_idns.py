@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.services.gateway.remote_link import RemoteLink
-from eap.codec.mailbox import MailboxHeader
 from eap.codec.soe import SoeHeader, SoeOpcode, encode_fragments
 from eap.gateway import elsewhere
 from eap.gateway.elsewhere import ElsewhereError
@@ -19,14 +18,12 @@ class RemoteIdns:
 
     Args:
         link: Leads to the slave.
-        room: Octets of the longest answer behind its mailbox header.
+        sizes: Of mailboxes, as the client is to know them.
     """
 
-    def __init__(self, link: RemoteLink, room: int) -> None:
-        size = room + MailboxHeader.SIZE
-        self.sizes = MailboxSizes(size, size)
+    def __init__(self, link: RemoteLink, sizes: MailboxSizes) -> None:
+        self.sizes = sizes
         self._link = link
-        self._room = room
         self._written = bytearray()
 
     def reset(self) -> None:
@@ -51,7 +48,7 @@ class RemoteIdns:
         else:
             raise ElsewhereError(Reason.SERVICE.value.ads)
         told = SoeHeader(opcode, 0, 0, head.drive, head.elements, head.idn)
-        return encode_fragments(told, answer, self._room - SoeHeader.SIZE)
+        return encode_fragments(told, answer, self.sizes.data_to_master - SoeHeader.SIZE)
 
     async def _do(self, head: SoeHeader, data: bytes | None = None) -> bytes:
         return await self._link.perform(elsewhere.idn_query(head, data))

@@ -10,7 +10,6 @@ from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.codec.ads import IndexGroup
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.coe import encode_message as encode_coe
-from eap.codec.mailbox import MailboxHeader
 from eap.codec.sdo import SdoHeader, SdoRequest
 from eap.codec.sdoinfo import InfoError, SdoInfoHeader, SdoInfoOpcode
 from eap.gateway import elsewhere
@@ -24,14 +23,12 @@ class RemoteObjects:
 
     Args:
         link: Leads to the slave.
-        room: Octets of the longest answer behind its mailbox header.
+        sizes: Of mailboxes, as the client is to know them.
     """
 
-    def __init__(self, link: RemoteLink, room: int) -> None:
-        size = room + MailboxHeader.SIZE
-        self.sizes = MailboxSizes(size, size)
+    def __init__(self, link: RemoteLink, sizes: MailboxSizes) -> None:
+        self.sizes = sizes
         self._link = link
-        self._room = room
         self._entries = RemoteEntries()
         self._server = SdoServer(self._entries, _op, self.sizes)
 
@@ -87,7 +84,8 @@ class RemoteObjects:
                 raise
             opcode = SdoInfoOpcode.ERROR
             answer = InfoError(elsewhere.abort_for(exc.result)).encode()
-        room = (self._room - CoeHeader.SIZE - SdoInfoHeader.SIZE) & ~1  # no index is cut in two
+        room = self.sizes.data_to_master - CoeHeader.SIZE - SdoInfoHeader.SIZE
+        room &= ~1  # no index is cut in two
         pieces = [answer[at : at + room] for at in range(0, len(answer), room)] or [answer]
         return [
             encode_coe(

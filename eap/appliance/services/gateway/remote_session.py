@@ -62,9 +62,9 @@ class RemoteSession:
         self._kind = kind
         self._answer_s = link.answer_s
         self._idle_s = idle_s
-        self._speaker = _speaker(kind, link, room)
-        sizes = self._speaker.sizes if self._speaker else MailboxSizes()
-        self._transfer = Transfer(kind, sizes)
+        sizes = MailboxSizes.of_data(room)
+        self._speaker = _speaker(kind, link, sizes)
+        self._transfer = Transfer(kind, self._speaker.sizes if self._speaker else sizes)
         self._last: list[Reply] = []
         self._turn = asyncio.Lock()
         self._timer: asyncio.TimerHandle | None = None
@@ -141,16 +141,16 @@ class RemoteSession:
             self._timer = None
 
 
-def _speaker(kind: MailboxType, link: RemoteLink, room: int) -> Speaker | None:
+def _speaker(kind: MailboxType, link: RemoteLink, sizes: MailboxSizes) -> Speaker | None:
     match kind:
         case MailboxType.COE:
-            return RemoteObjects(link, room)
+            return RemoteObjects(link, sizes)
         case MailboxType.SOE:
-            return RemoteIdns(link, room)
+            return RemoteIdns(link, sizes)
         case MailboxType.FOE:
             return RemoteFiles(link)
         case MailboxType.VOE:
             return RemoteVendor(link)
         case MailboxType.AOE:
-            return RemoteAds(link, room)
+            return RemoteAds(link, sizes)
     return None  # EoE: no service of ADS takes Ethernet frames

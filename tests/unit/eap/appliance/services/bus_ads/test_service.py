@@ -18,7 +18,7 @@ from eap.aoe.ads_operation import (
 )
 from eap.appliance.bus_request import AskMailbox
 from eap.appliance.services.bus_ads import files, idns, service
-from eap.appliance.services.gateway.master_desk import MasterDesk
+from eap.appliance.services.master.master_desk import MasterDesk
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,

@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import ReadWrite, Write
 from eap.appliance.services.gateway import remote_idns
 from eap.appliance.services.gateway.remote_idns import RemoteIdns, RemoteVendor
@@ -20,7 +21,7 @@ def answer(speaker: RemoteIdns | RemoteVendor, body: str) -> list[str]:
 
 def test_elements_are_read_and_written() -> None:
     station = Station(b"\2\0\0\0")
-    idns = RemoteIdns(station.link(), 100)
+    idns = RemoteIdns(station.link(), MailboxSizes.of_data(100))
     assert answer(idns, "01 40 2000") == ["02402000" + "02000000"]
     assert answer(idns, "0b 40 0100 0102") == []
     assert answer(idns, "03 40 2000 0304") == ["04402000"]
@@ -29,7 +30,7 @@ def test_elements_are_read_and_written() -> None:
 
 def test_fragments_that_were_given_up_are_forgotten() -> None:
     station = Station()
-    idns = RemoteIdns(station.link(), 100)
+    idns = RemoteIdns(station.link(), MailboxSizes.of_data(100))
     answer(idns, "0b 40 0100 0102")
     idns.reset()
     answer(idns, "03 40 2000 0304")
@@ -38,7 +39,7 @@ def test_fragments_that_were_given_up_are_forgotten() -> None:
 
 def test_a_list_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_idns, "MAX_WRITTEN", 3)
-    idns = RemoteIdns(Station().link(), 100)
+    idns = RemoteIdns(Station().link(), MailboxSizes.of_data(100))
     answer(idns, "0b 40 0100 0102")
     with pytest.raises(ElsewhereError) as caught:
         answer(idns, "0b 40 0100 0102")

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Write
 from eap.appliance.services.gateway.remote_objects import RemoteObjects
 from eap.codec.ads import AdsError, IndexGroup
@@ -18,7 +19,7 @@ def play(
     station: Station, scene: Callable[[Callable[[str], Awaitable[list[str]]]], Awaitable[None]]
 ) -> None:
     async def run() -> None:
-        speaker = RemoteObjects(station.link(), room=100)
+        speaker = RemoteObjects(station.link(), MailboxSizes.of_data(100))
 
         async def ask(body: str) -> list[str]:
             return [each.hex() for each in await speaker.answer(bytes.fromhex(body))]

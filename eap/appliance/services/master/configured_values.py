@@ -6,8 +6,8 @@ from typing import Any
 
 from devicebus.wire.register import DlStatus
 from eap.appliance.bus_request import SlaveReport
-from eap.appliance.services.gateway.master_look import communicating
-from eap.appliance.services.gateway.slave_facts import Facts
+from eap.appliance.services.master.master_look import communicating
+from eap.appliance.services.master.slave_facts import Facts
 from eap.od.profiles.master1100 import Live
 
 _NO_LINK, _NO_COMMUNICATION, _LINK_MISSING, _ADDITIONAL_LINK = 1, 2, 4, 8

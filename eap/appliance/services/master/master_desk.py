@@ -6,8 +6,7 @@ import platform
 
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.master_values import MasterView
+from eap.appliance.services.master.master_values import MasterView
 from eap.device.eap_content import Identity
 from eap.device.master_dictionary import MasterDictionary
 from eap.od.profiles.master1100 import CONFIGURED
@@ -56,10 +55,6 @@ class MasterDesk:
     def is_fresh(self, index: int) -> bool:
         """Say whether what the object at *index* shows may be read at once."""
         return self._view.is_fresh(with_registers=index in _OF_REGISTERS, place=_place(index))
-
-    def open_session(self, room: int) -> MasterSession:
-        """Begin a client's session with the dictionary."""
-        return MasterSession(self.dictionary, room, self.refresh, self.is_fresh)
 
 
 def _place(index: int) -> int | None:

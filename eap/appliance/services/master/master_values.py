@@ -18,8 +18,8 @@ from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import BusReport, SlaveReport
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.gateway.configured_values import configured_value
-from eap.appliance.services.gateway.master_look import (
+from eap.appliance.services.master.configured_values import configured_value
+from eap.appliance.services.master.master_look import (
     LOOPS,
     PORTS,
     Found,
@@ -29,7 +29,7 @@ from eap.appliance.services.gateway.master_look import (
     look_at,
     neighbour,
 )
-from eap.appliance.services.gateway.slave_facts import SlaveFacts
+from eap.appliance.services.master.slave_facts import SlaveFacts
 from eap.errors import EapError
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.master1100 import Live

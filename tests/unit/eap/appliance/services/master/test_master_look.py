@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from devicebus.master.access import Access, Reply
 from devicebus.wire.alstatus import AlState
-from eap.appliance.services.gateway.master_look import LOOPS, Seen, detect, look_at
+from eap.appliance.services.master.master_look import LOOPS, Seen, detect, look_at
 from tests.support.fakeengine import FakeBus
 from tests.support.loopbus import LoopBus
 

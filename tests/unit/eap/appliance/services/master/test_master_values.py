@@ -11,7 +11,7 @@ import pytest
 from eap.appliance.bus_request import AskMailbox, Bring, Transfer
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.gateway.master_values import FRESH_S, MasterView
+from eap.appliance.services.master.master_values import FRESH_S, MasterView
 from eap.od.abort import SdoAbortError
 from eap.od.profiles.master1100 import Live
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine

@@ -7,8 +7,8 @@ import pytest
 
 from devicebus.wire.register import DlStatus
 from eap.appliance.bus_request import SlaveReport
-from eap.appliance.services.gateway.configured_values import configured_value, link_status
-from eap.appliance.services.gateway.slave_facts import Facts
+from eap.appliance.services.master.configured_values import configured_value, link_status
+from eap.appliance.services.master.slave_facts import Facts
 from eap.od.profiles.master1100 import Live
 
 SLAVE = SlaveReport(

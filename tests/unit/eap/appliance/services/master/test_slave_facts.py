@@ -13,8 +13,8 @@ from devicebus.mailbox.conversation import Message
 from devicebus.wire.sii import SiiProtocol
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.handover import PortName
-from eap.appliance.services.gateway import slave_facts
-from eap.appliance.services.gateway.slave_facts import Facts, SlaveFacts
+from eap.appliance.services.master import slave_facts
+from eap.appliance.services.master.slave_facts import Facts, SlaveFacts
 from eap.codec.mailbox import MailboxType
 
 SLAVE = SlaveReport(

@@ -1,0 +1,1 @@
+"""The dictionary of a master, live: for its gateway, and for ADS."""
