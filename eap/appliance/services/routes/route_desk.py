@@ -18,7 +18,7 @@ from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.aoe.routes import Origin, RouteTable
 from eap.aoe.spec import AccessService, AmsUser, DoorKind, HopSpec, RouteSpec
 from eap.aoe.way import Way
-from eap.appliance.services.allowance import Allowance
+from eap.appliance.services.allowance import Rate, SourceRateLimiter, SourceRates
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.codec.ads import AdsError
 from eap.codec.ams import SYSTEM_PORT, AmsHeader
@@ -28,8 +28,14 @@ from eap.errors import ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, NetId, parse_host
 from eap.net.password import read_password
 
-BURST = 10
-"""Requests that are looked at, at once; one a second for long.  Passwords take time to guess."""
+RATES = SourceRates(
+    source=Rate(10, 1.0),
+    known=Rate(50, 5.0),
+    new=Rate(10, 1.0),
+    local=Rate(50, 10.0),
+)
+"""Requests that are decided; the others get no answer.  Passwords take time to guess."""
+MAX_SOURCES = 1024
 _SHOWN = 80
 
 logger = logging.getLogger(__name__)
@@ -56,21 +62,25 @@ class RouteDesk:
     ) -> None:
         self._stations = stations
         self._clock = clock
-        self._allowance = Allowance(BURST, BURST / 10, clock())
+        self._limiter = SourceRateLimiter(RATES, MAX_SOURCES, clock())
 
     async def take(
         self, question: Discovery, sender: str, *, is_this_host: bool
     ) -> AdsError | None:
         """Add the route that *question* asks for, and return the result for its sender.
 
-        None says nothing: too many ask.
+        None stands for no answer: the sender, or all together, ask too often.
 
         Args:
             question: The datagram.
             sender: IPv4 address that it came from.
             is_this_host: Whether a program of this host sent it.
         """
-        if not self._allowance.take(self._clock()):
+        now_s = self._clock()
+        is_allowed = (
+            self._limiter.take_local(now_s) if is_this_host else self._limiter.take(sender, now_s)
+        )
+        if not is_allowed:
             return None
         name = decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN]
         results = []

@@ -11,7 +11,7 @@ import pytest
 from eap.aoe.routes import Origin
 from eap.aoe.spec import AmsUser, DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.appliance.route_store import RouteStore
-from eap.appliance.services.routes.route_desk import BURST, RouteDesk
+from eap.appliance.services.routes.route_desk import RATES, RouteDesk
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import (
@@ -199,14 +199,50 @@ def test_who_asked_is_audited():
     assert [each.operations[0].verdict.is_allowed for each in entries] == [False, True]
 
 
-def test_passwords_are_not_tried_faster_than_they_may():
-    now = 0.0
-    desk = RouteDesk([routes()], clock=lambda: now)
+class Desk:
+    """A desk with a clock; *ask* returns the results of some requests of one sender."""
 
-    def results(count):
-        takings = [desk.take(ADD_ROUTE, "10.0.0.5", is_this_host=False) for _ in range(count)]
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.desk = RouteDesk([routes()], clock=lambda: self.now)
+
+    def ask(self, sender, count=1, *, is_this_host=False):
+        takings = [
+            self.desk.take(ADD_ROUTE, sender, is_this_host=is_this_host) for _ in range(count)
+        ]
         return [asyncio.run(each) for each in takings]
 
-    assert results(BURST + 2) == [AdsError.ACCESS] * BURST + [None] * 2
-    now = 2.0
-    assert results(3) == [AdsError.ACCESS] * 2 + [None]
+
+def test_route_desk_sender_guesses_passwords_is_limited():
+    desk = Desk()
+    burst = RATES.source.burst
+    assert desk.ask("10.0.0.5", burst + 2) == [AdsError.ACCESS] * burst + [None] * 2
+    desk.now = 2.0
+    assert desk.ask("10.0.0.5", 3) == [AdsError.ACCESS] * 2 + [None]
+
+
+def test_route_desk_flood_of_one_sender_others_are_answered():
+    desk = Desk()
+    desk.ask("10.0.0.5", 10 * RATES.source.burst)
+    assert desk.ask("10.0.0.6") == [AdsError.ACCESS]
+    assert desk.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
+
+
+def test_route_desk_flood_of_many_senders_known_ones_and_this_host_are_answered():
+    desk = Desk()
+    assert desk.ask("10.0.0.5") == [AdsError.ACCESS]
+    answers = [desk.ask(f"10.1.{number // 250}.{number % 250}") for number in range(5000)]
+    assert answers.count([AdsError.ACCESS]) == RATES.new.burst - 1
+    assert desk.ask("10.0.0.5") == [AdsError.ACCESS]
+    assert desk.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
+
+
+def test_route_desk_known_senders_are_limited_together_and_new_ones_are_answered():
+    desk = Desk()
+    senders = [f"10.0.0.{number}" for number in range(1, 30)]
+    for sender in senders:
+        desk.ask(sender)
+        desk.now += 1.0
+    answers = [each for sender in senders for each in desk.ask(sender, RATES.source.burst - 2)]
+    assert answers.count(AdsError.ACCESS) == RATES.known.burst
+    assert desk.ask("10.0.1.1") == [AdsError.ACCESS]
