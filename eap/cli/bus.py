@@ -92,7 +92,7 @@ def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
 
     write_tables([state_table(rows)])
     if target is not None and isinstance(bus, BusPort):
-        write_text(f"The master of {bus} keeps {'it' if rest else 'them'} there.")
+        write_text(f"\nThe master of {bus} keeps {'it' if rest else 'them'} there.")
 
 
 @click.command(cls=BusCommand)
@@ -158,7 +158,9 @@ def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
     else:
         write_text(f"slave {done['address']}: {done['octets']} octets written and compared")
         if isinstance(bus, BusPort):
-            write_text(f"The master of {bus} goes by the old content until its plant starts again.")
+            write_text(
+                f"\nThe master of {bus} goes by the old content until its plant starts again."
+            )
 
 
 @click.command(cls=BusCommand)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeAlias
 
-from rich import box
-from rich.table import Table
 from rich.text import Text
 
+from eap.cli.table import Column, TextTable
 from eap.cli.words import count
 from eap.od import abort
 
@@ -19,10 +18,19 @@ _COMMAND_STATES = {0x0: "idle", 0x3: "done", 0x7: "executing", 0xF: "failed"}
 _COUNTERS = ("invalid_frames", "physical", "forwarded", "lost_links")
 
 
-def scan_tables(rows: Iterable[Row]) -> Iterator[Table | Text]:
+def scan_tables(rows: Iterable[Row]) -> Iterator[TextTable | Text]:
     """Yield the table of a scan, and in words what is wrong with slaves."""
-    table = make_table("Slave", "Name", "Vendor", "Product", "Revision", "Serial", "Alias", "State",
-                       "Mailbox")  # fmt: skip
+    table = TextTable(
+        "Slave",
+        "Name",
+        Column("Vendor", rank=3),
+        "Product",
+        Column("Revision", rank=2),
+        Column("Serial", rank=4),
+        Column("Alias", rank=5),
+        "State",
+        Column("Mailbox", rank=1, wraps=True),
+    )
     faults = []
     for row in rows:
         numbers = (f"0x{row[key]:X}" for key in ("vendor", "product", "revision"))
@@ -38,21 +46,31 @@ def scan_tables(rows: Iterable[Row]) -> Iterator[Table | Text]:
         if row["fault"]:
             faults.append(f"{row['name']} ({row['address']}): {row['fault']}")
     yield table
+    if faults:
+        yield Text()
     yield from map(Text, faults)
 
 
-def state_table(rows: Iterable[Row]) -> Table:
+def state_table(rows: Iterable[Row]) -> TextTable:
     """Return the table of the slaves' states."""
-    table = make_table("Slave", "Name", "State", "Reason")
+    table = TextTable("Slave", "Name", "State", Column("Reason", wraps=True))
     for row in rows:
         table.add_row(str(row["address"]), row["name"], _state(row["state"]), _reason(row))
     return table
 
 
-def diagnosis_tables(found: Row) -> Iterator[Table | Text]:
+def diagnosis_tables(found: Row) -> Iterator[TextTable | Text]:
     """Yield the table of all ports, and in words where trouble starts."""
-    table = make_table(
-        "Slave", "Name", "State", "Port", "Open", "CRC", "RX", "Forwarded", "Lost link"
+    table = TextTable(
+        "Slave",
+        Column("Name", rank=2),
+        "State",
+        "Port",
+        Column("Open", rank=3),
+        Column("CRC", is_number=True),
+        Column("RX", is_number=True),
+        Column("Forwarded", rank=1, is_number=True),
+        Column("Lost link", is_number=True),
     )
     for row in found["slaves"]:
         state = row["state"] if row["answers"] else None
@@ -66,6 +84,7 @@ def diagnosis_tables(found: Row) -> Iterator[Table | Text]:
             table.add_row(*first, str(port.get("port", "")), is_open, *numbers)
             first = ("", "", Text())
     yield table
+    yield Text()
     for row in found["slaves"]:
         if row["reason"]:
             yield Text(f"{row['name']} ({row['address']}): {_reason(row)}")
@@ -107,18 +126,29 @@ def entry_name(row: Row) -> str:
     return abort.entry_name(row["index"], row["subindex"])
 
 
-def object_table(rows: Iterable[Row]) -> Table:
+def object_table(rows: Iterable[Row]) -> TextTable:
     """Return the table of objects."""
-    table = make_table("Index", "Name", "Kind", "Subindexes")
+    table = TextTable(
+        "Index",
+        Column("Name", wraps=True),
+        Column("Kind", rank=1),
+        Column("Subindexes", rank=2, is_number=True),
+    )
     for row in rows:
         top = str(row["max_subindex"] or "")
         table.add_row(f"0x{row['index']:04X}", row["name"], row["code"], top)
     return table
 
 
-def dump_table(rows: Iterable[Row]) -> Table:
+def dump_table(rows: Iterable[Row]) -> TextTable:
     """Return the table of all entries with their values."""
-    table = make_table("Entry", "Name", "Type", "Access", "Value")
+    table = TextTable(
+        "Entry",
+        Column("Name", wraps=True),
+        Column("Type", rank=1),
+        Column("Access", rank=2),
+        Column("Value", wraps=True),
+    )
     for row in rows:
         own, whole = row["name"], row["object"]
         name = own if own == whole or not own else f"{whole}: {own}"
@@ -151,19 +181,11 @@ def idn_lines(row: Row) -> Iterator[str]:
             yield f"  {key:10} {_plain(value)}"
 
 
-def idn_table(rows: Iterable[Row]) -> Table:
+def idn_table(rows: Iterable[Row]) -> TextTable:
     """Return the table of IDNs."""
-    table = make_table("IDN", "Name")
+    table = TextTable("IDN", Column("Name", wraps=True))
     for row in rows:
         table.add_row(row["idn"], row["name"])
-    return table
-
-
-def make_table(*columns: str) -> Table:
-    """Return a table without rows, whose cells are folded where a terminal is narrow."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for heading in columns:
-        table.add_column(heading, overflow="fold", vertical="top")
     return table
 
 

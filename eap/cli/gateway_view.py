@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, TypeAlias
 
 from rich.console import RenderableType
-from rich.table import Table
 from rich.text import Text
 
-from eap.cli.bus_view import make_table
+from eap.cli.table import Column, TextTable
 from eap.cli.words import count
 
 Row: TypeAlias = dict[str, Any]
@@ -30,10 +29,18 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
         f" answers within {settings['answer_ms']} ms{silent}{turned_away}"
     )
     if row["clients"]:
+        yield Text()
         latest = row["clients"][::-1]
         shown = [each for at, each in enumerate(latest) if at < _SHOWN_CLIENTS or each["transfers"]]
         yield _table(
-            ("Client", "Door", "Requests", "Repeated", "Errors", "Transfers"),
+            (
+                "Client",
+                Column("Door", rank=2),
+                Column("Requests", is_number=True),
+                Column("Repeated", rank=1, is_number=True),
+                Column("Errors", is_number=True),
+                Column("Transfers", wraps=True),
+            ),
             (
                 (
                     each["address"],
@@ -49,8 +56,18 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
         if left := len(latest) - len(shown):
             yield Text(f"  {count(left, 'client')} more asked before these; --json shows all")
     if row["slaves"]:
+        yield Text()
         yield _table(
-            ("Slave", "Protocol", "Requests", "Replies", "Errors", "Mean", "Slowest", "Last error"),
+            (
+                "Slave",
+                "Protocol",
+                Column("Requests", is_number=True),
+                Column("Replies", rank=1, is_number=True),
+                Column("Errors", is_number=True),
+                Column("Mean", is_number=True),
+                Column("Slowest", rank=2, is_number=True),
+                Column("Last error", wraps=True),
+            ),
             (
                 (
                     each["address"] or "master",
@@ -67,8 +84,8 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
         )
 
 
-def _table(titles: tuple[str, ...], rows: Iterator[tuple[object, ...]]) -> Table:
-    table = make_table(*titles)
+def _table(columns: Iterable[Column | str], rows: Iterable[tuple[object, ...]]) -> TextTable:
+    table = TextTable(*columns)
     for row in rows:
         table.add_row(*(Text(str(each)) for each in row))
     return table

@@ -18,8 +18,8 @@ from eap.errors import EnvironmentalError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-WIDTH = 100
-"""Columns of a table when stdout is no terminal."""
+UNLIMITED = 10_000
+"""Columns of a table when stdout is no terminal: no cell is wrapped, no column left out."""
 
 
 def write_json(document: Any) -> None:
@@ -47,12 +47,12 @@ def _close_stdout() -> None:
 
 
 def write_tables(parts: Iterable[RenderableType]) -> None:
-    """Print rich renderables on stdout, coloured only on a terminal."""
+    """Print rich renderables on stdout, coloured and fitted to the screen only on a terminal."""
     from rich.console import Console
 
     console = Console(highlight=False, emoji=False, markup=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = WIDTH
+        console.width = UNLIMITED
     with console.capture() as capture:
         for part in parts:
             console.print(part)

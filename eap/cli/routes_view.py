@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from rich import box
 from rich.console import RenderableType
-from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
 from eap.appliance.control_routes import ImportRow, NeighbourRow, RouterRow, TestResult
 from eap.cli import routes_text
+from eap.cli.table import Column, TextTable
 
 _STYLES = {"up": "green", "down": "bold red", "unknown": "dim"}
 
@@ -26,13 +24,14 @@ def routes_tables(stations: Sequence[RouterRow]) -> Iterator[RenderableType]:
     if remarks:
         yield ""
         yield Text("Worth a look", style="bold")
-        yield from (Padding(Text(remark), (0, 0, 0, 1)) for remark in remarks)
+        yield from map(Text, remarks)
 
 
 def result_table(results: Iterable[tuple[str, TestResult]]) -> RenderableType:
     """Return what came of questions to targets, by station."""
-    table = _table("Station", "Target", "Round trip", "Says")
-    table.columns[2].justify = "right"
+    table = TextTable(
+        "Station", "Target", Column("Round trip", is_number=True), Column("Says", wraps=True)
+    )
     for station, result in results:
         said = Text(result.text, style="" if result.ok else _STYLES["down"])
         if result.hint:
@@ -44,7 +43,14 @@ def result_table(results: Iterable[tuple[str, TestResult]]) -> RenderableType:
 
 def neighbour_table(rows: Iterable[NeighbourRow]) -> RenderableType:
     """Return the routers of other hosts, and by which route they are reached."""
-    table = _table("Station", "Found", "NetID", "Address", "Version", "Route")
+    table = TextTable(
+        "Station",
+        "Found",
+        "NetID",
+        "Address",
+        Column("Version", rank=1),
+        Column("Route", wraps=True),
+    )
     for row in rows:
         route = Text(row.route or "none", style=_STYLES["up" if row.route else "unknown"])
         if row.is_learned:
@@ -55,7 +61,8 @@ def neighbour_table(rows: Iterable[NeighbourRow]) -> RenderableType:
 
 def import_table(rows: Iterable[ImportRow], *, is_done: bool) -> RenderableType:
     """Return the routes of a file, and what became of each."""
-    table = _table("Route", "NetID", "Via", "Added" if is_done else "Would be added")
+    outcome_heading = "Added" if is_done else "Would be added"
+    table = TextTable("Route", "NetID", "Via", Column(outcome_heading, wraps=True))
     for row in rows:
         outcome = Text(row.reason or "yes", style=_STYLES["down" if row.reason else "up"])
         table.add_row(row.name, row.net_id, row.via, outcome)
@@ -63,10 +70,17 @@ def import_table(rows: Iterable[ImportRow], *, is_done: bool) -> RenderableType:
 
 
 def _routes(stations: Sequence[RouterRow]) -> RenderableType:
-    table = _table("Station", "Route", "NetID", "Door", "Address", "State", "Trip", "Requests")
-    table.add_column("Errors")
-    for column in table.columns[6:]:
-        column.justify = "right"
+    table = TextTable(
+        "Station",
+        "Route",
+        Column("NetID", rank=2),
+        Column("Door", rank=3),
+        Column("Address", rank=4),
+        "State",
+        Column("Trip", rank=1, is_number=True),
+        Column("Requests", is_number=True),
+        Column("Errors", is_number=True),
+    )
     for station in stations:
         own = station.station
         for row in station.routes:
@@ -84,9 +98,16 @@ def _routes(stations: Sequence[RouterRow]) -> RenderableType:
 
 
 def _connections(stations: Sequence[RouterRow]) -> RenderableType:
-    table = _table("Station", "Connection", "Door", "NetIDs", "For", "Requests", "Octets", "Errors")
-    for column in table.columns[4:]:
-        column.justify = "right"
+    table = TextTable(
+        "Station",
+        "Connection",
+        Column("Door", rank=3),
+        Column("NetIDs", rank=1),
+        Column("For", is_number=True),
+        Column("Requests", is_number=True),
+        Column("Octets", rank=2, is_number=True),
+        Column("Errors", is_number=True),
+    )
     for station in stations:
         own = station.station
         for row in station.connections:
@@ -109,10 +130,3 @@ def _remarks(station: RouterRow) -> Iterator[str]:
     for connection in station.connections:
         if connection.last_error:
             yield f"{routes_text.way(connection)}, last error: {connection.last_error}"
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
-    for heading in headings:
-        table.add_column(heading, overflow="fold", vertical="top")
-    return table

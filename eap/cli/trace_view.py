@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
-from rich import box
 from rich.console import RenderableType
-from rich.table import Table
 from rich.text import Text
 
+from eap.cli.table import Column, TextTable
 from eap.cli.words import duration
 from eap.codec.ads import AdsState
 
@@ -20,9 +19,14 @@ def trace_tables(found: Row) -> Iterator[RenderableType]:
     """Yield the way, what it ends with, and what is wrong with it."""
     name = f" ({found['name']})" if found["name"] not in {"", found["target"]} else ""
     yield Text(f"{found['target']}{name} is {found['address']}")
-    table = Table("Hop", "Router", "NetID", "There", "Part", "Goes on", box=box.SIMPLE_HEAD)
-    for number in (0, 3, 4):
-        table.columns[number].justify = "right"
+    table = TextTable(
+        Column("Hop", is_number=True),
+        "Router",
+        Column("NetID", rank=2),
+        Column("There", is_number=True),
+        Column("Part", rank=1, is_number=True),
+        Column("Goes on", wraps=True),
+    )
     for number, hop in enumerate(found["hops"], 1):
         times = (duration(hop["took_us"]), duration(hop["spent_us"]))
         table.add_row(str(number), hop["station"], hop["net_id"], *times, _onward(hop))

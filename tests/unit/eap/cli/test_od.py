@@ -247,5 +247,5 @@ def test_slaves(bus_appliance):
     target = "press/bus0/sensor"
     assert command("read", target, "0x1018:1") == "0x1018:01 = UDINT 3674  # Vendor ID, 0xE5A\n"
     assert command("write", target, "0x8000:1", "6") == "0x8000:01 = UDINT 6  # Filter\n"
-    assert " 0x8001  Calibration" in command("list", target)
+    assert "\n0x8001  Calibration" in command("list", target)
     assert "0x8000:01 = UDINT 6  # Filter\n" in command("dump", target)

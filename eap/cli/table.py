@@ -1,0 +1,115 @@
+"""Table for a terminal: leaves out columns before it breaks a word.
+
+Each column has a rank.  Where the table is wider than the screen, the columns of the highest rank
+go first, and a line below the table names them.  Columns that wrap give way only at spaces.  Piped
+output has no width, so that nothing is left out there (eap/cli/output.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+_GAP = 2
+"""Spaces between two columns: what rich puts there for one space of padding and no border."""
+_LEAST_WRAPPED = 20
+"""A column that wraps is not made narrower than this while another one can be left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column of a table.
+
+    Attributes:
+        heading: Its words above the rows.
+        rank: 0 is always shown; where there is no room, the highest rank is left out first.
+        is_number: Whether its cells are aligned to the right.
+        wraps: Whether its cells may take several lines, broken at spaces.
+    """
+
+    heading: str
+    rank: int = 0
+    is_number: bool = False
+    wraps: bool = False
+
+
+class TextTable:
+    """Rows below headings, as wide as they need and at most as wide as the screen."""
+
+    def __init__(self, *columns: Column | str) -> None:
+        self._columns = [Column(each) if isinstance(each, str) else each for each in columns]
+        self._rows: list[list[Text]] = []
+
+    def add_row(self, *cells: str | Text) -> None:
+        """Add one row; cells that are not given are empty."""
+        row = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
+        self._rows.append(row + [Text()] * (len(self._columns) - len(row)))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        shown = self._fitting(options.max_width)
+        widths = self._widths(shown, options.max_width)
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+        for at, width in zip(shown, widths, strict=True):
+            column = self._columns[at]
+            table.add_column(
+                column.heading,
+                width=width,
+                justify="right" if column.is_number else "left",
+                overflow="fold",
+                vertical="top",
+            )
+        for row in self._rows:
+            table.add_row(*(row[at] for at in shown))
+        yield table
+        if len(shown) < len(self._columns):
+            left_out = (each.heading for at, each in enumerate(self._columns) if at not in shown)
+            yield Text(f"not shown for lack of width: {', '.join(left_out)}", style="dim")
+
+    def _fitting(self, room: int) -> list[int]:
+        """Return the numbers of the columns for which there is *room* without breaking words."""
+        shown = list(range(len(self._columns)))
+        while _total(self._needs(at, "narrow") for at in shown) > room:
+            worst = max(shown, key=lambda at: self._columns[at].rank)
+            if not self._columns[worst].rank:
+                break
+            shown.remove(worst)
+        return shown
+
+    def _widths(self, shown: Sequence[int], room: int) -> list[int]:
+        """Return the width of each column; those that wrap share what the others leave."""
+        least = [self._needs(at, "narrow") for at in shown]
+        widths = [self._needs(at, "wide") for at in shown]
+        excess = _total(widths) - room
+        while excess > 0:
+            slack = [wide - narrow for wide, narrow in zip(widths, least, strict=True)]
+            widest = max(range(len(shown)), key=lambda at: (slack[at] > 0, widths[at]))
+            if not slack[widest]:
+                least = [1] * len(shown)  # nothing fits: break words of the widest column
+                if widths[widest] == 1:
+                    break
+                continue
+            widths[widest] -= 1
+            excess -= 1
+        return widths
+
+    def _needs(self, at: int, size: Literal["narrow", "wide"]) -> int:
+        """Return the width of a column on one line a cell, or of its longest word if it wraps."""
+        column = self._columns[at]
+        texts = [column.heading, *(row[at].plain for row in self._rows)]
+        whole = max(cell_len(line) for text in texts for line in text.splitlines() or [""])
+        if size == "wide" or not column.wraps:
+            return whole
+        word = max((cell_len(word) for text in texts for word in text.split()), default=0)
+        return max(word, min(whole, _LEAST_WRAPPED))
+
+
+def _total(widths: Iterable[int]) -> int:
+    listed = list(widths)
+    return sum(listed) + _GAP * (len(listed) - 1)
