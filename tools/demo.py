@@ -12,7 +12,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -26,7 +25,6 @@ from rich.table import Table
 
 import eap
 from eap.appliance.attach import AttachedStation
-from eap.appliance.runtime import VARIABLE, runtime_root
 from eap.errors import EapError
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL
 
@@ -48,7 +46,6 @@ def main() -> int:
     os.chdir(Path(__file__).resolve().parent.parent)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with ExitStack() as stack:
-        stack.enter_context(usable_runtime_directory())
         appliance = stack.enter_context(running(PLANT))
         names = wait_ready(appliance)
         if names is None:
@@ -62,25 +59,6 @@ def main() -> int:
             print(f"make demo: {exc}", file=sys.stderr)
             return 1
         return appliance.poll() or 0
-
-
-@contextmanager
-def usable_runtime_directory() -> Iterator[None]:
-    """Choose a directory for this run where the usual one cannot be written, and say so."""
-    root = runtime_root()
-    try:
-        root.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:
-        writable = False
-    else:
-        writable = os.access(root, os.W_OK)
-    if writable:
-        yield
-        return
-    with tempfile.TemporaryDirectory(prefix="eap-demo-") as made:
-        os.environ[VARIABLE] = made
-        print(f"To look from another terminal: export {VARIABLE}={made}")
-        yield
 
 
 @contextmanager

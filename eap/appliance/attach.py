@@ -17,7 +17,7 @@ from pathlib import Path
 from time import monotonic_ns, time_ns
 from typing import Any
 
-from eap.appliance.runtime import find_running, runtime_root
+from eap.appliance.runtime import describe_roots, find_running
 from eap.appliance.station_image import StationImage
 from eap.closing import Closing
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
@@ -176,7 +176,7 @@ def attach(station: str, *, plant: str = "") -> AttachedStation:
     if not found:
         listed = ", ".join(sorted(name for _, info in running for name in info.stations)) or "none"
         raise ImageError(
-            f"no station {station!r} runs here (running: {listed}; looked in {runtime_root()} as "
+            f"no station {station!r} runs here (running: {listed}; looked in {describe_roots()} as "
             f"user {os.getuid()}): start its plant with eapctl run"
         )
     if len(found) > 1:

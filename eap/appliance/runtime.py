@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import logging
 import os
+import pwd
 import shutil
+import stat
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,11 +25,15 @@ from eap.closing import Closing
 from eap.errors import EnvironmentalError
 
 VARIABLE = "EAP_RUNTIME_DIR"
+SYSTEM_ROOT = Path("/run/eap")
+FALLBACK_PARENT = Path("/tmp")  # noqa: S108  the folder in it is private, see _require_private
 MAX_SOCKET_PATH = 107
 """Octets of a Unix socket's path (``sun_path`` less its final zero)."""
 
 _FLOCK = struct.Struct("hhqqi4x")
 _MAX_NAME = 60
+
+logger = logging.getLogger(__name__)
 
 
 class ProcessInfo(msgspec.Struct):
@@ -54,12 +62,75 @@ class ApplianceInfo(msgspec.Struct):
 
 
 def runtime_root() -> Path:
-    """Return EAP_RUNTIME_DIR, else ``$XDG_RUNTIME_DIR/eap``, else ``/run/eap``."""
+    """Return the directory in which this user's appliances have their folders.
+
+    EAP_RUNTIME_DIR, else the first that can be written of ``$XDG_RUNTIME_DIR/eap``, ``/run/eap``
+    and the user's private folder ``/tmp/eap-UID``.
+    """
+    *preferred, last = runtime_roots()
+    return next(filter(_can_be_written, preferred), last)
+
+
+def runtime_roots() -> list[Path]:
+    """Return all directories in which appliances of this user may have their folders."""
     if given := os.environ.get(VARIABLE):
-        return Path(given)
-    if session := os.environ.get("XDG_RUNTIME_DIR"):
-        return Path(session) / "eap"
-    return Path("/run/eap")
+        return [Path(given)]
+    session = os.environ.get("XDG_RUNTIME_DIR")
+    roots = [Path(session) / "eap"] if session else []
+    return list(dict.fromkeys((*roots, SYSTEM_ROOT, _private_root())))
+
+
+def describe_roots() -> str:
+    """Return where appliances are looked for, in words."""
+    return ", ".join(map(str, runtime_roots()))
+
+
+def _private_root() -> Path:
+    return FALLBACK_PARENT / f"eap-{os.geteuid()}"
+
+
+def _can_be_written(path: Path) -> bool:
+    """Tell whether *path* is a directory in which this user may make files, or can become one."""
+    target = path if os.path.exists(path) else path.parent  # noqa: PTH110  never raises
+    return os.access(target, os.W_OK | os.X_OK, effective_ids=True)
+
+
+def _require_private(path: Path) -> None:
+    """Make *path*, or check that it is a directory which no other user can have touched.
+
+    Everybody may make files in its parent, so another user can be there first.
+
+    Raises:
+        EnvironmentalError: it is a symbolic link or no directory, or other users own or enter it.
+    """
+    try:
+        path.mkdir(mode=0o700, exist_ok=True)
+        found = path.lstat()
+    except OSError as exc:
+        reason = exc.strerror
+        if isinstance(exc, FileExistsError):
+            reason = "it is no directory"
+        raise _unsafe(path, str(reason)) from None
+    if stat.S_ISLNK(found.st_mode):
+        raise _unsafe(path, "it is a symbolic link")
+    if found.st_uid != os.geteuid():
+        raise _unsafe(path, f"it belongs to {_user_name(found.st_uid)}")
+    if mode := stat.S_IMODE(found.st_mode) & 0o077:
+        raise _unsafe(path, f"other users have rights in it (mode {mode:03o})")
+
+
+def _unsafe(path: Path, reason: str) -> EnvironmentalError:
+    return EnvironmentalError(
+        f"runtime directory {path} cannot be used: {reason}; remove it, or set {VARIABLE} to a"
+        f" directory that only you may write"
+    )
+
+
+def _user_name(uid: int) -> str:
+    try:
+        return f"user {pwd.getpwuid(uid).pw_name}"
+    except KeyError:
+        return f"user {uid}"
 
 
 def folder_name(plant: str, subset: Sequence[str] = ()) -> str:
@@ -78,6 +149,7 @@ class ApplianceFolder(Closing):
     def __init__(self, path: Path, lock_fd: int = -1) -> None:
         self.path = path
         self._lock_fd = lock_fd
+        self._folder_fd = -1
 
     @classmethod
     def claim(cls, name: str) -> Self:
@@ -87,7 +159,16 @@ class ApplianceFolder(Closing):
             EnvironmentalError: another process holds it, it holds somebody else's files, or the
                 directory cannot be written.
         """
-        path = runtime_root() / name
+        root = runtime_root()
+        if root == _private_root() and not os.environ.get(VARIABLE):
+            _require_private(root)
+            logger.warning(
+                "runtime directory is %s: there is no session directory (XDG_RUNTIME_DIR), and %s"
+                " cannot be written",
+                root,
+                SYSTEM_ROOT,
+            )
+        path = root / name
         if _holds_other_files(path):
             raise EnvironmentalError(
                 f"runtime directory {path} is no folder of an appliance, and would be emptied: set"
@@ -109,6 +190,7 @@ class ApplianceFolder(Closing):
                 f" {MAX_SOCKET_PATH} octets): set {VARIABLE} to a shorter one"
             )
         folder._empty()
+        folder._keep_from_ageing()
         return folder
 
     @property
@@ -157,6 +239,13 @@ class ApplianceFolder(Closing):
         shutil.rmtree(self.path, ignore_errors=True)
         os.close(self._lock_fd)
         self._lock_fd = -1
+        if self._folder_fd >= 0:
+            os.close(self._folder_fd)
+
+    def _keep_from_ageing(self) -> None:
+        """Lock the folder: systemd-tmpfiles removes what is old in /tmp, but not behind a lock."""
+        self._folder_fd = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        fcntl.flock(self._folder_fd, fcntl.LOCK_SH)
 
     def _empty(self) -> None:
         for entry in self.path.iterdir():
@@ -166,11 +255,13 @@ class ApplianceFolder(Closing):
 
 def find_appliances() -> list[ApplianceFolder]:
     """Return the folders of all running appliances, by name."""
-    try:
-        folders = sorted(entry for entry in runtime_root().iterdir() if entry.is_dir())
-    except OSError:
-        return []
-    return [folder for folder in map(ApplianceFolder, folders) if folder.is_alive()]
+    folders: list[Path] = []
+    for root in runtime_roots():
+        with suppress(OSError):
+            if root != _private_root() or root.lstat().st_uid == os.geteuid():
+                folders += (entry for entry in root.iterdir() if entry.is_dir())
+    ordered = sorted(folders, key=lambda path: path.name)
+    return [folder for folder in map(ApplianceFolder, ordered) if folder.is_alive()]
 
 
 def find_running() -> list[tuple[ApplianceFolder, ApplianceInfo]]:

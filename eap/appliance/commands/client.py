@@ -10,7 +10,7 @@ from typing import Any
 from eap.appliance.bus_failure import to_error
 from eap.appliance.bus_request import Failure
 from eap.appliance.control import MAX_LINE, ErrorCode, Reply, decode_reply, encode_request
-from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, find_running, runtime_root
+from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, describe_roots, find_running
 from eap.closing import Closing
 from eap.errors import ControlError
 from eap.near import near
@@ -202,5 +202,5 @@ def _none_runs(
         names = [name for info in running for name in info.stations]
         hint = f"running are {others}{near(station, names) if station else ''}"
     else:
-        hint = f"start one with 'eapctl run PLANT' (looked in {runtime_root()})"
+        hint = f"start one with 'eapctl run PLANT' (looked in {describe_roots()})"
     return ControlError(f"no {wanted} runs: {hint}", code=ErrorCode.UNAVAILABLE)

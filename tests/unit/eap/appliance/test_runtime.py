@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -30,14 +31,77 @@ def info(plant: str = "demo") -> ApplianceInfo:
     return ApplianceInfo(plant, "demo.yaml", ["a"], "2026-01-01T00:00:00+00:00", os.getpid())
 
 
-def test_order_of_directories(monkeypatch):
-    monkeypatch.setenv("EAP_RUNTIME_DIR", "/x")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "/y")
-    assert runtime.runtime_root() == Path("/x")
+@pytest.fixture
+def no_session(tmp_path, monkeypatch):
+    """Neither EAP_RUNTIME_DIR nor a session directory, and a /run/eap that cannot be made."""
     monkeypatch.delenv("EAP_RUNTIME_DIR")
-    assert runtime.runtime_root() == Path("/y/eap")
-    monkeypatch.delenv("XDG_RUNTIME_DIR")
-    assert runtime.runtime_root() == Path("/run/eap")
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(runtime, "SYSTEM_ROOT", tmp_path / "absent" / "eap")
+    monkeypatch.setattr(runtime, "FALLBACK_PARENT", tmp_path)
+    return tmp_path / f"eap-{os.geteuid()}"
+
+
+def test_runtime_root_is_the_first_that_can_be_written(tmp_path, no_session, monkeypatch):
+    assert runtime.runtime_root() == no_session
+    system = tmp_path / "run" / "eap"
+    system.mkdir(parents=True)
+    monkeypatch.setattr(runtime, "SYSTEM_ROOT", system)
+    assert runtime.runtime_root() == system
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "absent"))
+    assert runtime.runtime_root() == system
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert runtime.runtime_root() == tmp_path / "eap"
+    monkeypatch.setenv("EAP_RUNTIME_DIR", "/x")
+    assert runtime.runtime_root() == Path("/x")
+
+
+def test_claim_without_a_session_directory_makes_a_private_folder(no_session, caplog):
+    with ApplianceFolder.claim("demo") as folder:
+        assert folder.path == no_session / "demo"
+        assert stat.S_IMODE(no_session.stat().st_mode) == 0o700
+        folder.write_info(info())
+        assert [found.plant for _, found in find_running()] == ["demo"]
+    (line,) = caplog.messages
+    assert line.startswith(f"runtime directory is {no_session}: there is no session directory")
+
+
+def test_find_running_looks_in_every_directory(tmp_path, no_session, monkeypatch):
+    with ApplianceFolder.claim("of-cron") as first:
+        first.write_info(info("of-cron"))
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # as a client in a session has it
+        with ApplianceFolder.claim("of-session") as second:
+            second.write_info(info("of-session"))
+            assert [found.plant for _, found in find_running()] == ["of-cron", "of-session"]
+
+
+def test_claim_refuses_a_private_folder_that_is_a_link(tmp_path, no_session):
+    (tmp_path / "target").mkdir()
+    no_session.symlink_to(tmp_path / "target")
+    with pytest.raises(EnvironmentalError, match="it is a symbolic link; remove it, or set EAP_"):
+        ApplianceFolder.claim("demo")
+    assert list((tmp_path / "target").iterdir()) == []
+
+
+def test_claim_refuses_a_private_folder_that_is_a_file(no_session):
+    no_session.write_text("")
+    with pytest.raises(EnvironmentalError, match="it is no directory"):
+        ApplianceFolder.claim("demo")
+
+
+def test_claim_refuses_a_private_folder_that_others_may_enter(no_session):
+    no_session.mkdir()
+    no_session.chmod(0o770)
+    with pytest.raises(EnvironmentalError, match=r"other users have rights in it \(mode 070\)"):
+        ApplianceFolder.claim("demo")
+
+
+@pytest.mark.root
+def test_claim_refuses_a_private_folder_of_another_user(no_session):
+    no_session.mkdir(mode=0o700)
+    os.chown(no_session, 65534, 65534)
+    with pytest.raises(EnvironmentalError, match="it belongs to user nobody"):
+        ApplianceFolder.claim("demo")
+    assert find_appliances() == []
 
 
 def test_folder_names_are_readable_and_unique():
