@@ -16,7 +16,7 @@ from devicebus.master.bus import Bus, Unit
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.procedure import Procedure, Sleep, read
-from devicebus.wire.alstatus import AlState
+from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import Register, SyncManager
 from devicebus.wire.sii import SiiProtocol
 from eap.codec import foe, soe
@@ -58,8 +58,8 @@ def attach(bus: Bus, unit: Unit) -> Procedure[Mailbox]:
 def _opened(unit: Unit) -> Mailbox:
     if unit.mailbox is None:
         raise BusError(
-            f"slave {unit.station} ({unit.name}) has no mailbox in {unit.state.name}: nothing but"
-            " its state, its EEPROM and its registers can be reached"
+            f"slave {unit.station} ({unit.name}) has no mailbox in {state_name(unit.al_state)}:"
+            " nothing but its state, its EEPROM and its registers can be reached"
         )
     return unit.mailbox
 
@@ -76,7 +76,7 @@ def _settle(bus: Bus, unit: Unit) -> Procedure[None]:
         mailbox.look(now_ns)
 
 
-def _greet(protocols: SiiProtocol, state: AlState) -> Conversation[None]:
+def _greet(protocols: SiiProtocol, state: AlState | None) -> Conversation[None]:
     """Send what changes nothing, in a protocol that the slave knows; an answer is thrown away."""
     if protocols & SiiProtocol.COE and state is not AlState.BOOT:
         body = encode_plain(SdoRequest.UPLOAD, _DEVICE_TYPE, 0)

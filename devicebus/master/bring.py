@@ -48,6 +48,7 @@ def bring(bus: Bus, unit: Unit, target: AlState) -> Procedure[None]:
         if current in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
             yield from _end_process_data(bus, unit)
         unit.state = current = step
+        unit.is_set_up = step in _WITH_PROCESS_DATA
         if step in _WITH_PROCESS_DATA:
             bus.set_presence(unit, Presence.PRESENT)
         elif step is AlState.BOOT:

@@ -53,8 +53,9 @@ class Unit:
     """One slave that the master drives.
 
     Attributes:
-        state: Where it was brought.
+        state: Its AL state as it was read last; None until it was read since the slave answers.
         target: Where it belongs.
+        is_set_up: Whether its sync managers and FMMUs are set for process data.
         channels: Its process data.
         mailbox: Open in the states that have one.
         missed_ns: Since when it is not where it belongs; None while it is.
@@ -67,8 +68,9 @@ class Unit:
         self.found = found
         self.name = name
         self.station = found.station
-        self.state = AlState.INIT
+        self.state: AlState | None = None
         self.target = AlState.INIT
+        self.is_set_up = False
         self.channels: tuple[Channel, ...] = ()
         self.mailbox: Mailbox | None = None
         self.missed_ns: int | None = None
@@ -77,9 +79,20 @@ class Unit:
         self.retry_ns = 0
 
     @property
+    def al_state(self) -> int:
+        """AL state to be shown, 0 while it is not known."""
+        return int(self.state or 0)
+
+    @property
     def is_busy(self) -> bool:
         """Whether it is being brought somewhere."""
         return self.work is not None and not self.work.is_done
+
+    def lose(self) -> None:
+        """Forget where it was: it does not answer, or something else is in its place."""
+        self.is_lost = True
+        self.state = None
+        self.is_set_up = False
 
 
 class Bus:

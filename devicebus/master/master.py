@@ -127,11 +127,7 @@ class Master:
         unit = self._unit(station)
         if unit.mailbox is None:
             conversation.close()
-            raise BusError(
-                f"slave {station} ({unit.name}) has no mailbox in {unit.state.name}"
-                if not unit.is_lost
-                else f"slave {station} ({unit.name}) does not answer"
-            )
+            raise BusError(f"slave {station} ({unit.name}) {_why_closed(unit)}")
         return unit.mailbox.converse(conversation, now_ns, name=name, requester=requester)
 
     def run(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
@@ -202,3 +198,12 @@ class Master:
         except KeyError:
             known = ", ".join(map(str, self._bus.units)) or "none"
             raise BusError(f"there is no slave {station}; known are {known}") from None
+
+
+def _why_closed(unit: Unit) -> str:
+    """Return why a slave has no open mailbox."""
+    if unit.is_lost:
+        return "does not answer"
+    if unit.state is None:
+        return "answers again and is being identified: its mailbox is not open yet"
+    return f"has no mailbox in {unit.state.name}"

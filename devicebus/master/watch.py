@@ -84,7 +84,7 @@ def _lose(bus: Bus, unit: Unit, now_ns: int) -> None:
     """A slave does not answer: leave it out."""
     if unit.is_lost:
         return
-    unit.is_lost = True
+    unit.lose()
     unit.retry_ns = 0
     unit.missed_ns = unit.missed_ns or now_ns
     if unit.work is not None:
@@ -98,7 +98,11 @@ def _lose(bus: Bus, unit: Unit, now_ns: int) -> None:
 
 def _judge(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
     """A slave answers: bring it back if it is not where it belongs."""
-    if unit.is_busy or now_ns < unit.retry_ns:
+    if unit.is_busy:
+        return
+    if not unit.is_lost:  # of one that was, the identity is compared before its state counts
+        unit.state = AlState(status.state) if status.state in set(AlState) else None
+    if now_ns < unit.retry_ns:
         return
     is_right = status.state == unit.target and not status.error
     if is_right and not unit.is_lost:
@@ -115,7 +119,7 @@ def _begin(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
         not unit.is_lost
         and status.state in _WITH_MAILBOX
         and unit.target in _WITH_MAILBOX
-        and unit.state in _WITH_MAILBOX
+        and unit.is_set_up
     )
     unit.is_lost = False
     bus.is_troubled = True
@@ -127,7 +131,8 @@ def _begin(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
             bus.emit(SlaveBack(unit.station, end_ns - (missed_ns or end_ns), end_ns))
         elif not unit.is_lost:
             unit.retry_ns = now_ns + RETRY_NS
-            unit.is_lost = isinstance(task.error, IdentityError)
+            if isinstance(task.error, IdentityError):
+                unit.lose()
             bus.emit(SlaveFailed(unit.station, str(task.error), now_ns))
 
     work = _revive(bus, unit, stays=stays)

@@ -21,7 +21,7 @@ def test_switch_opens_the_valve_and_a_killed_engine_closes_it() -> None:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -64,7 +64,7 @@ def _found(bus: EngineBus, unit: Unit, link_preset: int) -> SlaveReport:
         revision=identity.revision,
         serial=identity.serial,
         alias=unit.found.alias,
-        state=0 if unit.is_lost else int(unit.state),
+        state=unit.al_state,
         target=int(unit.target),
         to_slave=sizes.to_slave if sizes else 0,
         to_master=sizes.to_master if sizes else 0,

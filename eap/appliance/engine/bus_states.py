@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from devicebus.master.bus import Unit
 from devicebus.master.master import Master
 from eap.pd.image import Image
 from eap.pd.spec import BusSlaveSpec
@@ -29,16 +28,12 @@ class BusStates:
     def show(self, master: Master) -> None:
         """Store what has changed; the caller stands in the engine's writing."""
         units, cycle = master.units, master.cycle
-        lowest = min([_state(unit) for unit in units.values()], default=0)
+        lowest = min([unit.al_state for unit in units.values()], default=0)
         values = [lowest, int(cycle is not None and cycle.is_full)]
-        values += [_state(units.get(station)) for station in self._stations]
+        values += [units[at].al_state if at in units else 0 for at in self._stations]
         if values == self._shown:
             return
         for name, value, shown in zip(self._names, values, self._shown, strict=True):
             if value != shown and name in self._image.places:
                 self._image.store(name, bytes((value,)))
         self._shown = values
-
-
-def _state(unit: Unit | None) -> int:
-    return 0 if unit is None or unit.is_lost else int(unit.state)

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import pytest
+
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.engine.bus_report import report_bus
+from tests.support import enginebus
 from tests.support.cyclic import MS
-from tests.support.enginebus import BusRig
+from tests.support.enginebus import US, BusRig
 
 
 def test_before_it_is_up_the_expected_slaves_are_told(tmp_path):
@@ -65,3 +68,54 @@ def test_a_slave_that_is_gone_says_why(tmp_path):
     rig.run(100 * MS)
     lost = report_bus(rig.bus).slaves[2]
     assert (lost.state, lost.target, lost.fault) == (0, AlState.OP, "it does not answer")
+
+
+def shown_states(rig, place, duration_ns):
+    """Run the bus; return what image and report say of a slave's state, without repeats."""
+    name = rig.bus.spec.slaves[place].name
+    ways = (lambda: rig.value(f"{name}.state"), lambda: report_bus(rig.bus).slaves[place].state)
+    shown = [[], []]
+    end_ns = rig.now_ns + duration_ns
+    while rig.now_ns < end_ns:
+        rig.step(end_ns)
+        for way, states in zip(ways, shown, strict=True):
+            if states[-1:] != [way()]:
+                states.append(way())
+    return shown
+
+
+@pytest.fixture
+def slow_trip(monkeypatch):
+    """Frames take most of a cycle, so that each step of a slave's way back can be seen."""
+    monkeypatch.setattr(enginebus, "TRIP_NS", 900 * US)
+
+
+def test_report_slave_back_from_power_fault_has_no_state_until_it_was_read(tmp_path, slow_trip):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    rig.fault(kind="power", slave="io", for_ms=200)
+    image, report = shown_states(rig, 1, 1_000 * MS)
+    assert image == [8, 0, 1, 2, 4, 8]
+    assert report == [8, 0, 1, 2, 4, 8]
+
+
+def test_report_slave_that_left_op_by_itself_shows_the_state_that_was_read(tmp_path):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    rig.fault(kind="refuse", slave="io", state="OP", code=0x52)
+    rig.fault(kind="al-error", slave="io", code=0x52)
+    image, report = shown_states(rig, 1, 500 * MS)
+    assert image == [8, 4]
+    assert report == [8, 4]
+
+
+def test_report_other_product_in_place_of_a_slave_has_no_state(tmp_path):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    io = rig.wire.segment.segment.slaves[1]
+    io.esc.image = io.esc.image[:20] + b"\x63" + io.esc.image[21:]
+    rig.fault(kind="power", slave="io", for_ms=200)
+    image, report = shown_states(rig, 1, 2_500 * MS)
+    assert image == [8, 0]
+    assert report == [8, 0]
+    assert "in place of io" in report_bus(rig.bus).slaves[1].fault

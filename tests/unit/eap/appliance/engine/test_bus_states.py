@@ -12,9 +12,8 @@ SLAVES = (BusSlaveSpec("a", 1001, 1, 2), BusSlaveSpec("b", 1002, 1, 2))
 
 
 class Unit:
-    def __init__(self, state, *, is_lost=False):
-        self.state = state
-        self.is_lost = is_lost
+    def __init__(self, al_state):
+        self.al_state = al_state
 
 
 class Cycle:
@@ -44,7 +43,7 @@ def test_the_lowest_state_is_that_of_the_bus(image):
     master.cycle = Cycle()
     states.show(master)
     assert read(image) == [4, 8, 4, True]
-    master.units[1002].is_lost = True
+    master.units[1002].al_state = 0
     master.cycle.is_full = False
     states.show(master)
     assert read(image) == [0, 8, 0, False]
