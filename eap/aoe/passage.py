@@ -69,25 +69,38 @@ class Passage:
         self._passed = Passed()
         self._ending = Ending(outlet, self.in_flight, self._ids, limits)
 
-    def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
-        """Pass a request on that is for nobody here, or refuse it.
+    def take_notification(
+        self, header: AmsHeader, data: bytes, way: Way, now_ns: int, *, is_own: bool
+    ) -> list[Action]:
+        """Hand samples to the clients that subscribed, whatever NetID these have.
+
+        What no client here subscribed to goes on by a route, or is ended where it comes from.
+
+        Args:
+            header: Of the notification.
+            data: All of the packet.
+            way: That it came by.
+            now_ns: The time on the monotonic clock.
+            is_own: Whether its target is of this station.
 
         Raises:
-            CodecError: it is a notification shorter or longer than it says.
+            CodecError: it is shorter or longer than it says.
         """
-        if header.command == _NOTIFICATION:
-            body = data[AmsHeader.SIZE :]
-            replies = self.notifier.hand_on(
-                header, body, lambda hop: self._outlet.is_from(hop, way)
-            )
-            if replies:
-                return list(replies)
+        body = data[AmsHeader.SIZE :]
+        replies = self.notifier.hand_on(header, body, lambda hop: self._outlet.is_from(hop, way))
+        if replies:
+            return list(replies)
+        found = None if is_own else self._judge.find_route(header, way)
+        if isinstance(found, Route) or (found and found.error != AdsError.TARGET_MACHINE):
+            return self.take_request(header, data, way, now_ns)
+        text = "no client here subscribed to it, or not any more"
+        self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
+        return self._ending.end_unwanted(header, body, way)
+
+    def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
+        """Pass a request on that is for nobody here, or refuse it."""
         found = self._let_on(header, data, way, now_ns)
         if isinstance(found, Refusal):
-            if header.command == _NOTIFICATION and found.error == AdsError.TARGET_MACHINE:
-                text = "nobody here asked for it, or not any more"
-                self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
-                return self._ending.end_unwanted(header, data[AmsHeader.SIZE :], way)
             return self._refuser.refuse(header, way, found, now_ns)
         route, data, judged = found
         onward = ADDRESSES.pack(

@@ -30,6 +30,7 @@ from eap.ids import NetId
 
 _RESPONSE = StateFlags.RESPONSE.value  # plain numbers: enums and operators of flags are slow
 _FRAGMENT = AmsCommand.FRAGMENT.value
+_NOTIFICATION = AmsCommand.NOTIFICATION.value
 _PLC_PORTS = frozenset((801, 811, 821, 831, *range(851, 860)))
 """Of the runtimes of TwinCAT 2 and 3."""
 _NOBODY = 0
@@ -107,14 +108,12 @@ class Router:
         """Take what comes by *connection* for what comes from the hop that is named *address*."""
         self._outlet.note_place(Way(door, address), connection)
 
-    def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
-        """Say whether a packet is for this station or for somebody who waits here.
+    def is_waiting_for(self, header: AmsHeader, body: bytes, door: str) -> bool:
+        """Say whether a client of this router waits for a packet: for the answer or the sample.
 
-        For whoever has several routers behind one socket.  A request is, if its target is of this
-        station; an answer, if it was asked for; a notification, if a client of this router has it.
+        This serves those that have several routers behind one socket.  The target does not say it:
+        clients may have the NetID of any router.
         """
-        if header.target in self._devices:
-            return True
         if header.state_flags & _RESPONSE:
             pending = self._passage.in_flight.get(header.invoke_id)
             return (
@@ -122,7 +121,7 @@ class Router:
                 and pending.route is not None
                 and (pending.route.hop.door == door)
             )
-        is_notification = header.command == AmsCommand.NOTIFICATION
+        is_notification = header.command == _NOTIFICATION
         return is_notification and self._passage.notifier.knows(header, body)
 
     def receive_packet(
@@ -284,6 +283,9 @@ class Router:
         if ports is None and for_all:
             return []
         self.record.connections.of(way, now_ns).ask(len(data), header.source)
+        if header.command == _NOTIFICATION:
+            is_own = ports is not None
+            return self._passage.take_notification(header, data, way, now_ns, is_own=is_own)
         if header.source in self._devices and not self.gate.is_this_host(way):
             text = f"it comes back to where it began: {header.source} is of this station"
             why = Refusal(AdsError.TARGET_MACHINE, text, outcome=Outcome.LOOP)

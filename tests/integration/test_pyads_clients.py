@@ -70,6 +70,21 @@ with one, two:
     print(wrong, "wrong of", count, flush=True)
 """
 
+SUBSCRIBER = """
+import sys, threading
+import pyads
+address, own, target = sys.argv[1:]
+pyads.open_port()
+pyads.set_local_address(own)
+came = threading.Semaphore(0)
+with pyads.Connection(target, 0xFFFF, address) as device:
+    cyclic = pyads.NotificationAttrib(4, pyads.ADSTRANS_SERVERCYCLE, cycle_time=50)
+    handles = device.add_device_notification("level", cyclic, lambda *_: came.release())
+    samples = sum(came.acquire(timeout=20) for _ in range(5))
+    device.del_device_notification(*handles)
+print(samples, flush=True)
+"""
+
 
 @pytest.fixture
 def appliance(farm: Plants) -> Appliance:
@@ -129,6 +144,10 @@ def test_clients_of_one_address_keep_apart_through_another_station(
 ) -> None:
     appliance = farm.run(farm.write(PLANT + THROUGH + route))
     assert_all_are_answered(GATE)
+    for own in (f"{GATE}.1.1", f"{GATE}.2.1", ROUTER):  # those of the routers and of a port
+        words = [sys.executable, "-c", SUBSCRIBER, GATE, own, FIRST]
+        run = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+        assert (run.returncode, run.stdout) == (0, "5\n"), run.stderr
     for station in ("tower", "gate"):
         assert appliance.station(station)["discarded"] == {}
 

@@ -42,8 +42,12 @@ class EchoStation:
     def find(self, net_id: NetId) -> tuple[None, int] | None:
         return (None, 6) if net_id in self._routes else None
 
-    def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
-        return header.target in self._devices
+    @property
+    def net_ids(self) -> set[NetId]:
+        return self._devices
+
+    def is_waiting_for(self, header: AmsHeader, body: bytes, door: str) -> bool:
+        return False
 
     def receive(self, data: bytes, door: str, connection: str, *, for_all: bool = False) -> None:
         self.seen.append((data, door, connection))

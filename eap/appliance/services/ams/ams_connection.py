@@ -7,8 +7,9 @@ Rule 3: a connection that this side opened is always read from: what comes are a
 two stations that wait for each other to read would wait for ever.
 Rule 4: a connection has a name that no other one ever has: clients of one host share its NetID, and
 often ports and numbers of requests too.
-Rule 5: who asks for an AMS address, as local clients of a TwinCAT router do, is given one to ask
-by; answers come back by the connection, so nothing is kept of it.
+Rule 5: a client that asks for an AMS address, as local clients of a TwinCAT router do, is given one
+that no station and no other client has; answers come back by the connection, so nothing is kept of
+the address.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import asyncio
 import itertools
 import logging
 import socket
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 import msgspec
@@ -51,8 +52,10 @@ _RECEIVED = memoryview(bytearray(64 << 10))
 kernel and given back each time, which takes longer than all the rest."""
 _PER_TURN = 8
 """Packets of one connection before others have their turn."""
-_PORTS = itertools.cycle(range(32768, 40960))
-"""For clients that ask for one, as a TwinCAT router numbers them."""
+_FIRST_PORT, _LAST_PORT = 32768, 40959
+"""AMS ports for clients that ask for one, as a TwinCAT router numbers them."""
+_FIRST_SUFFIX, _LAST_SUFFIX = 0x8001, 0xFEFE
+"""Last two bytes of the NetIDs for these clients: not .1.1, .2.1 and so on, which stations have."""
 _PROBE_AFTER_S = 30
 _PROBES = 3
 _PROBE_S = 10
@@ -80,6 +83,30 @@ class PacketTaker(Protocol):
         """Count what is not taken."""
 
 
+class ClientAddresses:
+    """AMS addresses for clients that ask for one: no two are the same, nor are they a station's.
+
+    The first four bytes are those of the client's IP address, as access rules expect them.
+
+    Args:
+        first: Number of the first address; another one in each process makes it unlikely that two
+            routers give the same address to two clients of one host.
+    """
+
+    def __init__(self, first: int) -> None:
+        self._numbers = itertools.count(first)
+
+    def next(self, host: str, taken: Callable[[NetId], bool]) -> tuple[NetId, int]:
+        """Return the next address for a client on *host* whose NetID is not *taken*."""
+        while True:
+            number = next(self._numbers)
+            suffix = _FIRST_SUFFIX + number % (_LAST_SUFFIX - _FIRST_SUFFIX + 1)
+            high, low = divmod(suffix, 0x100)
+            net_id = NetId.parse(f"{host}.{high}.{low}")
+            if not taken(net_id):
+                return net_id, _FIRST_PORT + number % (_LAST_PORT - _FIRST_PORT + 1)
+
+
 class AmsConnection(asyncio.BufferedProtocol):
     """One connection.
 
@@ -88,6 +115,8 @@ class AmsConnection(asyncio.BufferedProtocol):
         host: The peer's address.
         taker: Acts on what it brings.
         is_ours: Whether this side opened it.
+        give_address: Returns NetID and port for a client on a host that asks for an AMS address;
+            without it no peer may ask for one.
 
     Attributes:
         name: As above.
@@ -101,6 +130,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         taker: PacketTaker,
         *,
         is_ours: bool = False,
+        give_address: Callable[[str], tuple[NetId, int]] | None = None,
     ) -> None:
         self.name = name
         self.host = host
@@ -115,6 +145,8 @@ class AmsConnection(asyncio.BufferedProtocol):
         self._has_ended = False
         self._late_since: float | None = None
         self._why = "closed by the peer"
+        self._give_address = give_address
+        self._net_id: NetId | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Begin (asyncio)."""
@@ -263,11 +295,13 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._taker.take_packet(piece, self)
 
     def _answer_client(self, asked: Asked) -> None:
-        net_id = NetId.parse(f"{self.host}.1.1")
         port = int.from_bytes(asked.data, "little")
-        if self._is_ours:
+        if self._give_address is None:
             self._break_off("a router that asks for an address")
-        elif asked.command is RouterCommand.NET_ID:
+            return
+        net_id, own_port = self._give_address(self.host)
+        self._net_id = net_id = self._net_id or net_id
+        if asked.command is RouterCommand.NET_ID:
             self._transport.write(encode_net_id(net_id))
         elif asked.command is RouterCommand.CLOSE_PORT:
             self._why = "the client gave its port back"
@@ -276,7 +310,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         elif port:
             self._break_off(f"programs cannot serve AMS port {port} of a router")
         else:
-            self._transport.write(encode_opened_port(net_id, next(_PORTS)))
+            self._transport.write(encode_opened_port(net_id, own_port))
 
     def _refuse_length(self, header: AmsHeader) -> None:
         self._taker.refuse(Refusal.AMS_LENGTH)

@@ -6,21 +6,33 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable, Coroutine
+from secrets import randbelow
 from typing import Any
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.accepting import accept_connections, connection_name
-from eap.appliance.services.ams.ams_connection import PATIENCE_S, AmsConnection, set_options
+from eap.appliance.services.ams.ams_connection import (
+    PATIENCE_S,
+    AmsConnection,
+    ClientAddresses,
+    set_options,
+)
 from eap.appliance.services.ams.ams_shares import Shares
 from eap.appliance.services.routing.entrance import Entrance
+from eap.ids import NetId
 
 logger = logging.getLogger(__name__)
 
 
 class AmsClients:
-    """Who has connected to any listener of this process, by name; the carrier of their door."""
+    """Who has connected to any listener of this process, by name; the carrier of their door.
+
+    Attributes:
+        addresses: For clients that ask for an AMS address.
+    """
 
     def __init__(self) -> None:
+        self.addresses = ClientAddresses(randbelow(1 << 16))
         self._connections: dict[str, AmsConnection] = {}
 
     def __len__(self) -> int:
@@ -119,11 +131,16 @@ class AmsDoor:
         name = connection_name(sock)
         try:
             set_options(sock)
-            await loop.connect_accepted_socket(lambda: AmsConnection(name, host, self), sock)
+            await loop.connect_accepted_socket(
+                lambda: AmsConnection(name, host, self, give_address=self._give_address), sock
+            )
         except OSError as exc:  # it has gone again already
             logger.debug("AMS/TCP connection %s: %s", name, exc.strerror)
             self._shares.give_back(host)
             sock.close()
+
+    def _give_address(self, host: str) -> tuple[NetId, int]:
+        return self._clients.addresses.next(host, self._entrance.has)
 
     async def _watch_slow(self) -> None:
         loop = asyncio.get_running_loop()

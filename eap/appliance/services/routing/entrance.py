@@ -102,7 +102,10 @@ class Entrance:
 
     def _find(self, header: AmsHeader, body: bytes) -> tuple[StationRouter, str]:
         for station, door in self._behind:
-            if station.expects(header, body, door):
+            if station.is_waiting_for(header, body, door):
+                return station, door
+        for station, door in self._behind:
+            if header.target in station.net_ids:
                 return station, door
         return max(self._behind, key=lambda each: _match(each[0], header))
 

@@ -191,9 +191,9 @@ class StationRouter:
         """Say where a request would go that came by *way*."""
         return self._router.locate(header, way)
 
-    def expects(self, header: AmsHeader, body: bytes, door: str) -> bool:
-        """Say whether a packet is for this station or for somebody who waits here."""
-        return self._router.expects(header, body, door)
+    def is_waiting_for(self, header: AmsHeader, body: bytes, door: str) -> bool:
+        """Say whether a client of this router waits for a packet."""
+        return self._router.is_waiting_for(header, body, door)
 
     def receive(self, data: bytes, door: str, connection: str, *, for_all: bool = False) -> None:
         """Act on an AMS packet, or on the fragment of one.

@@ -103,8 +103,7 @@ class TestWhole:
 
     def test_notifications_need_no_rule(self) -> None:
         body = struct.pack("<II", 4, 0)
-        here = station()
-        assert isinstance(here.give(ask(NOTIFICATION, body), LAPTOP)[0], Deliver)
+        assert station(DRIVES).forwarded(ask(NOTIFICATION, body, FAR_DEVICE), LAPTOP).body == body
 
 
 class TestNoAnswer:

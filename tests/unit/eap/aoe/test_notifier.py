@@ -13,11 +13,21 @@ from tests.support.ams import (
     Ams,
     parse,
 )
-from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, SECOND_LINK, Station, route
+from tests.support.aoerouter import (
+    CLIENT,
+    FAR,
+    FAR_DEVICE,
+    LINK,
+    ROUTER,
+    SECOND_LINK,
+    Station,
+    route,
+)
 from tests.unit.eap.aoe.test_subscriptions import stream
 
 SECOND = 1_000_000_000
 ONE, TWO = Way("tcp", "1"), Way("tcp", "2")
+LOCAL, ALSO_LOCAL = Way("local", "1"), Way("local", "2")
 ADD = Ams(FAR_DEVICE, CLIENT, ADD_NOTIFICATION, body=bytes(40))
 NOTICE = Ams(CLIENT, FAR_DEVICE, NOTIFICATION)
 
@@ -44,6 +54,23 @@ def test_notification_goes_to_who_asked_for_it_with_one_address_for_both() -> No
     both = NOTICE._replace(body=stream((5, {1: b"a", 2: b"b"})))
     parts = {each.way: parse(*each.packets).body for each in station.give(both, LINK)}
     assert parts == {ONE: stream((5, {1: b"a"})), TWO: stream((5, {2: b"b"}))}
+
+
+def test_notifications_reach_clients_with_the_net_id_of_the_router() -> None:
+    station = Station([route(FAR, LINK)])
+    own = f"{ROUTER}:30000"
+    for handle, way in ((1, LOCAL), (2, ALSO_LOCAL)):
+        onward = station.forwarded(ADD._replace(source=own), way)
+        assert station.replied(onward.answer(granted(handle)), LINK)[0] == way
+        notice = NOTICE._replace(target=own, body=stream((5, {handle: b"data"})))
+        assert station.replied(notice, LINK) == (way, notice)
+
+
+def test_notification_for_the_router_that_no_client_has_is_ended() -> None:
+    station = Station([route(FAR, LINK)])
+    notice = NOTICE._replace(target=f"{ROUTER}:30000", body=stream((5, {9: b"data"})))
+    way, end = station.replied(notice, LINK)
+    assert (way, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
 
 
 def test_notification_comes_from_the_address_that_was_asked() -> None:

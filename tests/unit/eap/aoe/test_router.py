@@ -25,6 +25,7 @@ from tests.unit.eap.aoe.test_subscriptions import stream
 
 SECOND = 1_000_000_000
 TCP, UDP = Way("tcp", "10.0.0.9:4711 #1"), Way("segment", "02:00:00:00:00:09")
+OWN = Way("local", "1")
 
 
 def test_service_of_the_station_is_asked_and_its_answer_goes_back() -> None:
@@ -131,7 +132,7 @@ def test_request_without_answer_gets_none() -> None:
     quiet = Ams(DEVICE, CLIENT, flags=StateFlags.ADS | StateFlags.NO_RETURN)
     assert station.delivered(quiet, TCP).ticket == 0
     assert station.give(quiet._replace(target="9.9.9.9.9.9:1"), TCP) == []
-    assert station.delivered(Ams(DEVICE, CLIENT, NOTIFICATION, body=bytes(8)), TCP).ticket == 0
+    assert station.give(Ams(DEVICE, CLIENT, NOTIFICATION, body=bytes(8)), TCP) == []
     assert station.router.receive_answer(0, AmsAnswer(), 1) == []
     assert station.router.stats().in_flight == 0
 
@@ -153,25 +154,25 @@ def test_doors_come_and_go() -> None:
     assert station.router.notify(TCP, b"packet") == [Reply(TCP, (b"packet",))]
 
 
-def test_what_is_expected_is_for_here_or_for_who_waits_here() -> None:
+def test_router_is_waiting_for_answers_and_samples_of_its_clients_only() -> None:
     station = Station([route(FAR, LINK)])
 
-    def expects(packet: Ams, door: str = "link") -> bool:
+    def is_waiting_for(packet: Ams, door: str = "link") -> bool:
         header, body = decode_packet(packet.octets())
-        return station.router.expects(header, bytes(body), door)
+        return station.router.is_waiting_for(header, bytes(body), door)
 
-    onward = station.forwarded(Ams(FAR_DEVICE, CLIENT, ADD_NOTIFICATION, body=bytes(40)), TCP)
+    client = f"{ROUTER}:30000"  # the NetID says nothing
+    onward = station.forwarded(Ams(FAR_DEVICE, client, ADD_NOTIFICATION, body=bytes(40)), OWN)
     answer = onward.answer(bytes(4) + b"\7\0\0\0")
-    assert expects(answer)
-    assert not expects(answer, "tcp")
-    assert not expects(answer._replace(invoke_id=1))
+    assert is_waiting_for(answer)
+    assert not is_waiting_for(answer, "tcp")
+    assert not is_waiting_for(answer._replace(invoke_id=1))
     station.give(answer, LINK)
-    assert not expects(answer)
-    assert expects(Ams(DEVICE, CLIENT))
-    assert not expects(Ams(FAR_DEVICE, CLIENT))
-    notice = Ams(CLIENT, FAR_DEVICE, NOTIFICATION)
-    assert expects(notice._replace(body=stream((5, {6: b"", 7: b""}))))
-    assert not expects(notice._replace(body=stream((5, {6: b""}))))
+    assert not is_waiting_for(answer)
+    assert not is_waiting_for(Ams(DEVICE, CLIENT))
+    notice = Ams(client, FAR_DEVICE, NOTIFICATION)
+    assert is_waiting_for(notice._replace(body=stream((5, {6: b"", 7: b""}))))
+    assert not is_waiting_for(notice._replace(body=stream((5, {6: b""}))))
 
 
 def test_hop_that_is_down_is_known() -> None:

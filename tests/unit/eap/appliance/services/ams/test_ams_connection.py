@@ -7,6 +7,7 @@ import itertools
 import socket
 import struct
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any, TypeAlias
 
 import pytest
@@ -14,8 +15,13 @@ import pytest
 from eap.aoe.answer import AmsAnswer, response_to
 from eap.appliance.discards import Refusal
 from eap.appliance.services.ams import ams_connection, ams_window
-from eap.appliance.services.ams.ams_connection import AmsConnection, set_options
+from eap.appliance.services.ams.ams_connection import (
+    AmsConnection,
+    ClientAddresses,
+    set_options,
+)
 from eap.codec.ams import AmsHeader
+from eap.ids import NetId
 from tests.support import aoe
 from tests.support.eventually import eventually
 
@@ -78,6 +84,14 @@ class Taker:
         self.connection.send([self.waiting.pop(number)])
 
 
+ADDRESSES = ClientAddresses(0x100)
+
+
+def is_taken(net_id: NetId) -> bool:
+    """Say whether a station has a NetID; some have the usual one, some any other."""
+    return net_id[4:] == b"\1\1" or net_id[5] % 2 == 0
+
+
 def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more: Any) -> Taker:
     """Run ``script(reader, writer, taker)`` on a connection, and wait for its end."""
     made: list[Taker] = []
@@ -90,7 +104,13 @@ def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more
             ours = socket.create_connection(listener.getsockname())
             theirs, (host, port) = listener.accept()
         set_options(theirs)
-        connection = AmsConnection(f"{host}:{port}#1", host, taker, is_ours=is_ours)
+        connection = AmsConnection(
+            f"{host}:{port}#1",
+            host,
+            taker,
+            is_ours=is_ours,
+            give_address=None if is_ours else partial(ADDRESSES.next, taken=is_taken),
+        )
         await loop.connect_accepted_socket(lambda: connection, theirs)
         reader, writer = await asyncio.open_connection(sock=ours)
         watch = asyncio.ensure_future(look_for_slow(connection, taker, patience_s))
@@ -216,22 +236,30 @@ def test_what_is_no_ams_packet_ends_the_connection_when_all_has_been_answered(oc
     assert taker.why.startswith("no AMS packets: AmsTcpHeader")
 
 
-def test_local_client_is_given_an_address_to_ask_by() -> None:
+def test_client_that_asks_gets_an_address_that_nobody_else_has() -> None:
+    addresses = []
+
     async def script(reader, writer, taker):
         for _ in range(2):
             writer.write(prefixed(b"\0\0", reserved=0x1000))
         writer.write(prefixed(bytes(4), reserved=0x1002) + ask(b"x", 9))
         first, second = [await reader.readexactly(14) for _ in range(2)]
-        assert first[:12] == second[:12] == bytes.fromhex("0010 08000000 7f0000010101")
+        assert first[:10] == second[:10] == bytes.fromhex("0010 08000000 7f000001")
+        assert first[10:12] == second[10:12]
         assert first[12:] != second[12:]
-        assert await reader.readexactly(12) == bytes.fromhex("0210 06000000 7f0000010101")
+        addresses.append(first[6:12])
+        net_id = bytes.fromhex("0210 06000000") + first[6:12]
+        assert await reader.readexactly(12) == net_id
         assert (await hear(reader))[:2] == (0, 9)
         writer.write(prefixed(first[12:], reserved=1))
         assert await reader.read() == b""
 
-    taker = talk(script)
-    assert not taker.refused
-    assert taker.why == "the client gave its port back"
+    for _ in range(2):
+        taker = talk(script)
+        assert not taker.refused
+        assert taker.why == "the client gave its port back"
+    assert addresses[0] != addresses[1]
+    assert not any(map(is_taken, map(NetId, addresses)))
 
 
 @pytest.mark.parametrize(
