@@ -129,7 +129,7 @@ class AttachedStation(Closing):
 
     def status(self) -> dict[str, Any]:
         """Return the counters and states of the station, shaped as in ``eapctl status``."""
-        return station_status(self._current(), monotonic_ns(), time_ns())
+        return station_status(self._current().snapshot(), monotonic_ns(), time_ns())
 
     def _current(self) -> Image:
         """Return the image, of the newest layout and with an engine behind it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from functools import partial
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
@@ -72,14 +73,16 @@ def watch(
     """Print a line for each change of a variable, until Ctrl-C.
 
     All variables of STATION, or those named.  STATION/VAR names one of another station.  The first
-    lines say what the values are now.
+    lines say what the values are now, later ones how many cycles were skipped before them.
     """
-    from eap.cli.watching import changes
+    from eap.cli.watching import SkippedCycles, changes
 
     wanted = parse_names(names)
-    write = write_json if as_json else _write_change
+    skipped = SkippedCycles(period_ms, partial(click.echo, err=True))
+    write = skipped.without(write_json) if as_json else _write_change
     try:
         with ExitStack() as stack:
+            stack.callback(skipped.close)
             stream = changes(stack, wanted, period_ms=period_ms, plant=plant)
             for number, change in enumerate(stream, 1):
                 write(change)

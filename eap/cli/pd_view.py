@@ -67,15 +67,15 @@ def _typed(variable: Row) -> str:
 
 
 def change_line(change: Row) -> str:
-    """Return one change as a line: time, variable, value, cycle, quality of received ones."""
+    """Return one change as a line: time, variable, value, cycle, quality, cycles not looked at."""
     at = change["time"][11:23]
     line = (
         f"{at}  {change['station']}/{change['variable']} = {value_text(change['value'])}"
         f"  cycle {change['cycle']}"
     )
-    if "quality" not in change:
-        return line
-    return f"{line}  quality {words.quality(change['quality']) or 'never received'}"
+    if "quality" in change:
+        line = f"{line}  quality {words.quality(change['quality']) or 'never received'}"
+    return f"{line}  ({change['skipped']} skipped)" if "skipped" in change else line
 
 
 def value_text(value: Any) -> str:

@@ -7,7 +7,7 @@ waits for two sockets with one buffered reader misses what the buffer already ho
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from queue import SimpleQueue
@@ -22,8 +22,9 @@ def changes(
 ) -> Iterator[dict[str, Any]]:
     """Yield one dict for each change of the variables *names* of each station; none means all.
 
-    Keys: station, variable, value, time (ISO 8601), cycle, and quality for received variables (in
-    units of 100 us, None before the first time).  Connections are closed by *stack*.
+    Keys: station, variable, value, time (ISO 8601), cycle, quality for received variables (in units
+    of 100 us, None before the first time), and skipped, if there were cycles since the station's
+    change before that nobody has looked at.  Connections are closed by *stack*.
 
     Raises:
         ControlError: a station or variable is not there, or an appliance went away.
@@ -47,7 +48,46 @@ def changes(
             }
             if variable in quality:
                 change["quality"] = quality[variable]
+            if event.get("skipped"):
+                change["skipped"] = event["skipped"]
             yield change
+
+
+class SkippedCycles:
+    """Cycles that were skipped between the lines of programs, which have no place for that.
+
+    Args:
+        period_ms: How often values are looked at.
+        write: Takes a line for people.
+    """
+
+    def __init__(self, period_ms: int, write: Callable[[str], None]) -> None:
+        self._period_ms = period_ms
+        self._write = write
+        self._last: dict[str, int] = {}
+        self._totals: dict[str, int] = {}
+
+    def without(self, write: Callable[[dict[str, Any]], None]) -> Callable[[dict[str, Any]], None]:
+        """Return what writes changes without ``skipped``, and the first of each station's here."""
+
+        def write_change(change: dict[str, Any]) -> None:
+            skipped, station, cycle = change.pop("skipped", 0), change["station"], change["cycle"]
+            if skipped and self._last.get(station) != cycle:  # else another variable of that event
+                if station not in self._totals:
+                    self._write(
+                        f"{station}: {skipped} cycles before cycle {cycle} skipped: values are"
+                        f" looked at every {self._period_ms} ms; choose a shorter --period"
+                    )
+                self._totals[station] = self._totals.get(station, 0) + skipped
+                self._last[station] = cycle
+            write(change)
+
+        return write_change
+
+    def close(self) -> None:
+        """Write how many cycles of each station were skipped in all."""
+        for station, total in self._totals.items():
+            self._write(f"{station}: {total} cycles skipped in all")
 
 
 def _merge(streams: Sequence[Iterator[dict[str, Any]]]) -> Iterator[dict[str, Any]]:

@@ -1,7 +1,8 @@
 """Variables that the engine computes itself, once in each cycle.
 
-All but the random block are functions of the cycle counter alone, so that a restarted engine goes
-on where the first one would be.
+Every value is a function of the station's time alone: of the number of cycle times since the first
+cycle, whether or not a cycle ran in each of them.  So a late or skipped cycle slows nothing down,
+and a restarted engine goes on where the one before it would be.
 """
 
 from __future__ import annotations
@@ -15,6 +16,11 @@ from eap.codec import datatypes
 from eap.pd.image import Image
 from eap.pd.spec import CounterSource, EngineSource, RampSource, RandomSource, SineSource
 
+_POSITIONS = 65_537
+"""Values of a random variable before they repeat: a prime, so that every stride visits all."""
+_STRIDE = 40_503
+"""Between the positions of one cycle and the next: far enough that their bytes do not overlap."""
+
 
 class Generators:
     """Computes all generated variables of one station."""
@@ -22,10 +28,13 @@ class Generators:
     def __init__(self, image: Image, sources: Iterable[EngineSource]) -> None:
         self._steps = [_step(image, source) for source in sources]
 
-    def run(self, cycle: int) -> None:
-        """Store the values of this cycle; the engine's region is marked as changing."""
+    def run(self, tick: int) -> None:
+        """Store the values of the time *tick*, in cycle times since the first cycle.
+
+        The engine's region is marked as changing.
+        """
         for step in self._steps:
-            step(cycle)
+            step(tick)
 
 
 def _step(image: Image, source: EngineSource) -> Callable[[int], None]:
@@ -38,19 +47,26 @@ def _step(image: Image, source: EngineSource) -> Callable[[int], None]:
     value = _function(source, image.layout.cycle_us, finish=round if whole else float)
     store = image.storer(place.name)
     if limits is None or not whole:
-        return lambda cycle: store(value(cycle))
+        return lambda tick: store(value(tick))
     low, span = int(limits[0]), int(limits[1]) - int(limits[0]) + 1
-    return lambda cycle: store((value(cycle) - low) % span + low)
+    return lambda tick: store((value(tick) - low) % span + low)
 
 
 def _random_step(
     image: Image, source: RandomSource, offset: int, size: int
 ) -> Callable[[int], None]:
+    """Store a piece of a fixed random sequence, at a position that follows from the time.
+
+    Drawing new bytes in each cycle would tie the values to the number of cycles that ran, and
+    takes longer for all but the smallest variables.
+    """
     generator = random.Random(source.seed)  # noqa: S311  test data, not a secret
+    sequence = generator.randbytes(_POSITIONS + size)
     memory = image.memory[offset : offset + size]
 
-    def fill(_: int) -> None:
-        memory[:] = generator.randbytes(size)
+    def fill(tick: int) -> None:
+        position = tick * _STRIDE % _POSITIONS
+        memory[:] = sequence[position : position + size]
 
     return fill
 
@@ -62,12 +78,10 @@ def _function(
     finish: Callable[[float], Any],
 ) -> Callable[[int], Any]:
     if isinstance(source, CounterSource):
-        return lambda cycle: finish(cycle * source.step)
+        return lambda tick: finish(tick * source.step)
     period = max(source.period_ms * 1000 / cycle_us, 1.0)
     if isinstance(source, RampSource):
         span = source.high - source.low
-        return lambda cycle: finish(source.low + span * (cycle % period) / period)
+        return lambda tick: finish(source.low + span * (tick % period) / period)
     turn = 2 * math.pi / period
-    return lambda cycle: finish(
-        source.offset + source.amplitude * math.sin(turn * (cycle % period))
-    )
+    return lambda tick: finish(source.offset + source.amplitude * math.sin(turn * (tick % period)))

@@ -3,7 +3,8 @@
 Rule 1: each region of variables has one writer, who makes its sequence word odd while writing.
 Rule 2: a reader copies and looks whether the word was even and stayed the same; if not, it tries
 again, a bounded number of times, and then names the writer that stopped in the middle.
-Rule 3: counters are single words with a single writer and need no such care.
+Rule 3: counters are single words with a single writer; several of them that belong together are
+read from a snapshot, which is taken between two cycles.
 
 This module works on any writable buffer; ``eap.net.image_file`` maps one from a file.
 """
@@ -11,7 +12,7 @@ This module works on any writable buffer; ``eap.net.image_file`` maps one from a
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -22,14 +23,19 @@ from eap.codec import datatypes
 from eap.errors import ImageError, TornReadError
 from eap.pd.layout import HEADER, LAYOUT_VERSION, MAGIC, WORDS_OFFSET, ImageLayout, VariablePlace
 from eap.pd.spec import Writer
+from eap.pd.words import StationWord
 
 READ_ATTEMPTS = 1000
 """Spread over a tenth of a second by the pauses of a mapped file: a busy host stalls that long."""
+SNAPSHOT_ATTEMPTS = 200
+"""Fewer, because who takes snapshots has other clients, and gets a copy in any case."""
 
 _CODES = {
     (int, 1): "b", (int, 2): "h", (int, 4): "i", (int, 8): "q", (float, 4): "f", (float, 8): "d",
 }  # fmt: skip
 """Of those numbers that one call packs; capitals for those without a sign."""
+
+_CYCLE, _FUTEX, _SEQUENCE = StationWord.CYCLE, StationWord.FUTEX, StationWord.ENGINE_SEQUENCE
 
 
 def _no_pause() -> None:
@@ -73,16 +79,45 @@ class Image:
         first, last = place.bit_offset // 8, _end_octet(place)
         return take(place, self._stable_copy(place.writer, first, last, attempts), 8 * first)
 
-    def read_all(self) -> dict[str, Any]:
-        """Return all variables; those of one writer belong to one moment."""
+    def read_all(self, writers: Collection[Writer] = tuple(Writer)) -> dict[str, Any]:
+        """Return all variables of *writers*; those of one writer belong to one moment."""
         values = {}
         copies = {}
-        for writer, region in self.layout.regions.items():
+        for writer in writers:
+            region = self.layout.regions[writer]
             copies[writer] = self._stable_copy(writer, region.offset, region.offset + region.size)
         for place in self.layout.variables:
-            region = self.layout.regions[place.writer]
-            values[place.name] = _decode(place, copies[place.writer], 8 * region.offset)
+            if place.writer in copies:
+                region = self.layout.regions[place.writer]
+                values[place.name] = _decode(place, copies[place.writer], 8 * region.offset)
         return values
+
+    def try_snapshot(self) -> Image | None:
+        """Return a copy of all words and variables, None while the engine changes them.
+
+        The copy is that of a moment between two cycles: the word FUTEX has followed CYCLE, and no
+        frame is being taken.  What services and applications write may be in between.
+        """
+        words = self.words
+        cycle, sequence = words[_CYCLE], words[_SEQUENCE]
+        if sequence % 2 or words[_FUTEX] != cycle & 0xFFFFFFFF:
+            return None
+        copy = self._copy()
+        return copy if words[_SEQUENCE] == sequence and words[_CYCLE] == cycle else None
+
+    def snapshot(self) -> Image:
+        """Return a copy as :meth:`try_snapshot` does, after a bounded number of attempts.
+
+        If the engine stopped in the middle of a cycle, the copy is what it left.
+        """
+        for _ in range(SNAPSHOT_ATTEMPTS):
+            if copy := self.try_snapshot():
+                return copy
+            self._pause()
+        return self._copy()
+
+    def _copy(self) -> Image:
+        return Image(memoryview(bytes(self.memory[: self.layout.samples.last])), self.layout)
 
     def write(self, name: str, value: Any) -> None:
         """Store one value; raise ValueError if the type cannot hold it.

@@ -35,7 +35,7 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
     """Return one station's entry of ``eapctl status``.
 
     Args:
-        image: The station's image.
+        image: A snapshot of the station's image, so that all belongs to one moment.
         now_ns: The time on the monotonic clock.
         wall_ns: The same moment since 1970; without it nothing is dated.
     """

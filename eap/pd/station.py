@@ -39,6 +39,7 @@ _STARTED_AT_NS = int(StationWord.STARTED_AT_NS)
 _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
 _FUTEX = int(StationWord.FUTEX)
 _WAITERS = int(StationWord.WAITERS)
+_OVERRUNS = int(StationWord.OVERRUNS)
 _LATENESS = int(StationWord.LATENESS)
 _BINS_KNOWN = len(BIN_OF_US)
 _LATENESS_MAX_NS = int(StationWord.LATENESS_MAX_NS)
@@ -191,6 +192,7 @@ class Station:
             words[StationWord.RESTARTS] += 1
             elapsed = (now_ns - previous_ns) // self.cycle_ns
             words[_CYCLE] += elapsed
+            words[_FUTEX] = words[_CYCLE] & 0xFFFFFFFF  # no cycle is under way
             return int(previous_ns + (elapsed + 1) * self.cycle_ns)
         words[_CYCLE_AT_NS] = 0  # of a time before the host was booted
         phase_ns = self.spec.phase_us * 1000
@@ -339,7 +341,7 @@ class Station:
         for supervise in self._supervisors:
             supervise(now_ns)
         if self._computes:
-            self._generate(cycle)
+            self._generate(cycle + words[_OVERRUNS])
             changed = self._inputs.refresh()
             if self._run_links is not None:
                 self._run_links()

@@ -32,6 +32,7 @@ from eap.pd.words import (
 )
 
 _OWN_WORDS = {
+    StationWord.FUTEX,
     StationWord.ENGINE_SEQUENCE,
     StationWord.SERVICES_SEQUENCE,
     StationWord.APPLICATION_SEQUENCE,
@@ -73,6 +74,7 @@ class ImageSuccession:
         """Copy the words of the station, of its frames, PDs and accounts."""
         old, new = self._old.words, self._new.words
         _copy(self._runs, old, new)
+        new[StationWord.FUTEX] = new[StationWord.CYCLE] & 0xFFFFFFFF  # between two cycles
         self._sent.carry(old, new)
         self._received.carry(old, new)
 

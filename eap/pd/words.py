@@ -55,11 +55,11 @@ class StationWord(IntEnum):
     """The station's own block."""
 
     CYCLE = 0
-    """Cycle counter, not wrapped; its low 16 bits travel."""
+    """Cycle counter, not wrapped; its low 16 bits travel.  With OVERRUNS it tells the time."""
     CYCLE_AT_NS = 1
     """When that cycle was due, on the monotonic clock."""
     FUTEX = 2
-    """Low half: the cycle again, as the word that waiting programs sleep on."""
+    """Low half: the cycle again when it has ended, as the word that waiting programs sleep on."""
     WAITERS = 3
     """The cycle in which a program last went to sleep: whether anybody has to be woken."""
     ENGINE_SEQUENCE = 4

@@ -256,6 +256,9 @@ class _Client:
         return {"unsubscribed": subscription}
 
     async def _events(self, subscription: int, watch: Watch) -> None:
+        clock = asyncio.get_running_loop().time
+        period_s = watch.period_ms / 1000
+        due_s = clock()
         while True:
             try:
                 event = watch.next_event()
@@ -265,4 +268,6 @@ class _Client:
                 event = {"error": {"code": exc.code, "message": str(exc)}}
             if event is not None:
                 await self.send(encode_event(subscription, event))
-            await asyncio.sleep(watch.period_ms / 1000)
+            # From one due time to the next: a sleep of the period would be late by more each time.
+            due_s = max(due_s + period_s, clock())
+            await asyncio.sleep(due_s - clock())

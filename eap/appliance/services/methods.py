@@ -25,6 +25,8 @@ from eap.pd.spec import Writer
 from eap.pd.words import RxWord, StationWord
 
 MIN_PERIOD_MS = 10
+_OTHERS = (Writer.SERVICES, Writer.APPLICATION)
+"""The writers whose values do not belong to a cycle."""
 
 
 class Methods:
@@ -159,9 +161,13 @@ class Watch:
         self._names = names
         self._only_changes = only_changes
         self._last: dict[str, Any] = {}
+        self._looked_in: int | None = None
+        self._skipped = 0
 
     def next_event(self) -> dict[str, Any] | None:
         """Return what to send now, None if nothing changed.
+
+        ``skipped`` counts the cycles since the event before whose values nobody has looked at.
 
         Raises:
             ImageError: the values cannot be read.
@@ -169,6 +175,9 @@ class Watch:
         """
         image = self._station.image
         event = _snapshot(image, _places(image, self._names))
+        if self._looked_in is not None:
+            self._skipped += max(event["cycle"] - self._looked_in - 1, 0)
+        self._looked_in = event["cycle"]
         if self._only_changes:
             values = event["values"]
             changed = {
@@ -181,19 +190,28 @@ class Watch:
                 return None
             event["values"] = changed
             event["quality"] = {n: q for n, q in event["quality"].items() if n in changed}
+        event["skipped"], self._skipped = self._skipped, 0
         return event
 
 
 def _snapshot(image: Image, places: list[VariablePlace]) -> dict[str, Any]:
-    """Return the values of *places*; those of one writer belong to one moment."""
-    cycle = image.words[StationWord.CYCLE]
-    values = image.read_all() if len(places) > 1 else {p.name: image.read(p.name) for p in places}
+    """Return the values of *places*; those of one writer belong to one moment.
+
+    What the engine writes is that of the cycle which is named.
+    """
+    engine = image.snapshot()
+    if len(places) == 1:
+        (place,) = places
+        source = engine if place.writer is Writer.ENGINE else image
+        values = {place.name: source.read(place.name)}
+    else:
+        values = engine.read_all((Writer.ENGINE,)) | image.read_all(_OTHERS)
     plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in places}
     return {
         "station": image.layout.station,
-        "cycle": cycle,
+        "cycle": engine.words[StationWord.CYCLE],
         "values": plain,
-        "quality": _qualities(image, plain),
+        "quality": _qualities(engine, plain),
     }
 
 

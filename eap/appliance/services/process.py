@@ -55,7 +55,7 @@ from eap.appliance.services.routes.routing_methods import RoutingMethods
 from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sockets import open_doors
-from eap.appliance.services.status import ProcessMeter, appliance_status
+from eap.appliance.services.status import ProcessMeter, appliance_status, take_snapshot
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
@@ -166,12 +166,13 @@ class Services:
         identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
 
         async def status() -> dict[str, Any]:
+            reports = await buses.reports(STATUS_PATIENCE_S)
             return appliance_status(
                 self._folder.read_info(),
-                [each.image for each in images.values()],
+                [await take_snapshot(each.image) for each in images.values()],
                 (engine.stats(), self._counters.stats()),
                 meter,
-                await buses.reports(STATUS_PATIENCE_S),
+                reports,
             )
 
         return Methods(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,9 @@ from eap.pd.words import StationWord
 VERSION = 1
 MIN_SAMPLE_NS = 200_000_000
 """Two questions closer than this get the same CPU share: the kernel counts in ticks of 10 ms."""
+
+SNAPSHOT_PAUSES = 100
+"""A tenth of a second: an engine without real-time priority is interrupted for that long."""
 
 _TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -55,6 +59,18 @@ class ProcessMeter:
         return {"cpu": share, "rss": resident}
 
 
+async def take_snapshot(image: Image) -> Image:
+    """Return a consistent copy of *image*; other clients are served while the engine is in a cycle.
+
+    If the engine stays in the middle of one, the copy is what it left there.
+    """
+    for _ in range(SNAPSHOT_PAUSES):
+        if copy := image.try_snapshot():
+            return copy
+        await asyncio.sleep(0.0005)
+    return image.snapshot()
+
+
 def appliance_status(
     info: ApplianceInfo,
     images: Iterable[Image],
@@ -66,7 +82,7 @@ def appliance_status(
 
     Args:
         info: What the supervisor tells.
-        images: Of all stations.
+        images: Snapshots of all stations.
         discarded: What each process turned away, by station.
         meter: Of the processes.
         buses: What the engine says of its buses, of none if it does not answer.

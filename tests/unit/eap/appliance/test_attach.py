@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from eap.pd.spec import (
     CounterSource,
     PortKind,
     PortSpec,
+    RxPdSpec,
     StationSpec,
     TriggerSpec,
     TxFrameSpec,
@@ -34,6 +36,7 @@ from eap.pd.spec import (
 from eap.pd.station import Station
 from eap.pd.trigger import EVENT_BIT
 from eap.pd.words import StationWord
+from tests.support.cyclic import OWN, PEER, Wire, octets
 
 pytestmark = pytest.mark.net  # threads and real time
 
@@ -86,9 +89,18 @@ class Runner:
         """Run another specification soon."""
         self.successors.put(Successor(self._place, station))
 
-    def stop(self) -> None:
+    @property
+    def station(self) -> Station:
+        """What it runs."""
+        return self._place.station
+
+    def pause(self) -> None:
+        """Run no more cycles."""
         self._stop.set()
         self._thread.join()
+
+    def stop(self) -> None:
+        self.pause()
         self.file.close()
 
 
@@ -127,6 +139,55 @@ def test_reads_defaults_and_what_the_engine_computes(path: Path) -> None:
         assert station["ticks"] >= later
         assert set(station.read_all()) == {"ticks", "setpoint", "mode"}
         assert station.status()["state"] == "OP"
+
+
+def test_status_during_cycles_is_of_one_moment(path: Path) -> None:
+    pd = RxPdSpec("in", "eap0", 7, ("x",), PEER, step=1)
+    out = TxFrameSpec("out", "eap0", "127.9.9.9", (TxPdSpec("p", 1, ("setpoint",)),))
+    port = PortSpec("eap0", PortKind.EAP, "loop://line", OWN)
+    received = VariableSpec("x", "UINT", Writer.ENGINE)
+    whole = msgspec.structs.replace(
+        spec(received), ports=(port,), subscriptions=(pd,), frames=(out,)
+    )
+    with running(path, whole) as runner:
+        runner.pause()
+        wire = Wire()
+        station = runner.station
+        wire.takers = [station.takers["eap0"]]
+        station.connect("eap0", wire)
+        end = threading.Event()
+
+        def run_cycles() -> None:
+            while not end.is_set():
+                now_ns = time.monotonic_ns()
+                cycle = station.image.words[StationWord.CYCLE] + 1
+                wire.waiting = [(octets([(7, bytes(2))], cycle=cycle & 0xFFFF), now_ns)]
+                wire.sent.clear()
+                station.cycle(now_ns, now_ns)
+
+        engine = threading.Thread(target=run_cycles)
+        before = sys.getswitchinterval()
+        sys.setswitchinterval(1e-6)  # each look is interrupted somewhere
+        engine.start()
+        try:
+            with eap.attach("mixer") as attached:
+                rows = [attached.status() for _ in range(400)]
+        finally:
+            end.set()
+            engine.join()
+            sys.setswitchinterval(before)
+    apart = {
+        (
+            (row["cycle"] - rx["cycle_index"]) & 0xFFFF,
+            row["cycle"] - rx["received"],
+            row["cycle"] - tx["sent"],
+            row["cycle"] - row["frames"][0]["sent"],
+        )
+        for row in rows
+        for (tx,), (rx,) in [(row["pd"]["tx"], row["pd"]["rx"])]
+        if rx["received"]
+    }
+    assert len(apart) == 1
 
 
 def test_writes_are_seen_together(path: Path) -> None:

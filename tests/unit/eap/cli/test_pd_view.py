@@ -40,6 +40,11 @@ def test_quality_of_a_received_variable(quality: int | None, text: str) -> None:
     assert change_line(change(1, quality=quality)).endswith(f"  cycle 12  quality {text}")
 
 
+def test_change_line_after_skipped_cycles_says_how_many() -> None:
+    assert change_line(change(1, skipped=3)).endswith("  cycle 12  (3 skipped)")
+    assert change_line(change(1, quality=0, skipped=9)).endswith("  quality 0  (9 skipped)")
+
+
 def test_variables_of_no_pd_have_a_row_of_their_own() -> None:
     speed, level = (
         {"name": name, "type": "INT", "unit": "", "writer": "engine"} for name in ("speed", "level")

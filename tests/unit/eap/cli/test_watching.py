@@ -5,8 +5,9 @@ from contextlib import ExitStack
 import pytest
 
 from eap.appliance.commands.client import connect_station
-from eap.cli.watching import changes
+from eap.cli.watching import SkippedCycles, changes
 from eap.errors import ControlError
+from eap.pd.words import StationWord
 from tests.unit.eap.cli.conftest import Appliance
 
 pytestmark = pytest.mark.net
@@ -34,3 +35,30 @@ def test_station_of_two_appliances_needs_a_plant(other_appliance: Appliance) -> 
         connect_station("mixer", None)
     with connect_station("mixer", "hall") as client:
         assert client.info.plant == "hall"
+
+
+def test_skipped_cycles_between_json_lines_are_reported_once_and_at_the_end() -> None:
+    notes: list[str] = []
+    lines: list[dict[str, object]] = []
+    skipped = SkippedCycles(100, notes.append)
+    write = skipped.without(lines.append)
+    for cycle, more in [(5, {}), (15, {"skipped": 9}), (15, {"skipped": 9}), (18, {"skipped": 2})]:
+        write({"station": "mixer", "cycle": cycle, **more})
+    (note,) = notes
+    assert note.startswith(
+        "mixer: 9 cycles before cycle 15 skipped: values are looked at every 100"
+    )
+    skipped.close()
+    assert notes[1:] == ["mixer: 11 cycles skipped in all"]
+    assert lines == [{"station": "mixer", "cycle": cycle} for cycle in (5, 15, 15, 18)]
+
+
+def test_change_after_cycles_that_were_not_looked_at_says_so(appliance: Appliance) -> None:
+    with ExitStack() as stack:
+        stream = changes(stack, {"mixer": ["ticks"]}, period_ms=10, plant=None)
+        assert "skipped" not in next(stream)
+        words = appliance.images["mixer"].image.words
+        words[StationWord.FUTEX] = words[StationWord.CYCLE] = words[StationWord.CYCLE] + 10
+        appliance.set("mixer", "ticks", 77)
+        change = next(stream)
+        assert (change["value"], change["skipped"]) == (77, 9)

@@ -3,7 +3,17 @@ from __future__ import annotations
 import pytest
 
 from eap.pd.engine import SOON_NS, Engine
-from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
+from eap.pd.spec import (
+    CounterSource,
+    RampSource,
+    RandomSource,
+    RxPdSpec,
+    SineSource,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 from tests.support.cyclic import (
@@ -94,6 +104,36 @@ def test_cycles_that_are_missed_are_counted_and_left_out_and_the_grid_stays():
     assert engine.next_timeout() == 6 * MS
     engine.handle_timeout(6 * MS)
     assert [frame[10] for frame in wire.sent] == [1, 2, 3]
+
+
+def test_generated_values_after_skipped_cycles_and_restart_are_those_of_their_time():
+    sources = (
+        CounterSource("counter"),
+        RampSource("ramp", 0, 100, period_ms=50),
+        SineSource("sine", 2, period_ms=30),
+        RandomSource("noise"),
+    )
+    kinds = {"counter": "UDINT", "ramp": "LREAL", "sine": "LREAL", "noise": "BLOCK(8)"}
+    variables = tuple(VariableSpec(name, kind, Writer.ENGINE) for name, kind in kinds.items())
+    spec = station(variables=variables, sources=sources)
+
+    def started(image=None) -> tuple[Engine, Station]:
+        made = Station(spec, image or image_of(spec), lambda: None)
+        engine = Engine([made])
+        engine.start(0 if image is None else 81 * MS)
+        return engine, made
+
+    punctual, expected = started()
+    run(punctual, 100 * MS)
+    engine, made = started()
+    run(engine, 20 * MS)
+    engine.handle_timeout(61 * MS + 1)  # 21 runs, 22 to 61 are left out
+    run(engine, 70 * MS)
+    assert made.image.words[StationWord.OVERRUNS] == 40
+    assert made.image.read("counter") == 70
+    engine, made = started(made.image)  # another engine, 11 ms later
+    run(engine, 100 * MS)
+    assert made.image.read_all() == expected.image.read_all()
 
 
 def test_the_stop_ends_sending_and_receiving():

@@ -56,11 +56,18 @@ def test_a_period_shorter_than_a_cycle_stands_still():
     assert values("REAL", RampSource("v", 1, 2, period_ms=1), 0, 1, 2) == [1, 1, 1]
 
 
-def test_random_octets_repeat_with_the_seed_only():
-    first = values("BLOCK(8)", RandomSource("v", seed=1), 0, 1)
-    assert first == values("BLOCK(8)", RandomSource("v", seed=1), 5, 9)
-    assert first != values("BLOCK(8)", RandomSource("v", seed=2), 0, 1)
-    assert first[0] != first[1]
+def test_random_block_depends_on_seed_and_time_only():
+    first = values("BLOCK(8)", RandomSource("v", seed=1), *range(200))
+    assert values("BLOCK(8)", RandomSource("v", seed=1), 3, 150) == [first[3], first[150]]
+    assert values("BLOCK(8)", RandomSource("v", seed=2), *range(200)) != first
+    assert len(set(first)) == len(first)
+
+
+@pytest.mark.parametrize("size", [1, 1486])
+def test_random_block_at_any_time_has_its_size(size):
+    late = 1 << 50
+    for value in values(f"BLOCK({size})", RandomSource("v"), *range(late, late + 100)):
+        assert len(value) == size
 
 
 @given(

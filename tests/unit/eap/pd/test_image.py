@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 
 from eap.codec.datatypes import parse
 from eap.errors import ImageError, TornReadError
-from eap.pd.image import READ_ATTEMPTS, Image, default_value, format_image, read_header
+from eap.pd.image import (
+    READ_ATTEMPTS,
+    SNAPSHOT_ATTEMPTS,
+    Image,
+    default_value,
+    format_image,
+    read_header,
+)
 from eap.pd.layout import HEADER, plan_layout
 from eap.pd.spec import RxPdSpec, VariableSpec, Writer
 from eap.pd.words import StationWord
@@ -172,6 +179,60 @@ def test_a_copy_that_a_writer_changed_meanwhile_is_made_again():
     reader.words = Moving()
     assert reader.read("x") == 8
     assert len(looks) == 4
+
+
+def test_snapshot_between_two_cycles_is_a_copy():
+    image = image_of(station(variables=(VariableSpec("x", "UINT", Writer.ENGINE),)))
+    image.words[StationWord.CYCLE] = image.words[StationWord.FUTEX] = 7
+    snapshot = image.snapshot()
+    with image.writing(Writer.ENGINE):
+        image.write("x", 5)
+    image.words[StationWord.CYCLE] = 8
+    assert (snapshot.read("x"), snapshot.words[StationWord.CYCLE]) == (0, 7)
+
+
+@pytest.mark.parametrize("word", [StationWord.CYCLE, StationWord.ENGINE_SEQUENCE])
+def test_snapshot_within_a_cycle_waits_for_its_end(word):
+    image = image_of(station())
+    image.words[word] += 1
+
+    def end_cycle() -> None:
+        image.words[StationWord.FUTEX] = image.words[StationWord.CYCLE]
+        image.words[StationWord.ENGINE_SEQUENCE] = 2
+        image.words[StationWord.OVERRUNS] = 9
+
+    assert image.try_snapshot() is None
+    reader = Image(image.memory, image.layout, pause=end_cycle)
+    assert reader.snapshot().words[StationWord.OVERRUNS] == 9
+
+
+@pytest.mark.parametrize("word", [StationWord.CYCLE, StationWord.ENGINE_SEQUENCE])
+def test_snapshot_into_which_a_cycle_falls_is_not_taken(word):
+    image = image_of(station())
+    begun = []
+
+    class Moving:
+        """Words that begin to change when the last of them has been looked at."""
+
+        def __getitem__(self, index: int) -> int:
+            value = image.words[index]
+            if index == StationWord.FUTEX and not begun:
+                begun.append(index)
+                image.words[word] += 2
+            return value
+
+    reader = Image(image.memory, image.layout)
+    reader.words = Moving()
+    assert reader.try_snapshot() is None
+
+
+def test_snapshot_of_an_engine_that_stopped_within_a_cycle_is_what_it_left():
+    image = image_of(station())
+    image.words[StationWord.CYCLE] = 3
+    pauses = []
+    reader = Image(image.memory, image.layout, pause=lambda: pauses.append(1))
+    assert reader.snapshot().words[StationWord.CYCLE] == 3
+    assert len(pauses) == SNAPSHOT_ATTEMPTS
 
 
 def test_a_formatted_image_says_what_it_holds():

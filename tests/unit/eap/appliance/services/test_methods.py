@@ -15,6 +15,7 @@ from eap.errors import ControlError
 from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
+from eap.pd.words import StationWord
 
 
 async def status():
@@ -174,6 +175,59 @@ def test_a_watch_by_period_tells_all_and_by_change_what_changed(methods, files):
         image.write("running", True)
     assert always.next_event()["values"] == {"running": True, "name": "abc"}
     assert changes.next_event()["values"] == {"running": True}
+
+
+def test_watch_event_counts_the_cycles_since_the_event_before_that_were_not_looked_at(
+    methods, files
+):
+    image = files["left"].image
+    params = {"station": "left", "names": ["running"]}
+    always = methods.watch(params)
+    changes = methods.watch({**params, "on": "change"})
+
+    def run_until(cycle: int) -> None:
+        image.words[StationWord.CYCLE] = image.words[StationWord.FUTEX] = cycle
+
+    run_until(10)
+    assert (always.next_event()["skipped"], changes.next_event()["skipped"]) == (0, 0)
+    run_until(11)
+    assert (always.next_event()["skipped"], changes.next_event()) == (0, None)
+    run_until(21)
+    assert (always.next_event()["skipped"], changes.next_event()) == (9, None)
+    run_until(24)
+    with image.writing(Writer.APPLICATION):
+        image.write("running", True)
+    assert (always.next_event()["skipped"], changes.next_event()["skipped"]) == (2, 11)
+
+
+def test_read_while_a_cycle_runs_brings_values_of_the_cycle_that_is_named(methods, files):
+    image = files["left"].image
+    image.words[StationWord.CYCLE] = image.words[StationWord.FUTEX] = 4
+    copies = []
+
+    class Running:
+        """Words of an engine that runs cycle 5 as soon as somebody has looked at the counter."""
+
+        def __getitem__(self, index: int) -> int:
+            value = image.words[index]
+            if index == StationWord.CYCLE and not copies:
+                copies.append(value)
+                image.words[StationWord.CYCLE] = 5
+                with image.writing(Writer.ENGINE):
+                    image.write("ticks", 5)
+                image.words[StationWord.FUTEX] = 5
+            return value
+
+        def __len__(self) -> int:
+            return len(image.words)
+
+    live = methods._image("left")
+    words, live.words = live.words, Running()
+    try:
+        read = call(methods, "read", {"station": "left", "names": ["ticks"]})
+    finally:
+        live.words = words
+    assert (read["cycle"], read["values"]) == (5, {"ticks": 5})
 
 
 def test_a_watch_is_checked_when_it_begins(methods):
