@@ -264,6 +264,15 @@ def _received_remarks(row: Row) -> Iterator[str]:
             yield f"{row[key]} {key}"
     if discarded := _counts(row["discarded"]):
         yield f"discarded: {discarded}"
+    if wrong := row.get("wrong_source"):
+        ago = words.duration(wrong["age_us"])
+        yield f"{wrong['address']} sends with this publisher ID, last {ago} ago: dropped"
+    if other := row.get("other_source"):
+        ago = words.duration(other["age_us"])
+        yield (
+            f"two senders with this publisher ID: {row['source']} and {other['address']}, "
+            f"last {ago} ago"
+        )
 
 
 def _counts(counts: Row) -> str:

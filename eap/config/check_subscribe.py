@@ -8,9 +8,10 @@ from eap.config.check_publish import check_port_reference
 from eap.config.destination import reaches, resolve
 from eap.config.finding import Report, one_of
 from eap.config.index import Index, SentPd
-from eap.config.structs import From, Station, Subscribe
+from eap.config.structs import ANY_SOURCE, From, Station, Subscribe
 from eap.ids import NetId
 from eap.near import near
+from eap.pd.address import is_group_source, source_octets
 from eap.pd.spec import REQUESTER
 
 
@@ -23,6 +24,7 @@ def check_subscribe(index: Index, report: Report) -> None:
             check_port_reference(index, report, station, subscription.at, subscription.port)
             publishers = index.publishers(subscription)
             _check_source(index, report, subscription, publishers)
+            _check_sender(index, report, station, subscription)
             _check_variables(subscription, report)
             for sent in publishers:
                 _check_ends(index, report, subscription, sent)
@@ -52,6 +54,24 @@ def _check_source(
         if source not in known:  # else its frame or port was reported
             message = f"nobody in this plant publishes {source!r}{near(source, known)}"
             report.add(path, message, f"STATION/PD: {one_of(known)}")
+
+
+def _check_sender(index: Index, report: Report, station: Station, subscription: Subscribe) -> None:
+    """Report a source that no frame of the subscription's port can have."""
+    uri = index.uris.get((station.name, subscription.port))
+    if subscription.sender in {"", ANY_SOURCE} or uri is None:
+        return
+    kinds = {"ethernet": (6, "a MAC address"), "udp": (4, "an IPv4 address")}
+    size, kind = kinds.get(uri.scheme, kinds["udp"])
+    try:
+        octets = source_octets(subscription.sender)
+        is_host = len(octets) == size and any(octets) and not is_group_source(octets)
+    except ValueError:
+        is_host = False
+    if not is_host or uri.scheme == "loop":
+        expected = "it only on ethernet, udp and tcp" if uri.scheme == "loop" else f"{kind} or any"
+        message = f"source of {subscription.name!r} is {subscription.sender!r} on {uri}"
+        report.add(f"{subscription.at}.source", message, expected)
 
 
 def _check_numbers(report: Report, subscription: Subscribe, source: From) -> None:

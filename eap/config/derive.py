@@ -7,6 +7,7 @@ derived: writers, phases, addresses, groups to join, and what a subscriber must 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from eap.config.destination import IP_BROADCAST, find_net_id, group_of, resolve
 from eap.config.gateways import gateway_spec
 from eap.config.index import Index, SentPd
 from eap.config.links import ends, in_order, is_bitwise
-from eap.config.structs import Frame, From, Port, Publish, Station, Subscribe, Variable
+from eap.config.structs import ANY_SOURCE, Frame, From, Port, Publish, Station, Subscribe, Variable
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
-from eap.pd.address import net_id_of
+from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (
     REQUESTER,
     BusPortSpec,
@@ -227,7 +228,28 @@ def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
         step=step,
         poll_request=subscription.poll,
         changeable=subscription.changeable,
+        source=_sender_address(index, subscription, publishers),
     )
+
+
+def _sender_address(index: Index, subscription: Subscribe, publishers: list[SentPd]) -> str:
+    """Return the address that the frames of *publishers* come from, empty for any.
+
+    The plant knows it where the publisher's port has an address of its own: the IPv4 address of a
+    UDP or TCP port, the ``mac`` of an Ethernet port.
+    """
+    if subscription.sender:
+        is_any = subscription.sender == ANY_SOURCE
+        return "" if is_any else address_text(source_octets(subscription.sender))
+    known = {_own_address(index, sent) for sent in publishers}
+    return known.pop() if len(known) == 1 else ""
+
+
+def _own_address(index: Index, sent: SentPd) -> str:
+    uri = index.uris[sent.station.name, sent.port.name]
+    if uri.scheme in {"udp", "tcp"}:
+        return "" if IPv4Address(uri.host).is_unspecified else uri.host
+    return str(MacAddr.parse(sent.port.mac)) if sent.port.mac else ""
 
 
 def _pace(index: Index, publishers: list[SentPd]) -> tuple[int, int]:

@@ -153,6 +153,10 @@ class From(Section, frozen=True):
     step: Divider | None = None
 
 
+ANY_SOURCE = "any"
+"""Source of a subscription that takes frames from every address."""
+
+
 class Subscribe(Section, frozen=True):
     """A PD to receive."""
 
@@ -167,6 +171,8 @@ class Subscribe(Section, frozen=True):
     foreign: bool = False
     poll: str = ""
     changeable: bool = False
+    sender: str = msgspec.field(default="", name="source")
+    """Address that the frames must come from, ANY_SOURCE, or the publisher's where it is known."""
 
 
 class Link(Section, frozen=True):

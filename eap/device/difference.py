@@ -175,6 +175,8 @@ class _Comparison:
             before |= {Var.DEFAULT_GIVEN: _NONE, Var.DEFAULT: entry.default}
         if row is profile.TX_FRAME and index in self._old and self._is_rewritten(index):
             before = {sub: octets for sub, octets in before.items() if sub < Frame.TXPD}
+        if row is profile.RX_PD and before[Rx.PUBLISHER] != after[Rx.PUBLISHER]:
+            before[Rx.SOURCE] = b""  # as writing the publisher does
         for subindex in _REFERENCES.get(row.first, ()):
             if before[subindex] != after[subindex]:
                 before[subindex] = bytes(2)

@@ -24,7 +24,7 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary, check_value, take_bits
 from eap.od.model import Access, Entry, OdObject, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import Frame, Status, Tx, Var
+from eap.od.profiles.eap1000keys import Frame, Rx, Status, Tx, Var
 from eap.od.profiles.table import CONFIG, ObjectRange
 from eap.pd.spec import StationSpec
 
@@ -194,6 +194,8 @@ class EapDictionary(EapContent):
             raise SdoAbortError(AbortCode.VALUE, index, subindex, str(exc)) from None
         if row in profile.VARIABLES and subindex == Var.TYPE_NAME and data != entry.octets:
             self._check_unused(index, subindex)
+        if row is profile.RX_PD and subindex == Rx.PUBLISHER and data != entry.octets:
+            self.put(index, Rx.SOURCE, b"")  # it was the address of the publisher before
         self.put(index, subindex, data)
 
     def _write_count(self, row: ObjectRange, item: OdObject, data: bytes, state: OdState) -> None:

@@ -229,6 +229,7 @@ class _Filling:
             Rx.SENDER_CYCLE: pd.sender_cycle_us,
             Rx.STEP: pd.step,
             Rx.CHANGEABLE: pd.changeable,
+            Rx.SOURCE: pd.source,
         })  # fmt: skip
 
     def _fill_frame(self, index: int, frame: TxFrameSpec, tx: Mapping[str, int]) -> None:

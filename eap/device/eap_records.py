@@ -247,6 +247,7 @@ class PortReader:
                     step=value(Rx.STEP),
                     poll_request=self._asked(index, Rx.POLL_REQUEST_TXPD),
                     changeable=value(Rx.CHANGEABLE),
+                    source=value(Rx.SOURCE),
                 ),
             )
 

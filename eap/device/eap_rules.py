@@ -27,6 +27,7 @@ from eap.od.profiles.eap1000 import (
 )
 from eap.od.profiles.eap1000keys import Frame, Rx, RxFlag, Tx, Var
 from eap.od.profiles.table import ObjectRange
+from eap.pd.address import address_text, source_octets
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL
 
 GROUPS = 0xF811
@@ -139,6 +140,14 @@ def _request(data: bytes, _entry: Entry) -> bytes:
     return data
 
 
+def _source(data: bytes, _entry: Entry) -> bytes:
+    text = data.decode()
+    try:
+        return address_text(source_octets(text)).encode() if text else data
+    except ValueError:
+        raise ValueError(f"{text!r} is no MAC and no IPv4 address") from None
+
+
 _RULES: dict[tuple[int, int], Callable[[bytes, Entry], bytes]] = {
     (TX_VARIABLE.first, Var.TYPE_NAME): _type,
     (RX_VARIABLE.first, Var.TYPE_NAME): _type,
@@ -147,4 +156,5 @@ _RULES: dict[tuple[int, int], Callable[[bytes, Entry], bytes]] = {
     (GROUPS, 1): _group,
     (CONTROL, 1): _request,
     (RX_PD.first, Rx.FLAGS): _flags,
+    (RX_PD.first, Rx.SOURCE): _source,
 }

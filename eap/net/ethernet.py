@@ -18,6 +18,8 @@ ETHERNET_HEADER = 14
 MINIMUM_SIZE = 60
 """Shortest frame without its check sequence (IEEE 802.3)."""
 
+_SOURCE = struct.Struct("6x6s").unpack_from
+"""The source address in an Ethernet header."""
 _TPID = 0x8100
 _VID = 0x0FFF
 _CONTROL_SIZE = 72  # a time stamp, then the auxiliary data of a packet
@@ -54,9 +56,11 @@ class EthernetInterface:
         self._sock = sock
         self._batch = batch
         self._receive = batch.reader(sock.fileno())
+        self._octets = batch.octets
         self._heads = batch.octets.cast("Q")
         self._tags = batch.control.cast("H")
         self._routes: dict[int, dict[int, list[Taker]]] = {}
+        self._own_source = bytes(self.address)
         self.has_neighbours = False
         self._has_ports = False
         self._local: deque[tuple[Taker, memoryview, int]] = deque()
@@ -116,12 +120,16 @@ class EthernetInterface:
 
     def sender_of(self, data: memoryview) -> str:
         """Return the source address of the frame in *data*; nothing if it is none of a station."""
+        source = MacAddr(self.source_of(data))
+        return "" if source.is_group else str(source)
+
+    def source_of(self, data: memoryview) -> bytes:
+        """Return the source address of the frame in *data*; the interface's own by deliver()."""
         position = self._batch.position(data)
         if position is None:
-            return str(self.address)  # another port of this interface, by way of deliver()
-        start = position * BUFFER_SIZE + 6
-        source = MacAddr(self._batch.octets[start : start + 6])
-        return "" if source.is_group else str(source)
+            return self._own_source
+        source: bytes = _SOURCE(self._octets, position * BUFFER_SIZE)[0]
+        return source
 
     def is_for_many(self, data: memoryview) -> bool:
         """Tell whether the frame in *data* was addressed to a group or to all."""

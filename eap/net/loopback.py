@@ -116,6 +116,11 @@ class LoopbackChannel:
         del data  # the one that is being handed over
         return self._sender
 
+    def source_of(self, data: memoryview) -> bytes:
+        """Nothing: a line in memory has no addresses."""
+        del data
+        return b""
+
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Put copies of *frames* on the line; a lost frame counts as sent, as on a wire."""
         for frame in frames:

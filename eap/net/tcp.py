@@ -218,6 +218,7 @@ class TcpReceiver:
         self.name = name or f"{CONNECTION}{next(_numbers)}"
         self.closed = ""
         self._sock = sock
+        self._source = _peer_of(sock)
         self._buffer = bytearray(_RECEIVE_BUFFER)
         self._view = memoryview(self._buffer)
         self._start = 0
@@ -235,6 +236,11 @@ class TcpReceiver:
         if count < FRAMES_PER_DRAIN and not self.closed and self._read():
             count += self._take_frames(now_ns, FRAMES_PER_DRAIN - count)
         return count
+
+    def source_of(self, data: memoryview) -> bytes:
+        """Return the IPv4 address of the peer."""
+        del data  # all that comes from it has one source
+        return self._source
 
     def sender_of(self, data: memoryview) -> str:
         """Return the name of the connection."""
@@ -295,3 +301,11 @@ class TcpReceiver:
             for take in self.takers:
                 take(self._view[start : start + size], size, now_ns, self)
         return limit
+
+
+def _peer_of(sock: socket.socket) -> bytes:
+    """Return the IPv4 address at the other end; empty if the peer has gone already."""
+    try:
+        return socket.inet_aton(sock.getpeername()[0])
+    except OSError:
+        return b""

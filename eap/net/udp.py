@@ -35,6 +35,7 @@ class UdpChannel:
         self._batch = batch
         self._receive = batch.reader(sock.fileno())
         self._sender = SendBatch(sock, _socket_address)
+        self.source_of = batch.source_reader()
         self.errors = self._sender.errors
 
     def drain(self, now_ns: int) -> int:

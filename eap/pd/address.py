@@ -12,6 +12,7 @@ from eap.ids import Destination, DestinationKind, MacAddr, NetId
 _KIND_SHIFT = 48
 _KINDS = {DestinationKind.MAC: 1, DestinationKind.IP: 2, DestinationKind.TCP: 3}
 _BY_NUMBER = {number: kind for kind, number in _KINDS.items()}
+_MAC_SIZE = 6
 _LOW = (1 << _KIND_SHIFT) - 1
 
 
@@ -28,6 +29,43 @@ def to_word(destination: str) -> int:
     else:
         address = int(IPv4Address(host)) << 16 | port
     return _KINDS[kind] << _KIND_SHIFT | address
+
+
+def source_word(source: bytes) -> int:
+    """Return the address that a frame came from as a word: MAC or IPv4, 0 for none."""
+    if len(source) == _MAC_SIZE:
+        return _KINDS[DestinationKind.MAC] << _KIND_SHIFT | int.from_bytes(source)
+    if not source:
+        return 0
+    return _KINDS[DestinationKind.IP] << _KIND_SHIFT | int.from_bytes(source) << 16
+
+
+def source_text(word: int) -> str | None:
+    """Return the address that :func:`source_word` made a word of, None for 0."""
+    where = from_word(word)
+    return None if where is None else where.host
+
+
+def source_octets(text: str) -> bytes:
+    """Return the address *text*, a MAC or an IPv4 address, as origins of frames give it.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    return MacAddr.parse(text) if ":" in text or "-" in text else IPv4Address(text).packed
+
+
+def is_group_source(source: bytes) -> bool:
+    """Tell whether *source* is a group's or everybody's address, which no sender has."""
+    if len(source) == _MAC_SIZE:
+        return MacAddr(source).is_group
+    address = IPv4Address(source)
+    return address.is_multicast or address == IPv4Address(0xFFFFFFFF)
+
+
+def address_text(source: bytes) -> str:
+    """Return the address that a frame came from as people write it."""
+    return str(MacAddr(source)) if len(source) == _MAC_SIZE else str(IPv4Address(source))
 
 
 def from_word(word: int) -> Destination | None:

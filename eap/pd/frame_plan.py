@@ -16,6 +16,7 @@ from eap.ids import NetId
 from eap.pd.account import Account
 from eap.pd.copyplan import CopyPlan
 from eap.pd.poll import Answer
+from eap.pd.sourcewatch import SourceWatch
 
 Copy: TypeAlias = tuple[slice, slice]
 """Octets of the frame and where they go in the image."""
@@ -40,7 +41,9 @@ class Refused(NamedTuple):
 
     counters: tuple[int, ...]
     mismatches: tuple[tuple[int, int], ...] = ()
-    """(index of the MISMATCH word, its value)"""
+    """(first word of the RxPD, VarState)"""
+    wrong_source: tuple[int, ...] = ()
+    """First words of the RxPDs whose publisher has another address."""
 
 
 class FramePlan:
@@ -60,6 +63,7 @@ class FramePlan:
         answers: RxPDs that this station asked for, likewise.
         roaming: Accounts that follow any publisher.
         publisher: The frame's, as a number.
+        watch: The addresses that such frames come from; it belongs to this plan if they do.
     """
 
     __slots__ = (
@@ -76,6 +80,7 @@ class FramePlan:
         "requests",
         "roaming",
         "taken_words",
+        "watch",
     )
 
     def __init__(
@@ -85,6 +90,7 @@ class FramePlan:
         taken: Iterable[Taken],
         refused: Iterable[Refused],
         *,
+        watch: SourceWatch,
         requests: Iterable[tuple[Account, str]] = (),
         answers: Iterable[tuple[Account, Answer]] = (),
         roaming: Iterable[Account] = (),
@@ -109,6 +115,7 @@ class FramePlan:
         self.has_more = bool(self.alternates or self.refused or self.requests or self.answers)
         self.roaming = tuple(roaming)
         self.publisher = int.from_bytes(publisher)
+        self.watch = watch
 
     def copy_alternates(self, data: memoryview, cycle: int, memory: memoryview) -> None:
         """Copy what is laid out otherwise from the frame *data* of *cycle*, if it was taken."""

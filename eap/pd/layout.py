@@ -33,7 +33,7 @@ from eap.pd.spec import (
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 
 MAGIC = b"EAPIMAGE"
-LAYOUT_VERSION = 3
+LAYOUT_VERSION = 4
 HEADER = struct.Struct("<8sIIQQQ")
 """Magic, layout version, generation, offset and length of the directory, size of the file."""
 WORDS_OFFSET = 64
@@ -151,6 +151,8 @@ class RxPlace(Record, frozen=True):
     poll_request: str = ""
     """The TxPD that asks for it."""
     alternates: tuple[AlternatePlace, ...] = ()
+    source: str = ""
+    """Address that its frames must come from; empty takes any."""
 
 
 class ImageLayout(Record, frozen=True):
@@ -370,4 +372,5 @@ def _rx_places(
             substitute=pd.substitute,
             poll_request=pd.poll_request,
             alternates=place_alternates(pd, kinds, bits, offset),
+            source=pd.source,
         )

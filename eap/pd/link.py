@@ -10,7 +10,13 @@ from typing import Protocol, TypeAlias
 
 
 class Origin(Protocol):
-    """Whoever hands a frame to a taker, and can tell whose it is: asked only for polled data."""
+    """Whoever hands a frame to a taker, and can tell whose it is."""
+
+    def source_of(self, data: memoryview) -> bytes:
+        """Return the address that *data* came from: MAC (6 bytes), IPv4 (4), or none (empty).
+
+        Called for each frame of process data, with *data* as it was handed over.
+        """
 
     def sender_of(self, data: memoryview) -> str:
         """Return the destination by which the port's channel reaches the sender of *data*.

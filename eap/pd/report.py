@@ -9,6 +9,7 @@ from typing import Any
 
 from eap.codec.pd import PdHeader
 from eap.pd import outcome
+from eap.pd.address import source_text
 from eap.pd.device import DeviceState
 from eap.pd.frame_status import frame_state, frame_status, presence
 from eap.pd.image import Image
@@ -195,5 +196,19 @@ def _rx(image: Image, place: RxPlace, now_ns: int, wall_ns: int | None) -> dict[
         "last_good": round((wall_ns - age_ns) / 1e9, 3) if received and wall_ns else None,
         "jitter_us": _spread([], 0) if place.poll_request else spread,
         "response_us": {"last": last_us, **spread} if place.poll_request else None,
+        "source": source_text(words[place.words + RxWord.SOURCE]),
+        "other_source": _seen(words, place, RxWord.OTHER_SOURCE, RxWord.OTHER_SOURCE_AT_NS, now_ns),
+        "wrong_source": _seen(words, place, RxWord.WRONG_SOURCE, RxWord.WRONG_SOURCE_AT_NS, now_ns),
         "state": RxState(words[first + RxWord.STATE]).name.lower(),
     }
+
+
+def _seen(
+    words: memoryview, place: RxPlace, address: RxWord, at: RxWord, now_ns: int
+) -> dict[str, Any] | None:
+    """Return an address that frames came from and how long ago, None if there was none."""
+    text = source_text(words[place.words + address])
+    if text is None:
+        return None
+    age_ns = now_ns - words[place.words + at]
+    return {"address": text, "age_us": max(age_ns, 0) // 1000}

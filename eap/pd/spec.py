@@ -242,6 +242,9 @@ class RxPdSpec(Record, frozen=True):
     """
     changeable: bool = False
     """Whether its ID, publisher and poll request may be written in SafeOp and Op."""
+    source: str = ""
+    """Address that its frames must come from, the publisher's: a MAC address on Ethernet, else an
+    IPv4 address; empty takes frames from any."""
 
 
 class PortKind(StrEnum):

@@ -20,6 +20,7 @@ from eap.pd.image import Image
 from eap.pd.layout import RxPlace
 from eap.pd.link import Origin
 from eap.pd.poll import Question, Requests
+from eap.pd.sourcewatch import SourceWatch
 from eap.pd.spec import RxPdSpec
 from eap.pd.subscription import Subscription
 from eap.pd.substitute import SubstituteValue
@@ -80,7 +81,9 @@ class Subscriber:
             self._by_id.setdefault(place.pd_id, []).append(subscription)
         timeouts = [s.timeout_ns for s in self._subscriptions if s.timeout_ns]
         self._shortest_timeout_ns = min(timeouts, default=_NEVER)
+        self._sources = frozenset(s.source for s in self._subscriptions if s.source)
         self._plans: dict[tuple[bytes, bytes], list[FramePlan]] = {}
+        self._watches: dict[tuple[bytes, bytes], SourceWatch] = {}
         self._pds_planned = 0
         self._open_from_ns = _NEVER
         self._closed_reason = Discard.SUPPRESSED
@@ -109,7 +112,7 @@ class Subscriber:
         """Plan for all layouts of frames that *before* knows, so that none is new."""
         for plans in list(before._plans.values()):
             for plan in list(plans):
-                self._learn(plan.example(), plan.end)
+                self._learn(plan.example(), plan.end, plan.watch.source or b"", 0)
 
     def become(self, after: Subscriber, now_ns: int) -> None:
         """Exchange subscriptions, image and accounts with *after*.
@@ -127,7 +130,7 @@ class Subscriber:
 
     def dissolve(self) -> None:
         """Let go of all subscriptions, one by one: freeing many keeps others from running."""
-        for container in (self._by_key, self._by_id, self._plans):
+        for container in (self._by_key, self._by_id, self._plans, self._watches):
             while container:
                 container.popitem()
         while self._subscriptions:
@@ -135,7 +138,8 @@ class Subscriber:
 
     def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
         """Take one EtherCAT frame of *size* octets that arrived at *at_ns* from *origin*."""
-        plan = self._find_plan(data, size) or self._learn(data, size)
+        source = origin.source_of(data)
+        plan = self._find_plan(data, size, source, at_ns) or self._learn(data, size, source, at_ns)
         if plan is None:
             return
         if at_ns < self._open_from_ns:
@@ -152,8 +156,8 @@ class Subscriber:
         own_cycle = words[_CYCLE] + outside
         for account, copies in plan.parts:
             if account.arrived(cycle, at_ns, own_cycle):
-                for source, target in copies:
-                    memory[target] = data[source]
+                for piece, target in copies:
+                    memory[target] = data[piece]
         if plan.has_more:
             plan.copy_alternates(data, cycle, memory)
             self._refuse(plan, at_ns)
@@ -202,17 +206,21 @@ class Subscriber:
                 subscription.substitute.apply()
         self._next_timeout_ns = following
 
-    def _find_plan(self, data: memoryview, size: int) -> FramePlan | None:
+    def _find_plan(
+        self, data: memoryview, size: int, source: bytes, at_ns: int
+    ) -> FramePlan | None:
         if size >= _SHORTEST:
             for plan in self._plans.get(_KEY(data), ()):
                 if plan.end <= size and (
                     plan.is_single or plan.headers(data, FIRST_PD) == plan.expected
                 ):
-                    return plan
+                    watch = plan.watch
+                    if source == watch.source or watch.includes(source, at_ns):
+                        return plan
         return None
 
-    def _learn(self, data: memoryview, size: int) -> FramePlan | None:
-        """Make the plan of a layout not seen before; count and drop what is no PD frame."""
+    def _learn(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
+        """Make the plan of a layout not seen before from *source*; drop what is no PD frame."""
         pds = walk(data, size)
         if isinstance(pds, Discard):
             self._discard(pds, 1)
@@ -221,7 +229,7 @@ class Subscriber:
         chosen: list[tuple[Subscription, PdHeader, int]] = []
         refused = []
         for header, offset in pds:
-            match = self._match(publisher, header)
+            match = self._match(publisher, header, source)
             if isinstance(match, Refused):
                 refused.append(match)
             else:
@@ -234,6 +242,7 @@ class Subscriber:
             [(bytes(data[offset : offset + 6]), header.length) for header, offset in pds],
             [_take(subscription, header, offset) for subscription, header, offset in chosen],
             refused,
+            watch=self._watch(publisher, source, at_ns, taking, refused),
             requests=[
                 (s.account, s.place.name) for s in taking if s.place.name in self._requests.names
             ],
@@ -252,18 +261,43 @@ class Subscriber:
         same_key.append(plan)
         return plan
 
+    def _watch(
+        self,
+        publisher: bytes,
+        source: bytes,
+        at_ns: int,
+        taking: Iterable[Subscription],
+        refused: Iterable[Refused],
+    ) -> SourceWatch:
+        """Return the watch over the frames of *publisher* that are judged as those of *source*."""
+        expected = source if source in self._sources else b""
+        watch = self._watches.get((publisher, expected))
+        if watch is None:
+            watch = SourceWatch(self._words, expected, self._sources)
+            self._watches[publisher, expected] = watch
+        if source != watch.source:
+            watch.includes(source, at_ns)
+        watch.follow(
+            (subscription.place.words for subscription in taking),
+            (first for pd in refused for first in pd.wrong_source),
+        )
+        return watch
+
     def _forget_plans(self) -> None:
         self._plans.clear()
+        self._watches.clear()
         self._pds_planned = 0
 
-    def _match(self, publisher: bytes, header: PdHeader) -> list[Subscription] | Refused:
-        """Find who takes a PD, or what to count instead."""
+    def _match(
+        self, publisher: bytes, header: PdHeader, source: bytes
+    ) -> list[Subscription] | Refused:
+        """Find the subscriptions that take a PD, or what to count instead."""
         pd_id = header.pd_id
         candidates = self._by_key.get((publisher, pd_id), []) + self._by_key.get((b"", pd_id), [])
         if not candidates:
             others = self._by_id.get(pd_id, [])
             return _refuse_all([(other, Discard.WRONG_PUBLISHER) for other in others])
-        misfits = [(c, c.mismatch(header.version, header.length)) for c in candidates]
+        misfits = [(c, c.mismatch(header.version, header.length, source)) for c in candidates]
         fitting = [candidate for candidate, reason in misfits if reason is None]
         return fitting or _refuse_all([(c, reason) for c, reason in misfits if reason is not None])
 
@@ -281,6 +315,8 @@ class Subscriber:
             for first_word, bit in pd.mismatches:
                 words[first_word + RxWord.MISMATCH] = bit
                 words[first_word + RxWord.MISMATCH_AT_NS] = at_ns
+            for first_word in pd.wrong_source:
+                words[first_word + RxWord.WRONG_SOURCE_AT_NS] = at_ns
 
     def _enter_answers(self, plan: FramePlan, cycle: int, at_ns: int) -> None:
         entered: set[Account] = set()
@@ -372,4 +408,5 @@ def _refuse_all(reasons: list[tuple[Subscription, Discard]]) -> Refused:
     counters = [StationWord.DISCARDED + DISCARD_INDEX[reasons[0][1]]]
     counters += [s.place.words + RxWord.DISCARDED + DISCARD_INDEX[why] for s, why in reasons]
     mismatches = [(s.place.words, _VAR_STATE[why]) for s, why in reasons if why in _VAR_STATE]
-    return Refused(tuple(counters), tuple(mismatches))
+    wrong_source = [s.place.words for s, why in reasons if why is Discard.WRONG_SOURCE]
+    return Refused(tuple(counters), tuple(mismatches), tuple(wrong_source))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from eap.pd.account import Account
+from eap.pd.address import source_octets
 from eap.pd.layout import RxPlace
 from eap.pd.poll import Answer, Question
 from eap.pd.spec import RxPdSpec
@@ -23,6 +24,7 @@ class Subscription:
         account: Where its arrivals are entered; the subscriber opens it.
         alternates: What copies another layout that is taken as well, by version and length.
         answer: What it is to its question; None if it comes by itself.
+        source: The address that its frames must come from; empty for any.
     """
 
     __slots__ = (
@@ -31,6 +33,7 @@ class Subscription:
         "answer",
         "ignore_version",
         "place",
+        "source",
         "substitute",
         "timeout_ns",
     )
@@ -48,10 +51,13 @@ class Subscription:
         self.ignore_version = spec.ignore_version
         self.timeout_ns = spec.timeout_ms * 1_000_000
         self.substitute = substitute
+        self.source = source_octets(spec.source) if spec.source else b""
         self.account: Account
 
-    def mismatch(self, version: int, length: int) -> Discard | None:
-        """Return why a PD of this version and length does not fit, None if it does."""
+    def mismatch(self, version: int, length: int, source: bytes) -> Discard | None:
+        """Return why such a PD from the address *source* does not fit, None if it does."""
+        if self.source and source != self.source:
+            return Discard.WRONG_SOURCE
         if (version, length) in self.alternates:
             return None
         if version != self.place.version and not self.ignore_version:

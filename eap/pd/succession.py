@@ -41,6 +41,15 @@ _OWN_WORDS = {
 """What belongs to an image, and not to the station."""
 
 
+_SOURCE_WORDS = (
+    RxWord.SOURCE,
+    RxWord.OTHER_SOURCE,
+    RxWord.OTHER_SOURCE_AT_NS,
+    RxWord.WRONG_SOURCE,
+    RxWord.WRONG_SOURCE_AT_NS,
+)
+
+
 class _Run(NamedTuple):
     """Words that are copied in one piece."""
 
@@ -162,6 +171,11 @@ class _Received:
         )
         self._owners = array("q", [0] * len(new.layout.rx))
         """By RxPD of the new image: where its account is, as in RxWord.ACCOUNT."""
+        self._from_elsewhere = [
+            place.words
+            for _, was, _, place in self._heirs
+            if (was.publisher, was.port, was.source) != (place.publisher, place.port, place.source)
+        ]
         first_of: dict[object, int] = {}
         for index, was, account, place in self._heirs:
             judged = account, _begins_anew(was, place), _judged(place)
@@ -184,6 +198,9 @@ class _Received:
         for first in self._strangers:
             new[first + RxWord.LAST_CYCLE] = -1
             for word in (RxWord.BEHIND, RxWord.HOLES, RxWord.SENDER):
+                new[first + word] = 0
+        for first in self._from_elsewhere:
+            for word in _SOURCE_WORDS:
                 new[first + word] = 0
 
     def _plan_accounts(self) -> None:

@@ -30,6 +30,8 @@ class Discard(StrEnum):
     """The data was taken, but more stations asked in one cycle than are answered in one."""
     NO_SENDER = auto()
     """The data was taken, but its frame does not tell whom to answer."""
+    WRONG_SOURCE = auto()
+    """The frame came from another address than the publisher's."""
 
 
 class Reason(StrEnum):
@@ -149,7 +151,15 @@ class RxWord(IntEnum):
     MISMATCH_AT_NS = 2
     RESPONSE_NS = 3
     """From a request to its answer: of the one that was taken last; 0 if nobody asked."""
-    DISCARDED = 4
+    SOURCE = 4
+    """Address that the last frame taken came from, as ``eap.pd.address`` puts it; 0 unknown."""
+    OTHER_SOURCE = 5
+    """Address that takes turns with SOURCE: a second sender with the same publisher ID."""
+    OTHER_SOURCE_AT_NS = 6
+    WRONG_SOURCE = 7
+    """Address of the last frame dropped because it is not the publisher's."""
+    WRONG_SOURCE_AT_NS = 8
+    DISCARDED = 9
     RECEIVED = DISCARDED + len(DISCARDS)
     DUPLICATED = RECEIVED + 1
     REORDERED = RECEIVED + 2

@@ -121,7 +121,9 @@ def target(farm: Plants) -> Target:
 
 @pytest.fixture
 def sock() -> Iterator[socket.socket]:
+    """Yield a socket at the publisher's own address: what it sends is judged by its content."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((ADDRESS, 0))
         yield sock
 
 
@@ -134,6 +136,20 @@ def test_each_kind_is_counted_under_its_reason(target: Target, sock: socket.sock
     wait_until(lambda: target.counted("reader") == expected)
     of_pd = target.appliance.rx("reader", "sender")["discarded"]
     assert of_pd == {"wrong_publisher": 1, "version": 1, "length": 1}
+    target.assert_undisturbed()
+
+
+def test_values_from_another_address_are_dropped_and_their_source_named(target: Target) -> None:
+    values = (666).to_bytes(4, "little") + (31337).to_bytes(2, "little")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.9.5.99", 0))
+        for _ in range(5):
+            other.sendto(pd_frame(SENDER, PdHeader(1, 7, LENGTH), values), ("127.9.5.2", EAP_PORT))
+        wait_until(lambda: target.counted("reader") == {"wrong_source": 5})
+    row = target.appliance.rx("reader", "sender")
+    assert row["discarded"] == {"wrong_source": 5}
+    assert row["wrong_source"]["address"] == "127.9.5.99"
+    assert row["source"] == ADDRESS
     target.assert_undisturbed()
 
 

@@ -76,17 +76,24 @@ def octets(
 class From:
     """An origin whose frames all come from one sender."""
 
-    def __init__(self, sender: str = "somebody") -> None:
+    def __init__(self, sender: str = "somebody", source: bytes = b"") -> None:
         self._sender = sender
+        self._source = source
+
+    def source_of(self, data: memoryview) -> bytes:
+        del data
+        return self._source
 
     def sender_of(self, data: memoryview) -> str:
         del data
         return self._sender
 
 
-def give(taker: Taker, frame: bytes, at_ns: int, sender: str = "somebody") -> None:
+def give(
+    taker: Taker, frame: bytes, at_ns: int, sender: str = "somebody", source: bytes = b""
+) -> None:
     """Hand *frame* over as a driver does: in a buffer that is longer than it."""
-    taker(memoryview(frame + b"\xee" * 32), len(frame), at_ns, From(sender))
+    taker(memoryview(frame + b"\xee" * 32), len(frame), at_ns, From(sender, source))
 
 
 class Receiver:
@@ -105,8 +112,8 @@ class Receiver:
         )
         self.subscriber.open(now_ns)
 
-    def give(self, frame: bytes, at_ns: int) -> None:
-        give(self.subscriber.receive_frame, frame, at_ns)
+    def give(self, frame: bytes, at_ns: int, source: bytes = b"") -> None:
+        give(self.subscriber.receive_frame, frame, at_ns, source=source)
 
     def place(self, name: str) -> RxPlace:
         return next(place for place in self.image.layout.rx if place.name == name)

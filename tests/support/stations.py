@@ -223,6 +223,7 @@ def _subscription(draw: st.DrawFn, number: int, names: tuple[str, ...]) -> RxPdS
         sender_cycle_us=draw(st.sampled_from([0, 500])),
         step=draw(st.integers(0, 2)),
         changeable=draw(st.booleans()),
+        source=draw(st.sampled_from(["", "10.0.0.1", "02:00:00:00:00:01"])),
     )
 
 

@@ -200,6 +200,9 @@ RX_PD = ObjectRange(
         config(16, "Changeable", "BOOL", "Whether PD ID, NetID and poll request may be written in "
                "SafeOp and Op."),
         live(17, "State", "USINT", Live.RX_STATE, "0 waiting, 1 running, 2 stale."),
+        config(18, "Source", "STRING(40)", "Address that its frames must come from: MAC on "
+               "Ethernet, else IPv4; empty any. Writing another publisher empties it.",
+               changeable=True),
     ),
     "One PD to receive: from whom, and into which PDO.", dynamic=True, companion=0xC000,
 )  # fmt: skip
@@ -217,6 +220,8 @@ RX_DIAGNOSIS = ObjectRange(
         live(9, "Wrong length", "ULINT", Live.RX_DISCARDED_LENGTH, "Discarded for it."),
         live(10, "Not in Op", "ULINT", Live.RX_DISCARDED_SUPPRESSED, "Discarded for it."),
         live(11, "Stale", "ULINT", Live.RX_DISCARDED_STALE, "Had waited since before the start."),
+        live(12, "Wrong source", "ULINT", Live.RX_DISCARDED_WRONG_SOURCE,
+             "Discarded for it: came from another address."),
     ),
     "What became of the RxPD of the same number.",
 )  # fmt: skip

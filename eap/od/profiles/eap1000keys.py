@@ -40,6 +40,7 @@ class Live(StrEnum):
     RX_DISCARDED_LENGTH = auto()
     RX_DISCARDED_SUPPRESSED = auto()
     RX_DISCARDED_STALE = auto()
+    RX_DISCARDED_WRONG_SOURCE = auto()
     STATION_CYCLE = auto()
     STATION_OVERRUNS = auto()
     STATION_RESTARTS = auto()
@@ -147,6 +148,7 @@ class Rx(IntEnum):
     STEP = 15
     CHANGEABLE = 16
     STATE = 17
+    SOURCE = 18
 
 
 class Status(IntEnum):

@@ -86,6 +86,10 @@ _SUBSCRIBER.open(0)
 class _Anybody:
     """The sender of a frame: any of 256, as its last octet says, the first of them without name."""
 
+    def source_of(self, data: memoryview) -> bytes:
+        """Return one of four addresses."""
+        return bytes((10, 0, 0, data[len(data) - 17] & 3))
+
     def sender_of(self, data: memoryview) -> str:
         """Return a destination for answers."""
         number = data[len(data) - 17]

@@ -196,7 +196,15 @@ def test_requests_to_buses_that_got_lost_are_worth_a_look() -> None:
 
 def test_remarks_name_all_that_is_rare() -> None:
     left = rx(
-        "left", timeouts=1, duplicated=2, reordered=3, late=4, discarded={"version": 5, "length": 6}
+        "left",
+        timeouts=1,
+        duplicated=2,
+        reordered=3,
+        late=4,
+        discarded={"version": 5, "length": 6},
+        source="10.0.0.1",
+        wrong_source={"address": "10.0.0.9", "age_us": 2_000_000},
+        other_source={"address": "10.0.0.8", "age_us": 3_000_000},
     )
     status = document(
         tx=[tx("state", skipped=7)],
@@ -206,10 +214,10 @@ def test_remarks_name_all_that_is_rare() -> None:
         torn=2,
     )
     _, _, remarks = show(status).partition("Worth a look\n")
-    first, second, third = (line.strip() for line in remarks.splitlines())
+    first, second, *third = (line.strip() for line in remarks.splitlines())
     assert first == "mixer: left out 1 cycle; found 2 torn writes; turned away: 8 unknown id"
     assert second == "mixer → state: skipped 7 times"
-    heading, _, reasons = third.partition(": ")
+    heading, _, reasons = " ".join(third).partition(": ")
     assert heading == "mixer ← left"
     assert reasons.split("; ") == [
         "timed out once",
@@ -217,6 +225,8 @@ def test_remarks_name_all_that_is_rare() -> None:
         "3 reordered",
         "4 late",
         "discarded: 5 version, 6 length",
+        "10.0.0.9 sends with this publisher ID, last 2.0 s ago: dropped",
+        "two senders with this publisher ID: 10.0.0.1 and 10.0.0.8, last 3.0 s ago",
     ]
 
 

@@ -36,6 +36,18 @@ VARIABLES = ", variables: {a: REAL, b: UDINT}}"
             "21: left/state is in this plant, which gives cycle_us and step; both to be left out",
         ),
         (
+            [(FROM, f"{FROM}, source: somewhere")],
+            "21: source of 'seen' is 'somewhere' on udp://127.0.9.2; an IPv4 address or any",
+        ),
+        (
+            [(FROM, f'{FROM}, source: "02:00:00:00:00:01"')],
+            "21: source of 'seen' is '02:00:00:00:00:01' on udp://127.0.9.2; an IPv4 address",
+        ),
+        (
+            [(FROM, f"{FROM}, source: 239.1.2.3")],
+            "21: source of 'seen' is '239.1.2.3' on udp://127.0.9.2; an IPv4 address or any",
+        ),
+        (
             [(FROM, f"{FROM}, version: 2")],
             "21: version 2 of 'seen', but left/state has 3 (line 15)",
         ),

@@ -86,6 +86,21 @@ def test_what_is_known_of_a_publisher_by_numbers(stations, source, facts):
     assert (rx.publisher, rx.pd_id, rx.version, rx.step, rx.sender_cycle_us) == facts
 
 
+@pytest.mark.parametrize(
+    ("edit", "source"),
+    [
+        (FROM, "127.0.9.1"),
+        (f"{FROM}, source: any", ""),
+        (f"{FROM}, source: 10.0.0.7", "10.0.0.7"),
+        ("from: {publisher: any, id: 1}", "127.0.9.1"),
+        ("from: {publisher: 9.9.9.9.9.9, id: 7}, foreign: true", ""),
+        ("from: {publisher: 9.9.9.9.9.9, id: 7}, foreign: true, source: 10.0.0.7", "10.0.0.7"),
+    ],
+)
+def test_subscription_expects_the_publishers_address_unless_told_otherwise(stations, edit, source):
+    assert stations((FROM, edit))[1].subscriptions[0].source == source
+
+
 def test_of_several_publishers_only_the_common_pace_is_known(stations):
     more = "\n      - {name: more, frame: more, id: 1, divider: 2, variables: [speed, count]}"
     second_port = "{name: eap1, kind: eap, interface: tcp://127.0.9.3, net_id: 127.0.9.1.3.1}"

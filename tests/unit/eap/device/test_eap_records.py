@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_records import PortReader
 from eap.device.fault import DeviceFault, FaultCode
+from eap.od.abort import SdoAbortError
 from eap.od.profiles.eap1000keys import AddressMode, Frame, Port, Rx, RxFlag, Tx
 from eap.pd.spec import OnChangeSpec, PortKind, PortSpec, TriggerSpec
 from tests.support.downloads import (
@@ -170,6 +171,26 @@ def test_any_publisher_is_a_flag_or_no_netid(udp):
         write(udp, 0xE000, Rx.FLAGS, RxFlag.ENABLED | flags)
         read += [pd.publisher for _, pd in PortReader(udp).subscriptions()]
     assert read == ["", "1.2.3.4.5.6", ""]
+
+
+def test_writing_another_publisher_empties_the_source(udp):
+    receiver(udp)
+    rx_pd(udp, 0xE000, 0x1600, 1)
+    write(udp, 0xE000, Rx.PUBLISHER, b"\1\2\3\4\5\6")
+    write(udp, 0xE000, Rx.SOURCE, "10.0.0.7")
+    read = [next(PortReader(udp).subscriptions())[1].source]
+    write(udp, 0xE000, Rx.PUBLISHER, b"\1\2\3\4\5\6")
+    read.append(next(PortReader(udp).subscriptions())[1].source)
+    write(udp, 0xE000, Rx.PUBLISHER, b"\1\2\3\4\5\7")
+    read.append(next(PortReader(udp).subscriptions())[1].source)
+    assert read == ["10.0.0.7", "10.0.0.7", ""]
+
+
+def test_source_of_a_received_pd_is_an_address(udp):
+    receiver(udp)
+    rx_pd(udp, 0xE000, 0x1600, 1)
+    with pytest.raises(SdoAbortError, match="no MAC and no IPv4 address"):
+        write(udp, 0xE000, Rx.SOURCE, "somewhere")
 
 
 def test_times_of_on_change_switch_it_on(udp):

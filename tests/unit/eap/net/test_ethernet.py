@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from eap.ids import MacAddr
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.packetsocket import open_packet_pair
 from eap.pd.link import OutFrame
@@ -27,6 +28,7 @@ class Listener:
         self.got = []
         self.times = []
         self.senders = []
+        self.sources = []
         self.for_many = []
         self.port = interface.port(self.take, **options)
 
@@ -34,6 +36,7 @@ class Listener:
         self.got.append(bytes(data[: min(size, 3)]))
         self.times.append(at_ns)
         self.senders.append(origin.sender_of(data))
+        self.sources.append(MacAddr(origin.source_of(data)))
         self.for_many.append(origin.is_for_many(data))
 
     def drain(self, count):
@@ -231,6 +234,7 @@ def test_an_answer_goes_to_the_mac_address_that_asked(ends, raw):
         client.port.send([client.frame(n) for n in range(count)], 0)
         server.drain(len(server.got) + count)
         assert server.senders[-count:] == [str(ends[0].address)] * count
+        assert server.sources[-count:] == [ends[0].address] * count
     server.port.send([server.frame(7, server.senders[0])], 0)
     assert client.drain(1) == [expect(7)]
     assert expect(7) not in idle.got

@@ -324,6 +324,9 @@ def test_what_comes_back_is_taken_by_who_wants_it(listener):
 
     def take(data, size, at_ns, origin):
         got.append((bytes(data[:size]), at_ns, origin.sender_of(data)))
+        assert origin.source_of(data) == socket.inet_aton(
+            DESTINATION.removeprefix("tcp://").split(":")[0]
+        )
 
     sender = TcpSender(DESTINATION, HERE, errors, [take])
     try:

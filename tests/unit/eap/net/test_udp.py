@@ -110,8 +110,9 @@ def test_destination_without_a_port_goes_to_the_usual_one():
 
 def test_an_answer_goes_to_the_address_and_port_that_asked(channels):
     server, _ = channels
-    senders = []
+    senders, sources = [], []
     server.takers.append(lambda view, _size, _at, origin: senders.append(origin.sender_of(view)))
+    server.takers.append(lambda view, _size, _at, origin: sources.append(origin.source_of(view)))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(5)
         client.bind(("127.0.3.14", 0))
@@ -121,6 +122,7 @@ def test_an_answer_goes_to_the_address_and_port_that_asked(channels):
             assert server.drain(0) == count
         host, port = client.getsockname()
         assert senders == [f"{host}:{port}"] * 3
+        assert sources == [bytes((127, 0, 3, 14))] * 3
         server.send([OutFrame(bytearray(b"\x01\x40\x02"), 0, senders[0])], 0)
         assert client.recv(10) == b"\x01\x40\x02"
 

@@ -3,9 +3,11 @@ from __future__ import annotations
 from eap.codec.pd import FIRST_PD
 from eap.pd.account import Account, Timing
 from eap.pd.frame_plan import FramePlan, Refused, Taken
+from eap.pd.sourcewatch import SourceWatch
 from eap.pd.words import RxWord
 from tests.support.cyclic import PEER, octets
 
+WATCH = SourceWatch(memoryview(b""), b"", frozenset())
 TIMING = Timing(step=1, sender_cycle_ns=0, own_cycle_ns=1)
 
 
@@ -25,6 +27,7 @@ def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
             Taken(one, 0, source=36, target=300, size=9),
         ],
         [],
+        watch=WATCH,
     )
     assert plan.parts == (
         (one, ((slice(14, 36), slice(200, 222)), (slice(36, 45), slice(300, 309)))),
@@ -38,6 +41,7 @@ def test_each_account_has_its_own_copies():
         [(b"\x01\0\0\0\0\0", 0), (b"\x02\0\0\0\0\0", 0)],
         [Taken(one, 3, 14, 200, 8), Taken(other, 4, 22, 208, 8)],
         [Refused((1,))],
+        watch=WATCH,
         roaming=[other],
         publisher=bytes([5, 23, 91, 23, 1, 1]),
     )
@@ -54,6 +58,7 @@ def test_headers_are_compared_without_their_quality():
         [(b"\x01\0\x07\0\x02\0", 2), (b"\x02\0\x03\0\0\0", 0)],
         [],
         [],
+        watch=WATCH,
     )
     assert plan.headers(frame, FIRST_PD) == plan.expected
     other = octets([(1, b"ab", 7, 0), (2, b"", 4, 0)], publisher=PEER)

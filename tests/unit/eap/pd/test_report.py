@@ -116,6 +116,9 @@ def test_a_subscription_that_waits_knows_nothing():
         "last_good": None,
         "jitter_us": {"p50": None, "p99": None, "max": None},
         "response_us": None,
+        "source": None,
+        "other_source": None,
+        "wrong_source": None,
         "state": "waiting",
     }
 

@@ -29,15 +29,15 @@ def subscription(*, polled: bool = False, **options: object) -> tuple[Subscripti
 
 def test_version_and_length_have_to_fit():
     made, _ = subscription()
-    assert made.mismatch(3, 2) is None
-    assert made.mismatch(4, 2) is made.mismatch(4, 3) is Discard.VERSION
-    assert made.mismatch(3, 3) is Discard.LENGTH
+    assert made.mismatch(3, 2, b"") is None
+    assert made.mismatch(4, 2, b"") is made.mismatch(4, 3, b"") is Discard.VERSION
+    assert made.mismatch(3, 3, b"") is Discard.LENGTH
 
 
 def test_the_version_may_be_of_no_interest_but_never_the_length():
     made, _ = subscription(ignore_version=True)
-    assert made.mismatch(4, 2) is None
-    assert made.mismatch(4, 3) is Discard.LENGTH
+    assert made.mismatch(4, 2, b"") is None
+    assert made.mismatch(4, 3, b"") is Discard.LENGTH
 
 
 def test_what_comes_by_itself_is_too_old_when_nothing_has_come_for_so_long():

@@ -1,0 +1,121 @@
+"""Frames of one publisher ID from several addresses, through a whole subscriber."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eap.ids import MacAddr
+from eap.pd.report import station_status
+from eap.pd.sourcewatch import ALTERNATION_NS
+from eap.pd.spec import RxPdSpec
+from tests.support.cyclic import MS, PEER, Receiver, octets, received
+
+OWN = bytes((10, 77, 0, 1))
+OTHER = bytes((10, 77, 0, 9))
+MAC = MacAddr.parse("02:00:00:00:00:01")
+
+
+def receiver(*, source: str = "10.77.0.1", publisher: str = PEER) -> Receiver:
+    pds = (
+        RxPdSpec("a", "eap0", 7, ("x",), publisher, step=1, source=source),
+        RxPdSpec("b", "eap0", 8, ("y",), publisher, step=1, source=source),
+    )
+    return Receiver(*pds, variables=received("x:UINT", "y:UINT"))
+
+
+def frame(value: int, cycle: int, *, pd_id: int = 7) -> bytes:
+    return octets([(pd_id, value.to_bytes(2, "little"))], cycle=cycle, publisher=PEER)
+
+
+def rows(r: Receiver, now_ns: int = 0) -> list[dict[str, object]]:
+    return station_status(r.image, now_ns)["pd"]["rx"]
+
+
+def test_subscriber_drops_frames_of_another_source_and_names_it():
+    r = receiver()
+    r.give(frame(1, 1), 1 * MS, OWN)
+    for cycle in range(2, 7):
+        r.give(frame(666, cycle), cycle * MS, OTHER)
+    r.give(frame(3, 2), 9 * MS, OWN)
+
+    row = rows(r, 10 * MS)[0]
+    assert r.image.read("x") == 3
+    assert (row["received"], row["lost"], row["duplicated"]) == (2, 0, 0)
+    assert row["discarded"] == {"wrong_source": 5}
+    assert row["source"] == "10.77.0.1"
+    assert row["wrong_source"] == {"address": "10.77.0.9", "age_us": 4000}
+    assert station_status(r.image, 0)["discarded"] == {"wrong_source": 5}
+
+
+def test_subscriber_drops_a_first_frame_of_another_source():
+    r = receiver()
+    r.give(frame(666, 1), 1 * MS, OTHER)
+    assert r.image.read("x") == 0
+    assert rows(r)[0]["state"] == "waiting"
+    r.give(frame(5, 1), 2 * MS, OWN)
+    assert r.image.read("x") == 5
+
+
+def test_subscriber_on_ethernet_compares_mac_addresses():
+    r = receiver(source=str(MAC))
+    r.give(frame(1, 1), 1 * MS, MAC)
+    r.give(frame(666, 2), 2 * MS, b"\x02\0\0\0\0\x02")
+    row = rows(r)[0]
+    assert r.image.read("x") == 1
+    assert row["source"] == str(MAC)
+    assert row["wrong_source"]["address"] == "02:00:00:00:00:02"
+
+
+def test_subscription_of_any_source_takes_all_and_names_two_senders():
+    r = receiver(source="")
+    r.give(frame(1, 1), 1 * MS, OWN)
+    r.give(frame(2, 2), 2 * MS, OTHER)
+    assert rows(r)[0]["other_source"] is None  # one change: a publisher that moved
+    r.give(frame(3, 3), 3 * MS, OWN)
+    row = rows(r, 4 * MS)[0]
+    assert row["source"] == "10.77.0.1"
+    assert row["other_source"] == {"address": "10.77.0.9", "age_us": 1000}
+    assert row["received"] == 3
+
+
+def test_two_senders_that_send_different_pds_of_one_publisher_are_named():
+    r = receiver(source="")
+    for cycle in range(3):
+        r.give(frame(1, cycle), 2 * cycle * MS, OWN)
+        r.give(frame(2, cycle, pd_id=8), (2 * cycle + 1) * MS, OTHER)
+    assert all(row["other_source"] is not None for row in rows(r))
+
+
+def test_publisher_that_moves_twice_in_a_long_time_is_one_sender():
+    r = receiver(source="")
+    for cycle, source in enumerate((OWN, OTHER, OWN), 1):
+        r.give(frame(cycle, cycle), cycle * ALTERNATION_NS, source)
+    assert rows(r)[0]["other_source"] is None
+
+
+def test_subscriptions_of_one_publisher_judge_the_source_each_by_its_own_rule():
+    strict = RxPdSpec("a", "eap0", 7, ("x",), PEER, source="10.77.0.1")
+    lax = RxPdSpec("b", "eap0", 7, ("y",), "")
+    r = Receiver(strict, lax, variables=received("x:UINT", "y:UINT"))
+    r.give(frame(1, 1), 1 * MS, OWN)
+    r.give(frame(2, 2), 2 * MS, OTHER)
+    assert (r.image.read("x"), r.image.read("y")) == (1, 2)
+
+
+@pytest.mark.parametrize("source", ["10.77.0.1", ""])
+@given(
+    sent=st.lists(st.tuples(st.sampled_from((7, 8)), st.integers(0, 5)), max_size=60),
+)
+def test_only_frames_of_the_expected_source_count_as_received(source, sent):
+    r = receiver(source=source)
+    taken = {7: 0, 8: 0}
+    for cycle, (pd_id, host) in enumerate(sent, 1):
+        address = bytes((10, 77, 0, host))
+        r.give(frame(cycle, cycle, pd_id=pd_id), cycle * MS, address)
+        if not source or address == OWN:
+            taken[pd_id] = cycle
+    assert (r.image.read("x"), r.image.read("y")) == (taken[7], taken[8])
+    dropped = sum(row["discarded"].get("wrong_source", 0) for row in rows(r))
+    assert dropped == (sum(host != 1 for _, host in sent) if source else 0)
