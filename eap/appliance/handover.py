@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from enum import StrEnum
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 
@@ -116,7 +116,6 @@ class SegmentHandover(Handed, frozen=True):
     """This side of the pair with the engine."""
     command_fd: int
     """This side of the pair with services."""
-    ready_fd: int = NO_DESCRIPTOR
 
 
 class EngineOptions(Record, frozen=True):
@@ -141,7 +140,6 @@ class Handover(Handed, frozen=True):
     plant_file: str
     stations: tuple[StationSpec, ...]
     sockets: tuple[SharedSocket, ...]
-    ready_fd: int = NO_DESCRIPTOR
     link_fd: int = NO_DESCRIPTOR
     """This side of the SOCK_SEQPACKET pair between engine and services."""
     control_fd: int = NO_DESCRIPTOR
@@ -167,14 +165,3 @@ class Handover(Handed, frozen=True):
             for port in station.ports
             if port.name == name.port
         )
-
-
-def tell_ready(fd: int, report: dict[str, Any]) -> None:
-    """Say that this process runs, with a *report* for ``status``; close *fd*."""
-    os.write(fd, msgspec.json.encode(report) + b"\n")
-    os.close(fd)
-
-
-def decode_report(line: bytes) -> dict[str, Any]:
-    """Read what ``tell_ready`` wrote."""
-    return msgspec.json.decode(line, type=dict[str, Any])

@@ -43,6 +43,8 @@ class ProcessInfo(msgspec.Struct):
     restarts: int = 0
     report: dict[str, Any] = {}
     """What the process said of itself when it became ready."""
+    step: str = ""
+    """Step of its start-up; empty when it runs."""
 
 
 class ApplianceInfo(msgspec.Struct):
@@ -209,10 +211,7 @@ class ApplianceFolder(Closing):
     def write_info(self, info: ApplianceInfo) -> None:
         """Replace ``appliance.json`` in one step."""
         temporary = self.path / "appliance.json.new"
-        with temporary.open("wb") as file:
-            file.write(msgspec.json.format(msgspec.json.encode(info)))
-            file.flush()
-            os.fsync(file.fileno())
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(info)))
         temporary.replace(self.path / "appliance.json")
 
     def read_info(self) -> ApplianceInfo:

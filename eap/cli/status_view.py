@@ -75,6 +75,9 @@ def _processes(appliance: Row) -> RenderableType:
         if not process["pid"]:
             table.add_row(name, Text("restarting", style=_BAD))
             continue
+        if step := process.get("step"):
+            table.add_row(name, f"process {process['pid']}", Text(f"starting: {step}", style=_BAD))
+            continue
         cpu, rss = process.get("cpu"), process.get("rss")
         table.add_row(
             name,

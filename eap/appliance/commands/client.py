@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
+import msgspec
+
 from eap.appliance.bus_failure import to_error
 from eap.appliance.bus_request import Failure
 from eap.appliance.control import MAX_LINE, ErrorCode, Reply, decode_reply, encode_request
@@ -22,8 +24,11 @@ TIMEOUT_S = 10.0
 class Client(Closing):
     """One connection to one running appliance."""
 
-    def __init__(self, connection: socket.socket, info: ApplianceInfo) -> None:
+    def __init__(
+        self, connection: socket.socket, info: ApplianceInfo, folder: ApplianceFolder | None = None
+    ) -> None:
         self.info = info
+        self._folder = folder
         self._socket = connection
         self._socket.settimeout(TIMEOUT_S)
         self._reader = connection.makefile("rb")
@@ -91,6 +96,8 @@ class Client(Closing):
 
     def _gone(self, cause: OSError | None) -> ControlError:
         why = str(cause) if cause else "it closed the connection"
+        if self._folder is not None:
+            why = "; ".join((why, *_starting(self._folder)))
         return ControlError(
             f"appliance {self.info.plant} (process {self.info.supervisor}) does not answer: {why}",
             code=ErrorCode.UNAVAILABLE,
@@ -190,7 +197,19 @@ def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> Client:
             f" {folder.control_socket}: {exc.strerror}",
             code=ErrorCode.UNAVAILABLE,
         ) from None
-    return Client(connection, info)
+    return Client(connection, info, folder)
+
+
+def _starting(folder: ApplianceFolder) -> Iterator[str]:
+    """Yield which processes of an appliance do not run yet, or not again, and how far they are."""
+    with suppress(OSError, msgspec.MsgspecError):
+        info = folder.read_info()
+        processes = {"engine": info.engine, "services": info.services, **info.segments}
+        for name, process in processes.items():
+            if process.step:
+                yield f"{name} is starting ({process.step})"
+            elif not process.pid:
+                yield f"{name} ended and will be started again"
 
 
 def _none_runs(

@@ -17,6 +17,7 @@ from eap.appliance.engine.tcp_ports import has_tcp, open_tcp_port
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.appliance.passing import PassedConnection
 from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.startup import Step, no_step
 from eap.ids import InterfaceUri
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import create_image
@@ -43,6 +44,10 @@ class SocketChannel(Channel, Protocol):
 class EnginePlant:
     """All stations of one engine process, with their images and channels.
 
+    Args:
+        handover: What to build.
+        step: Is told what is built next.
+
     Attributes:
         engine: Runs them.
         rebuilds: Changes them while they run.
@@ -50,7 +55,7 @@ class EnginePlant:
         arrivals: Descriptors to wake up for besides the cycle, and what to call then.
     """
 
-    def __init__(self, handover: Handover) -> None:
+    def __init__(self, handover: Handover, *, step: Step = no_step) -> None:
         self.arrivals: dict[int, Callable[[int], object]] = {}
         self._resources = ExitStack()
         self._handover = handover
@@ -62,9 +67,11 @@ class EnginePlant:
             DiscardCounters(folder.discards("engine"), [s.name for s in handover.stations])
         )
         for spec in handover.stations:
+            step(f"building station {spec.name}")
             file = create_image(folder.image(spec.name), plan_layout(spec))
             station = Station(spec, file.image, file.wake_waiters)
             self._stations[spec.name] = EngineStation(station, file)
+        step("opening ports")
         self._open_own()
         for shared in handover.sockets:
             if shared.kind is SocketKind.PACKET:
@@ -75,6 +82,7 @@ class EnginePlant:
         self.rebuilds = Rebuilds(self.engine, self._stations)
         self._resources.callback(self.rebuilds.close)
         self.arrivals[self.rebuilds.fileno()] = self.rebuilds.collect
+        step("building buses")
         self.buses = EngineBuses(handover, self._stations, self.rebuilds.serve)
         self._resources.callback(self.buses.close)
         self.arrivals.update(self.buses.arrivals)

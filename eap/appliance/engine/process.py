@@ -1,7 +1,7 @@
 """The engine process: the cycles of all stations of an appliance, and nothing beside them.
 
-It is started by the supervisor with one argument, the descriptor of its handover, and says that it
-is ready when its stations have run a cycle.  From then on it does not log and waits for nobody.
+The supervisor starts it with the descriptor of its handover.  It reports that it runs when its
+stations have run a cycle.  From then on it does not log and waits for nobody.
 Its cycles make nothing that the garbage collector would look for; what requests to buses leave
 behind when they fail is collected between them.
 """
@@ -18,8 +18,9 @@ from time import monotonic_ns
 
 from eap.appliance.engine.arrivals import Arrivals
 from eap.appliance.engine.build import EnginePlant
-from eap.appliance.handover import EngineOptions, Handover, tell_ready
+from eap.appliance.handover import EngineOptions, Handover
 from eap.appliance.passing import take_connection
+from eap.appliance.startup import Startup
 from eap.errors import ConfigError, EapError, EnvironmentalError
 from eap.net import realtime
 from eap.net.ticker import Ticker
@@ -73,17 +74,19 @@ def run_cycles(
         ticker.close()
 
 
-def run_engine(handover: Handover) -> None:
-    """Build all stations, say that they run, and run them until SIGTERM."""
+def run_engine(handover: Handover, startup: Startup) -> None:
+    """Build all stations, report that they run, and run them until SIGTERM."""
     stop = StopFlag()
     link = socket.socket(fileno=handover.link_fd)
-    plant = EnginePlant(handover)
+    plant = EnginePlant(handover, step=startup.step)
     try:
+        startup.step("locking memory, setting the scheduler")
         report = _prepare(handover.options)
+        startup.step("starting the stations")
         plant.start(monotonic_ns())
+        startup.step("running the first cycle")
         # A program that attaches behind the ready line finds values of a cycle, not an empty image.
-        tell = partial(tell_ready, handover.ready_fd, {"realtime": report})
-        run_cycles(plant, link, stop, tell)
+        run_cycles(plant, link, stop, partial(startup.finish, {"realtime": report}))
         plant.stop()
     finally:
         plant.close()
@@ -100,17 +103,13 @@ def _prepare(options: EngineOptions) -> realtime.Report:
     return {"scheduler": "other: not asked for"}
 
 
-def main() -> int:
+def main(handover_fd: int, startup: Startup) -> int:
     """Return the exit code: 2 for what this machine or the specification lacks."""
-    handover = Handover.from_descriptor(int(sys.argv[1]))
+    handover = Handover.from_descriptor(handover_fd)
     realtime.die_with_parent(handover.supervisor)
     try:
-        run_engine(handover)
+        run_engine(handover, startup)
     except EapError as exc:
         sys.stderr.write(f"engine: {exc}\n")
         return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

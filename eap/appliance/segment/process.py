@@ -24,8 +24,9 @@ from devicebus.sim.command import obey
 from devicebus.sim.fault import FaultySegment
 from devicebus.sim.wiring import Side
 from eap.appliance.busfile import Bus, load_or_raise
-from eap.appliance.handover import SegmentHandover, tell_ready
+from eap.appliance.handover import SegmentHandover
 from eap.appliance.signals import catch_end_signals
+from eap.appliance.startup import Startup
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.net import realtime
@@ -129,13 +130,15 @@ def run(
         _Loop(segment, sockets, commands).run(end_fd)
 
 
-def run_for_appliance(handover: SegmentHandover) -> None:
+def run_for_appliance(handover: SegmentHandover, startup: Startup) -> None:
     """Answer the engine at the other end of a pair until SIGTERM.
 
     Raises:
         ConfigError: the bus file is none; one line a finding.
     """
+    startup.step("reading the bus file")
     bus = load_or_raise(Path(handover.file))
+    startup.step("building the slaves")
     segment = bus.build()
     with catch_end_signals() as end_fd, ExitStack() as stack:
         frames = SegmentSocket(socket.socket(fileno=handover.frames_fd))
@@ -145,7 +148,7 @@ def run_for_appliance(handover: SegmentHandover) -> None:
             continue  # sent while nobody was here, and awaited no longer
         gc.collect()
         gc.freeze()
-        tell_ready(handover.ready_fd, {"slaves": len(bus.spec.slaves)})
+        startup.finish({"slaves": len(bus.spec.slaves)})
         _Loop(segment, {Side.PRIMARY: frames}, CommandMessages(commands)).run(end_fd)
 
 
@@ -213,17 +216,13 @@ class _Loop:
         return outcome
 
 
-def main() -> int:
+def main(handover_fd: int, startup: Startup) -> int:
     """Return the exit code: 2 for a bus file that is none."""
-    handover = SegmentHandover.from_descriptor(int(sys.argv[1]))
+    handover = SegmentHandover.from_descriptor(handover_fd)
     realtime.die_with_parent(handover.supervisor)
     try:
-        run_for_appliance(handover)
+        run_for_appliance(handover, startup)
     except ConfigError as exc:
         sys.stderr.write(f"segment: {exc}\n")
         return 2
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -20,6 +20,7 @@ from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routes.station_routing import StationRouting
 from eap.appliance.services.routing.planned import access_of, make_router
 from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.startup import Step, no_step
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
 from eap.device.eap_content import Identity
@@ -42,6 +43,7 @@ class Devices:
         engine: Who runs the stations.
         release: Of this software.
         routing: What the routers of the stations are told; nothing for one that is not there.
+        step: Is told which station is built next.
 
     Attributes:
         by_station: The devices.
@@ -59,6 +61,8 @@ class Devices:
         engine: StationEngine,
         release: str,
         routing: Mapping[str, RoutingSpec] = {},
+        *,
+        step: Step = no_step,
     ) -> None:
         store = Store(plant)
         self.by_station: dict[str, StationDevice] = {}
@@ -71,6 +75,7 @@ class Devices:
         self._images = images
         self._has_restarted = asyncio.Event()
         for station in stations:
+            step(f"building station {station.name}")
             state = states.get(station.name, DeviceState.OP)
             keeper = StationKeeper(station, state, store, engine)
             self._add(station, keeper, routing.get(station.name, RoutingSpec()))

@@ -1,7 +1,7 @@
 """The services process: everything of an appliance that may take its time.
 
-It is started by the supervisor with one argument, the descriptor of its handover.  Whatever happens
-here, the engine goes on: the two share images, and pairs of sockets on which it never waits.
+The supervisor starts it with the descriptor of its handover.  Whatever happens here, the engine
+goes on: the two share images, and pairs of sockets on which it never waits.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from contextlib import ExitStack
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from time import monotonic_ns
 from typing import Any
 
 from eap.aoe.directory import Directory
@@ -28,7 +27,6 @@ from eap.appliance.handover import (
     Handover,
     PortName,
     SocketKind,
-    tell_ready,
 )
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.services.audit import Audit
@@ -56,13 +54,13 @@ from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.status import ProcessMeter, appliance_status, take_snapshot
+from eap.appliance.startup import Startup
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.ids import NetId
 from eap.net import realtime
 
-IMAGE_PATIENCE_S = 15.0
 STATUS_PATIENCE_S = 0.3
 """How long ``status`` waits for what the engine says of its buses."""
 RELEASE = version("eap-appliance")
@@ -72,8 +70,9 @@ _IMAGE_PAUSE_S = 0.01
 class Services:
     """The objects of one services process, from its start to its end."""
 
-    def __init__(self, handover: Handover, resources: ExitStack) -> None:
+    def __init__(self, handover: Handover, startup: Startup, resources: ExitStack) -> None:
         self._handover = handover
+        self._startup = startup
         self._resources = resources
         self._folder = ApplianceFolder(Path(handover.folder))
         self._directory = Directory(handover.directory)
@@ -93,6 +92,7 @@ class Services:
         link = EngineLink(socket.socket(fileno=self._handover.bus_fd))
         self._resources.callback(link.close)
         devices = self._devices(images, link)
+        self._startup.step("opening gateways and sockets")
         client = BusClient(link, [bus.owner for bus in self._handover.buses])
         desks = open_desks(self._handover, client, RELEASE)
         gateways = open_gateways(self._handover, client, desks, devices.routers)
@@ -117,20 +117,21 @@ class Services:
             tasks.append(group.create_task(audit.serve()))
             watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
             tasks.append(group.create_task(watch.run()))
-            tell_ready(self._handover.ready_fd, {})
+            self._startup.finish({})
             await self._stopping.wait()
             for task in tasks:
                 task.cancel()
 
     async def _open_image(self, station: str) -> StationImage:
-        """Open one image; at the first start the engine is just making it."""
-        deadline_ns = monotonic_ns() + int(IMAGE_PATIENCE_S * 1e9)
+        """Open one image; at the first start the engine is just making it.
+
+        How long that may take is the supervisor's decision, by the progress of both.
+        """
         while True:
             try:
                 image = StationImage(self._folder.image(station))
-            except ImageError:
-                if monotonic_ns() > deadline_ns:
-                    raise
+            except ImageError as exc:
+                self._startup.step(f"waiting for the engine: {exc}", waits_for="engine")
             else:
                 self._resources.callback(image.close)
                 return image
@@ -147,6 +148,7 @@ class Services:
             engine,
             RELEASE,
             handover.routing,
+            step=self._startup.step,
         )
         link.on_restart.append(devices.engine_has_restarted)
         gc.freeze()  # what a collection would go through again and again, while clients wait
@@ -235,23 +237,19 @@ class Services:
         return Buses(handover.stations, client if handover.buses else None, segments)
 
 
-def main() -> int:
+def main(handover_fd: int, startup: Startup) -> int:
     """Return the exit code: 2 for what this machine or the specification lacks."""
-    handover = Handover.from_descriptor(int(sys.argv[1]))
+    handover = Handover.from_descriptor(handover_fd)
     realtime.die_with_parent(handover.supervisor)
     logging.basicConfig(format="services: %(message)s", level=logging.INFO)
     try:
         with ExitStack() as resources:
-            asyncio.run(_serve(handover, resources))
+            asyncio.run(_serve(handover, startup, resources))
     except EapError as exc:
         sys.stderr.write(f"services: {exc}\n")
         return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
     return 0
 
 
-async def _serve(handover: Handover, resources: ExitStack) -> None:
-    await Services(handover, resources).run()
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+async def _serve(handover: Handover, startup: Startup, resources: ExitStack) -> None:
+    await Services(handover, startup, resources).run()

@@ -149,4 +149,5 @@ def link_state(interface: str) -> str:
 
 def _process(process: ProcessInfo, meter: ProcessMeter, now_ns: int) -> dict[str, Any]:
     measured = meter.measure(process.pid, now_ns) if process.pid else {"cpu": None, "rss": None}
-    return {"pid": process.pid or None, **measured, "restarts": process.restarts}
+    document = {"pid": process.pid or None, **measured, "restarts": process.restarts}
+    return document | {"step": process.step} if process.step else document

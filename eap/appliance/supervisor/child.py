@@ -15,8 +15,10 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.handover import Handover, SegmentHandover, decode_report
+from eap.appliance.handover import Handover, SegmentHandover
+from eap.appliance.startup import Report
 from eap.appliance.supervisor.output import STDERR
+from eap.appliance.supervisor.progress import StartWatch
 
 FIRST_BACKOFF_NS = 100_000_000
 LONGEST_BACKOFF_NS = 5_000_000_000
@@ -24,6 +26,7 @@ HEALTHY_AFTER_NS = 1_000_000_000
 """A process that lived this long is started again at once."""
 
 _LAST_LINES = 12
+_LAUNCHER = "eap.appliance.startup"
 
 
 class RestartPolicy:
@@ -51,13 +54,15 @@ class Child:
         self.report: dict[str, Any] = {}
         self.started_ns = 0
         self.pid_fd = -1
-        self.ready_fd = -1
+        self.report_fd = -1
         self.error_fd = -1
         self.policy = RestartPolicy()
+        self.watch = StartWatch()
         self._module = module
         self._process: subprocess.Popen[bytes] | None = None
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
         self._partial = b""
+        self._partial_report = b""
 
     @property
     def pid(self) -> int:
@@ -68,39 +73,48 @@ class Child:
         self, handover: Handover | SegmentHandover, descriptors: Iterable[int], now_ns: int
     ) -> None:
         """Start the process; *descriptors* are those that *handover* speaks of."""
-        self.ready_fd, ready_end = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        self.report_fd, report_end = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self.error_fd, error_end = os.pipe2(os.O_CLOEXEC)
         os.set_blocking(self.error_fd, False)
-        described = msgspec.structs.replace(handover, ready_fd=ready_end).to_descriptor()
+        described = handover.to_descriptor()
+        # A SIGINT before the child can take one would end it with a traceback: it waits.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process = subprocess.Popen(  # noqa: S603  our own module
-                [sys.executable, "-m", self._module, str(described)],
+                [sys.executable, "-m", _LAUNCHER, self._module, str(described), str(report_end)],
                 stdin=subprocess.DEVNULL,
                 stdout=error_end,
                 stderr=error_end,
-                pass_fds=(described, ready_end, *descriptors),
+                pass_fds=(described, report_end, *descriptors),
                 process_group=0,  # a terminal's Ctrl-C reaches the supervisor alone
             )
         finally:
-            for fd in (described, ready_end, error_end):
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            for fd in (described, report_end, error_end):
                 os.close(fd)
         self.pid_fd = os.pidfd_open(self._process.pid)
         self.started_ns = now_ns
+        self.watch.begin(now_ns)
         self.is_ready = False
         self._last_lines.clear()
+        self._partial_report = b""
 
-    def take_readiness(self) -> bool:
-        """Read from *ready_fd*; return whether the process has said that it runs.
+    def take_reports(self) -> list[Report]:
+        """Return what the process reported since the last time.
 
-        The descriptor is closed then, and also if the process died before.
+        *report_fd* is closed when the process runs, and also if it died before.
         """
-        line = os.read(self.ready_fd, 65536)
-        os.close(self.ready_fd)
-        self.ready_fd = -1
-        if line:
-            self.is_ready = True
-            self.report = decode_report(line)
-        return self.is_ready
+        data = os.read(self.report_fd, 65536)
+        *lines, self._partial_report = (self._partial_report + data).split(b"\n")
+        reports = [msgspec.json.decode(line, type=Report) for line in lines]
+        for each in reports:
+            if each.ready is not None:
+                self.is_ready = True
+                self.report = each.ready
+        if self.is_ready or not data:
+            os.close(self.report_fd)
+            self.report_fd = -1
+        return reports
 
     def forward_output(self) -> bool:
         """Pass on what the process wrote; return whether there was anything.
@@ -134,15 +148,16 @@ class Child:
         while self.error_fd >= 0 and self.forward_output():
             pass
         self.close()
+        self.watch.end()
         self._process = None
         return code, self._last_lines[-1] if self._last_lines else "it said nothing"
 
     def close(self) -> None:
         """Close what is left of the descriptors."""
-        for fd in (self.pid_fd, self.ready_fd, self.error_fd):
+        for fd in (self.pid_fd, self.report_fd, self.error_fd):
             if fd >= 0:
                 os.close(fd)
-        self.pid_fd = self.ready_fd = self.error_fd = -1
+        self.pid_fd = self.report_fd = self.error_fd = -1
 
 
 def describe_end(code: int) -> str:

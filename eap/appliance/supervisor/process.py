@@ -11,7 +11,7 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic_ns
@@ -29,6 +29,7 @@ from eap.appliance.store import Store, effective, settle
 from eap.appliance.supervisor.bus_sockets import segments
 from eap.appliance.supervisor.child import Child, describe_end
 from eap.appliance.supervisor.output import OutputHandler
+from eap.appliance.supervisor.progress import StartEvent
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.appliance.supervisor.what_runs import what_runs_now
 from eap.config.load import Plant
@@ -37,7 +38,6 @@ from eap.near import near
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
-READY_TIMEOUT_NS = 20_000_000_000
 GRACE_NS = 1_000_000_000
 """How long a process may take to end when asked; the whole appliance has two seconds."""
 SEGMENT_GRACE_NS = 500_000_000
@@ -167,7 +167,9 @@ class Supervisor:
         *,
         options: EngineOptions,
         first_state: DeviceState = DeviceState.OP,
+        clock: Callable[[], int] = monotonic_ns,
     ) -> None:
+        self._clock = clock
         self._info = info
         self._folder = folder
         self._engine = Child("engine", "eap.appliance.engine.process")
@@ -175,6 +177,7 @@ class Supervisor:
         self._segments: dict[str, Child] = {}
         self._restart_ns: dict[Child, int] = {}
         self._announced = False
+        self._is_info_old = False
         self._exit_code: int | None = None
         common = Handover(
             supervisor=os.getpid(),
@@ -223,24 +226,21 @@ class Supervisor:
         handover, descriptors = self._given[child]
         if isinstance(handover, Handover):
             handover = what_runs_now(handover)
-        child.start(handover, descriptors, monotonic_ns())
+        child.start(handover, descriptors, self._clock())
         self._write_info()
 
     def _timeout_ms(self) -> int:
-        now_ns = monotonic_ns()
+        now_ns = self._clock()
         deadlines = list(self._restart_ns.values())
-        deadlines += [
-            child.started_ns + READY_TIMEOUT_NS
-            for child in self._children
-            if child.pid and not child.is_ready
-        ]
+        timeouts = (child.watch.next_timeout() for child in self._children)
+        deadlines += [each for each in timeouts if each is not None]
         return max(0, -(-(min(deadlines) - now_ns) // 1_000_000)) if deadlines else -1
 
     def _wait(self, wake_fd: int, timeout_ms: int) -> None:
         poll = select.poll()
         poll.register(wake_fd, select.POLLIN)
         for child in self._children:
-            for fd in (child.pid_fd, child.ready_fd, child.error_fd):
+            for fd in (child.pid_fd, child.report_fd, child.error_fd):
                 if fd >= 0:
                     poll.register(fd, select.POLLIN)
         fired = {fd for fd, _ in poll.poll(timeout_ms)}
@@ -251,15 +251,29 @@ class Supervisor:
         for child in self._children:
             if child.error_fd in fired:
                 child.forward_output()
-            if child.ready_fd in fired and child.take_readiness():
-                self._is_ready(child)
+            if child.report_fd in fired:
+                self._follow_start(child)
             if child.pid_fd in fired:
                 self._has_died(child)
 
+    def _follow_start(self, child: Child) -> None:
+        running = {each.name for each in self._children if each.is_ready}
+        reports = child.take_reports()
+        for each in reports:
+            waits_for = "" if each.waits_for in running else each.waits_for
+            child.watch.advance(each.step, self._clock(), waits_for=waits_for)
+        if child.is_ready:
+            self._is_ready(child)
+        elif reports:
+            self._write_info()
+
     def _is_ready(self, child: Child) -> None:
+        child.watch.succeed()
+        for each in self._children:
+            each.watch.release(child.name, self._clock())
         self._write_info()
         if child.restarts:
-            took_ms = (monotonic_ns() - child.started_ns) // 1_000_000
+            took_ms = (self._clock() - child.started_ns) // 1_000_000
             logger.warning("%s runs again (process %d, %d ms)", child.name, child.pid, took_ms)
         if not self._announced and all(child.is_ready for child in self._children):
             self._announced = True
@@ -268,9 +282,9 @@ class Supervisor:
             sys.stdout.flush()
 
     def _has_died(self, child: Child) -> None:
-        lived_ns = monotonic_ns() - child.started_ns
+        lived_ns = self._clock() - child.started_ns
         code, last_line = child.reap()
-        if not self._announced:
+        if not child.watch.has_run and not child.watch.is_stuck:
             if code < 0:
                 logger.error("%s was %s while starting", child.name, describe_end(code))
             self._exit_code = 2 if code == 2 else 1
@@ -286,21 +300,36 @@ class Supervisor:
             delay_ns // 1_000_000,
         )
         if delay_ns:
-            self._restart_ns[child] = monotonic_ns() + delay_ns
+            self._restart_ns[child] = self._clock() + delay_ns
             self._write_info()
         else:
             self._start(child)
 
     def _check_time(self) -> None:
-        now_ns = monotonic_ns()
+        now_ns = self._clock()
         for child, due_ns in list(self._restart_ns.items()):
             if now_ns >= due_ns and self._exit_code is None:
                 self._start(child)
         for child in self._children:
-            if child.pid and not child.is_ready and now_ns > child.started_ns + READY_TIMEOUT_NS:
-                logger.error("%s does not get ready; killing it", child.name)
-                child.ask_to_end(signal.SIGKILL)
-                child.started_ns = now_ns
+            self._check_start(child, now_ns)
+
+    def _check_start(self, child: Child, now_ns: int) -> None:
+        watch = child.watch
+        step, limit_s = watch.step, watch.limit_ns // 1_000_000_000
+        event = watch.handle_timeout(now_ns)
+        if event is StartEvent.SLOW:
+            took_s = watch.took_ns(now_ns) // 1_000_000_000
+            logger.warning("%s has been starting for %d s: %s", child.name, took_s, step)
+        elif event is StartEvent.STUCK:
+            logger.error(
+                "%s is stuck: %s, no progress for %d s; it is killed and started again, with %d s"
+                " for each step",
+                child.name,
+                step,
+                limit_s,
+                watch.limit_ns // 1_000_000_000,
+            )
+            child.ask_to_end(signal.SIGKILL)
 
     def _end_children(self) -> None:
         """End all: segments last, for the engine brings their slaves to rest."""
@@ -310,9 +339,9 @@ class Supervisor:
     def _end(self, children: Collection[Child], grace_ns: int) -> None:
         for child in children:
             child.ask_to_end(signal.SIGTERM)
-        deadline_ns = monotonic_ns() + grace_ns
+        deadline_ns = self._clock() + grace_ns
         while running := [child for child in children if child.pid]:
-            now_ns = monotonic_ns()
+            now_ns = self._clock()
             if now_ns >= deadline_ns:
                 for child in running:
                     logger.warning("%s does not end when asked; killing it", child.name)
@@ -330,7 +359,14 @@ class Supervisor:
         self._info.engine = _process_info(self._engine)
         self._info.services = _process_info(self._services)
         self._info.segments = {name: _process_info(child) for name, child in self._segments.items()}
-        self._folder.write_info(self._info)
+        try:
+            self._folder.write_info(self._info)
+        except OSError as exc:  # a full disk: what commands find in it is older than it should be
+            if not self._is_info_old:
+                logger.warning("%s cannot be written: %s", self._folder.path, exc.strerror)
+            self._is_info_old = True
+        else:
+            self._is_info_old = False
 
 
 def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> ApplianceInfo:
@@ -345,7 +381,7 @@ def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> A
 
 
 def _process_info(child: Child) -> ProcessInfo:
-    return ProcessInfo(child.pid, child.restarts, child.report)
+    return ProcessInfo(child.pid, child.restarts, child.report, child.watch.step)
 
 
 def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:

@@ -13,8 +13,6 @@ from eap.appliance.handover import (
     SegmentHandover,
     SharedSocket,
     SocketKind,
-    decode_report,
-    tell_ready,
 )
 from eap.pd.spec import CounterSource, PortKind, PortSpec, StationSpec, VariableSpec, Writer
 
@@ -49,10 +47,3 @@ def test_a_segment_gets_its_own():
 
 def test_finds_a_port_by_name():
     assert handover().port(PortName("a", "eap0")) == PORT
-
-
-def test_readiness_is_one_line_and_the_end_of_the_pipe():
-    read_end, write_end = os.pipe()
-    tell_ready(write_end, {"realtime": {"scheduler": "fifo 50"}})
-    with os.fdopen(read_end, "rb") as pipe:
-        assert decode_report(pipe.read()) == {"realtime": {"scheduler": "fifo 50"}}

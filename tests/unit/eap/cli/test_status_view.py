@@ -112,6 +112,13 @@ def test_process_that_was_restarted_and_one_that_is_being() -> None:
     assert row_of(text, "services") == "services restarting"
 
 
+def test_process_that_starts_is_shown_with_its_step() -> None:
+    status = document()
+    status["processes"]["engine"]["step"] = "building station mixer"
+    shown = row_of(show(status), "engine")
+    assert shown.endswith("starting: building station mixer")
+
+
 def test_what_the_engine_was_denied() -> None:
     status = document()
     status["processes"]["engine"]["realtime"] = {

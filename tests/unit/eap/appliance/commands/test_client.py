@@ -11,7 +11,7 @@ import pytest
 
 from devicebus.errors import AlStatusError
 from eap.appliance.commands.client import Client, connect, merge_status
-from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
+from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
 from eap.errors import ControlError
 
 pytestmark = pytest.mark.net
@@ -132,6 +132,20 @@ def test_running_appliances_are_chosen_by_plant_and_station(tmp_path):
         assert plants(station="b") == ["demo"]
         with pytest.raises(ControlError, match=r"no station x runs.*demo \(a, b\), line \(c\)"):
             connect(station="x")
+
+
+@pytest.mark.usefixtures("root")
+def test_client_without_an_answer_names_the_processes_that_are_starting():
+    with ApplianceFolder.claim("demo") as demo, listen(demo) as listener:
+        starting = info()
+        starting.engine = ProcessInfo(7, step="building station a")
+        starting.services = ProcessInfo(0, 1)
+        demo.write_info(starting)
+        (client,) = connect()
+        listener.accept()[0].close()
+        with client, pytest.raises(ControlError) as caught:
+            client.request("hello")
+    assert "; engine is starting (building station a); services ended" in str(caught.value)
 
 
 @pytest.mark.usefixtures("root")

@@ -20,6 +20,7 @@ from eap.appliance.engine.process import StopFlag, run_cycles
 from eap.appliance.handover import EngineOptions, Handover
 from eap.net.image_file import open_image
 from eap.pd.words import StationWord
+from tests.support.startup import read_reports
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
@@ -69,16 +70,19 @@ def test_every_cycle_runs_until_the_signal(tmp_path):
     assert min(told[0]) >= 1  # who hears it finds values of a cycle
 
 
+MODULE = "eap.appliance.engine.process"
+
+
 class Engine:
     """The engine as the supervisor starts it."""
 
     def __init__(self, given: Handover) -> None:
         self.link, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.ready, ready_end = os.pipe()
-        given = msgspec.structs.replace(given, link_fd=theirs.fileno(), ready_fd=ready_end)
+        given = msgspec.structs.replace(given, link_fd=theirs.fileno())
         fd = given.to_descriptor()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "eap.appliance.engine.process", str(fd)],
+            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready_end)],
             pass_fds=(fd, ready_end, theirs.fileno()),
             stderr=subprocess.PIPE,
             text=True,
@@ -97,12 +101,16 @@ class Engine:
         os.close(self.ready)
 
 
-def test_it_says_that_it_is_ready_and_ends_when_asked(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_engine_reports_its_start_and_ends_when_asked(tmp_path, number):
     with Engine(handover(tmp_path)) as engine:
-        report = msgspec.json.decode(os.read(engine.ready, 4096))
-        assert report == {"realtime": {"scheduler": "other: not asked for"}}
+        *steps, ready = read_reports(engine.ready)
+        assert [each.step for each in steps][-2:] == [
+            "starting the stations", "running the first cycle"
+        ]  # fmt: skip
+        assert ready.ready == {"realtime": {"scheduler": "other: not asked for"}}
         assert min(cycles(tmp_path)) >= 1
-        engine.process.terminate()
+        engine.process.send_signal(number)
         assert engine.process.communicate(timeout=20)[1] == ""
         assert engine.process.returncode == 0
 
@@ -111,7 +119,7 @@ def test_what_is_missing_is_one_line_and_exit_code_2(tmp_path):
     with Engine(handover(tmp_path / "nowhere")) as engine:
         error = engine.process.communicate(timeout=20)[1]
         assert engine.process.returncode == 2
-        assert os.read(engine.ready, 1) == b""
+        assert not any(each.ready for each in read_reports(engine.ready))
     assert error.startswith("engine: ")
     assert len(error.splitlines()) == 1
 

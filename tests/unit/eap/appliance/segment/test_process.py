@@ -21,6 +21,7 @@ from eap.appliance.handover import SegmentHandover
 from eap.appliance.segment import process as segment_process
 from eap.ids import InterfaceUri
 from tests.support.bus import datagram, generic
+from tests.support.startup import read_reports
 
 pytestmark = pytest.mark.net
 
@@ -147,6 +148,9 @@ def test_late_frame_comes_when_its_time_has_come(master):
     assert run_with(script)[1] == {"ok": True}
 
 
+MODULE = "eap.appliance.segment.process"
+
+
 class Child:
     """The process that the supervisor starts for a simulated bus."""
 
@@ -157,11 +161,11 @@ class Child:
             self.frames.send(frame)
         self.ready, ready = os.pipe()
         given = SegmentHandover(
-            supervisor or os.getpid(), str(file), frames.fileno(), commands.fileno(), ready
+            supervisor or os.getpid(), str(file), frames.fileno(), commands.fileno()
         )
         fd = given.to_descriptor()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "eap.appliance.segment.process", str(fd)],
+            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready)],
             pass_fds=(fd, frames.fileno(), commands.fileno(), ready),
             stderr=subprocess.PIPE,
             text=True,
@@ -199,19 +203,20 @@ def bus_file(tmp_path):
     return file
 
 
-def test_child_answers_what_came_after_its_start_and_ends_when_asked(bus_file):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_child_answers_what_came_after_its_start_and_ends_when_asked(bus_file, number):
     with Child(bus_file, stale=[SCAN] * 20) as child:
-        assert json.loads(os.read(child.ready, 4096)) == {"slaves": 2}
+        assert read_reports(child.ready)[-1].ready == {"slaves": 2}
         assert child.scan() == 2
         assert not select.select([child.frames], [], [], 0.1)[0]
-        child.process.terminate()
+        child.process.send_signal(number)
         assert child.process.communicate(timeout=20)[1] == ""
         assert child.process.returncode == 0
 
 
 def test_child_takes_commands_one_a_message(bus_file):
     with Child(bus_file) as child:
-        os.read(child.ready, 4096)
+        read_reports(child.ready)
         assert child.command(kind="power", slave="b", id=3) == {"ok": True, "id": 3}
         assert child.scan() == 1
         assert child.command(kind="power", slave="b", end=True) == {"ok": True}
@@ -220,7 +225,7 @@ def test_child_takes_commands_one_a_message(bus_file):
 
 def test_child_that_nobody_listens_to_goes_on(bus_file):
     with Child(bus_file) as child:
-        os.read(child.ready, 4096)
+        read_reports(child.ready)
         for _ in range(2000):
             child.commands.send(b"{}")
         assert child.scan() == 2
@@ -231,7 +236,7 @@ def test_child_without_a_bus_file_says_so_in_its_exit_code(bus_file):
     with Child(bus_file) as child:
         error = child.process.communicate(timeout=20)[1]
         assert child.process.returncode == 2
-        assert os.read(child.ready, 1) == b""
+        assert not any(each.ready for each in read_reports(child.ready))
     assert error.startswith("segment: ")
     assert "the bus has no slaves" in error
 

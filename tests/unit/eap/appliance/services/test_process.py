@@ -16,13 +16,17 @@ from eap.appliance.bus_request import Answer, BusReport, Request
 from eap.appliance.commands.client import Client
 from eap.appliance.handover import Handover
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
+from eap.appliance.startup import Report
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EtherCatHeader
 from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec
+from tests.support.startup import read_reports
 
 pytestmark = pytest.mark.net
+
+MODULE = "eap.appliance.services.process"
 
 
 class Services:
@@ -43,14 +47,13 @@ class Services:
             "demo.yaml",
             stations,
             self.sockets.descriptions,
-            ready_fd=ready_end,
             link_fd=self.sockets.services_link,
             control_fd=self.sockets.control,
             buses=self.sockets.buses,
             bus_fd=self.sockets.services_bus,
         ).to_descriptor()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "eap.appliance.services.process", str(fd)],
+            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready_end)],
             pass_fds=(fd, ready_end, *self.sockets.services_descriptors()),
             stderr=subprocess.PIPE,
             text=True,
@@ -74,11 +77,14 @@ class Services:
 
 
 @pytest.mark.usefixtures("files")
-def test_it_answers_counts_and_ends_when_asked(tmp_path, stations):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_it_answers_counts_and_ends_when_asked(tmp_path, stations, number):
     with Services(tmp_path, stations, os.getpid()) as services:
         with services.connect() as client:  # before it runs: the listener is the supervisor's
             assert client.request("hello")["stations"] == ["left", "right"]
-            assert msgspec.json.decode(os.read(services.ready, 100)) == {}
+            *steps, ready = read_reports(services.ready)
+            assert Report("building station right") in steps
+            assert ready == Report(ready={})
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 sender.sendto(EtherCatHeader(6, 0, 5).encode() + bytes(6), ("127.9.2.1", 34980))
             for _ in range(1000):
@@ -87,7 +93,7 @@ def test_it_answers_counts_and_ends_when_asked(tmp_path, stations):
                     break
             assert left["discarded"] == {"mailbox": 1}
             assert right["discarded"] == {}
-        services.process.terminate()
+        services.process.send_signal(number)
         assert services.process.communicate(timeout=20)[1] == ""
         assert services.process.returncode == 0
 
@@ -140,3 +146,14 @@ def test_an_orphan_does_not_start(tmp_path, stations):
     with Services(tmp_path, stations, supervisor=1) as services:
         services.process.communicate(timeout=20)
         assert services.process.returncode == -signal.SIGKILL
+
+
+def test_services_waits_for_images_as_long_as_the_supervisor_lets_it(tmp_path, stations):
+    with Services(tmp_path, stations, os.getpid()) as services:
+        with os.fdopen(os.dup(services.ready)) as reports:
+            steps = (msgspec.json.decode(line, type=Report) for line in reports)
+            waiting = next(each for each in steps if each.waits_for)
+        assert waiting.waits_for == "engine"
+        assert waiting.step.startswith("waiting for the engine: ")
+        services.process.terminate()
+        assert services.process.communicate(timeout=20)[1] == ""

@@ -90,7 +90,7 @@ def test_buses_and_segments(tmp_path):
     bus = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
     station = msgspec.structs.replace(left(), ports=(*left().ports, bus))
     info = ApplianceInfo("demo", "demo.yaml", ["left"], "now", os.getpid())
-    info.segments = {"left/bus0": ProcessInfo(os.getpid(), 3)}
+    info.segments = {"left/bus0": ProcessInfo(os.getpid(), 3, step="building the slaves")}
     report = BusReport(is_up=True, cycles=5, malformed=1, dropped=2)
     with create_image(tmp_path / "left.image", plan_layout(station)) as file:
         documents = [
@@ -107,3 +107,5 @@ def test_buses_and_segments(tmp_path):
     assert "bus" not in silent[1]
     segment = documents[0]["processes"]["segments"]["left/bus0"]
     assert (segment["pid"], segment["restarts"]) == (os.getpid(), 3)
+    assert segment["step"] == "building the slaves"
+    assert "step" not in engines[0]

@@ -17,13 +17,16 @@ from eap.appliance.supervisor.child import Child, RestartPolicy, describe_end
 SECOND_NS = 1_000_000_000
 HANDOVER = Handover(os.getpid(), "/nowhere", "demo", "demo.yaml", (), ())
 READS_ITS_HANDOVER = """\
-import os, sys
-from eap.appliance.handover import Handover, tell_ready
-handover = Handover.from_descriptor(int(sys.argv[1]))
-tell_ready(handover.ready_fd, {"plant": handover.plant})
-print("first line")
-sys.stderr.write("no newline")
-sys.exit(3)
+import sys
+from eap.appliance.handover import Handover
+def main(handover_fd, startup):
+    handover = Handover.from_descriptor(handover_fd)
+    startup.step("reading")
+    startup.step("reading")
+    startup.finish({"plant": handover.plant})
+    print("first line")
+    sys.stderr.write("no newline")
+    return 3
 """
 
 
@@ -66,10 +69,14 @@ def test_from_start_to_end(tmp_path, monkeypatch, capfd):
     assert child.pid == 0
     child.start(HANDOVER, [], monotonic_ns())
     assert child.pid
-    wait(child.ready_fd)
-    assert child.take_readiness()
+    steps = []
+    while not child.is_ready:
+        wait(child.report_fd)
+        steps += [each.step for each in child.take_reports()]
+    assert [steps[0], *steps[-2:]] == ["importing modules", "reading", ""]
+    assert steps.count("reading") == 1
     assert child.report == {"plant": "demo"}
-    assert child.ready_fd == -1
+    assert child.report_fd == -1
     wait(child.pid_fd)
     assert child.reap() == (3, "no newline")
     assert (child.pid, child.pid_fd, child.error_fd) == (0, -1, -1)
@@ -82,8 +89,18 @@ def test_one_that_dies_before_it_is_ready(tmp_path, monkeypatch):
     child.start(HANDOVER, [], monotonic_ns())
     assert not child.forward_output()
     child.ask_to_end(signal.SIGKILL)
-    wait(child.ready_fd)
-    assert not child.take_readiness()
     wait(child.pid_fd)
+    while child.report_fd >= 0:
+        child.take_reports()
+    assert not child.is_ready
     assert child.reap() == (-signal.SIGKILL, "it said nothing")
     child.ask_to_end(signal.SIGTERM)  # nobody is there: nothing happens
+
+
+@pytest.mark.net
+def test_child_that_is_interrupted_while_it_starts_ends_without_a_traceback(tmp_path, monkeypatch):
+    child = make(tmp_path, monkeypatch, READS_ITS_HANDOVER)
+    child.start(HANDOVER, [], monotonic_ns())
+    child.ask_to_end(signal.SIGINT)
+    wait(child.pid_fd)
+    assert child.reap() == (-signal.SIGTERM, "it said nothing")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -90,3 +93,38 @@ def test_a_segment_that_cannot_start_ends_all_with_its_exit_code(tmp_path, stati
     assert out == ""
     assert "segment: " in err
     assert "the bus has no slaves" in err
+
+
+def end_when_all_run(folder: ApplianceFolder) -> None:
+    """Ask this process to end as soon as engine and services run."""
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s:
+        time.sleep(0.02)
+        processes = (folder.read_info().engine, folder.read_info().services)
+        if all(each.pid and not each.step for each in processes):
+            break
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.net
+def test_supervisor_gives_children_that_got_stuck_more_time_and_never_gives_up(
+    stations, caplog, capfd
+):
+    options = EngineOptions(realtime=False)
+    info = make_info("demo", "demo.yaml", stations)
+    with (
+        ApplianceFolder.claim("demo") as folder,
+        SharedSockets(stations, folder.control_socket) as sockets,
+        ThreadPoolExecutor(1) as other,
+    ):
+        supervisor = Supervisor(
+            info, Plant("x", stations), folder, sockets, options=options,
+            clock=lambda: time.monotonic_ns() * 400,  # no Python starts in 50 ms, which are 20 s
+        )  # fmt: skip
+        folder.write_info(info)
+        other.submit(end_when_all_run, folder)
+        assert supervisor.run() == 0
+    assert '"ready":true' in capfd.readouterr().out
+    stuck = [line for line in caplog.messages if " is stuck: " in line]
+    wanted = "no progress for 20 s; it is killed and started again, with 40 s for each step"
+    assert stuck[0].endswith(wanted)

@@ -1,0 +1,110 @@
+"""Start-up of a child process: its entry point, and the steps that it reports to the supervisor.
+
+The supervisor runs ``python -m eap.appliance.startup MODULE HANDOVER_FD REPORT_FD``.  This module
+imports next to nothing, so that the first report comes before the imports of the process.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from time import monotonic
+from types import FrameType
+from typing import Any, TypeAlias
+
+import msgspec
+
+Step: TypeAlias = Callable[[str], None]
+"""Reports the beginning of a step."""
+
+_IMPORT_PERIOD_S = 0.5
+"""How often a process that imports says that it goes on."""
+
+
+class Report(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One line of a process to its supervisor: a step that begins, or that it runs."""
+
+    step: str = ""
+    waits_for: str = ""
+    """Process without which this step cannot end."""
+    ready: dict[str, Any] | None = None
+    """What ``status`` says of the process, when it runs."""
+
+
+class Startup:
+    """Start-up of this process, as the supervisor follows it.
+
+    Args:
+        fd: Where reports go, one JSON object a line; closed when the process runs.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._last = Report()
+
+    def step(self, text: str, *, waits_for: str = "") -> None:
+        """Report the beginning of a step; *waits_for* names the process that has to come first."""
+        report = Report(step=text, waits_for=waits_for)
+        if report == self._last:
+            return
+        self._last = report
+        with suppress(OSError):  # a supervisor that does not read, or has gone, stops no start
+            self._write(report)
+
+    def finish(self, report: dict[str, Any]) -> None:
+        """Report that this process runs, with a *report* for ``status``."""
+        self._write(Report(ready=report))
+        os.close(self._fd)
+
+    def _write(self, report: Report) -> None:
+        os.write(self._fd, msgspec.json.encode(report) + b"\n")
+
+
+def no_step(text: str) -> None:
+    """Report nothing: for those who build the objects of a process outside one."""
+
+
+class _ImportProgress:
+    """Finder of modules that finds none, and reports that imports go on."""
+
+    def __init__(self, startup: Startup) -> None:
+        self._startup = startup
+        self._count = 0
+        self._report_at_s = monotonic() + _IMPORT_PERIOD_S
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        """Count a module, as the import system asks for it."""
+        self._count += 1
+        if monotonic() >= self._report_at_s:
+            self._report_at_s = monotonic() + _IMPORT_PERIOD_S
+            self._startup.step(f"importing modules, {self._count} so far")
+
+
+def _interrupted(number: int, frame: FrameType | None) -> None:
+    """Take SIGINT for SIGTERM: the process ends as it does when it is asked to."""
+    signal.raise_signal(signal.SIGTERM)
+
+
+def main(arguments: list[str]) -> int:
+    """Run ``main`` of a module, with its handover and its start-up; return its exit code."""
+    module, handover, report = arguments
+    signal.signal(signal.SIGINT, _interrupted)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    startup = Startup(int(report))
+    startup.step("importing modules")
+    progress = _ImportProgress(startup)
+    sys.meta_path.insert(0, progress)
+    try:
+        run = importlib.import_module(module).main
+    finally:
+        sys.meta_path.remove(progress)
+    code: int = run(int(handover), startup)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
