@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eap.aoe.report import RouteReport, RouteState
+from eap.aoe.report import Obstacle, RouteReport, RouteState
 from eap.aoe.spec import DoorKind
 from eap.codec.ads import AdsError
 from eap.ids import NetId
@@ -19,6 +19,7 @@ _UNREACHED: dict[str, str] = {
     DoorKind.MQTT: "see whether both stations are connected to the broker, under the same network",
 }
 """What to do about a hop that is down, by the kind of the door."""
+_CLIENT = "nothing is wrong if it only asks; to be asked, it has to listen there"
 
 
 class Advice(NamedTuple):
@@ -59,11 +60,12 @@ def advise(
 
 def _behind(error: int, words: str, target: NetId, report: RouteReport, own: NetId) -> Advice:
     """Say what is wrong with a route, or behind it."""
-    name, hop = report.route.name, report.route.hop
-    where = f"{name} ({hop})"
-    if report.state is RouteState.DOWN:
-        hint = _UNREACHED.get(hop.kind, "")
-        return Advice(is_reached=False, text=f"{where} is down: {report.why}", hint=hint)
+    hop = report.route.hop
+    where = f"{report.next_name} ({hop})"
+    if report.state in {RouteState.DOWN, RouteState.CLIENT}:
+        hint = _CLIENT if report.state is RouteState.CLIENT else _UNREACHED.get(hop.kind, "")
+        obstacle = Obstacle(report.state, report.why)
+        return Advice(is_reached=False, text=f"{where} {obstacle}", hint=hint)
     if error == AdsError.TIMEOUT:
         hint = (
             f"it may be overloaded, or answer only whom it has a route to, as TwinCAT does: there,"

@@ -40,6 +40,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         route: Name of the route that it has; empty if none.
         next_net_id: NetID of the router at the other end of it, as this one knows it; empty if it
             does not know that.
+        next_name: Name of that router, as this one knows it.
         door: By which packets leave.
         address: That they go to.
         target: NetID of the target over there.
@@ -54,6 +55,7 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     is_here: bool = False
     route: str = ""
     next_net_id: str = ""
+    next_name: str = ""
     door: str = ""
     address: str = ""
     target: str = ""
@@ -77,6 +79,7 @@ def report_of(station: str, net_id: NetId, target: NetId, location: Location) ->
         report,
         route=route.name,
         next_net_id="" if next_router is None else str(next_router),
+        next_name=found.next_name,
         door=route.hop.door,
         address=route.hop.connection,
         target=str(route.to_real(target)),
@@ -106,6 +109,7 @@ def decode_report(data: bytes) -> HopReport:
 
 def _require_printable(report: HopReport) -> None:
     """Raise ValueError for a text that would do something to a terminal."""
-    for text in (report.station, report.route, report.door, report.address, report.why):
+    texts = (report.station, report.route, report.next_name, report.door, report.address)
+    for text in (*texts, report.why):
         if not text.isprintable():
             raise ValueError(f"{text!r} cannot be printed")

@@ -13,6 +13,7 @@ from eap.aoe.action import Outcome
 from eap.aoe.inflight import InFlight
 from eap.aoe.prober import Prober
 from eap.aoe.refusal import Refusal
+from eap.aoe.report import Obstacle, RouteState
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
 from eap.codec.ads import AdsError
@@ -62,6 +63,8 @@ class Judge:
         self._prober = prober
         self._down: dict[Way, str] = {}
         self._closed: dict[str, str] = {}
+        self._opened: set[str] = set()
+        """Doors by which some hop was reached; a client behind one listens, or did."""
 
     def hop_down(self, door: str, address: str | None, text: str) -> None:
         """Refuse what would go to *address* by *door*, or to any address; *text* says why."""
@@ -72,10 +75,19 @@ class Judge:
 
     def hop_up(self, door: str, address: str | None) -> None:
         """Take back what :meth:`hop_down` was told with the same arguments."""
+        if door in self._doors:
+            self._opened.add(door)
         if address is None:
             self._closed.pop(door, None)
         else:
             self._down.pop(Way(door, address), None)
+
+    def door_removed(self, name: str) -> None:
+        """Forget everything about a door."""
+        self._opened.discard(name)
+        self._closed.pop(name, None)
+        for way in [each for each in self._down if each.door == name]:
+            del self._down[way]
 
     def is_down(self, hop: Way) -> bool:
         """Say whether nothing can go to *hop* now."""
@@ -91,6 +103,16 @@ class Judge:
             return why
         is_dead = self._prober is not None and self._prober.is_dead(hop)
         return "it does not answer" if is_dead else ""
+
+    def find_obstacle(self, route: Route) -> Obstacle | None:
+        """Return why nothing can go by *route* now; None if something can."""
+        why = self.why_down(route.hop)
+        if not why:
+            return None
+        door = route.hop.door
+        if route.is_client and door in self._doors and door not in self._opened:
+            return Obstacle(RouteState.CLIENT, f"not listening: {why}")
+        return Obstacle(RouteState.DOWN, why)
 
     def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
         """Return how a request goes on that is for nobody here."""
@@ -146,6 +168,6 @@ class Judge:
             text = f"route {route.name} leads back to where it came from"
             return Refusal(AdsError.TARGET_MACHINE, text, route, Outcome.LOOP)
         if self.is_down(hop):
-            text = f"{route.name} ({hop}) is down: {self.why_down(hop)}"
+            text = f"{self._table.describe_hop(route)} {self.find_obstacle(route)}"
             return Refusal(AdsError.HOST_UNREACHABLE, text, route)
         return None

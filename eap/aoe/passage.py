@@ -21,6 +21,7 @@ from eap.aoe.passed import Passed
 from eap.aoe.prober import Prober
 from eap.aoe.record import Record, describe
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
+from eap.aoe.report import Obstacle
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Way
 from eap.codec.ads import AdsError
@@ -211,9 +212,13 @@ class Passage:
         """Pass requests on to a hop again."""
         self._judge.hop_up(door, address)
 
-    def why_down(self, hop: Way) -> str:
-        """Return in words why nothing can go to *hop* now; empty if it can."""
-        return self._judge.why_down(hop)
+    def door_removed(self, name: str) -> None:
+        """Forget everything about a door."""
+        self._judge.door_removed(name)
+
+    def find_obstacle(self, route: Route) -> Obstacle | None:
+        """Return why nothing can go by *route* now; None if something can."""
+        return self._judge.find_obstacle(route)
 
     def find_route(self, header: AmsHeader, way: Way) -> Route | Refusal:
         """Return how a request would go on that is for nobody here."""
@@ -312,8 +317,9 @@ class Passage:
             traffic = self._record.routes.of(route.key, now_ns)
             if error_code:
                 error = AdsError.words_of(error_code)
-                text = f"{error} from {route.name} ({hop}) or from behind it"
-                traffic.fail(text)
+                why = f"{error} from {self._table.describe_hop(route)} or from behind it"
+                text = f"{describe(pending.header, way)}: {why}"
+                traffic.fail(why)
             traffic.answer(len(packet), took_ns)
         connection = self._record.connections.of(way, now_ns)
         if error_code:
@@ -328,13 +334,15 @@ class Passage:
         if pending.route is None or pending.came_by is None:
             return []
         route = pending.route
-        why = Refusal(AdsError.HOST_UNREACHABLE, f"{route.name} ({route.hop}): {text}", route)
+        why = Refusal(
+            AdsError.HOST_UNREACHABLE, f"{self._table.describe_hop(route)}: {text}", route
+        )
         return self._refuse(pending, why, now_ns)
 
     def _time_out(self, pending: Pending, now_ns: int) -> list[Action]:
         allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
         route = pending.route
-        who = "its service" if route is None else f"{route.name} ({route.hop})"
+        who = "its service" if route is None else self._table.describe_beyond(route)
         why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route)
         actions = self._refuse(pending, why, now_ns)
         if pending.handles:

@@ -19,13 +19,27 @@ class RouteState(StrEnum):
     DOWN = "down"
     UNKNOWN = "unknown"
     """Nothing speaks against it, and nothing was answered yet."""
+    CLIENT = "client"
+    """A client asked for it by "add route", and does not listen: it has its own connections."""
+
+
+class Obstacle(NamedTuple):
+    """Reason why nothing can go by a route now, and the *state* that this makes of it."""
+
+    state: RouteState
+    why: str
+
+    def __str__(self) -> str:
+        if self.state is RouteState.CLIENT:
+            return f"is a client, {self.why}"
+        return f"is {self.state}: {self.why}"
 
 
 class RouteReport(NamedTuple):
     """One route.
 
     *why* says what is wrong with one that is down.  *round_trip_ns* is that of its next hop, and
-    None while that is not known.
+    None while that is not known.  *next_name* is the name of the router at that hop.
     """
 
     route: Route
@@ -33,6 +47,7 @@ class RouteReport(NamedTuple):
     why: str
     round_trip_ns: int | None
     traffic: Traffic
+    next_name: str
 
 
 class ConnectionReport(NamedTuple):
@@ -56,15 +71,24 @@ class Location(NamedTuple):
 
 
 def report_route(
-    route: Route, why_down: str, traffic: Traffic | None, prober: Prober | None
-) -> RouteReport:
-    """Return what is known of a route; *why_down* is empty unless nothing can go there."""
+    route: Route, obstacle: Obstacle | None, traffic: Traffic | None, prober: Prober | None, *,
+    next_name: str,
+) -> RouteReport:  # fmt: skip
+    """Return what is known of a route.
+
+    Args:
+        route: The route.
+        obstacle: Reason why nothing can go there; None if something can.
+        traffic: By the route so far; None for none.
+        prober: Of its router, if that has one.
+        next_name: Name of the router at the next hop.
+    """
     known = traffic or Traffic()
     round_trip_ns = None if prober is None else prober.round_trip_ns(route.hop)
-    if why_down:
-        return RouteReport(route, RouteState.DOWN, why_down, None, known)
+    if obstacle is not None:
+        return RouteReport(route, obstacle.state, obstacle.why, None, known, next_name)
     if round_trip_ns is None and known.answers:
         round_trip_ns = known.round_trip_ns
     is_up = known.is_answered or (prober is not None and prober.is_heard(route.hop))
     state = RouteState.UP if is_up else RouteState.UNKNOWN
-    return RouteReport(route, state, "", round_trip_ns, known)
+    return RouteReport(route, state, "", round_trip_ns, known, next_name)

@@ -101,6 +101,7 @@ class Router:
         for way in self._passage.ways_of(name):
             actions += self.connection_closed(*way, now_ns)
         actions += self._passage.hop_lost(name, None, f"{name} is there no more", now_ns)
+        self._passage.door_removed(name)
         self._outlet.remove(name)
         return actions
 
@@ -234,7 +235,9 @@ class Router:
     def report(self, route: Route) -> RouteReport:
         """Return what is known of one of the routes."""
         traffic = self.record.routes.get(route.key)
-        return report_route(route, self._passage.why_down(route.hop), traffic, self._prober)
+        obstacle = self._passage.find_obstacle(route)
+        name = self._table.next_name(route)
+        return report_route(route, obstacle, traffic, self._prober, next_name=name)
 
     def locate(self, header: AmsHeader, way: Way) -> Location:
         """Say where a request would go that came by *way*."""

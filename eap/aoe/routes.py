@@ -59,6 +59,8 @@ class Route(msgspec.Struct, frozen=True):
             only whom it has a route to, it would be taken for dead.
         router: NetID of the router at the hop; None if that is not known, and the station itself
             is asked instead.
+        is_client: Whether its own end asked for it by "add route": it may be a client, which has
+            connections of its own and does not listen.
 
     Raises:
         ValueError: a number of octets that cannot be, or a virtual NetID of a default route.
@@ -75,6 +77,7 @@ class Route(msgspec.Struct, frozen=True):
     timeout_ns: int = 0
     is_probed: bool = True
     router: NetId | None = None
+    is_client: bool = False
 
     def __post_init__(self) -> None:
         if self.octets not in _LEVELS:
@@ -207,6 +210,29 @@ class RouteTable:
                     return route, level
                 learned = learned or (route, level)
         return learned
+
+    def next_name(self, route: Route) -> str:
+        """Return the name of the router at the next hop of *route*.
+
+        That of the route itself, unless another router is at the hop: then that of a route to it
+        by the same hop, else its NetID.
+        """
+        router = route.next_router
+        if router is None or router.station == route.to_real(route.net_id).station:
+            return route.name
+        found = self.find(router)
+        if found is None or not found[1] or found[0].hop != route.hop:
+            return str(router)
+        return found[0].name
+
+    def describe_hop(self, route: Route) -> str:
+        """Return the next hop of *route* in words: the router there, address and door."""
+        return f"{self.next_name(route)} ({route.hop})"
+
+    def describe_beyond(self, route: Route) -> str:
+        """Return in words which routers a failed request by *route* may have failed at."""
+        hop = self.describe_hop(route)
+        return hop if self.next_name(route) == route.name else f"{hop} or from behind it"
 
     def to_virtual(self, source: NetId, hop: Way) -> NetId:
         """Return the NetID by which *source*, met at *hop*, is known here."""

@@ -70,6 +70,8 @@ class RouteSpec(Record, frozen=True, kw_only=True):
         timeout_ms: How long an answer may take; 0 for as long as usual.
         is_probed: Whether the next hop is asked from time to time whether it is alive.
         is_derived: Whether it follows from the ports of the plant, and nobody wrote it.
+        is_client: Whether its own end asked for it by "add route" (UDP 48899): it may be a client,
+            which has connections of its own and does not listen.
     """
 
     name: str
@@ -82,6 +84,7 @@ class RouteSpec(Record, frozen=True, kw_only=True):
     timeout_ms: int = 0
     is_probed: bool = True
     is_derived: bool = False
+    is_client: bool = False
 
 
 class AccessService(StrEnum):

@@ -22,7 +22,7 @@ MAX_TEXT = 255
 
 Text: TypeAlias = Annotated[str, Meta(max_length=MAX_TEXT)]
 OriginName: TypeAlias = Literal["static", "derived", "added", "learned"]
-StateName: TypeAlias = Literal["up", "down", "unknown"]
+StateName: TypeAlias = Literal["up", "down", "unknown", "client"]
 
 
 class RoutesListParameters(Parameters, frozen=True, kw_only=True):
@@ -167,6 +167,7 @@ class RouteRow(WayRow, frozen=True, kw_only=True):
         origin: Who says so: the plant file, its ports, somebody at run time, the station itself.
         state: Whether a request would go on.
         why: What is wrong with one that is down.
+        next_name: Name of the router at the next hop.
         rtt_us: Round trip to the next hop; None while it is not known.
         expires_s: In how many seconds it is forgotten; None for never.
         real: The NetID that the station itself has, where *net_id* is a virtual one; else empty.
@@ -181,6 +182,7 @@ class RouteRow(WayRow, frozen=True, kw_only=True):
     origin: OriginName
     state: StateName
     why: str = ""
+    next_name: str = ""
     rtt_us: int | None = None
     expires_s: int | None = None
     real: str = ""

@@ -65,6 +65,8 @@ def route_kind(row: RouteRow) -> str:
 def route_state(row: RouteRow) -> str:
     """Return the state of a route, and why, or how long its next hop takes."""
     rest = row.why or (f"round trip {round_trip(row.rtt_us)}" if row.rtt_us is not None else "")
+    if row.why and row.next_name not in {"", row.name}:
+        rest = f"{row.next_name}: {row.why}"
     if row.state == "unknown" and not rest:
         rest = "nothing was answered yet"
     return f"{row.state}: {rest}" if rest else row.state

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from rich.console import RenderableType
 from rich.text import Text
 
-from eap.appliance.control_routes import ImportRow, NeighbourRow, RouterRow, TestResult
+from eap.appliance.control_routes import ImportRow, NeighbourRow, RouteRow, RouterRow, TestResult
 from eap.cli import routes_text
 from eap.cli.table import Column, TextTable
 
-_STYLES = {"up": "green", "down": "bold red", "unknown": "dim"}
+_STYLES = {"up": "green", "down": "bold red", "unknown": "dim", "client": "dim"}
 
 
 def routes_tables(stations: Sequence[RouterRow]) -> Iterator[RenderableType]:
@@ -122,11 +122,23 @@ def _connections(stations: Sequence[RouterRow]) -> RenderableType:
 
 def _remarks(station: RouterRow) -> Iterator[str]:
     yield from station.warnings
+    yield from _dead_hops(station.routes)
     for row in station.routes:
-        if row.why:
-            yield f"{row.name} ({routes_text.way(row)}) is down: {row.why}"
         if row.last_error:
             yield f"{row.name}, last error: {row.last_error}"
     for connection in station.connections:
         if connection.last_error:
             yield f"{routes_text.way(connection)}, last error: {connection.last_error}"
+
+
+def _dead_hops(routes: Sequence[RouteRow]) -> Iterator[str]:
+    """Yield one remark for each next hop that is down, whatever number of routes lead by it."""
+    by_hop: dict[tuple[str, str], list[RouteRow]] = {}
+    for row in routes:
+        if row.state == "down":
+            by_hop.setdefault((row.door, row.address), []).append(row)
+    for first, *others in by_hop.values():
+        name = first.next_name or first.name
+        beyond = dict.fromkeys(row.name for row in (first, *others) if row.name != name)
+        text = f"; so are the routes by it: {', '.join(beyond)}" if beyond else ""
+        yield f"{name} ({routes_text.way(first)}) is down: {first.why}{text}"

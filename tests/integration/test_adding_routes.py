@@ -56,6 +56,11 @@ def added(appliance: Appliance, station: str) -> list[str]:
     return [route["name"] for route in row["routes"] if route["origin"] == "added"]
 
 
+def state(appliance: Appliance, station: str, name: str) -> str:
+    (row,) = appliance.request("routes_list", station=station, match=name)
+    return str(row["routes"][0]["state"])
+
+
 def test_pyads_adds_a_route_that_is_there_after_a_new_start(appliance, farm):
     pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 
@@ -71,6 +76,12 @@ def test_pyads_adds_a_route_that_is_there_after_a_new_start(appliance, farm):
         add(CLOSED, "guessed", "other")
     assert r"\x04\x07\x00\x00" in str(refused.value)  # which pyads 3.6 looks for one octet off
     assert [added(appliance, name) for name in ("open", "closed")] == [["tool"], ["tool"]]
+    wait_until(lambda: state(appliance, "open", "tool") == "client")  # which listens nowhere
+    tested = run_eapctl(appliance.runtime, "routes", "test")
+    assert "is a client, not listening" in " ".join(tested.stdout.split())
+    assert tested.returncode == 0
+    with socket.create_server(("127.0.0.1", 48898)):
+        wait_until(lambda: state(appliance, "open", "tool") != "client")
     appliance.command("routes", "remove", "open", "tool")
     appliance.stop()
     wait_until(lambda: all(map(is_free, (OPEN, CLOSED))))

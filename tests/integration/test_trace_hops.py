@@ -59,7 +59,18 @@ def test_every_hop_is_named_and_the_one_that_fails(line: Row) -> None:
     assert found["why"].startswith(gone)
 
     line.places[1].ip("link", "set", "west0", "down")
-    wait_until(lambda: trace(line)[1]["why"].startswith(("a: ", "b: it does not answer a")))
+    wait_until(lambda: trace(line)[1]["why"].startswith("a: b ("))  # and not c, dead as well
+    runtime = line.appliances["a"].runtime
+    tested = run_eapctl(runtime, "routes", "test", "a", "c", "--json")
+    assert json.loads(tested.stdout)["text"].startswith("b (")
+    read = run_eapctl(runtime, "od", "read", SLAVE, "1018:01")
+    assert f"{SLAVE}: " in read.stderr
+    assert ": a: b (" in read.stderr
+    stations = json.loads(run_eapctl(runtime, "scan", "--json").stdout)["stations"]
+    assert [each["error"][:6] for each in stations] == ["", "a: b (", "a: b ("]
+    log = line.appliances["a"].stop()[2]
+    assert ": b (" in log
+    assert " c (" not in log
 
 
 def test_rules_that_refuse_are_named(line: Row) -> None:

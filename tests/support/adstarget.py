@@ -30,17 +30,20 @@ class AdsTarget:
         al_state: That it is in.
         slow: How often it tells of its old state before it is in a new one.
         error: Of the AMS header, in place of any answer.
+        why: Result of a trace: the router at which the way to the device ends.
     """
 
     def __init__(self, dictionary: ObjectDictionary, stack: ExitStack) -> None:
         self.al_state = 2
         self.slow = 0
         self.error = 0
+        self.why = ""
         self._wanted = 2
         info = AdsDeviceInfo(1, 0, 0, device_name("far"))
         space = ObjectSpace(dictionary, lambda: OdState.PREOP)
         self._device = AdsDevice(info, self._states, [space], control=self._take)
-        self.stub = ControlStub("line", ["near"], {"ams_ask": self._ask}, stack)
+        methods = {"ams_ask": self._ask, "trace": lambda params: {"why": self.why}}
+        self.stub = ControlStub("line", ["near"], methods, stack)
 
     def _ask(self, params: dict[str, Any]) -> dict[str, Any]:
         if params["target"] != TARGET:

@@ -35,6 +35,10 @@ PRESS = RouteRow(
     origin="added", state="down", why="connection refused", requests=3, errors=3,
     last_error="press (192.168.1.5:48898 by ams-tcp): connection refused",
 )  # fmt: skip
+CLIENT = RouteRow(
+    name="laptop", net_id="192.168.1.9.1.1", octets=4, door="ams-tcp", address="192.168.1.9:48898",
+    origin="added", state="client", why="not listening: connection refused", probed=False,
+)  # fmt: skip
 TOOL = ConnectionRow(
     door="ams-tcp", address="127.0.0.1:40112#3", since_s=75, net_ids=["127.0.0.1.1.1"],
     requests=15, answers=15, errors=3, octets_out=45_900, octets_in=1_400, took_us=900,
@@ -130,7 +134,7 @@ class FakeRoutes:
         for row in self.stations[wanted.station].routes:
             if wanted.target in {row.name, row.net_id}:
                 target = f"{row.net_id}:10000"
-                if row.state == "down":
+                if row.state in {"down", "client"}:
                     return TestResult(
                         target=target, name=row.name, ok=False, error=0x1B,
                         text=f"down: {row.why}", hint="see whether it is switched on",

@@ -14,6 +14,8 @@ from eap.codec.ads import AdsError
 from eap.errors import ControlError
 
 PATIENCE_S = 10.0
+_ON_THE_WAY = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsError.TIMEOUT))
+"""Errors of routers between here and the device."""
 _WORDS: dict[int, str] = {
     AdsError.ACCESS: "it may not be read or written so",
     AdsError.SIZE: "the wrong number of octets",
@@ -66,10 +68,20 @@ class AmsDevice:
 
     def refusal(self, result: int, what: str) -> AmsRefusedError:
         """Return the error that tells of *result*."""
+        if result in _ON_THE_WAY and (why := self._find_fault()):
+            return AmsRefusedError(f"{self.target}: {what}: {why}", result)
         text = _WORDS.get(result)
         said = f"{text} (error 0x{result:x})" if text else AdsError.words_of(result)
         hint = "" if text else f"; 'eapctl trace {self.target}' shows where"
         return AmsRefusedError(f"{self.target}: {what}: {said}{hint}", result)
+
+    def _find_fault(self) -> str:
+        """Return at which router the way to the device ends, and why; empty if that is unknown."""
+        try:
+            found = self._client.request_within(PATIENCE_S, "trace", target=self.target)
+        except ControlError:
+            return ""
+        return str(found["why"])
 
 
 @contextmanager

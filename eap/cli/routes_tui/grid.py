@@ -9,7 +9,14 @@ from textual.widgets import DataTable
 
 from eap.cli.routes_tui.table import Column, Line, View, cut, fit
 
-STYLES = {"up": "green", "down": "bold red", "unknown": "dim", "bold": "bold", "": ""}
+STYLES = {
+    "up": "green",
+    "down": "bold red",
+    "unknown": "dim",
+    "client": "dim",
+    "bold": "bold",
+    "": "",
+}
 """How texts are coloured, by what they say."""
 
 

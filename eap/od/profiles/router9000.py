@@ -81,7 +81,7 @@ ROUTE = ObjectRange(
         live(5, "Address", NAME, Live.ROUTE_ADDRESS, "Where they go from there."),
         live(6, "Origin", "USINT", Live.ROUTE_ORIGIN, "0 the plant file, 1 added at run time, 2 "
              "learned."),
-        live(7, "State", "USINT", Live.ROUTE_STATE, "0 unknown, 1 up, 2 down."),
+        live(7, "State", "USINT", Live.ROUTE_STATE, "0 unknown, 1 up, 2 down, 3 client."),
         live(8, "Round trip", "UDINT", Live.ROUTE_ROUND_TRIP, "To the next hop and back, at the "
              "last time; 0 unknown.", unit="us"),
         live(9, "Requests", "ULINT", Live.ROUTE_REQUESTS, "That went there."),

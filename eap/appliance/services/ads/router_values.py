@@ -120,7 +120,12 @@ _FIGURES: dict[Live, Callable[[Stats], int]] = {
     Live.ROUTES: lambda stats: stats.routes,
     Live.SUBSCRIPTIONS: lambda stats: stats.subscriptions,
 }
-_STATES = {RouteState.UNKNOWN: 0, RouteState.UP: 1, RouteState.DOWN: 2}
+_STATES = {
+    RouteState.UNKNOWN: 0,
+    RouteState.UP: 1,
+    RouteState.DOWN: 2,
+    RouteState.CLIENT: 3,
+}
 _OF_ROUTE: dict[Live, Callable[[Route], Any]] = {
     Live.ROUTE_NET_ID: lambda route: route.net_id,
     Live.ROUTE_OCTETS: lambda route: route.octets,

@@ -76,6 +76,7 @@ class AmsUplink:
         claims: Peers that the station is connected with, by address and port: all its uplinks share
             it.
         refuse: Counts what is not taken.
+        may_be_client: Says whether the peer may be a client that does not listen.
     """
 
     def __init__(
@@ -88,9 +89,12 @@ class AmsUplink:
         sources: Collection[str],
         claims: dict[tuple[str, int], AmsUplink],
         refuse: Callable[[Refusal], None],
+        may_be_client: Callable[[], bool] = bool,
         patience_s: float = PATIENCE_S,
     ) -> None:
         self.peer = peer
+        self._may_be_client = may_be_client
+        self._was_open = False
         self.refuse = refuse
         self._way = door, address
         self._router = router
@@ -115,7 +119,11 @@ class AmsUplink:
             self._router.hop_down(*self._way, why)
             if why != self._said:  # it is tried again and again
                 self._said = why
-                logger.warning("%s: %s", self._router.name, why)
+                if self._may_be_client() and not self._was_open:
+                    text = "%s: %s; a client added the route to it, and does not listen"
+                    logger.info(text, self._router.name, why)
+                else:
+                    logger.warning("%s: %s", self._router.name, why)
             await asyncio.sleep(backoff.next_s())
 
     def send(self, connection: str, packets: Iterable[bytes]) -> str | None:
@@ -133,6 +141,7 @@ class AmsUplink:
     def connection_opened(self, connection: AmsConnection) -> None:
         """Send what has waited (PacketTaker)."""
         self._connection = connection
+        self._was_open = True
         early, self._early = self._early, None
         self._router.hop_up(*self._way)
         if early:

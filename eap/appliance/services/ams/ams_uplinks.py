@@ -95,6 +95,9 @@ class AmsUplinks:
             sources=self._sources,
             claims=self._claims,
             refuse=self._refuse,
+            may_be_client=lambda: all(
+                route.is_client for route in self._router.table if route.hop == hop
+            ),
         )
         self._router.add_door(Door(hop.door, is_stream=True, is_hub=True), uplink)
         self._start(hop)

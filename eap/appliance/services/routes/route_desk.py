@@ -191,5 +191,6 @@ async def _add(station: StationRoutes, wanted: _Request) -> None:
         hop=hop,
         octets=len(wanted.net_id) if is_here else STATION_OCTETS,
         is_probed=False,  # most tools answer nobody
+        is_client=True,
     )
     await station.add(spec, is_kept=wanted.is_kept)

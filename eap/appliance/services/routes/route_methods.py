@@ -259,6 +259,7 @@ def _removed(spec: RouteSpec) -> RouteRow:
         origin="added",
         state="down",
         why="removed",
+        next_name=spec.name,
         real=spec.net_id if spec.virtual else "",
         unidirectional=spec.is_unidirectional,
         timeout_ms=spec.timeout_ms,

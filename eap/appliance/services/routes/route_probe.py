@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
 from time import monotonic_ns
 
-from eap.aoe.advice import advise
+from eap.aoe.advice import Advice, advise
 from eap.aoe.directory import AmsAddress, Directory
+from eap.aoe.report import RouteReport, RouteState
 from eap.appliance.control import ErrorCode
 from eap.appliance.control_routes import TestResult
+from eap.appliance.services.routes.tracing import find_fault
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ads import AdsState, AdsStates
 from eap.codec.ams import SYSTEM_PORT, AmsCommand
 from eap.errors import CodecError, ControlError
 from eap.ids import NetId
 
+BLAME_S = 3.0
+"""Limit for finding the router at which the way ends."""
+_NO_FURTHER = frozenset((RouteState.DOWN, RouteState.CLIENT))
+"""States of a route whose own next hop is at fault."""
+_TRACE_HINT = "'eapctl trace' shows the routers before it"
 _RESULT_SIZE = 4
 """Octets of an ADS answer before its data."""
 
@@ -46,6 +54,8 @@ async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: flo
     took_us = (monotonic_ns() - began_ns) // 1000
     report = None if route is None else router.report(route)
     advice = advise(answer.error_code, target.net_id, report, router.net_id, is_own=is_own)
+    if not advice.is_reached and report is not None and _leads_further(report):
+        advice = await _blame(router, target, advice)
     state = _state(answer.data) if not answer.error_code else ""
     return TestResult(
         target=str(target),
@@ -57,6 +67,21 @@ async def probe_target(router: StationRouter, target: AmsAddress, timeout_s: flo
         text=f"{advice.text}: {state}" if state else advice.text,
         hint=advice.hint,
     )
+
+
+def _leads_further(report: RouteReport) -> bool:
+    """Say whether a router behind the next hop of a route may be at fault."""
+    return report.next_name != report.route.name and report.state not in _NO_FURTHER
+
+
+async def _blame(router: StationRouter, target: AmsAddress, advice: Advice) -> Advice:
+    """Return *advice* about the router at which the way to *target* ends, if one is found."""
+    try:
+        async with asyncio.timeout(BLAME_S):
+            why = await find_fault(router, *target)
+    except TimeoutError:
+        return advice
+    return Advice(is_reached=False, text=why, hint=_TRACE_HINT) if why else advice
 
 
 def _state(data: bytes) -> str:

@@ -94,6 +94,7 @@ def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow
         origin="derived" if is_derived else _ORIGINS[route.origin],
         state=report.state.value,
         why=report.why,
+        next_name=report.next_name,
         rtt_us=None if trip_ns is None else trip_ns // 1000,
         expires_s=None if end_ns is None else max(0, (end_ns - now_ns) // _S),
         real="" if route.real is None else str(route.real),

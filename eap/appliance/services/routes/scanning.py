@@ -16,7 +16,7 @@ from eap.aoe.ads_operation import OperationOutcome, Read, ReadDeviceInfo
 from eap.aoe.directory import AmsAddress, Directory
 from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryPort, DirectoryStation
-from eap.appliance.services.routes.tracing import Station, ask_one
+from eap.appliance.services.routes.tracing import Station, ask_one, find_fault
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.ids import STATION_OCTETS, NetId
@@ -103,6 +103,7 @@ class _Look:
                 ports = [await self._port(place, number) for place, number in enumerate(numbers)]
         except (_FailedError, TimeoutError) as exc:
             reason = str(exc) or f"not all was said within {STATION_S:g} s"
+            reason = await find_fault(self._asker, self._known.net_id, IO_PORT) or reason
             planned = [_planned_row(port) for port in self._planned.values()]
             return row | {"ports": planned, "error": reason}
         ports.sort(key=lambda port: port["kind"] != "eap")

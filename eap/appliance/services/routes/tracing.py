@@ -173,6 +173,16 @@ async def trace(
     return Traced(tuple(hops), answer, took_ns, why)
 
 
+async def find_fault(station: Station, target: NetId, port: int) -> str:
+    """Return at which router the way to *target* ends, and why; empty if it ends at none.
+
+    For a request that was not answered: the router that refused it may not know which one of those
+    behind it is the cause.
+    """
+    _, why = await _follow(station, target, port, monotonic_ns)
+    return why
+
+
 async def _follow(
     station: Station, target: NetId, port: int, clock: Callable[[], int]
 ) -> tuple[list[Hop], str]:
@@ -186,7 +196,7 @@ async def _follow(
         took_ns = clock() - began_ns
         if report.error:
             why = _explain(report)
-            opaque = HopReport(station=report.route, net_id=report.next_net_id)
+            opaque = HopReport(station=_next_name(report), net_id=report.next_net_id)
             hops.append(Hop(opaque, took_ns, is_opaque=True))
         elif any(report.net_id == each.report.net_id for each in hops):
             why = f"{report.station}: the routes run in a circle, it was on the way already"
@@ -208,7 +218,12 @@ def _explain(report: HopReport) -> str:
     if report.error in _NO_ANSWER:
         where = f"{report.address} by {report.door}"
         text = AdsError.words_of(report.error)
-        return f"{report.route}: it does not answer {report.station} at {where}: {text}"
+        return f"{_next_name(report)}: it does not answer {report.station} at {where}: {text}"
     if report.error == AdsError.ACCESS_DENIED:
-        return f"{report.route}: its access rules let {report.station} ask nothing"
+        return f"{_next_name(report)}: its access rules let {report.station} ask nothing"
     return ""
+
+
+def _next_name(report: HopReport) -> str:
+    """Return the name of the next router; an older router tells that of its route only."""
+    return report.next_name or report.route

@@ -44,6 +44,7 @@ def to_route(spec: RouteSpec, hop: Way, origin: Origin) -> Route:
         timeout_ns=spec.timeout_ms * 1_000_000,
         is_probed=spec.is_probed,
         router=NetId.parse(spec.router) if spec.router else None,
+        is_client=spec.is_client,
     )
 
 

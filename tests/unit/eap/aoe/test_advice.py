@@ -12,7 +12,7 @@ from tests.support.aoerouter import FAR, ROUTER, route
 
 TARGET, OWN = NetId.parse(FAR), NetId.parse(ROUTER)
 HOP = Way("udp:eap0", "10.0.0.6:34980")
-UP = RouteReport(route(FAR, HOP, "island"), RouteState.UP, "", 1, Traffic())
+UP = RouteReport(route(FAR, HOP, "island"), RouteState.UP, "", 1, Traffic(), "island")
 DOWN = UP._replace(state=RouteState.DOWN, why="it does not answer")
 
 
@@ -22,11 +22,17 @@ def test_answers_are_answers() -> None:
     assert found[:2] == (True, "is there; error 0x6 (nothing has that AMS port)")
 
 
+CLIENT = UP._replace(state=RouteState.CLIENT, why="not listening: refused")
+BEYOND = DOWN._replace(next_name="near")
+
+
 @pytest.mark.parametrize(
     ("error", "report", "text", "hint"),
     [
         (7, None, f"there is no route to {FAR}", "eapctl routes add"),
         (0x1B, DOWN, f"island ({HOP}) is down: it does not answer", "in the same network"),
+        (0x1B, BEYOND, f"near ({HOP}) is down: it does not answer", "in the same network"),
+        (0x1B, CLIENT, f"island ({HOP}) is a client, not listening: refused", "nothing is wrong"),
         (0x1B, UP, f"the way is cut behind island ({HOP})", "eapctl trace"),
         (0x719, UP, f"no answer from island ({HOP}) in time", f"add one to {ROUTER}"),
         (7, UP, f"island ({HOP}) knows no way to {FAR}", f"needs a route to {FAR}"),

@@ -8,6 +8,7 @@ from eap.aoe.action import Forward, Outcome
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.invoke import is_marked
 from eap.aoe.judge import Limits
+from eap.aoe.routes import Route
 from eap.aoe.way import Way
 from eap.codec.ams import StateFlags
 from eap.ids import NetId
@@ -50,12 +51,12 @@ def test_error_from_behind_the_hop_is_passed_back_and_named() -> None:
     station = Station([route(FAR, LINK, "island")])
     onward = station.forwarded(ASKED, ONE)
     assert station.replied(onward.answer(b"", 6), LINK) == (ONE, ASKED.answer(b"", 6))
-    assert station.events() == [
-        (
-            Outcome.ANSWERED,
-            f"error 0x6 (nothing has that AMS port) from island ({LINK}) or from behind it",
-        )
-    ]
+    ((outcome, text),) = station.events()
+    assert outcome is Outcome.ANSWERED
+    assert text.startswith(f"READ of {FAR_DEVICE} for {CLIENT} ({ONE}): ")
+    assert text.endswith(
+        f": error 0x6 (nothing has that AMS port) from island ({LINK}) or from behind it"
+    )
 
 
 @pytest.mark.parametrize(
@@ -108,6 +109,21 @@ def test_time_out_is_answered_before_the_client_gives_up_and_names_the_hop() -> 
     assert f"no answer from island ({LINK}) within 4.5 s" in station.events()[-1][1]
     assert station.give(onward.answer(), LINK) == []
     assert station.router.next_timeout() is None
+
+
+def test_request_by_a_hop_that_is_dead_names_the_hop_and_not_the_target() -> None:
+    near = NetId.parse("5.1.1.2.1.1")
+    beyond = route(FAR, LINK, "far", router=near)
+    station = Station([beyond, Route(near, "near", LINK)])
+    station.forwarded(ASKED, ONE)
+    station.router.handle_timeout(5 * SECOND)
+    text = f"no answer from near ({LINK}) or from behind it within 4.5 s"
+    assert station.events()[-1][1].endswith(text)
+    station.forwarded(ASKED, ONE)
+    station.router.hop_down(*LINK, "it does not answer", 0)
+    assert station.events()[-1][1].endswith(f"near ({LINK}): it does not answer")
+    station.replied(ASKED, ONE)
+    assert station.events()[-1][1].endswith(f"near ({LINK}) is down: it does not answer")
 
 
 def test_service_that_says_nothing_is_answered_for() -> None:

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-from eap.aoe.report import RouteState, report_route
+from eap.aoe.report import Obstacle, RouteState, report_route
 from eap.aoe.traffic import Traffic
-from eap.aoe.way import Way
+from eap.aoe.way import Door, Way
 from tests.support.ams import Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, Station, route
 
@@ -17,7 +17,7 @@ def report(station: Station):
 
 def test_route_is_unknown_until_something_is_answered() -> None:
     station = Station([route(FAR, LINK)])
-    assert report(station)[1:] == (RouteState.UNKNOWN, "", None, Traffic())
+    assert report(station)[1:5] == (RouteState.UNKNOWN, "", None, Traffic())
     onward = station.forwarded(ASKED, TCP)
     assert report(station).state is RouteState.UNKNOWN
     station.now_ns = 3 * MS
@@ -61,5 +61,34 @@ def test_door_tells_why_a_route_is_down() -> None:
 
 
 def test_route_by_a_door_that_is_not_there_is_down() -> None:
-    found = report_route(route(FAR, LINK), "this station has no door link", None, None)
+    obstacle = Obstacle(RouteState.DOWN, "this station has no door link")
+    found = report_route(route(FAR, LINK), obstacle, None, None, next_name="far")
     assert (found.state, found.why) == (RouteState.DOWN, "this station has no door link")
+
+
+def test_route_of_a_client_that_does_not_listen_is_not_down() -> None:
+    station = Station([route(FAR, LINK, "tool", is_client=True)])
+    station.router.hop_down("link", LINK.connection, "refused", 0)
+    assert report(station)[1:4] == (RouteState.CLIENT, "not listening: refused", None)
+    assert station.replied(ASKED, TCP)[1].error == 0x1B
+    text = f"tool ({LINK}) is a client, not listening: refused"
+    assert station.events()[-1][1].endswith(text)
+
+
+def test_route_of_a_client_that_listens_is_up_and_then_down() -> None:
+    station = Station([route(FAR, LINK, "tool", is_client=True)])
+    station.router.hop_down("link", LINK.connection, "refused", 0)
+    station.router.hop_up("link", LINK.connection)
+    station.give(station.forwarded(ASKED, TCP).answer(), LINK)
+    assert report(station).state is RouteState.UP
+    station.router.hop_down("link", LINK.connection, "refused", 0)
+    assert report(station)[1:3] == (RouteState.DOWN, "refused")
+
+
+def test_route_of_a_client_is_forgotten_with_its_door() -> None:
+    station = Station([route(FAR, LINK, "tool", is_client=True)])
+    station.router.hop_down("link", LINK.connection, "refused", 0)
+    station.router.remove_door("link", 0)
+    assert report(station)[1:3] == (RouteState.DOWN, "this station has no door link")
+    station.router.add_door(Door("link"))
+    assert report(station).state is RouteState.UNKNOWN

@@ -170,3 +170,27 @@ def test_found_is_what_a_search_through_all_finds(
     assert found is not None
     assert (match(found[0]), found[0].origin) == (match(best), best.origin)
     assert found[1] == match(best)
+
+
+def test_next_name_is_that_of_the_router_at_the_hop() -> None:
+    near, far = NetId.parse("5.1.1.2.1.1"), NetId.parse("5.1.1.3.1.1")
+    beyond = Route(far, "far", A, router=near)
+    nameless = Route(NetId.parse("5.1.1.4.1.1"), "farther", B, router=near)
+    rest = Route(NetId(bytes(6)), "default", A, octets=0, router=near)
+    unknown = Route(NetId(bytes(6)), "default", C, octets=0)
+    table = RouteTable([beyond, nameless, unknown])
+    assert table.next_name(beyond) == "5.1.1.2.1.1"
+    assert table.describe_hop(unknown) == f"default ({C})"
+    direct = Route(near, "near", A)
+    table.add(direct)
+    assert [table.next_name(each) for each in (direct, beyond, rest)] == ["near"] * 3
+    assert table.next_name(nameless) == "5.1.1.2.1.1", "the route to near is by another hop"
+    assert table.describe_hop(beyond) == f"near ({A})"
+    assert table.describe_beyond(beyond) == f"near ({A}) or from behind it"
+    assert table.describe_beyond(direct) == f"near ({A})"
+
+
+def test_next_name_of_a_virtual_net_id_is_that_of_its_route() -> None:
+    real = NetId.parse("5.1.1.2.1.1")
+    virtual = Route(NetId.parse("10.2.2.2.1.1"), "near", A, real=real, router=real)
+    assert RouteTable([virtual]).next_name(virtual) == "near"

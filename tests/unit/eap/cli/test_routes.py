@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from eap.cli import main
 from tests.support.controlstub import ControlStub
-from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
+from tests.support.fakeroutes import CLIENT, ISLAND, PRESS, FakeRoutes
 
 
 @pytest.fixture
@@ -118,6 +118,17 @@ def test_test_of_one_target(command):
         "rtt_us": None, "state": "", "error": 27, "text": "down: connection refused",
         "hint": "see whether it is switched on",
     }  # fmt: skip
+
+
+def test_test_of_everything_client_that_does_not_listen_is_no_failure(command, fake):
+    fake.set_routes("island-01", ISLAND, CLIENT)
+    result = command("test")
+    assert result.exit_code == 0
+    assert "not listening: connection refused" in result.output
+    assert command("test", "island-01", "laptop").exit_code == 1
+    output = command("list").output
+    assert "client" in output
+    assert "laptop (" not in output, "there is nothing to look at"
 
 
 def test_test_of_everything(command):

@@ -4,6 +4,7 @@ import msgspec
 from rich.console import Console
 
 from eap.appliance.control_routes import ImportRow, NeighbourRow, TestResult
+from eap.cli import routes_text
 from eap.cli.routes_view import (
     import_table,
     neighbour_table,
@@ -71,3 +72,17 @@ def test_routers_of_other_hosts() -> None:
     rows = [line.split() for line in shown(neighbour_table([cx, lone])).splitlines()]
     assert ["left", "cx", "5.1.2.3.1.1", "10.0.0.5", "3.1.4024", "cx", "(learned)"] in rows
     assert ["left", "pc", "5.1.2.3.1.1", "10.0.0.5", "none"] in rows
+
+
+def test_routes_by_a_hop_that_is_down_are_one_remark() -> None:
+    station = FakeRoutes().stations["island-01"]
+    (press,) = (each for each in station.routes if each.name == "press")
+    down = msgspec.structs.replace(press, name="saw", net_id="5.1.2.4.1.1", last_error="")
+    rows = [msgspec.structs.replace(each, next_name="press") for each in (down, press)]
+    text = " ".join(shown(*routes_tables([msgspec.structs.replace(station, routes=rows)])).split())
+    assert (
+        "press (192.168.1.5:48898 by ams-tcp) is down: connection refused; so are the routes by it:"
+        " saw" in text
+    )
+    assert "saw (192" not in text
+    assert routes_text.route_state(rows[0]) == "down: press: connection refused"

@@ -45,3 +45,12 @@ def test_a_target_that_nobody_knows(target):
         open_ams("elsewhere", None),
     ):
         pass
+
+
+def test_ams_device_unreachable_names_the_router_that_does_not_answer(target):
+    target.error = 0x1B
+    target.why = "near: middle (10.0.0.2:34980 by udp:eap0) is down: it does not answer"
+    with open_ams(TARGET, None) as device, pytest.raises(AmsRefusedError) as caught:
+        device.demand(ReadState(), "state")
+    assert str(caught.value) == f"{TARGET}: state: {target.why}"
+    assert target.stub.requests[-1] == ("trace", {"target": TARGET})

@@ -210,6 +210,23 @@ def test_log_says_once_why_there_is_no_connection_and_when_there_is(caplog):
         asyncio.run(run())
 
 
+def test_uplink_to_a_client_that_does_not_listen_is_no_warning_until_it_listened(caplog):
+    async def run():
+        port = free_port()
+        async with serving(port, may_be_client=lambda: True) as (_, router, _):
+            await eventually(lambda: len(caplog.messages) == 1)
+            async with listening(port) as (plc, _):
+                _, writer = await plc.take()
+                await eventually(lambda: "up" in router.seen)
+                writer.transport.abort()
+            await eventually(lambda: caplog.records[-1].levelname == "WARNING")
+
+    with caplog.at_level(logging.INFO):
+        asyncio.run(run())
+    assert caplog.records[0].levelname == "INFO"
+    assert caplog.messages[0].endswith("a client added the route to it, and does not listen")
+
+
 def test_connection_that_is_lost_is_opened_again():
     async def run():
         async with listening() as (plc, port), serving(port) as (uplink, router, _):

@@ -33,6 +33,7 @@ ADDED = RouteSpec(
     net_id=str(TOOL),
     hop=HopSpec(DoorKind.AMS_TCP, "", "myhost:48898"),
     is_probed=False,
+    is_client=True,
 )
 
 

@@ -5,6 +5,9 @@ import asyncio
 import pytest
 
 from eap.aoe.directory import AmsAddress
+from eap.aoe.routes import Route
+from eap.aoe.way import Way
+from eap.appliance.services.routes import route_probe
 from eap.appliance.services.routes.route_probe import find_target, probe_target
 from eap.errors import ControlError
 from eap.ids import NetId
@@ -12,6 +15,10 @@ from tests.support.ams import Ams
 from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 
+BEYOND = Route(
+    NetId.parse("127.0.9.3.1.1"), "third", Way("udp:eap0", "127.0.9.2:34980"),
+    router=NetId.parse("127.0.9.2.1.1"),
+)  # fmt: skip
 RIGHT = AmsAddress(NetId.parse("127.0.9.2.1.1"), 10000)
 
 
@@ -41,9 +48,14 @@ def test_what_is_no_target_is_refused(text: str, reason: str) -> None:
         find_target(Left().router, DIRECTORY, text)
 
 
-def probe(target: AmsAddress, *, data: bytes | None = None, error: int = 0, down: str = ""):
+def probe(
+    target: AmsAddress, *, data: bytes | None = None, error: int = 0, down: str = "",
+    more: Route | None = None,
+):  # fmt: skip
     """Ask *target*; the hop answers with *data* or *error*, if with either."""
     left = Left()
+    if more is not None:
+        left.router.add_route(more)
 
     async def script():
         if down:
@@ -87,6 +99,41 @@ def test_errors_are_told_with_what_to_do() -> None:
     found = probe(AmsAddress(NetId.parse("9.9.9.9.1.1"), 10000))
     assert found.text == "there is no route to 9.9.9.9.1.1"
     assert "eapctl routes add" in found.hint
+
+
+def test_request_beyond_a_dead_router_names_the_router() -> None:
+    left = Left()
+    left.router.add_route(BEYOND)
+    target = AmsAddress(NetId.parse("127.0.9.3.1.1"), 10000)
+    ask = probe_target(left.router, target, 0.2)
+    left.router.hop_down("udp:eap0", "127.0.9.2:34980", "it does not answer")
+    found = asyncio.run(while_serving(ask, left.router))
+    text = "right (127.0.9.2:34980 by udp:eap0) is down: it does not answer"
+    assert (found.name, found.text) == ("third", text)
+
+
+def test_request_beyond_a_router_that_finds_a_fault_names_it(monkeypatch) -> None:
+    async def find(router, *address):
+        assert (router.name, str(AmsAddress(*address))) == ("left", "127.0.9.3.1.1:10000")
+        return why
+
+    monkeypatch.setattr(route_probe, "find_fault", find)
+    target = AmsAddress(NetId.parse("127.0.9.3.1.1"), 10000)
+    why = "right: third (127.0.9.3:34980 by udp:eap1) is down: it does not answer"
+    assert probe(target, data=b"", error=0x1B, more=BEYOND).text == why
+    why = ""
+    assert "the way is cut behind right" in probe(target, data=b"", error=0x1B, more=BEYOND).text
+    assert probe(RIGHT, data=b"", error=0x1B).text.startswith("the way is cut behind right")
+
+
+def test_search_for_a_fault_that_takes_too_long_is_given_up(monkeypatch) -> None:
+    async def find(router, *address):
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(route_probe, "find_fault", find)
+    monkeypatch.setattr(route_probe, "BLAME_S", 0.01)
+    target = AmsAddress(NetId.parse("127.0.9.3.1.1"), 10000)
+    assert "no answer from right" in probe(target, more=BEYOND).text
 
 
 def test_silence_is_told() -> None:

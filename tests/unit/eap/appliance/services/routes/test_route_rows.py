@@ -107,7 +107,7 @@ def test_all_of_a_route_is_told() -> None:
         FAR, "far", HOP, Origin.LEARNED, 6, is_unidirectional=True, expires_at_ns=61 * 10**9,
         real=NetId.parse("9.9.9.9.1.1"), timeout_ns=900_000_000, is_probed=False,
     )  # fmt: skip
-    report = RouteReport(route, RouteState.DOWN, "cut", None, TRAFFIC)
+    report = RouteReport(route, RouteState.DOWN, "cut", None, TRAFFIC, "press")
     found = route_row(report, 10**9, is_derived=False)
     assert (found.origin, found.state, found.why, found.rtt_us) == ("learned", "down", "cut", None)
     assert (found.expires_s, found.real, found.timeout_ms) == (60, "9.9.9.9.1.1", 900)

@@ -138,7 +138,10 @@ def test_a_dead_station_is_there_with_what_the_plant_file_says() -> None:
     line.dead.add("island-02")
     here, dead = look(first)
     assert not here["error"]
-    assert dead["error"] == "5.1.1.2.1.1:300: error 0x719 (no answer in time)"
+    assert dead["error"] == (
+        "island-02: it does not answer island-01 at island-02 by link:"
+        " error 0x719 (no answer in time)"
+    )
     assert dead["ports"][1]["slaves"] == [{"address": 1001, "name": "drive", "state": None}]
 
 
@@ -163,7 +166,15 @@ def test_stations_that_only_routes_tell_of() -> None:
     names = [slave["name"] for slave in rows[2]["ports"][1]["slaves"]]
     assert names == ["coupler 7", "coupler 7"]
     assert rows[3]["ports"] == []
-    assert rows[3]["error"] == "5.1.1.4.1.1:300: error 0x719 (no answer in time)"
+    assert rows[3]["error"].startswith("island-04: it does not answer island-01 at island-04")
+
+
+def test_scan_station_behind_a_dead_one_names_the_dead_one() -> None:
+    line, first = plant(to(3, 2))
+    line.add(3, serve=Devices(3))
+    line.dead |= {"island-02", "island-03"}
+    rows = look(first, PLANT, to(2), to(3, 2))
+    assert [row["error"].partition(":")[0] for row in rows] == ["", "island-02", "island-02"]
 
 
 def test_default_routes_are_no_stations() -> None:

@@ -6,7 +6,7 @@ from itertools import count
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule
 from eap.aoe.spec import AccessService as Service
-from eap.appliance.services.routes.tracing import Traced, trace
+from eap.appliance.services.routes.tracing import Traced, find_fault, trace
 from eap.codec.ads import AdsError, AdsStates
 from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
@@ -82,6 +82,42 @@ def test_a_link_that_a_router_knows_to_be_down() -> None:
     assert traced.why == "island-02: island-03 (island-03 by link) is down: cable pulled"
 
 
+def line_of_four() -> tuple[Line, Station]:
+    """Four stations in a row."""
+    line = Line()
+    first = line.add(1, to(2), to(3, 2), to(4, 2))
+    line.add(2, to(1), to(3), to(4, 3))
+    line.add(3, to(1, 2), to(2), to(4))
+    line.add(4, to(1, 3), to(2, 3), to(3))
+    return line, first
+
+
+LAST = NetId.parse("5.1.1.4.3.1")
+
+
+def test_trace_several_dead_stations_names_the_first() -> None:
+    line, first = line_of_four()
+    line.dead |= {"island-02", "island-03", "island-04"}
+    silent = "it does not answer island-01 at island-02 by link: error 0x719 (no answer in time)"
+    assert follow(first, LAST).why == f"island-02: {silent}"
+    assert names(follow(first, LAST)) == ["island-01", "island-02"]
+    line.dead.remove("island-02")
+    assert follow(first, LAST).why.startswith("island-03: it does not answer island-02 at ")
+
+
+def test_trace_several_stations_known_to_be_dead_names_the_first() -> None:
+    line, first = line_of_four()
+    line.dead |= {"island-03", "island-04"}
+    line.stations["island-02"].router.hop_down("link", "island-03", "it does not answer", 1)
+    why = "island-02: island-03 (island-03 by link) is down: it does not answer"
+    assert follow(first, LAST).why == why
+    assert asyncio.run(find_fault(first, LAST, 1001)) == why
+    line.dead.add("island-02")
+    first.router.hop_down("link", "island-02", "it does not answer", 1)
+    why = "island-01: island-02 (island-02 by link) is down: it does not answer"
+    assert follow(first, LAST).why == why
+
+
 def test_a_missing_route_and_a_missing_port() -> None:
     _, first = line_of_three()
     assert follow(first, NetId.parse("7.7.7.7.1.1")).why == ("island-01: no route to 7.7.7.7.1.1")
@@ -103,7 +139,7 @@ def test_a_router_that_is_not_ours_is_opaque_and_its_target_is_asked_all_the_sam
     line, first = line_of_three()
     line.stations["island-02"].is_ours = False
     traced = follow(first)
-    assert names(traced) == ["island-01", "island-03"]
+    assert names(traced) == ["island-01", "island-02"]
     assert traced.hops[1].is_opaque
     assert traced.hops[1].report.net_id == "5.1.1.2.1.1"
     assert not traced.why
