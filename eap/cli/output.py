@@ -16,10 +16,14 @@ import click
 from eap.errors import EnvironmentalError
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console, RenderableType
 
 UNLIMITED = 10_000
 """Columns of a table when stdout is no terminal: no cell is wrapped, no column left out."""
+
+
+_HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
+"""ECMA-48: cursor to the first column of the first line, erase to the end of line, of screen."""
 
 
 def write_json(document: Any) -> None:
@@ -48,15 +52,40 @@ def _close_stdout() -> None:
 
 def write_tables(parts: Iterable[RenderableType]) -> None:
     """Print rich renderables on stdout, coloured and fitted to the screen only on a terminal."""
+    write_text(_render(_console(), parts), end="")
+
+
+def repaint(parts: Iterable[RenderableType]) -> None:
+    """Print rich renderables in place of what the screen shows; piped, as a block of lines.
+
+    Each line overwrites that of the time before, so that nothing flickers; what exceeds the screen
+    is cut off, and a line says so.
+    """
+    console = _console()
+    text = _render(console, parts)
+    if not console.is_terminal:
+        write_text(text)
+        return
+    lines = text.rstrip("\n").split("\n")
+    if (hidden := len(lines) - console.height) > 0:
+        lines[console.height - 1 :] = [f"… {hidden + 1} more lines"]
+    write_text(_HOME + "\n".join(line + _CLEAR_LINE for line in lines) + _CLEAR_BELOW, end="")
+
+
+def _console() -> Console:
     from rich.console import Console
 
     console = Console(highlight=False, emoji=False, markup=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = UNLIMITED
+    return console
+
+
+def _render(console: Console, parts: Iterable[RenderableType]) -> str:
     with console.capture() as capture:
         for part in parts:
             console.print(part)
     text = capture.get()
-    if not console.is_terminal:
-        text = "\n".join(line.rstrip() for line in text.split("\n"))
-    write_text(text, end="")
+    if console.is_terminal:
+        return text
+    return "\n".join(line.rstrip() for line in text.split("\n"))

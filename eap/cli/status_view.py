@@ -1,7 +1,7 @@
-"""A status document as tables: processes, stations with their ports, process data, remarks.
+"""The whole status as tables: findings, processes, stations with their ports, buses, process data.
 
 Pure: the document of ``eapctl status --json`` in, rich renderables out.  Tables hold what every row
-has; what is rare, and worth a look because it is, follows below them in words.
+has; what happened since the start without being wrong now follows below them in words.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rich import box
 from rich.console import RenderableType
-from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
 from eap.cli import words
+from eap.cli.status_findings import REASONS, STATES, Finding, Severity, is_special
+from eap.cli.status_screen import finding_grid, verdict
+from eap.cli.table import Column, TextTable
 
 Row = Mapping[str, Any]
 
@@ -24,84 +24,72 @@ _GOOD, _BAD, _DIM = "green", "bold red", "dim"
 _STATE_STYLE = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
 _OFF = "off"
 _STATE_STYLE |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM, _OFF: _DIM}
-_HUNG_AFTER_US = 2_000_000
-_HUNG_AFTER_CYCLES = 10
-_NET_ID_DOTS = 5
-_NOT_ASKED = "other: not asked for"
-_REASONS = {
-    "cycle": "cyclic",
-    "divider": "divider",
-    "change": "on change",
-    "change_timeout": "resend",
-    "event": "event",
-    "poll": "polled",
-}
-_STATES = {
-    "PREOP": "in PREOP, as was asked for last: it exchanges no process data",
-    "SAFEOP": "in SAFEOP, as was asked for last: it receives no process data",
-}
-"""What it means when a station is there."""
-_FRAME_STATES = {2: "larger than its network carries", 4: "nobody is there"}
-"""What the bits of FrameState say beyond that a frame was not sent."""
 
 
-def status_tables(document: Row) -> Iterator[RenderableType]:
-    """Yield what to print for a status *document*, top to bottom."""
+def status_tables(document: Row, now_s: float) -> Iterator[RenderableType]:
+    """Yield what to print for a status *document* of *now_s*, top to bottom."""
     stations = document["stations"]
+    yield from (verdict(document, appliance) for appliance in document["appliances"])
+    found = [Finding.from_plain(row) for row in document["findings"]]
+    if faults := [each for each in found if each.severity is not Severity.INFO]:
+        yield finding_grid(faults, now_s)
     for appliance in document["appliances"]:
+        yield Text()
         yield _processes(appliance)
+    yield Text()
     yield _stations(stations)
     if any("bus" in port for station in stations for port in station["ports"]):
+        yield Text()
         yield _buses(stations)
+    yield Text()
     yield _process_data(stations)
-    if any(_is_special(row) for station in stations for row in station.get("frames", ())):
+    if any(is_special(row) for station in stations for row in station.get("frames", ())):
+        yield Text()
         yield _frames(stations)
-    remarks = [remark for appliance in document["appliances"] for remark in _of_engine(appliance)]
-    remarks += [remark for station in stations for remark in _remarks(station)]
-    if remarks:
-        yield Text("Worth a look", style="bold")
-        yield from (Padding(Text(remark), (0, 0, 0, 1)) for remark in remarks)
+    if remarks := [each for each in found if each.severity is Severity.INFO]:
+        yield Text("\nSince the start", style="bold")
+        yield from (Text(each.text(now_s)) for each in remarks)
 
 
 def _processes(appliance: Row) -> RenderableType:
-    table = Table(title=f"Plant {appliance['plant']}", title_justify="left", title_style="bold")
-    table.box, table.show_header, table.pad_edge = None, False, True
-    for _ in range(5):
-        table.add_column()
+    table = TextTable(
+        f"Process of {appliance['plant']}",
+        Column("PID", rank=1, is_number=True),
+        Column("CPU", is_number=True),
+        Column("Memory", is_number=True),
+        Column("Restarts", is_number=True),
+    )
     processes = dict(appliance["processes"])
     segments = processes.pop("segments", {})
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():
         if not process["pid"]:
-            table.add_row(name, Text("restarting", style=_BAD))
+            table.add_row(name, "", Text("restarting", style=_BAD))
             continue
-        if step := process.get("step"):
-            table.add_row(name, f"process {process['pid']}", Text(f"starting: {step}", style=_BAD))
+        if process.get("step"):
+            table.add_row(name, str(process["pid"]), Text("starting", style=_BAD))
             continue
         cpu, rss = process.get("cpu"), process.get("rss")
         table.add_row(
             name,
-            f"process {process['pid']}",
-            "" if cpu is None else f"{cpu:.1f} % of a core",
+            str(process["pid"]),
+            "" if cpu is None else f"{cpu:.1f} %",
             "" if rss is None else f"{rss / 1e6:.0f} MB",
-            f"restarted {words.times(process['restarts'])}" if process.get("restarts") else "",
+            str(process.get("restarts", "")),
         )
     return table
 
 
-def _of_engine(appliance: Row) -> Iterator[str]:
-    """Yield what the engine asked for, to be on time, and was not given; and lost requests."""
-    engine = appliance["processes"]["engine"]
-    for what, outcome in engine.get("realtime", {}).items():
-        if isinstance(outcome, str) and not outcome.startswith("fifo") and outcome != _NOT_ASKED:
-            reason = outcome.removeprefix("other: ")
-            yield f"{appliance['plant']} engine, {what.replace('_', ' ')}: {reason}"
-    if counts := _counts(engine.get("bus_requests", {})):
-        yield f"{appliance['plant']} engine, requests to buses: {counts}"
-
-
 def _stations(stations: Sequence[Row]) -> RenderableType:
-    table = _table("Station", "State", "Cycle", "Port", "Interface", "NetID", "Link")
+    table = TextTable(
+        "Station",
+        "State",
+        Column("Cycle", rank=2),
+        "Port",
+        Column("Interface", rank=1),
+        Column("NetID", rank=3),
+        "Link",
+    )
     for station in stations:
         own = (
             station["name"],
@@ -123,9 +111,15 @@ def _interface(uri: str) -> str:
 
 
 def _buses(stations: Sequence[Row]) -> RenderableType:
-    table = _table("Bus", "Slaves", "State", "Cycles", "Lost", "Counters", "Trip")
-    for column in table.columns[3:]:
-        column.justify, column.no_wrap = "right", True
+    table = TextTable(
+        "Bus",
+        Column("Slaves", rank=3, is_number=True),
+        Column("State", wraps=True),
+        Column("Cycles", rank=1, is_number=True),
+        Column("Lost", is_number=True),
+        Column("Counters", is_number=True),
+        Column("Trip", rank=2, is_number=True),
+    )
     for station in stations:
         for port in station["ports"]:
             if (bus := port.get("bus")) is None:
@@ -146,35 +140,31 @@ def _buses(stations: Sequence[Row]) -> RenderableType:
     return table
 
 
-def _bus_remarks(name: str, bus: Row) -> Iterator[str]:
-    if bus["fault"]:
-        yield f"{name}: {'; '.join(bus['fault'].splitlines())}"
-    if bus["wkc_errors"]:
-        yield f"{name}: {words.count(bus['wkc_errors'], 'cycle')} with a wrong working counter"
-    for slave in bus["slaves"]:
-        if slave["fault"]:
-            yield f"{name} {slave['name']} ({slave['address']}): {slave['fault']}"
-
-
 def _process_data(stations: Sequence[Row]) -> RenderableType:
-    table = _table("", "Process data", "State", "Frames", "Lost", "Quality", "Age")
-    table.add_column("Jitter or\nresponse µs\np50 / p99 / max")
-    for column in table.columns[3:]:
-        column.justify, column.no_wrap = "right", True
+    table = TextTable(
+        "",
+        "Process data",
+        "State",
+        Column("Frames", is_number=True),
+        Column("Lost", is_number=True),
+        Column("Quality", rank=2, is_number=True),
+        Column("Age", rank=1, is_number=True),
+        Column("Jitter or\nresponse µs\np50 / p99 / max", rank=3, is_number=True),
+    )
     for station in stations:
         pd = station["pd"]
         if pd["tx"] or pd["rx"]:
             table.add_row("", Text(station["name"], style="bold"))
         for row in pd["tx"]:
             why = row.get("last_reason") or next(reversed(row["reason"]), "silent")
-            shown = _OFF if station["state"] == "PREOP" else _REASONS.get(why, why)
+            shown = _OFF if station["state"] == "PREOP" else REASONS.get(why, why)
             table.add_row("→", row["name"], _state(shown), str(row["sent"]))
         for row in pd["rx"]:
-            table.add_row(*_received(row, _OFF if station["state"] in _STATES else row["state"]))
+            table.add_row(*_received(row, _OFF if station["state"] in STATES else row["state"]))
     return table
 
 
-def _received(row: Row, state: str) -> tuple[RenderableType, ...]:
+def _received(row: Row, state: str) -> tuple[str | Text, ...]:
     lost, quality, age = row["lost"], row["quality"], row["age_us"]
     times = row.get("response_us") or row["jitter_us"]
     spread = [times[key] for key in ("p50", "p99", "max")]
@@ -190,17 +180,16 @@ def _received(row: Row, state: str) -> tuple[RenderableType, ...]:
     )
 
 
-def _is_special(row: Row) -> bool:
-    """Tell whether a frame has more to say than its PDs: a monitored subscriber, or a NetID."""
-    return bool(row["monitor_interval_ms"]) or row["destination"].count(".") == _NET_ID_DOTS
-
-
 def _frames(stations: Sequence[Row]) -> RenderableType:
-    table = _table("Frame", "Goes to", "Subscriber", "Frames", "Skipped")
-    for column in table.columns[3:]:
-        column.justify, column.no_wrap = "right", True
+    table = TextTable(
+        "Frame",
+        Column("Goes to", wraps=True),
+        "Subscriber",
+        Column("Frames", rank=1, is_number=True),
+        Column("Skipped", is_number=True),
+    )
     for station in stations:
-        for row in filter(_is_special, station.get("frames", ())):
+        for row in filter(is_special, station.get("frames", ())):
             name, address = row["destination"], row["address"]
             table.add_row(
                 f"{station['name']}/{row['name']}",
@@ -212,83 +201,5 @@ def _frames(stations: Sequence[Row]) -> RenderableType:
     return table
 
 
-def _remarks(station: Row) -> Iterator[str]:
-    name = station["name"]
-    if own := "; ".join(_own_remarks(station)):
-        yield f"{name}: {own}"
-    for port in station["ports"]:
-        if (bus := port.get("bus")) is not None:
-            yield from _bus_remarks(f"{name}/{port['name']}", bus)
-    for row in filter(_is_special, station.get("frames", ())):
-        if row["address"] is None:
-            waits = f"waits for a frame of {row['destination']}, to learn its MAC address"
-            yield f"{name} → {row['name']}: {waits}"
-    for row in station["pd"]["tx"]:
-        if remark := "; ".join(_sent_remarks(row)):
-            yield f"{name} → {row['name']}: {remark}"
-    for row in station["pd"]["rx"]:
-        if remark := "; ".join(_received_remarks(row)):
-            yield f"{name} ← {row['name']}: {remark}"
-
-
-def _own_remarks(station: Row) -> Iterator[str]:
-    if meaning := _STATES.get(station["state"]):
-        yield f"{meaning} until 'eapctl state {station['name']} OP'"
-    silent_us = station.get("cycle_age_us") or 0
-    if silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * station.get("cycle_us", 0)):
-        yield f"has not run a cycle for {words.duration(silent_us)}"
-    if overruns := station.get("overruns"):
-        yield f"left out {words.count(overruns, 'cycle')}"
-    if torn := station.get("torn"):
-        yield f"found {words.count(torn, 'torn write')}"
-    if held := station.get("links_held"):
-        yield f"held {words.count(held, 'linked value')} back: no number"
-    if discarded := _counts(station["discarded"]):
-        yield f"turned away: {discarded}"
-
-
-def _sent_remarks(row: Row) -> Iterator[str]:
-    if row["skipped"]:
-        yield f"skipped {words.times(row['skipped'])}"
-    for bit, meaning in _FRAME_STATES.items():
-        if row.get("frame_state", 0) & bit:
-            yield meaning
-    if len(row["reason"]) > 1:
-        yield "sent " + ", ".join(
-            f"{_REASONS.get(why, why)} {words.times(count)}" for why, count in row["reason"].items()
-        )
-
-
-def _received_remarks(row: Row) -> Iterator[str]:
-    if row.get("timeouts"):
-        yield f"timed out {words.times(row['timeouts'])}"
-    for key in ("duplicated", "reordered", "late"):
-        if row[key]:
-            yield f"{row[key]} {key}"
-    if discarded := _counts(row["discarded"]):
-        yield f"discarded: {discarded}"
-    if wrong := row.get("wrong_source"):
-        ago = words.duration(wrong["age_us"])
-        yield f"{wrong['address']} sends with this publisher ID, last {ago} ago: dropped"
-    if other := row.get("other_source"):
-        ago = words.duration(other["age_us"])
-        yield (
-            f"two senders with this publisher ID: {row['source']} and {other['address']}, "
-            f"last {ago} ago"
-        )
-
-
-def _counts(counts: Row) -> str:
-    words = (f"{count} {reason.replace('_', ' ')}" for reason, count in counts.items() if count)
-    return ", ".join(words)
-
-
 def _state(state: str) -> Text:
     return Text(state, style=_STATE_STYLE.get(state, ""))
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for heading in headings:
-        table.add_column(heading, overflow="fold", vertical="top")
-    return table

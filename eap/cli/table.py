@@ -19,7 +19,7 @@ from rich.text import Text
 
 _GAP = 2
 """Spaces between two columns: what rich puts there for one space of padding and no border."""
-_LEAST_WRAPPED = 20
+_LEAST_WRAPPED = 16
 """A column that wraps is not made narrower than this while another one can be left out."""
 
 
@@ -70,7 +70,8 @@ class TextTable:
         yield table
         if len(shown) < len(self._columns):
             left_out = (each.heading for at, each in enumerate(self._columns) if at not in shown)
-            yield Text(f"not shown for lack of width: {', '.join(left_out)}", style="dim")
+            names = ", ".join(" ".join(heading.split()) for heading in left_out)
+            yield Text(f"not shown for lack of width: {names}", style="dim")
 
     def _fitting(self, room: int) -> list[int]:
         """Return the numbers of the columns for which there is *room* without breaking words."""
@@ -113,3 +114,21 @@ class TextTable:
 def _total(widths: Iterable[int]) -> int:
     listed = list(widths)
     return sum(listed) + _GAP * (len(listed) - 1)
+
+
+class ItemLine:
+    """A heading and items behind it, with commas between them; a line ends between two items."""
+
+    def __init__(self, heading: str, items: Sequence[Text]) -> None:
+        self._heading = heading
+        self._items = items
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        line = Text(self._heading, style="bold")
+        for number, item in enumerate(self._items):
+            comma = "," if number + 1 < len(self._items) else ""
+            if line.cell_len + item.cell_len + 1 + len(comma) > options.max_width:
+                yield line
+                line = Text(" " * len(self._heading))
+            line.append(" ").append_text(item).append(comma, "none")
+        yield line

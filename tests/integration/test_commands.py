@@ -141,7 +141,11 @@ def test_status_for_people_fits(
     monkeypatch.setenv("COLUMNS", str(columns))
     done = run(demo, "status")
     assert done.returncode == 0, done.stderr
-    assert max(map(len, done.stdout.splitlines())) <= columns
+    lines = done.stdout.splitlines()
+    assert len(lines) < 24
+    assert lines[0].startswith("demo: ")
+    full = run(demo, "status", "--full").stdout.splitlines()
+    assert max(map(len, (*lines, *full))) <= columns
     assert all(name in done.stdout for name in ISLANDS)
 
 

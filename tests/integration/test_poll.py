@@ -112,7 +112,7 @@ def test_two_servers_answer_on_loopback(farm: Plants) -> None:
         assert plant.rx("desk", name)["response_us"]["p50"] < SERVER_CYCLE_US + CLIENT_CYCLE_US
     plant.command("pd", "set", "desk", "job", "7")
     wait_until(lambda: plant.values("mill")["asked.job"] == plant.values("lathe")["asked.job"] == 7)
-    shown = plant.command("status")
+    shown = plant.command("status", "--full")
     assert "polled" in shown
     listed = plant.command("pd", "list", "--station", "mill")
     assert "part  id 71, version 0, eap0 to requester, polled by asked" in listed

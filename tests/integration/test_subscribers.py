@@ -77,7 +77,7 @@ def test_on_the_loopback_a_subscriber_is_missing_or_unknown_but_never_present(
     row = left.tx("left", "left")
     assert (row["frame_state"], row["subscriber"], row["skipped"]) == (4, "missing", 0)
     assert row["sent"] > 0
-    shown = left.command("status")
+    shown = left.command("status", "--full")
     assert "left/to-right" in shown
     assert "missing" in shown
 

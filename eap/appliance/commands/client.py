@@ -167,20 +167,25 @@ def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return one answer for several appliances.
 
     *processes* are those of the first; *appliances* lists all, each with its plant, its stations'
-    names and its processes.
+    names, its processes and its findings.  Each station has the name of its plant.
     """
     appliances = [
         {
             "plant": answer["plant"],
             "stations": [station["name"] for station in answer["stations"]],
             "processes": answer["processes"],
+            "findings": answer.get("findings", []),
         }
         for answer in answers
     ]
     return {
         "version": answers[0]["version"],
         "processes": answers[0]["processes"],
-        "stations": [station for answer in answers for station in answer["stations"]],
+        "stations": [
+            {"plant": answer["plant"], **station}
+            for answer in answers
+            for station in answer["stations"]
+        ],
         "appliances": appliances,
     }
 

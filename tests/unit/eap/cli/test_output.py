@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from rich.text import Text
 
-from eap.cli.output import write_json, write_tables, write_text
+from eap.cli.output import repaint, write_json, write_tables, write_text
 from eap.cli.table import Column, TextTable
 from eap.errors import EnvironmentalError
 
@@ -60,3 +62,32 @@ def test_stdout_that_is_full_is_an_error_in_words(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr("sys.stdout", full)
         with pytest.raises(EnvironmentalError, match="stdout cannot be written: No space left"):
             write_text("a")
+
+
+def repaint_on_terminal(parts: list[Text], monkeypatch: pytest.MonkeyPatch, height: int) -> str:
+    written = io.StringIO()
+    console = Console(file=written, width=40, height=height, force_terminal=True)
+    monkeypatch.setattr("eap.cli.output._console", lambda: console)
+    monkeypatch.setattr(
+        "eap.cli.output.write_text", lambda text, end="\n": written.write(text + end)
+    )
+    repaint(parts)
+    return written.getvalue()
+
+
+def test_repaint_overwrites_the_screen_without_scrolling(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = repaint_on_terminal([Text("one"), Text("two")], monkeypatch, 5)
+    assert shown == "\x1b[Hone\x1b[K\ntwo\x1b[K\x1b[J"
+
+
+def test_repaint_cuts_off_what_exceeds_the_screen_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shown = repaint_on_terminal([Text("\n".join("abcdef"))], monkeypatch, 4)
+    assert shown == "\x1b[Ha\x1b[K\nb\x1b[K\nc\x1b[K\n… 3 more lines\x1b[K\x1b[J"
+
+
+def test_repaint_writes_blocks_when_piped(capfd: pytest.CaptureFixture[str]) -> None:
+    repaint([Text("one")])
+    repaint([Text("two")])
+    assert capfd.readouterr().out == "one\n\ntwo\n\n"

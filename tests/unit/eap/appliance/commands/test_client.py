@@ -163,6 +163,6 @@ def test_status_of_several_becomes_one():
     assert merged["processes"] == {"engine": {}}
     assert [station["name"] for station in merged["stations"]] == ["a", "b"]
     assert merged["appliances"] == [
-        {"plant": "p", "stations": ["a"], "processes": {"engine": {}}},
-        {"plant": "q", "stations": ["b"], "processes": {}},
+        {"plant": "p", "stations": ["a"], "processes": {"engine": {}}, "findings": []},
+        {"plant": "q", "stations": ["b"], "processes": {}, "findings": []},
     ]

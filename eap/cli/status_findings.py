@@ -1,0 +1,315 @@
+"""Findings of a status document: each fault with its place, its beginning, and a remedy.
+
+Pure: the document of ``eapctl status --json`` and the time in, a list of findings out, errors
+first.
+A finding comes from a generator of this module, which reads it from the counters and states, or
+from the list ``findings`` that the services of an appliance report by themselves.  A new kind of
+finding is one more ``yield``.
+
+Counters that only say what happened since the start are of severity INFO: they are no fault of this
+moment, and the one-screen view leaves them out.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+from eap.cli import words
+
+Row = Mapping[str, Any]
+
+_HUNG_AFTER_US = 2_000_000
+_HUNG_AFTER_CYCLES = 10
+_NET_ID_DOTS = 5
+_NOT_ASKED = "other: not asked for"
+_RECENT_US = 60_000_000
+"""A sender that should not be there is a warning for so long, then a remark."""
+_LISTED = 3
+"""So many PDs or slaves with the same fault are named; of more, their number is given."""
+
+REASONS = {
+    "cycle": "cyclic",
+    "divider": "divider",
+    "change": "on change",
+    "change_timeout": "resend",
+    "event": "event",
+    "poll": "polled",
+}
+STATES = {
+    "PREOP": "it exchanges no process data",
+    "SAFEOP": "it receives no process data",
+}
+"""Effect of the states that a station can be left in by request."""
+_TOO_LARGE, _NO_SUBSCRIBER = 2, 4
+"""Bits of FrameState."""
+_OTHER_VERSION, _OTHER_LENGTH = 1, 2
+"""Values of VarState of a received PD."""
+
+
+class Severity(StrEnum):
+    """How much a finding matters."""
+
+    ERROR = "error"  # a function fails now
+    WARNING = "warning"  # it works, but not as configured
+    INFO = "info"  # something happened since the start
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One fault or remark.
+
+    Attributes:
+        severity: How much it matters.
+        where: Name of the appliance's process, station, port, slave or PD.
+        what: The fault, in words.
+        advice: What to do about it; empty if there is nothing to do.
+        since: Unix time at which it began, if that is known.
+        plant: Plant of the appliance.
+    """
+
+    severity: Severity
+    where: str
+    what: str
+    advice: str = ""
+    since: float | None = None
+    plant: str = ""
+
+    def text(self, now_s: float) -> str:
+        """Return the finding as a sentence: what happened, since when; what to do."""
+        since = "" if self.since is None else f", since {_moment(self.since, now_s)}"
+        return f"{self.where}: {self.what}{since}" + (f"; {self.advice}" if self.advice else "")
+
+    @classmethod
+    def from_plain(cls, row: Row) -> Finding:
+        """Return the finding of a *row* of a document."""
+        return cls(**{**row, "severity": Severity(row["severity"])})
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return the finding as JSON has it."""
+        return asdict(self)
+
+
+def findings(document: Row, now_s: float) -> list[Finding]:
+    """Return all findings of a status *document*, errors first, then warnings."""
+    found = [
+        replace(each, plant=appliance["plant"])
+        for appliance in document["appliances"]
+        for each in _of_appliance(appliance)
+    ]
+    for appliance in document["appliances"]:
+        plant = appliance["plant"]
+        stations = [row for row in document["stations"] if row["plant"] == plant]
+        found += [replace(each, plant=plant) for each in _of_engine(plant, stations, now_s)]
+        for station in stations:
+            found += [replace(each, plant=plant) for each in _of_station(station)]
+    order = list(Severity)
+    return sorted(found, key=lambda each: order.index(each.severity))
+
+
+def is_special(frame: Row) -> bool:
+    """Tell whether a frame has more to show than its PDs: a monitored subscriber, or a NetID."""
+    return bool(frame["monitor_interval_ms"]) or frame["destination"].count(".") == _NET_ID_DOTS
+
+
+def _error(where: str, what: str, advice: str = "", since: float | None = None) -> Finding:
+    return Finding(Severity.ERROR, where, what, advice, since)
+
+
+def _warning(where: str, what: str, advice: str = "", since: float | None = None) -> Finding:
+    return Finding(Severity.WARNING, where, what, advice, since)
+
+
+def _info(where: str, what: str) -> Finding:
+    return Finding(Severity.INFO, where, what)
+
+
+def _of_appliance(appliance: Row) -> Iterator[Finding]:
+    plant = appliance["plant"]
+    for row in appliance.get("findings", ()):
+        yield Finding.from_plain(row)
+    processes = dict(appliance["processes"])
+    segments = processes.pop("segments", {})
+    processes |= {f"segment {name}": process for name, process in segments.items()}
+    for name, process in processes.items():
+        if not process["pid"]:
+            yield _error(f"{plant} {name}", "not running", "it is being started again")
+        elif step := process.get("step"):
+            yield _warning(f"{plant} {name}", f"starting: {step}")
+    engine = processes["engine"]
+    refused = [
+        f"{name.replace('_', ' ')} ({outcome.removeprefix('other: ')})"
+        for name, outcome in engine.get("realtime", {}).items()
+        if isinstance(outcome, str) and not outcome.startswith("fifo") and outcome != _NOT_ASKED
+    ]
+    if refused:
+        advice = "cycles may be late: run as root, or with --no-realtime"
+        yield _warning(f"{plant} engine", f"no realtime: {', '.join(refused)}", advice)
+    if counts := _counts(engine.get("bus_requests", {})):
+        yield _info(f"{plant} engine", f"requests to buses: {counts}")
+
+
+def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[Finding]:
+    """Yield one finding for all stations that the engine runs no more."""
+    if hung := [station for station in stations if _is_hung(station)]:
+        names = ", ".join(station["name"] for station in hung)
+        of_all = "any station" if len(hung) == len(stations) > 1 else names
+        since = now_s - max(station["cycle_age_us"] for station in hung) / 1e6
+        what = f"runs no cycles of {of_all}"
+        yield _error(f"{plant} engine", what, "the log of 'eapctl run' says why", since)
+
+
+def _is_hung(station: Row) -> bool:
+    silent_us: int = station.get("cycle_age_us") or 0
+    cycle_us: int = station.get("cycle_us", 0)
+    return silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * cycle_us)
+
+
+def _of_station(station: Row) -> Iterator[Finding]:
+    yield from _of_cycles(station)
+    for port in station["ports"]:
+        where = f"{station['name']}/{port['name']}"
+        if (bus := port.get("bus")) is not None:
+            yield from _of_bus(where, bus)
+        elif port.get("link") == "down" and port["kind"] != "bus":
+            advice = f"check cable and interface of {port['interface']}"
+            yield _error(where, "link down", advice)
+        elif port.get("link") == "down" and not _is_hung(station):
+            yield _error(where, "no frame comes back", "check cable and interface of the bus")
+    for frame in filter(is_special, station.get("frames", ())):
+        if frame["address"] is None:
+            waits = f"waits for a frame of {frame['destination']}, to learn its MAC address"
+            yield _warning(f"{station['name']} → {frame['name']}", waits)
+    for row in station["pd"]["tx"]:
+        yield from _of_sent(f"{station['name']} → {row['name']}", row)
+    if station["state"] not in STATES:
+        yield from _of_silent(station)
+    for row in station["pd"]["rx"]:
+        yield from _of_received(f"{station['name']} ← {row['name']}", row)
+
+
+def _of_cycles(station: Row) -> Iterator[Finding]:
+    name, state = station["name"], station["state"]
+    if effect := STATES.get(state):
+        advice = f"'eapctl state {name} OP' ends that"
+        yield _warning(name, f"in {state}, as requested: {effect}", advice)
+    if held := station.get("links_held"):
+        yield _warning(name, f"held {words.count(held, 'linked value')} back: not a number")
+    if overruns := station.get("overruns"):
+        yield _info(name, f"left out {words.count(overruns, 'cycle')}")
+    if torn := station.get("torn"):
+        yield _info(name, f"found {words.count(torn, 'torn write')}")
+    if discarded := _counts(station["discarded"]):
+        yield _info(name, f"dropped: {discarded}")
+
+
+def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
+    advice = f"'eapctl bus diag {where}' says more"
+    if bus["fault"]:
+        yield _error(where, "; ".join(bus["fault"].splitlines()), advice)
+    elif not bus["is_up"]:
+        yield _warning(where, "not up yet")
+    by_fault = defaultdict(list)
+    for slave in bus["slaves"]:
+        if slave["fault"]:
+            by_fault[slave["fault"]].append(slave)
+    for fault, slaves in by_fault.items():
+        names = [f"{slave['name']} ({slave['address']})" for slave in slaves]
+        if len(names) <= _LISTED:
+            yield from (_error(f"{where} {name}", fault, advice) for name in names)
+        else:
+            yield _error(f"{where}: {len(names)} slaves from {names[0]} on", fault, advice)
+    if bus["wkc_errors"]:
+        cycles = words.count(bus["wkc_errors"], "cycle")
+        yield _info(where, f"{cycles} with a wrong working counter")
+    if bus["lost"]:
+        yield _info(where, f"{words.count(bus['lost'], 'exchange')} lost")
+
+
+def _of_sent(where: str, row: Row) -> Iterator[Finding]:
+    frame_state = row.get("frame_state", 0)
+    if frame_state & _TOO_LARGE:
+        advice = "fewer or smaller PDs in its frame"
+        yield _error(where, "not sent: its frame is larger than its network carries", advice)
+    if frame_state & _NO_SUBSCRIBER:
+        advice = "check cable and power of the receiving station"
+        yield _error(where, "its subscriber does not answer", advice)
+    if row["skipped"]:
+        yield _info(where, f"skipped {words.times(row['skipped'])}")
+    if len(row["reason"]) > 1:
+        counts = (
+            f"{REASONS.get(why, why)} {words.times(count)}" for why, count in row["reason"].items()
+        )
+        yield _info(where, f"sent {', '.join(counts)}")
+
+
+def _of_silent(station: Row) -> Iterator[Finding]:
+    """Yield the subscriptions that receive nothing; many with the same fault as one finding."""
+    stale = [row for row in station["pd"]["rx"] if row["state"] == "stale"]
+    advice = "check its sender and the way to it"
+    yield from _grouped(station, stale, "stale: nothing received within the time-out", advice)
+    waiting = [row for row in station["pd"]["rx"] if row["state"] == "waiting"]
+    cyclic = [row for row in waiting if row["lost"] is not None]
+    yield from _grouped(station, cyclic, "nothing received yet", advice, _warning)
+    if rest := [row["name"] for row in waiting if row["lost"] is None]:
+        yield _info(f"{station['name']} ← {', '.join(rest)}", "nothing received yet")
+
+
+def _grouped(
+    station: Row, rows: Sequence[Row], what: str, advice: str, finding: Any = _error
+) -> Iterator[Finding]:
+    name = station["name"]
+    if len(rows) <= _LISTED:
+        for row in rows:
+            yield finding(f"{name} ← {row['name']}", what, advice, row.get("last_good"))
+        return
+    times = [row["last_good"] for row in rows if row.get("last_good")]
+    of_all = f"{len(rows)} of {len(station['pd']['rx'])} received PDs"
+    where = f"{name} ← {rows[0]['name']} and others ({of_all})"
+    yield finding(where, what, advice, min(times, default=None))
+
+
+def _of_received(where: str, row: Row) -> Iterator[Finding]:
+    if wrong := {_OTHER_VERSION: "version", _OTHER_LENGTH: "length"}.get(row.get("var_state", 0)):
+        advice = "compare the plant files of both stations"
+        yield _error(where, f"dropped: another {wrong} than expected", advice)
+    for key in ("wrong_source", "other_source"):
+        if source := row.get(key):
+            yield _of_source(where, key, source, row)
+    remarks = []
+    if row.get("timeouts"):
+        remarks.append(f"timed out {words.times(row['timeouts'])}")
+    remarks += [f"{row[key]} {key}" for key in ("duplicated", "reordered", "late") if row[key]]
+    if discarded := _counts(row["discarded"]):
+        remarks.append(f"dropped: {discarded}")
+    if remarks:
+        yield _info(where, "; ".join(remarks))
+
+
+def _of_source(where: str, key: str, source: Row, row: Row) -> Finding:
+    """Return the finding about a second sender with the publisher ID of a subscription."""
+    ago = words.duration(source["age_us"])
+    if key == "wrong_source":
+        what = f"{source['address']} sends with this publisher ID, last {ago} ago: dropped"
+    else:
+        both = f"{row['source']} and {source['address']}"
+        what = f"two senders with this publisher ID: {both}, last {ago} ago"
+    if source["age_us"] > _RECENT_US:
+        return _info(where, what)
+    return _warning(where, what, "find out which of them should not send")
+
+
+def _counts(counts: Row) -> str:
+    listed = (f"{count} {reason.replace('_', ' ')}" for reason, count in counts.items() if count)
+    return ", ".join(listed)
+
+
+def _moment(at_s: float, now_s: float) -> str:
+    """Return a time of day, with the date if it is another day, and how long ago that is."""
+    at, now = (datetime.fromtimestamp(each).astimezone() for each in (at_s, now_s))
+    form = "%H:%M:%S" if at.date() == now.date() else "%Y-%m-%d %H:%M:%S"
+    return f"{at.strftime(form)} ({words.duration(max(0, round((now_s - at_s) * 1e6)))})"

@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+import pytest
+
+from eap.cli.status_findings import Finding, Severity, findings
+from tests.support.statusdocument import NOW_S, bus_port, document, frame, rx, tx
+
+
+def found(status: dict[str, Any]) -> list[tuple[str, str]]:
+    return [(each.severity.value, each.text(NOW_S)) for each in findings(status, NOW_S)]
+
+
+def texts(**parts: Any) -> list[str]:
+    return [f"{severity} {text}" for severity, text in found(document(**parts))]
+
+
+def clock(at_s: float) -> str:
+    return datetime.fromtimestamp(at_s).astimezone().strftime("%H:%M:%S")
+
+
+def test_findings_of_a_plant_without_faults_are_none() -> None:
+    assert found(document(tx=[tx("state")], rx=[rx("left")])) == []
+
+
+def test_findings_are_sorted_errors_first_and_name_the_plant() -> None:
+    status = document(state="SAFEOP", overruns=2, ports=[bus_port()])
+    listed = findings(status, NOW_S)
+    assert [each.severity for each in listed] == [
+        Severity.ERROR, Severity.WARNING, Severity.INFO, Severity.INFO,
+    ]  # fmt: skip
+    assert {each.plant for each in listed} == {"line"}
+
+
+@pytest.mark.parametrize(
+    ("state", "effect"),
+    [("PREOP", "exchanges"), ("SAFEOP", "receives")],
+)
+def test_station_in_a_requested_state_is_a_warning(state: str, effect: str) -> None:
+    assert texts(state=state, rx=[rx("left", state="stale")]) == [
+        (
+            f"warning mixer: in {state}, as requested: it {effect} no process data;"
+            " 'eapctl state mixer OP' ends that"
+        )
+    ]
+
+
+def test_process_that_does_not_run_is_an_error() -> None:
+    status = document()
+    status["processes"]["services"]["pid"] = None
+    status["processes"]["segments"] = {"mixer/bus0": {"pid": None}}
+    assert found(status) == [
+        ("error", "line services: not running; it is being started again"),
+        ("error", "line segment mixer/bus0: not running; it is being started again"),
+    ]
+
+
+def test_process_that_starts_is_a_warning_with_its_step() -> None:
+    status = document()
+    status["processes"]["engine"]["step"] = "building station mixer"
+    assert found(status) == [("warning", "line engine: starting: building station mixer")]
+
+
+@pytest.mark.parametrize(("age_s", "severity"), [(2, "warning"), (120, "info")])
+def test_second_sender_with_a_publisher_id_is_a_warning_for_a_minute(
+    age_s: int, severity: str
+) -> None:
+    other = {"address": "10.0.0.9", "age_us": age_s * 1_000_000}
+    rows = [rx("a", wrong_source=other), rx("b", source="10.0.0.1", other_source=other)]
+    first, second = texts(rx=rows)
+    assert first.startswith(f"{severity} mixer ← a: 10.0.0.9 sends with this publisher ID, last ")
+    assert second.startswith(
+        f"{severity} mixer ← b: two senders with this publisher ID: 10.0.0.1 and 10.0.0.9, last "
+    )
+
+
+def test_engine_without_realtime_is_one_warning() -> None:
+    status = document()
+    status["processes"]["engine"]["realtime"] = {
+        "scheduler": "other: needs CAP_SYS_NICE",
+        "cpus": [0, 1],
+        "memory_locked": "needs CAP_IPC_LOCK",
+        "pm_qos": True,
+    }
+    assert found(status) == [
+        (
+            "warning",
+            (
+                "line engine: no realtime: scheduler (needs CAP_SYS_NICE), memory locked (needs"
+                " CAP_IPC_LOCK); cycles may be late: run as root, or with --no-realtime"
+            ),
+        )
+    ]
+
+
+@pytest.mark.parametrize("scheduler", ["fifo 50", "other: not asked for"])
+def test_engine_that_got_all_it_requested_has_no_finding(scheduler: str) -> None:
+    status = document()
+    status["processes"]["engine"]["realtime"] = {"scheduler": scheduler, "pm_qos": True}
+    assert found(status) == []
+
+
+def test_requests_to_buses_that_were_lost_are_a_remark() -> None:
+    status = document()
+    status["processes"]["engine"]["bus_requests"] = {"malformed": 0, "dropped": 3}
+    assert found(status) == [("info", "line engine: requests to buses: 3 dropped")]
+
+
+def test_findings_of_the_services_are_taken_over() -> None:
+    status = document()
+    alarm = Finding(Severity.ERROR, "line audit", "changes not recorded: disk full", "free space")
+    status["appliances"][0]["findings"] = [alarm.to_plain()]
+    (only,) = findings(status, NOW_S)
+    assert only == Finding(**{**alarm.to_plain(), "severity": Severity.ERROR, "plant": "line"})
+
+
+@pytest.mark.parametrize(("cycle_us", "hangs"), [(10_000, True), (1_000_000, False)])
+def test_station_without_cycles_is_an_error_since_its_last_one(cycle_us: int, hangs: bool) -> None:
+    since = f"{clock(NOW_S - 3.1)} (3.1 s)"
+    expected = (
+        f"error line engine: runs no cycles of mixer, since {since};"
+        " the log of 'eapctl run' says why"
+    )
+    assert texts(cycle_us=cycle_us, cycle_age_us=3_100_000) == [expected] * hangs
+
+
+def test_stale_pd_is_an_error_since_the_last_good_one() -> None:
+    last = NOW_S - 90
+    assert texts(rx=[rx("left", state="stale", last_good=last), rx("right")]) == [
+        (
+            f"error mixer ← left: stale: nothing received within the time-out, since {clock(last)}"
+            " (90.0 s); check its sender and the way to it"
+        )
+    ]
+
+
+def test_time_of_another_day_has_its_date() -> None:
+    text = Finding(Severity.ERROR, "a", "b", since=NOW_S - 3 * 86400).text(NOW_S)
+    day = datetime.fromtimestamp(NOW_S - 3 * 86400).astimezone().strftime("%Y-%m-%d")
+    assert text.startswith(f"a: b, since {day} ")
+    assert text.endswith("(72 h)")
+
+
+def test_many_stale_pds_are_one_finding() -> None:
+    rows = [rx(f"pd{n}", state="stale", last_good=NOW_S - n) for n in range(5)]
+    (only,) = texts(rx=[*rows, rx("good")])
+    assert only.startswith("error mixer ← pd0 and others (5 of 6 received PDs): stale")
+    assert f"since {clock(NOW_S - 4)}" in only
+
+
+def test_cyclic_pd_that_never_came_is_a_warning_and_any_other_a_remark() -> None:
+    waiting = {"state": "waiting", "received": 0}
+    assert [
+        each.partition(";")[0]
+        for each in texts(rx=[rx("a", **waiting), rx("b", lost=None, **waiting)])
+    ] == ["warning mixer ← a: nothing received yet", "info mixer ← b: nothing received yet"]
+
+
+@pytest.mark.parametrize(("var_state", "wrong"), [(1, "version"), (2, "length")])
+def test_pd_of_another_layout_is_an_error(var_state: int, wrong: str) -> None:
+    assert texts(rx=[rx("left", var_state=var_state)]) == [
+        (
+            f"error mixer ← left: dropped: another {wrong} than expected;"
+            " compare the plant files of both stations"
+        )
+    ]
+
+
+def test_frame_states_of_sent_pds_are_errors() -> None:
+    rows = [tx("a", frame_state=3), tx("b", frame_state=4), tx("c", frame_state=1, skipped=2)]
+    first, second, third = texts(tx=rows)
+    assert first.startswith("error mixer → a: not sent: its frame is larger than its network")
+    assert second.startswith("error mixer → b: its subscriber does not answer")
+    assert third == "info mixer → c: skipped 2 times"
+
+
+def test_frame_that_waits_for_an_address_is_a_warning() -> None:
+    rows = [frame("new", destination="5.3.3.3.2.1", address=None), frame("known")]
+    assert texts(frames=rows) == [
+        "warning mixer → new: waits for a frame of 5.3.3.3.2.1, to learn its MAC address"
+    ]
+
+
+def test_port_without_link_is_an_error() -> None:
+    port = {"name": "eap0", "kind": "eap", "interface": "ethernet://eth0", "link": "down"}
+    assert texts(ports=[port]) == [
+        "error mixer/eap0: link down; check cable and interface of ethernet://eth0"
+    ]
+    assert texts(ports=[port | {"kind": "bus"}]) == [
+        "error mixer/eap0: no frame comes back; check cable and interface of the bus"
+    ]
+
+
+def test_engine_that_runs_no_station_is_one_finding() -> None:
+    silent_bus = {"name": "bus0", "kind": "bus", "interface": "sim://x", "link": "down"}
+    status = document(cycle_age_us=3_000_000, ports=[silent_bus])
+    (mixer,) = status["stations"]
+    status["stations"] = [mixer | {"name": name} for name in ("a", "b", "c")]
+    ((_, text),) = found(status)
+    assert text.startswith("line engine: runs no cycles of any station, since")
+
+
+def test_buses_and_their_slaves() -> None:
+    down = bus_port("bus1", is_up=False, fault="no frame comes back\nso far", slaves=[], lost=0)
+    starting = bus_port("bus2", is_up=False, slaves=[], lost=0)
+    assert texts(ports=[bus_port(wkc_errors=4), down, starting]) == [
+        "error mixer/bus0 press (1002): is lost; 'eapctl bus diag mixer/bus0' says more",
+        "error mixer/bus1: no frame comes back; so far; 'eapctl bus diag mixer/bus1' says more",
+        "warning mixer/bus2: not up yet",
+        "info mixer/bus0: 4 cycles with a wrong working counter",
+        "info mixer/bus0: 3 exchanges lost",
+    ]
+
+
+def test_many_slaves_with_the_same_fault_are_one_finding() -> None:
+    slaves = [
+        {"address": 1000 + n, "name": f"s{n}", "state": None, "target": "OP", "fault": "is lost"}
+        for n in range(1, 33)
+    ]
+    (only,) = texts(ports=[bus_port(slaves=slaves, lost=0)])
+    assert only.startswith("error mixer/bus0: 32 slaves from s1 (1001) on: is lost; ")
+
+
+def test_what_happened_since_the_start_are_remarks() -> None:
+    left = rx(
+        "left", timeouts=1, duplicated=2, reordered=3, late=4, discarded={"version": 5, "length": 6}
+    )
+    alarm = tx("alarm", reason={"change": 1, "change_timeout": 8})
+    assert texts(
+        tx=[alarm], rx=[left], discarded={"unknown_id": 8}, overruns=1, torn=2, links_held=3
+    ) == [
+        "warning mixer: held 3 linked values back: not a number",
+        "info mixer: left out 1 cycle",
+        "info mixer: found 2 torn writes",
+        "info mixer: dropped: 8 unknown id",
+        "info mixer → alarm: sent on change once, resend 8 times",
+        (
+            "info mixer ← left: timed out once; 2 duplicated; 3 reordered; 4 late;"
+            " dropped: 5 version, 6 length"
+        ),
+    ]
