@@ -152,7 +152,7 @@ def _runs(parts: Iterable[Mapped]) -> Iterator[_Whole | _Bits]:
     for part in parts:
         aligned = end == 8 * first
         end = part.start + part.bits
-        if aligned and part.entry is not None and not part.bits % 8:
+        if aligned and part.entry is not None and part.bits == 8 * part.entry.kind.size:
             yield _Whole(part.entry, first, end // 8)
             first = end // 8
             continue

@@ -57,6 +57,8 @@ class ChannelSpec(msgspec.Struct, frozen=True, kw_only=True):
     """Inputs: the same from a file with one value a line."""
     follows: str = ""
     """Inputs: the output of this slave that they show."""
+    bits: Annotated[int, Meta(ge=0, le=255)] = 0
+    """In the PDO; 0 for those of its type."""
     pdo: U16 = 0
     """The PDO that maps it; left out, 0x1A00 for inputs and 0x1600 for outputs."""
     assigned: bool = True

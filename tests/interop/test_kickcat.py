@@ -8,6 +8,7 @@ what there is not: 2.5 takes no abort for an answer.  SOEM does all of this (tes
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.simulator import NEAR, simulator, veth_pair
+from tests.support.terminals import sizes_of, write_bus
 
 kickcat = pytest.importorskip("kickcat", reason="needs kickcat: pip install kickcat")
 
@@ -40,10 +42,18 @@ ATTEMPTS = 5  # KickCAT waits out FRAME_S for every frame, so it is short, and a
 CYCLES = 20
 
 
-def run_alone(tmp_path, body):
-    """Run *body* in a process of its own; again if KickCAT 2.5 crashes, as on late frames."""
+@pytest.fixture
+def island_bus(tmp_path):
     path = tmp_path / "bus.yaml"
     path.write_text(BUS)
+    return path
+
+
+def run_alone(path, body):
+    """Run *body* in a process of its own; again if KickCAT 2.5 crashes, as on late frames.
+
+    Return what it prints last.
+    """
     with veth_pair(), simulator(path):
         for _ in range(ATTEMPTS):
             command = [sys.executable, "-m", "tests.interop.test_kickcat", body.__name__]
@@ -51,6 +61,7 @@ def run_alone(tmp_path, body):
             if done.returncode != -signal.SIGSEGV:
                 break
     assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
 
 
 def open_bus():
@@ -105,13 +116,26 @@ def process_data_in_op(bus):
     assert [bus.get_state(each) for each in bus.slaves()] == [kickcat.State.OPERATIONAL] * 2
 
 
-def test_scan_and_sdo(tmp_path):
-    run_alone(tmp_path, scan_and_sdo)
+def print_sizes_in_op(bus):
+    operate(bus)
+    assert {bus.get_state(each) for each in bus.slaves()} == {kickcat.State.OPERATIONAL}
+    print(json.dumps([(each.output_size, each.input_size) for each in bus.slaves()]))
 
 
-def test_process_data_in_op(tmp_path):
-    run_alone(tmp_path, process_data_in_op)
+def test_scan_and_sdo(island_bus):
+    run_alone(island_bus, scan_and_sdo)
+
+
+def test_process_data_in_op(island_bus):
+    run_alone(island_bus, process_data_in_op)
+
+
+@pytest.mark.parametrize("name", ["io", "terminals"])
+def test_kickcat_exchanges_as_many_bytes_of_each_slave_as_our_master(tmp_path, name):
+    path = write_bus(tmp_path) if name == "terminals" else ROOT / f"config/buses/{name}.yaml"
+    sizes = json.loads(run_alone(path, print_sizes_in_op))
+    assert [tuple(each) for each in sizes] == sizes_of(path)
 
 
 if __name__ == "__main__":
-    {body.__name__: body for body in (scan_and_sdo, process_data_in_op)}[sys.argv[1]](open_bus())
+    globals()[sys.argv[1]](open_bus())

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from time import monotonic
 
 import pytest
 
 from tests.support.appliance import wait_until
 from tests.support.simulator import FAR, FAR_2, NEAR, NEAR_2, simulator, veth_pair
+from tests.support.terminals import sizes_of, write_bus
 
 pysoem = pytest.importorskip("pysoem", reason="needs pysoem: pip install pysoem")
 
@@ -42,6 +44,7 @@ slaves:
   - {name: plain, kind: digital, product: 8, mailbox: null,
      inputs: [{name: a}, {name: b}], outputs: [{name: c}]}
 """
+CONFIG_BUSES = Path(__file__).parents[2] / "config" / "buses"
 CYCLES = 1000
 TIMEOUT_US = 2_500_000
 FRAME_US = 1_000_000
@@ -365,6 +368,23 @@ def test_ring_goes_on_with_a_cut_cable(tmp_path):
             assert exchange(found) == 3
             assert running.fault(kind="cut", slave="b") == {"ok": True}
             assert exchange(found) == 3
+            found.state = pysoem.INIT_STATE
+            found.write_state()
+        finally:
+            found.close()
+
+
+@pytest.mark.parametrize("name", ["io", "terminals"])
+def test_soem_exchanges_as_many_bytes_of_each_slave_as_our_master(tmp_path, name):
+    path = write_bus(tmp_path) if name == "terminals" else CONFIG_BUSES / f"{name}.yaml"
+    ours = sizes_of(path)
+    with veth_pair(), simulator(path):
+        found = pysoem.Master()
+        found.open(NEAR)
+        try:
+            assert found.config_init() == len(ours)
+            operate(found)
+            assert [(len(each.output), len(each.input)) for each in found.slaves] == ours
             found.state = pysoem.INIT_STATE
             found.write_state()
         finally:

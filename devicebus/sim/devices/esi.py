@@ -18,8 +18,7 @@ from devicebus.sim.spec import ChannelSpec, MailboxSpec, SlaveSpec
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-_PADDING = (64, 32, 16, 8, 4, 2, 1)
-_BY_BITS = {64: "ULINT", 32: "UDINT", 16: "UINT"}
+_MAX_ENTRY_BITS = 255
 _MINIMUM_MAILBOX = 32
 
 
@@ -100,14 +99,14 @@ def _channels(pdos: Iterable[Element]) -> Iterator[ChannelSpec]:
                     name=text_at(entry, "Name", name),
                     type=type_of(text_at(entry, "DataType", ""), bits),
                     object=name,
+                    bits=bits,
                     pdo=index,
                     assigned=assigned,
                 )
 
 
 def _padding(bits: int, pdo: int, *, assigned: bool) -> Iterator[ChannelSpec]:
-    for size in _PADDING:
-        while bits >= size:
-            kind = _BY_BITS.get(size, f"BIT{size}")
-            yield ChannelSpec(name="", type=kind, object="0", pdo=pdo, assigned=assigned)
-            bits -= size
+    while bits:
+        part = min(bits, _MAX_ENTRY_BITS)
+        yield ChannelSpec(name="", object="0", bits=part, pdo=pdo, assigned=assigned)
+        bits -= part

@@ -47,7 +47,7 @@ def text_at(element: Element, path: str, default: str) -> str:
 
 
 def type_of(name: str, bits: int) -> str:
-    """Return the type of that name if it has so many bits, else one that has."""
+    """Return the type of that name if it has so many bits, else one that has room for them."""
     try:
         kind = datatypes.parse(name)
     except ValueError:
@@ -56,7 +56,12 @@ def type_of(name: str, bits: int) -> str:
         return name
     if bits in _BY_BITS:
         return _BY_BITS[bits]
-    return f"BIT{bits}" if bits < 8 else f"BLOCK({(bits + 7) // 8})"
+    if bits < 8:
+        return f"BIT{bits}"
+    if bits % 8 == 0:
+        return f"BLOCK({bits // 8})"
+    whole = f"BLOCK({bits // 8 + 1})"
+    return next((kind for size, kind in _BY_BITS.items() if size > bits), whole)
 
 
 def objects(device: Element) -> Iterator[ObjectSpec]:

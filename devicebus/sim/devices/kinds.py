@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
@@ -10,7 +10,8 @@ from devicebus.mailbox.soe_parameter import SoeParameter
 from devicebus.sim.device import Behaviour
 from devicebus.sim.devices import drive, driveidns, esi
 from devicebus.sim.devices.signal import Signals
-from devicebus.sim.spec import DeviceKind, SlaveSpec
+from devicebus.sim.spec import ChannelSpec, DeviceKind, SlaveSpec
+from eap.codec import datatypes
 from eap.od.dictionary import ObjectDictionary
 
 MODULAR_DEVICE = 5001
@@ -32,9 +33,28 @@ def complete(spec: SlaveSpec, resources: Mapping[str, bytes]) -> SlaveSpec:
         raise ValueError("a coupler has no process data, expected no inputs and no outputs")
     if spec.kind is DeviceKind.DRIVE:
         spec = drive.complete(spec)
-    if not spec.product:
-        spec = msgspec.structs.replace(spec, product=_PRODUCTS[spec.kind])
-    return spec
+    return msgspec.structs.replace(
+        spec,
+        product=spec.product or _PRODUCTS[spec.kind],
+        inputs=(*spec.inputs, *_padding(spec.inputs)),
+        outputs=(*spec.outputs, *_padding(spec.outputs)),
+    )
+
+
+def _padding(channels: Iterable[ChannelSpec]) -> Iterator[ChannelSpec]:
+    """Yield what fills the last byte of each PDO.
+
+    Real devices with an application of their own do so, and masters count them reliably: SOEM
+    expects too small a working counter of slaves that share a byte.  Devices from an ESI file have
+    what the file says.
+    """
+    ends: dict[int, int] = {}
+    for channel in channels:
+        bits = channel.bits or datatypes.parse(channel.type).bit_length
+        ends[channel.pdo] = ends.get(channel.pdo, 0) + bits
+    for pdo, end in ends.items():
+        if end % 8:
+            yield ChannelSpec(name="", object="0", bits=-end % 8, pdo=pdo)
 
 
 def device_type(spec: SlaveSpec) -> int:

@@ -102,10 +102,10 @@ def _add_side(
     pdos: dict[int, list[tuple[int, int, int]]] = {}
     assigned: dict[int, bool] = {}
     for channel, (index, subindex) in zip(channels, places(channels, base), strict=True):
+        kind = datatypes.parse(channel.type)
         if index:
-            bits = _add_entry(dictionary, index, subindex, channel, access).kind.bit_length
-        else:
-            bits = datatypes.parse(channel.type).bit_length
+            kind = _add_entry(dictionary, index, subindex, channel, access).kind
+        bits = channel.bits or kind.bit_length
         pdo = channel.pdo or first_pdo
         if not 0 <= pdo - first_pdo < PDOS:
             raise ValueError(f"{channel.name}: 0x{pdo:04X} is no PDO of its direction")

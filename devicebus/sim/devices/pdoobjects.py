@@ -28,9 +28,10 @@ _PDO_MAPPING = 0x21
 def mapping(
     index: int, mapped: Sequence[tuple[int, int, int]], dictionary: ObjectDictionary
 ) -> OdObject:
-    """Make a PDO of entries (index, subindex, bits); it ends on a whole octet.
+    """Make a PDO of entries (index, subindex, bits), in which nothing is padded.
 
-    A master may change it in PreOp.
+    Only the sync manager begins and ends on whole bytes: PDOs of one bit follow each other bit by
+    bit, as those of real digital terminals do.  A master may change it in PreOp.
 
     Raises:
         ValueError: there is no such PDO, or it maps too much.
@@ -38,15 +39,12 @@ def mapping(
     if not (0 <= index - RX_PDO < PDOS or 0 <= index - TX_PDO < PDOS):
         raise ValueError(f"0x{index:04X} is no PDO (0x1600 to 0x17FF, 0x1A00 to 0x1BFF)")
     name = "TxPDO" if index >= TX_PDO else "RxPDO"
-    rest = -sum(bits for _, _, bits in mapped) % 8
     numbers = [entry << 16 | sub << 8 | bits for entry, sub, bits in mapped]
-    if rest:
-        numbers.append(rest)
     if any(bits > 0xFF for _, _, bits in mapped) or len(numbers) > _MAX_ENTRIES:
         raise ValueError(
             f"{name} maps {len(numbers)} entries, expected at most 254 of at most 255 bits"
         )
-    room = max(MIN_ROOM, sum(number & 0xFF for number in numbers) // 8)
+    room = max(MIN_ROOM, (sum(number & 0xFF for number in numbers) + 7) // 8)
     limit = min(len(numbers) + SPARE_ENTRIES, _MAX_ENTRIES)
     count = Entry("SubIndex 000", "USINT", RW_PREOP, len(numbers), maximum=limit)
     entries = {0: count, **_numbered(index, numbers, limit, "UDINT", count)}
@@ -93,6 +91,7 @@ def _judge_mapping(
     index: int, entries: dict[int, Entry], dictionary: ObjectDictionary, room: int
 ) -> Callable[[bytes], None]:
     right = Access.TX_MAPPABLE if index >= TX_PDO else Access.RX_MAPPABLE
+    own = {entry.value for entry in entries.values()}
 
     def check(octets: bytes) -> None:
         total = 0
@@ -107,7 +106,7 @@ def _judge_mapping(
             entry = dictionary.entry(*place)
             if not entry.access & right:
                 raise SdoAbortError(AbortCode.NOT_MAPPABLE, index, sub, entry.name)
-            if bits != entry.kind.bit_length:
+            if bits != entry.kind.bit_length and number not in own:
                 raise SdoAbortError(AbortCode.PARAMETER, index, sub,
                                     f"{bits} bits of {entry.kind.text}")  # fmt: skip
         if total > 8 * room:

@@ -1,10 +1,11 @@
-"""What is worth a warning in a plant file that is well: stations that tools cannot reach whole.
+"""Warnings about a plant file without errors: too small dictionaries, slaves that look alike.
 
-What routes come to is told by those who load the file.
+Warnings about routes come with the loaded file.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from eap.appliance.plantfile import load_plant
@@ -13,26 +14,56 @@ from eap.config.load import LoadResult
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
 from eap.device.fault import DeviceFault
-from eap.pd.spec import PortKind, StationSpec
+from eap.ids import InterfaceUri
+from eap.pd.spec import BusSlaveSpec, PortKind, StationSpec
 
 
 def check_plant(path: Path) -> tuple[LoadResult, tuple[Finding, ...]]:
-    """Load the plant file at *path*; return that, and its warnings if it is well."""
+    """Load the plant file at *path*; return that, and its warnings if it has no errors."""
     result = load_plant(path)
     if result.plant is None:
         return result, ()
     warnings = []
     for number, station in enumerate(result.plant.stations):
         place = f"stations[{number}]"
-        line = result.lines.get(place, 0)
-        for port, reason in _misfits(station):
-            message = (
-                f"station {station.name}, port {port}: {reason}; it runs, but cannot be changed"
-                " while it does"
+        for message, expected in (*_small_dictionaries(station), *_alike_slaves(station)):
+            line = result.lines.get(place, 0)
+            warnings.append(
+                Finding(str(path), line, place, f"station {station.name}, {message}", expected)
             )
-            expected = "no more than an object dictionary holds"
-            warnings.append(Finding(str(path), line, place, message, expected))
     return result, (*warnings, *result.warnings)
+
+
+def _small_dictionaries(station: StationSpec) -> Iterator[tuple[str, str]]:
+    for port, reason in _misfits(station):
+        yield (
+            f"port {port}: {reason}; it runs, but cannot be changed while it does",
+            "no more than an object dictionary holds",
+        )
+
+
+def _alike_slaves(station: StationSpec) -> Iterator[tuple[str, str]]:
+    """Yield simulated slaves that have the identity of one before, but other process data."""
+    for port in station.ports:
+        if port.bus is None or InterfaceUri.parse(port.interface).scheme != "sim":
+            continue
+        known: dict[tuple[int, int, int | None], BusSlaveSpec] = {}
+        for slave in port.bus.slaves:
+            first = known.setdefault((slave.vendor, slave.product, slave.revision), slave)
+            if _process_data(first) != _process_data(slave):
+                message = (
+                    f"port {port.name}: {first.name} and {slave.name} have the same vendor,"
+                    " product and revision, but other process data; masters such as SOEM take"
+                    " them to be alike"
+                )
+                yield message, f"a product number of its own for {slave.name} in the bus file"
+
+
+def _process_data(slave: BusSlaveSpec) -> list[list[tuple[int, int, int]]]:
+    return [
+        [(entry.index, entry.subindex, entry.bit_length) for entry in entries]
+        for entries in (slave.outputs, slave.inputs)
+    ]
 
 
 def _misfits(station: StationSpec) -> list[tuple[str, str]]:

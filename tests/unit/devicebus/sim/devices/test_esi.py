@@ -8,6 +8,7 @@ from devicebus.sim.devices.build import build_slave
 from devicebus.sim.devices.esi import complete
 from devicebus.sim.spec import DeviceKind, SlaveSpec
 from devicebus.wire import sii
+from tests.support.terminals import DI4, DI8, DO8, esi
 
 XML = b"""<?xml version="1.0"?>
 <EtherCATInfo>
@@ -54,20 +55,52 @@ def test_device_is_what_its_file_says():
     spec = complete(SPEC, XML)
     assert (spec.vendor, spec.product, spec.revision) == (0x123, 2, 0x20000)
     assert (spec.mailbox.size, spec.mailbox.foe, spec.mailbox.soe) == (160, True, False)
-    assert [(c.name, c.type, c.object, c.pdo, c.assigned) for c in spec.outputs] == [
-        ("Nibble", "BIT4", "0x7000:1", 0x1600, True),
-        ("", "BIT4", "0", 0x1600, True),
-        ("0x7010:1", "USINT", "0x7010:1", 0x1601, False),
+    assert [(c.name, c.type, c.bits, c.object, c.pdo, c.assigned) for c in spec.outputs] == [
+        ("Nibble", "BIT4", 4, "0x7000:1", 0x1600, True),
+        ("", "BOOL", 4, "0", 0x1600, True),
+        ("0x7010:1", "USINT", 8, "0x7010:1", 0x1601, False),
     ]
     assert [(c.name, c.type) for c in spec.inputs] == [("Level", "INT"), ("Odd", "BLOCK(3)")]
     assert [(o.index, o.name, o.type) for o in spec.objects] == [(0x8001, "Gain", "UINT")]
 
 
-def test_wide_padding_is_cut():
+@pytest.mark.parametrize(
+    ("bits", "expected"), [(3, [3]), (12, [12]), (28, [28]), (255, [255]), (300, [255, 45])]
+)
+def test_esi_padding_is_one_entry_as_far_as_a_mapping_can_say(bits, expected):
     xml = XML.replace(
-        b"<Index>0</Index><BitLen>4</BitLen>", b"<Index>#x0</Index><BitLen>28</BitLen>"
+        b"<Index>0</Index><BitLen>4</BitLen>", b"<Index>#x0</Index><BitLen>%d</BitLen>" % bits
     )
-    assert [c.type for c in complete(SPEC, xml).outputs[1:4]] == ["UINT", "BIT8", "BIT4"]
+    assert [c.bits for c in complete(SPEC, xml).outputs[1:-1]] == expected
+    slave = build_slave(SPEC, {"mixed.xml": xml})
+    assert slave.device.process_data.outputs.size == (4 + bits + 7) // 8
+
+
+@pytest.mark.parametrize(
+    ("bits", "kind"), [(3, "BIT3"), (12, "UINT"), (24, "BLOCK(3)"), (69, "BLOCK(9)")]
+)
+def test_esi_entry_of_odd_length_keeps_its_bits(bits, kind):
+    xml = XML.replace(b"<BitLen>24</BitLen>", b"<BitLen>%d</BitLen>" % bits)
+    assert complete(SPEC, xml).inputs[1].type == kind
+    slave = build_slave(SPEC, {"mixed.xml": xml})
+    assert [entry.bit_length for entry in sii.decode(slave.esc.image).tx_pdos[0].entries] == [
+        16,
+        bits,
+    ]
+    slave.device.process_data.inputs.parts[1].entry.octets = bytes((0xFF,)) * 9
+    assert slave.device.process_data.inputs.pack() == ((1 << bits) - 1 << 16).to_bytes(
+        (16 + bits + 7) // 8, "little"
+    )
+
+
+@pytest.mark.parametrize(("product", "outputs", "inputs"), [(DI8, 0, 1), (DO8, 1, 0), (DI4, 0, 1)])
+def test_esi_pdos_of_one_bit_share_a_byte(product, outputs, inputs):
+    spec = SlaveSpec(name="x", kind=DeviceKind.ESI, esi="terminals.xml", product=product)
+    slave = build_slave(spec, {"terminals.xml": esi().encode()})
+    data = slave.device.process_data
+    assert (data.outputs.size, data.inputs.size) == (outputs, inputs)
+    read = sii.decode(slave.esc.image)
+    assert {e.bit_length for pdo in (*read.rx_pdos, *read.tx_pdos) for e in pdo.entries} == {1}
 
 
 def test_first_device_without_a_product_code():

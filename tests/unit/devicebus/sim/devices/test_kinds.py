@@ -21,6 +21,20 @@ def test_kind_gives_a_product_code_unless_there_is_one(kind):
     assert complete(spec(kind, product=77), {}).product == 77
 
 
+def test_kind_fills_the_last_byte_of_each_pdo():
+    inputs = (
+        ChannelSpec(name="a"),
+        ChannelSpec(name="b", type="UINT", pdo=0x1A01),
+        ChannelSpec(name="c", type="UINT", bits=12, pdo=0x1A02),
+    )
+    filled = complete(spec("digital", inputs=inputs), {}).inputs
+    assert filled[:3] == inputs
+    assert [(each.object, each.bits, each.pdo) for each in filled[3:]] == [
+        ("0", 7, 0),
+        ("0", 4, 0x1A02),
+    ]
+
+
 def test_profile_of_a_drive():
     assert (device_type(spec("drive")), device_type(spec("digital"))) == (0x20192, 5001)
 

@@ -45,9 +45,8 @@ def test_identity_and_names():
 
 def test_pdos_map_the_channels():
     dictionary = build_dictionary(generic(), 5001)
-    assert dictionary[0x1A00].max_subindex == 3
-    mapped = [dictionary.entry(0x1A00, sub).value for sub in (1, 2, 3)]
-    assert mapped == [0x6000_0110, 0x6000_0201, 7]
+    assert dictionary[0x1A00].max_subindex == 2
+    assert [dictionary.entry(0x1A00, sub).value for sub in (1, 2)] == [0x6000_0110, 0x6000_0201]
     assert dictionary[0x6000].name == "Inputs"
     assert dictionary[0x7000].entries[2].name == "valve"
     assert dictionary.entry(0x1C12, 1).value == 0x1600

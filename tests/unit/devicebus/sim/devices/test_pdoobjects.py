@@ -26,9 +26,16 @@ def write(dictionary, sub, number, size=2, index=0x1C13):
     dictionary.download(index, sub, number.to_bytes(size, "little"), OdState.PREOP)
 
 
-def test_mapping_ends_on_a_whole_octet(dictionary):
+def test_mapping_has_what_it_is_given_and_no_padding(dictionary):
     assert [e.value for e in dictionary[0x1A00].entries.values()][:3] == [1, 0x6000_0110, 0]
-    assert [e.value for e in dictionary[0x1A01].entries.values()][:3] == [2, 0x6000_0201, 7]
+    assert [e.value for e in dictionary[0x1A01].entries.values()][:3] == [1, 0x6000_0201, 0]
+
+
+def test_mapping_of_part_of_an_entry_can_be_written_again(dictionary):
+    dictionary.add(mapping(0x1A02, [(0x6000, 1, 12)], dictionary))
+    for sub, number, size in ((0, 0, 1), (1, 0x6000_010C, 4), (0, 1, 1)):
+        write(dictionary, sub, number, size, 0x1A02)
+    assert dictionary.entry(0x1A02, 0).value == 1
 
 
 @pytest.mark.parametrize("mapped", [[(0x6000, 1, 256)], [(0x6000, 1, 8)] * 255])

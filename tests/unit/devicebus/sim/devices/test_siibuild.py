@@ -43,8 +43,8 @@ def test_names_of_pdos_and_entries():
     read = sii.decode(image_of(generic("island")))
     ((rx, outputs),), ((tx, inputs),) = read.rx_pdos, read.tx_pdos
     assert (read.string(rx.name), read.string(tx.name)) == ("Outputs", "Inputs")
-    assert [read.string(each.name) for each in outputs] == ["speed", "valve", ""]
-    assert [read.string(each.name) for each in inputs] == ["level", "limit", ""]
+    assert [read.string(each.name) for each in outputs] == ["speed", "valve"]
+    assert [read.string(each.name) for each in inputs] == ["level", "limit"]
     assert len(set(read.strings)) == len(read.strings)
     assert read.general.coe_pdo_configuration == 1
 
@@ -111,8 +111,8 @@ def test_image_tells_what_the_slave_is():
     )
     ((header, entries),) = read.tx_pdos
     assert (header.index, header.sync_manager) == (0x1A00, 3)
-    assert [e.bit_length for e in entries] == [16, 1, 7]
-    assert [e.data_type for e in entries] == [6, 1, 0]
+    assert [e.bit_length for e in entries] == [16, 1]
+    assert [e.data_type for e in entries] == [6, 1]
 
 
 def test_image_of_a_slave_without_mailbox_boot_and_clock():

@@ -8,6 +8,7 @@ import pytest
 
 from eap.appliance.commands.plant_check import check_plant
 
+PLANTS = sorted((Path(__file__).parents[5] / "config").glob("*.yaml"))
 PLANT = """\
 plant: line
 stations:
@@ -57,3 +58,35 @@ def test_a_file_that_is_no_plant_has_findings_only(tmp_path: Path) -> None:
     result, warnings = check_plant(write(tmp_path, name="a b"))
     assert result.findings
     assert warnings == ()
+
+
+BUS_PLANT = """\
+plant: line
+stations:
+  - name: mixer
+    net_id: 1.1.1.1.1.1
+    ports:
+      - {name: bus0, kind: bus, interface: "sim://bus.yaml", net_id: 1.1.1.1.3.1}
+"""
+BUS = """\
+bus: b
+slaves:
+  - {name: in, kind: digital, inputs: [{name: a}]}
+  - {name: in2, kind: digital, inputs: [{name: b}]}
+  - {name: out, kind: digital, outputs: [{name: c}]}
+"""
+
+
+def test_check_warns_of_slaves_of_one_product_with_other_process_data(tmp_path: Path) -> None:
+    (tmp_path / "plant.yaml").write_text(BUS_PLANT)
+    (tmp_path / "bus.yaml").write_text(BUS)
+    result, (warning,) = check_plant(tmp_path / "plant.yaml")
+    assert (result.findings, warning.line) == ((), 3)
+    assert warning.message.startswith("station mixer, port bus0: in and out have the same vendor")
+    (tmp_path / "bus.yaml").write_text(BUS.replace("out, kind", "out, product: 7, kind"))
+    assert check_plant(tmp_path / "plant.yaml")[1] == ()
+
+
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda path: path.stem)
+def test_check_has_no_warning_for_our_own_plants(plant: Path) -> None:
+    assert check_plant(plant)[1] == ()

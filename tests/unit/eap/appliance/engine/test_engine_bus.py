@@ -11,6 +11,7 @@ from eap.appliance.engine.engine_bus import RETRY_NS, SILENT_RETRY_NS
 from eap.pd.spec import BusTarget
 from tests.support.cyclic import MS
 from tests.support.enginebus import BUS, BusRig
+from tests.support.terminals import write_bus
 
 
 @pytest.fixture
@@ -226,3 +227,17 @@ def test_frames_that_nobody_waits_for_are_taken_on_arrival_only(rig):
     assert rig.bus.master.stats().link.late == late
     rig.bus.drain(rig.now_ns)
     assert rig.bus.master.stats().link.late == late + 1
+
+
+def test_engine_bus_terminals_of_one_bit_pdos_share_a_byte_in_the_image(tmp_path):
+    rig = BusRig(tmp_path, bus=write_bus(tmp_path).read_text())
+    rig.start()
+    rig.wait_op()
+    places = {place.name: place.bit_offset for place in rig.image.layout.variables}
+    bits = [places[f"bus0.di8.Signal_60{channel}0_01"] for channel in range(8)]
+    assert bits == list(range(bits[0], bits[0] + 8))
+    assert not bits[0] % 8
+    assert places["bus0.di4.Signal_6000_01"] == bits[0] + 8
+    rig.set("bus0.do8.Signal_7050_01", True)
+    rig.run(5 * MS)
+    assert rig.wire.segment.segment.slaves[2].device.process_data.outputs.pack() == b"\x20"
