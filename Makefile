@@ -18,19 +18,23 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-6s %s\n", $$1, $$2 }' Makefile
 
-setup: .venv/.stamp-dev  ## prepare .venv (done once, and again when pyproject.toml changes)
+setup: .venv/.stamp-dev  ## prepare .venv for tests and checks (once, and when pyproject.toml changes)
+
+# What runs the appliance; neither stamp depends on the other, for the second covers both.
+.venv/.stamp-run: pyproject.toml
+	@PYTHON='$(PYTHON)' sh tools/venv.sh run
 
 .venv/.stamp-dev: pyproject.toml
-	@PYTHON='$(PYTHON)' sh tools/venv.sh
+	@PYTHON='$(PYTHON)' sh tools/venv.sh dev
 
 .venv/.stamp-bench: .venv/.stamp-dev
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --group bench
 	@touch $@
 
-demo: setup  ## run the demo plant and show its values moving; Ctrl-C ends it
+demo: .venv/.stamp-run  ## run the demo plant and show its values moving; Ctrl-C ends it
 	@$(BIN)/python tools/demo.py $(if $(SECONDS),--seconds '$(SECONDS)')
 
-valve: setup  ## a limit switch on one station's bus opens a valve on another's, through EAP
+valve: .venv/.stamp-run  ## a limit switch on one station's bus opens a valve on another's, through EAP
 	@$(BIN)/python tools/valve_demo.py
 
 # Tests with sockets and processes come last, a file at a time with nothing beside it: see tests/conftest.py.

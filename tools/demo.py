@@ -1,7 +1,8 @@
 """``make demo``: run the demo plant and show its variables moving.
 
 The plant runs as ``eapctl run`` would run it; this program only looks at it, with ``eap.attach``,
-as any user program may.  On a terminal tables are redrawn, elsewhere a line a station is printed.
+as any user program may.  On a terminal one screen is redrawn in place, elsewhere it prints a line a
+second.
 """
 
 from __future__ import annotations
@@ -12,30 +13,105 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import zip_longest
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
-from rich.columns import Columns
-from rich.console import Console, Group
-from rich.live import Live
-from rich.table import Table
+from rich.console import Group, RenderableType
+from rich.text import Text
 
 import eap
 from eap.appliance.attach import AttachedStation
+from eap.cli import words
+from eap.cli.output import repaint
+from eap.cli.table import Column, TextTable
 from eap.errors import EapError
-from eap.pd.layout import FRAME_CTRL, VAR_CTRL
 
 PLANT = Path("config/demo.yaml")
 EAPCTL = Path(sys.executable).with_name("eapctl")
 REFRESH_S = 0.5
-LINE_S = 0.7
+LINE_S = 1.0
+RATE_OVER_S = 1.0
 ENDS_WITHIN_S = 3.0
-VALUE_LENGTH = 32
-COLUMN = 42
-"""Columns of the terminal that the tables of one station take."""
+CELL = 25
+"""Columns that a station's variables take."""
+CLEAR_SCREEN = "\x1b[2J"
+
+
+class Shown(NamedTuple):
+    """A variable that the screen shows, with a name of its own where that says more."""
+
+    name: str
+    unit: str = ""
+    title: str = ""
+
+    @property
+    def label(self) -> str:
+        """Return the name that is shown."""
+        return self.title or self.name
+
+
+class Way(NamedTuple):
+    """One PD on its way from the station that sends it to one that receives it."""
+
+    sender: str
+    receiver: str
+    name: str
+    subscription: str
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Return the key of its counters in a look."""
+        return self.receiver, self.subscription
+
+
+class Look(NamedTuple):
+    """All values and counters at one time: values by station, counters by station and PD."""
+
+    at_s: float
+    values: dict[str, dict[str, Any]]
+    received: dict[tuple[str, str], dict[str, Any]]
+
+
+SHOWN = {
+    "island-01": (
+        Shown("load"),
+        Shown("cpu", "%"),
+        Shown("ticks"),
+        Shown("setpoint", "1/min"),
+        Shown("left_position", "mm", "position (03)"),
+        Shown("drive_enabled", title="drive"),
+    ),
+    "island-02": (
+        Shown("memory", "KiB"),
+        Shown("temperature", "degC"),
+        Shown("left_ticks", title="ticks (01)"),
+        Shown("left_setpoint", "1/min", "setpoint (01)"),
+        Shown("pressure", "bar"),
+        Shown("bus0.buttons.limit_switch", title="limit switch"),
+    ),
+    "island-03": (
+        Shown("position", "mm"),
+        Shown("running"),
+        Shown("left-state.temperature", "degC", "temp. (02)"),
+        Shown("left-state.left_setpoint", "1/min", "setpoint (02)"),
+        Shown("alarm"),
+        Shown("bus0.outputs.out1", title="output 1"),
+    ),
+}
+"""The variables that the screen shows of each station of the demo; in brackets, their origin."""
+
+WAYS = (
+    Way("island-01", "island-02", "state", "left-state"),
+    Way("island-02", "island-03", "state", "left-state"),
+    Way("island-03", "island-01", "state", "left-state"),
+    Way("island-03", "island-01", "alarm", "line-alarm"),
+    Way("island-03", "island-02", "alarm", "line-alarm"),
+)
 
 
 def main() -> int:
@@ -46,6 +122,9 @@ def main() -> int:
     os.chdir(Path(__file__).resolve().parent.parent)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with ExitStack() as stack:
+        print(
+            "make demo: starting three stations on 127.0.1.1, 127.0.1.2 and 127.0.1.3", flush=True
+        )
         appliance = stack.enter_context(running(PLANT))
         names = wait_ready(appliance)
         if names is None:
@@ -88,16 +167,19 @@ def show(
     stations: list[AttachedStation], appliance: subprocess.Popen[str], seconds: float | None
 ) -> None:
     """Show what the stations hold until the appliance ends or *seconds* are over."""
-    console = Console(markup=False)
-    end = monotonic() + seconds if seconds is not None else float("inf")
-    if not console.is_terminal:
-        while goes_on(appliance, end, LINE_S):
-            for station in stations:
-                print(as_line(station), flush=True)
-        return
-    with Live(console=console, auto_refresh=False) as live:
-        while goes_on(appliance, end, REFRESH_S):
-            live.update(as_view(stations, console.width), refresh=True)
+    is_terminal = sys.stdout.isatty()
+    start = monotonic()
+    end = start + seconds if seconds is not None else float("inf")
+    meter = RateMeter()
+    if is_terminal:
+        print(CLEAR_SCREEN, end="")
+    while goes_on(appliance, end, REFRESH_S if is_terminal else LINE_S):
+        look = take_look(stations, monotonic() - start)
+        rates = meter.rates(look)
+        if is_terminal:
+            repaint([as_screen(look, rates)])
+        else:
+            print(as_line(look, rates), flush=True)
 
 
 def goes_on(appliance: subprocess.Popen[str], end: float, pause_s: float) -> bool:
@@ -111,55 +193,112 @@ def goes_on(appliance: subprocess.Popen[str], end: float, pause_s: float) -> boo
     return False
 
 
-def as_line(station: AttachedStation) -> str:
-    """Write the values of one station, short."""
-    values = "  ".join(f"{name}={text}" for name, text in texts(station))
-    return f"{station.name} cycle {station.cycle}: {values}"
+def take_look(stations: list[AttachedStation], at_s: float) -> Look:
+    """Read all values and counters."""
+    values = {station.name: station.read_all() for station in stations}
+    received = {
+        (station.name, row["name"]): row
+        for station in stations
+        for row in station.status()["pd"]["rx"]
+    }
+    return Look(at_s, values, received)
 
 
-def as_view(stations: list[AttachedStation], width: int) -> Columns | Group:
-    """Lay out tables side by side, or a paragraph a station where the terminal is too narrow."""
-    if width < COLUMN * len(stations):
-        return Group(*(f"{as_line(station)}\n" for station in stations))
-    return Columns([Group(variables(station), subscriptions(station)) for station in stations])
+class RateMeter:
+    """Rates of received PDs, over the last looks of about a second."""
+
+    def __init__(self) -> None:
+        self._looks: deque[Look] = deque()
+
+    def rates(self, look: Look) -> dict[Way, float]:
+        """Return how many PDs a second came by each way; nothing at the first look."""
+        self._looks.append(look)
+        while len(self._looks) > 2 and look.at_s - self._looks[1].at_s >= RATE_OVER_S:
+            self._looks.popleft()
+        before = self._looks[0]
+        seconds = look.at_s - before.at_s
+        if not seconds:
+            return {}
+        return {
+            way: (look.received[way.key]["received"] - before.received[way.key]["received"])
+            / seconds
+            for way in WAYS
+        }
 
 
-def variables(station: AttachedStation) -> Table:
-    """Make the table of a station's values."""
-    table = Table(title=f"{station.name}, cycle {station.cycle}")
-    table.add_column("variable")
-    table.add_column("value", justify="right")
-    for row in texts(station):
-        table.add_row(*row)
+def as_screen(look: Look, rates: Mapping[Way, float]) -> RenderableType:
+    """Return stations, their values, and the arrows between them; at most 80 columns, 23 lines."""
+    stations = TextTable(*(Column(name, rank=number) for number, name in enumerate(SHOWN)))
+    for row in zip_longest(*(cells(look.values[name], SHOWN[name]) for name in SHOWN)):
+        stations.add_row(*(cell or "" for cell in row))
+    return Group(
+        Text(f"EAP demo: each station pushes its values to the next one{look.at_s:10.0f} s\n"),
+        stations,
+        Text(),
+        arrows(look, rates),
+        Text("\nCtrl-C ends it; try in another terminal:", style="dim"),
+        Text("  eapctl status    eapctl pd set island-01 setpoint 75", style="dim"),
+    )
+
+
+def cells(values: Mapping[str, Any], shown: Sequence[Shown]) -> Iterator[str]:
+    """Yield name and value of variables, all of the same width."""
+    for each in shown:
+        value = as_text(values[each.name], each.unit)
+        room = CELL - len(value) - 1
+        yield f"{each.label[:room]:<{room}} {value}"
+
+
+def arrows(look: Look, rates: Mapping[Way, float]) -> TextTable:
+    """Return a line for each way that PDs take, with its rate and what it lost."""
+    table = TextTable(
+        "From",
+        "",
+        "To",
+        "Process data",
+        Column("Rate", is_number=True),
+        Column("Lost", is_number=True),
+        Column("Late", is_number=True),
+        Column("Age", rank=1, is_number=True),
+    )
+    for way in WAYS:
+        row = look.received[way.key]
+        runs = row["state"] == "running"
+        rate = f"{rates[way]:.1f}/s" if way in rates else "      "
+        table.add_row(
+            way.sender,
+            Text("──────►" if runs else "── x ──", style="green" if runs else "bold red"),
+            way.receiver,
+            f"{way.name:<12}",
+            f"{rate:>7}",
+            Text("-" if row["lost"] is None else str(row["lost"]), "red" * bool(row["lost"])),
+            str(row["late"]),
+            f"{'-' if row['age_us'] is None else words.duration(row['age_us']):>8}",
+        )
     return table
 
 
-def subscriptions(station: AttachedStation) -> Table:
-    """Make the table of what a station receives."""
-    table = Table()
-    for name in ("receives", "frames", "lost", "age"):
-        table.add_column(name, justify="left" if name == "receives" else "right")
-    received: list[dict[str, Any]] = station.status()["pd"]["rx"]
-    for pd in received:
-        age = "-" if pd["age_us"] is None else f"{pd['age_us'] / 1000:.0f} ms"
-        lost = "-" if pd["lost"] is None else str(pd["lost"])
-        table.add_row(pd["name"], str(pd["received"]), lost, age)
-    return table
+def as_line(look: Look, rates: Mapping[Way, float]) -> str:
+    """Return one line of less than 80 columns: rate, losses, and a value on its way."""
+    rows = [look.received[way.key] for way in WAYS]
+    lost = sum(row["lost"] or 0 for row in rows)
+    late = sum(row["late"] for row in rows)
+    rate = f"{sum(rates.values()):.0f}" if rates else "-"
+    here, there = look.values["island-01"]["ticks"], look.values["island-02"]["left_ticks"]
+    return (
+        f"{look.at_s:.0f} s: {rate} PDs/s, {lost} lost, {late} late;"
+        f" ticks of island-01 {here}, at island-02 {there}"
+    )
 
 
-def texts(station: AttachedStation) -> Iterator[tuple[str, str]]:
-    """Yield the variables that say something to people, as text."""
-    for name, value in station.read_all().items():
-        if not name.endswith((VAR_CTRL, FRAME_CTRL)):  # bits by which programs hold PDs back
-            yield name, as_text(value)
-
-
-def as_text(value: Any) -> str:
-    """Write a value, shortened where it is long."""
-    text = f"{value:.3f}" if isinstance(value, float) else str(value)
-    if isinstance(value, bytes):
-        text = value.hex(" ")
-    return text if len(text) <= VALUE_LENGTH else f"{text[: VALUE_LENGTH - 1]}…"
+def as_text(value: Any, unit: str) -> str:
+    """Return a value as people read it, in few characters."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    text = f"{value:.2f}" if isinstance(value, float) else str(value)
+    if unit == "KiB":
+        text, unit = f"{value / 1024**2:.1f}", "GiB"
+    return f"{text} {unit}".rstrip()
 
 
 if __name__ == "__main__":

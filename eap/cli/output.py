@@ -67,9 +67,10 @@ def repaint(parts: Iterable[RenderableType]) -> None:
         write_text(text)
         return
     lines = text.rstrip("\n").split("\n")
-    if (hidden := len(lines) - console.height) > 0:
-        lines[console.height - 1 :] = [f"… {hidden + 1} more lines"]
-    write_text(_HOME + "\n".join(line + _CLEAR_LINE for line in lines) + _CLEAR_BELOW, end="")
+    room = console.height - 1  # the cursor rests below, where the shell will go on
+    if (hidden := len(lines) - room) > 0:
+        lines[room - 1 :] = [f"… {hidden + 1} more lines"]
+    write_text(_HOME + "".join(f"{line}{_CLEAR_LINE}\n" for line in lines) + _CLEAR_BELOW, end="")
 
 
 def _console() -> Console:

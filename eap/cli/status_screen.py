@@ -24,8 +24,8 @@ Row = Mapping[str, Any]
 _STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: ""}
 _GOOD = "green"
 _STATE_STYLES = {"OP": _GOOD, "INIT": "bold red", "PREOP": "yellow", "SAFEOP": "yellow"}
-_PROMPT_LINES = 1
-"""Lines of the screen that stay free, for the prompt of the shell."""
+_SPARE_LINES = 2
+"""Lines of the screen that stay free: for the heading of ``--watch``, and for the shell."""
 _LEAST_ROWS = 1
 """So many findings and stations are shown on the smallest screen."""
 
@@ -51,7 +51,7 @@ class StatusScreen:
         def excess(findings: int, stations: int) -> int:
             """Return the number of lines for which the screen has no room."""
             lines = console.render_lines(self._layout(findings, stations), options, pad=False)
-            return len(lines) + _PROMPT_LINES - console.height
+            return len(lines) + _SPARE_LINES - console.height
 
         stations, findings = len(self._document["stations"]), len(self._findings)
         if console.is_terminal:

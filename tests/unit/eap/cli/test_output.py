@@ -77,14 +77,14 @@ def repaint_on_terminal(parts: list[Text], monkeypatch: pytest.MonkeyPatch, heig
 
 def test_repaint_overwrites_the_screen_without_scrolling(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = repaint_on_terminal([Text("one"), Text("two")], monkeypatch, 5)
-    assert shown == "\x1b[Hone\x1b[K\ntwo\x1b[K\x1b[J"
+    assert shown == "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J"
 
 
 def test_repaint_cuts_off_what_exceeds_the_screen_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    shown = repaint_on_terminal([Text("\n".join("abcdef"))], monkeypatch, 4)
-    assert shown == "\x1b[Ha\x1b[K\nb\x1b[K\nc\x1b[K\n… 3 more lines\x1b[K\x1b[J"
+    shown = repaint_on_terminal([Text("\n".join("abcdef"))], monkeypatch, 5)
+    assert shown == "\x1b[Ha\x1b[K\nb\x1b[K\nc\x1b[K\n… 3 more lines\x1b[K\n\x1b[J"
 
 
 def test_repaint_writes_blocks_when_piped(capfd: pytest.CaptureFixture[str]) -> None:
