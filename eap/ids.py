@@ -74,6 +74,32 @@ class MacAddr(bytes):
         return f"MacAddr.parse({str(self)!r})"
 
 
+_OBJECT_ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]+)(?::(?:0[xX])?([0-9A-Fa-f]+))?")
+
+
+class ObjectId(NamedTuple):
+    """Index and subindex of an entry of an object dictionary, written ``0x1018:01``.
+
+    Both are hexadecimal wherever people read or write them: the field knows no others, and
+    ``1000:0`` read as decimal would silently be another object.
+    """
+
+    object_index: int
+    subindex: int = 0
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read ``INDEX[:SUB]`` in hexadecimal, with or without 0x; raise ValueError otherwise."""
+        match = _OBJECT_ID.fullmatch(text)
+        index, subindex = (int(match[1], 16), int(match[2] or "0", 16)) if match else (-1, 0)
+        if not 0 <= index <= 0xFFFF or subindex > 0xFF:
+            raise ValueError(f"{text!r} is not INDEX[:SUB] in hexadecimal, such as 0x1018:01")
+        return cls(index, subindex)
+
+    def __str__(self) -> str:
+        return f"0x{self.object_index:04X}:{self.subindex:02X}"
+
+
 BROADCAST_MAC = MacAddr(b"\xff" * 6)
 EAP_MULTICAST_MAC = MacAddr.parse("01:01:05:04:00:00")
 """Default destination of a publisher on Ethernet."""

@@ -108,7 +108,7 @@ def _count_text(row: ObjectRange) -> str:
 def _entry(row: EntryRow) -> str:
     kind = None if row.kind == OWN_TYPE else datatypes.parse(row.kind)
     cells = (
-        f"{row.subindex} to {row.last}" if row.last else str(row.subindex),
+        f"{row.subindex:02X} to {row.last:02X}" if row.last else f"{row.subindex:02X}",
         row.name.format(n="0…") if row.last else row.name,
         "of the variable" if kind is None else kind.text,
         "" if kind is None else str(kind.bit_length),

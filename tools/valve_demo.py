@@ -34,6 +34,7 @@ from eap.appliance.attach import AttachedStation
 from eap.appliance.commands.bus_running import open_running
 from eap.appliance.runtime import VARIABLE
 from eap.errors import EapError
+from eap.ids import ObjectId
 from eap.net.ticker import Ticker
 
 PLANT = Path(__file__).resolve().parent.parent / "config" / "valve.yaml"
@@ -132,8 +133,7 @@ class Plant:
                 answer = str(exc)
             return answer == f"{is_open:d}"
 
-        index, subindex = VALVE_ENTRY
-        entry = f"0x{index:04X}:{subindex:02X}"
+        entry = str(ObjectId(*VALVE_ENTRY))
         try:
             self.wait(agrees, f"its slave says {entry} = {is_open:d}")
         except DemoError as exc:

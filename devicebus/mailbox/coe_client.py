@@ -30,6 +30,7 @@ from eap.codec.sdo import (
     encode_segment,
     encode_segment_answer,
 )
+from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 
 MAX_SIZE = 1 << 24
@@ -126,7 +127,7 @@ class _Sdo:
         self.subindex = subindex
 
     def __str__(self) -> str:
-        return f"SDO 0x{self.index:04X}:{self.subindex:02X}"
+        return f"SDO {ObjectId(self.index, self.subindex)}"
 
     def ask(self, body: bytes) -> Conversation[tuple[SdoHeader, bytes]]:
         """Send the first message of a transfer; return the head of the answer and the rest."""

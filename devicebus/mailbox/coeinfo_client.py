@@ -19,6 +19,7 @@ from eap.codec.sdoinfo import (
     SdoInfoHeader,
     SdoInfoOpcode,
 )
+from eap.ids import ObjectId
 from eap.od.abort import SdoAbortError
 from eap.od.info import ListType, ValueInfo
 
@@ -54,7 +55,7 @@ def entry_description(
 ) -> Conversation[EntryDescription]:
     """Read what the slave says of an entry; raises as object_list() does."""
     body = yield from read_entry(index, subindex, value_info)
-    with reading(f"entry description 0x{index:04X}:{subindex:02X}"):
+    with reading(f"entry description {ObjectId(index, subindex)}"):
         return EntryDescription.decode(body)
 
 
@@ -73,7 +74,7 @@ def read_object(index: int) -> Conversation[bytes]:
 
 def read_entry(index: int, subindex: int, value_info: int) -> Conversation[bytes]:
     """As entry_description(), but return the octets."""
-    what = f"entry description 0x{index:04X}:{subindex:02X}"
+    what = f"entry description {ObjectId(index, subindex)}"
     request = EntryRequest(index, subindex, value_info).encode()
     opcode = SdoInfoOpcode.ENTRY_REQUEST
     return (yield from _ask(what, opcode, request, index=index, subindex=subindex))

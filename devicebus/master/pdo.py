@@ -17,6 +17,7 @@ from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import Sii, SiiPdo
 from devicebus.wire.siirecord import SiiSyncManager
+from eap.ids import ObjectId
 from eap.od.abort import SdoAbortError
 
 ASSIGNMENT = 0x1C10
@@ -192,14 +193,14 @@ def _read_list(index: int, size: int) -> Conversation[list[int]]:
     count = int.from_bytes(octets, "little")
     if len(octets) not in {1, 2} or count > MAX_ENTRIES:
         raise MailboxProtocolError(
-            f"0x{index:04X}:00 is {octets.hex()}, expected a count up to {MAX_ENTRIES}"
+            f"{ObjectId(index)} is {octets.hex()}, expected a count up to {MAX_ENTRIES}"
         )
     numbers = []
     for subindex in range(1, count + 1):
         octets = yield from coe_client.upload(index, subindex)
         if len(octets) != size:
             raise MailboxProtocolError(
-                f"0x{index:04X}:{subindex:02X} has {len(octets)} octets, expected {size}"
+                f"{ObjectId(index, subindex)} has {len(octets)} octets, expected {size}"
             )
         numbers.append(int.from_bytes(octets, "little"))
     return numbers

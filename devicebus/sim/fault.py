@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable
 from itertools import count
 from typing import Any, NamedTuple
 
-from devicebus.sim.devices.objects import parse_entry
 from devicebus.sim.devices.pdoobjects import TX_PDO
 from devicebus.sim.findentry import find_entry
 from devicebus.sim.segment import Segment
@@ -22,6 +21,7 @@ from devicebus.sim.wiring import Side
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import OVERHEAD, DatagramHeader
 from eap.codec.ethercat import EtherCatHeader
+from eap.ids import ObjectId
 
 _MS = 1_000_000
 _ON_FRAMES = frozenset((FaultKind.LOSS, FaultKind.DELAY, FaultKind.CORRUPT, FaultKind.WKC))
@@ -63,8 +63,9 @@ class FaultySegment:
             problem = f"no slave {spec.slave!r}" if spec.slave else "it needs a slave"
             raise ValueError(f"fault {spec.kind.value}: {problem} (one of {known})")
         if spec.kind is FaultKind.SDO:
-            parse_entry(spec.object)
-        if spec.kind is FaultKind.TX_PDO and not 0 <= parse_entry(spec.object)[0] - TX_PDO < 0x200:
+            ObjectId.parse(spec.object)
+        is_tx_pdo = spec.kind is FaultKind.TX_PDO
+        if is_tx_pdo and not 0 <= ObjectId.parse(spec.object).object_index - TX_PDO < 0x200:
             raise ValueError(f"fault tx-pdo: {spec.object} is no TxPDO (0x1A00 to 0x1BFF)")
         if spec.kind is FaultKind.REFUSE and spec.state not in AlState.__members__:
             known = ", ".join(AlState.__members__)

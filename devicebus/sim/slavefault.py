@@ -7,13 +7,13 @@ from collections.abc import Callable
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.sim.devices.drive import Axes
-from devicebus.sim.devices.objects import parse_entry
 from devicebus.sim.devices.pdoobjects import TX_PDO
 from devicebus.sim.faultydictionary import FaultyDictionary
 from devicebus.sim.slave import Slave
 from devicebus.sim.spec import FaultKind, FaultSpec
 from devicebus.wire.alstatus import AlState, AlStatusCode
 from eap.codec.mailbox import MailboxType
+from eap.ids import ObjectId
 from eap.od.abort import AbortCode
 
 
@@ -36,7 +36,7 @@ def _sdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del now_ns
     dictionary = slave.device.dictionary
     if isinstance(dictionary, FaultyDictionary):
-        index, _ = parse_entry(spec.object)
+        index, _ = ObjectId.parse(spec.object)
         dictionary.aborts.pop(index, None)
         if on:
             dictionary.aborts[index] = spec.code or AbortCode.GENERAL
@@ -62,7 +62,7 @@ def _tx_pdo(slave: Slave, spec: FaultSpec, now_ns: int, on: bool) -> None:
     del now_ns
     mailbox = slave.device.mailbox
     server = mailbox.protocols.get(MailboxType.COE) if mailbox else None
-    index, _ = parse_entry(spec.object)
+    index, _ = ObjectId.parse(spec.object)
     data = slave.device.process_data.read_pdo(index)
     if on and isinstance(server, CoeServer) and data is not None:
         server.send_tx_pdo(index - TX_PDO, data)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import click
 
 from eap.cli.params import CommandT
+from eap.ids import ObjectId
 
 if TYPE_CHECKING:
     from eap.codec.datatypes import DataType
-
-Entry: TypeAlias = tuple[int, int]
-"""Index and subindex."""
 
 
 def number_up_to(limit: int) -> Callable[[str | int], int]:
@@ -31,19 +29,12 @@ def number_up_to(limit: int) -> Callable[[str | int], int]:
     return parse
 
 
-def parse_entry(text: str) -> Entry:
-    """Read ``INDEX[:SUB]`` in hex or decimal; raise BadParameter with an example otherwise.
-
-    Zeros in front, as in 0xD000:07, mean nothing.
-    """
-    index, _, subindex = text.partition(":")
+def parse_entry(text: str) -> ObjectId:
+    """Read ``INDEX[:SUB]`` in hexadecimal; raise BadParameter with an example otherwise."""
     try:
-        numbers = int(index, 0), int(subindex or "0", 10 if subindex.isdecimal() else 0)
-    except ValueError:
-        numbers = -1, 0
-    if not 0 <= numbers[0] <= 0xFFFF or not 0 <= numbers[1] <= 0xFF:
-        raise click.BadParameter(f"{text!r} is not INDEX[:SUB], such as 0x1018:1")
-    return numbers
+        return ObjectId.parse(text)
+    except ValueError as exc:
+        raise click.BadParameter(str(exc)) from None
 
 
 def parse_type(text: str) -> DataType:

@@ -6,18 +6,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.bus_params import (
-    Entry,
-    parse_entry,
-    parse_type,
-    slave_argument,
-)
+from eap.cli.bus_params import parse_entry, parse_type, slave_argument
 from eap.cli.bus_place import BusCommand, Place, bus_options, open_session
 from eap.cli.output import write_json, write_tables, write_text
 from eap.cli.params import CommandT, json_option
 
 if TYPE_CHECKING:
     from eap.codec.datatypes import DataType
+    from eap.ids import ObjectId
 
 
 def _value_options(command: CommandT) -> CommandT:
@@ -47,7 +43,7 @@ def sdo() -> None:
 @json_option("Print one object.")
 def read(
     slave: str,
-    entry: Entry,
+    entry: ObjectId,
     kind: DataType | None,
     complete: bool,
     bus: Place,
@@ -75,7 +71,7 @@ def read(
 @json_option("Print one object: what was written.")
 def write(
     slave: str,
-    entry: Entry,
+    entry: ObjectId,
     value: str,
     kind: DataType | None,
     complete: bool,

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from eap.cli.table import Column, TextTable
 from eap.cli.words import count
-from eap.od import abort
+from eap.ids import ObjectId
 
 Row: TypeAlias = dict[str, Any]
 
@@ -123,7 +123,7 @@ def value_line(row: Row) -> str:
 
 def entry_name(row: Row) -> str:
     """Return index and subindex as people write them."""
-    return abort.entry_name(row["index"], row["subindex"])
+    return str(ObjectId(row["index"], row["subindex"]))
 
 
 def object_table(rows: Iterable[Row]) -> TextTable:
@@ -135,7 +135,7 @@ def object_table(rows: Iterable[Row]) -> TextTable:
         Column("Subindexes", rank=2, is_number=True),
     )
     for row in rows:
-        top = str(row["max_subindex"] or "")
+        top = f"{row['max_subindex']:X}" if row["max_subindex"] else ""
         table.add_row(f"0x{row['index']:04X}", row["name"], row["code"], top)
     return table
 

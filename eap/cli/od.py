@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.bus_params import Entry, parse_entry, parse_octets, parse_type
+from eap.cli.bus_params import parse_entry, parse_octets, parse_type
 from eap.cli.od_params import target_argument
 from eap.cli.output import write_json, write_tables, write_text
 from eap.cli.params import json_option
@@ -15,6 +15,7 @@ from eap.cli.params import json_option
 if TYPE_CHECKING:
     from eap.appliance.commands.od_target import Target
     from eap.codec.datatypes import DataType
+    from eap.ids import ObjectId
 
 _TYPE = click.option(
     "--type",
@@ -32,7 +33,7 @@ def od() -> None:
     TARGET is STATION or STATION/PORT for an EAP port of a station, STATION/router for its router,
     STATION/PORT for the master of a bus port, and STATION/PORT/SLAVE for a slave behind it.  What
     does not run here, by name or as NETID:PORT, is asked through routes.  INDEX and SUB are
-    hexadecimal (0xD000:7) or decimal.
+    hexadecimal, with or without 0x (0xD000:07, D000:7).
     """
 
 
@@ -66,7 +67,7 @@ def list_objects(target: Target, as_json: bool) -> None:
 )
 @json_option("Print one object.")
 def read(
-    entry: Entry, kind: DataType | None, complete: bool, target: Target, as_json: bool
+    entry: ObjectId, kind: DataType | None, complete: bool, target: Target, as_json: bool
 ) -> None:
     """Read an entry, or a whole object."""
     from eap.appliance.commands.od_access import read_entry, read_object
@@ -166,7 +167,7 @@ def dump(target: Target, as_json: bool) -> None:
 
 def _entry_to_write(
     entry: str | None, value: str | None, octets: bytes | None, *, complete: bool
-) -> Entry:
+) -> ObjectId:
     """Return index and subindex; raise UsageError unless exactly one value is given."""
     if entry is None:
         raise click.UsageError("say what to write: INDEX[:SUB] VALUE, or --from FILE")

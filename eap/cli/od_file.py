@@ -11,12 +11,11 @@ from typing import Any
 import msgspec
 
 from eap.appliance.commands.od_load import Download
-from eap.cli.bus_params import parse_entry
 from eap.cli.od_view import RAW, Row, object_line, value_line
 from eap.codec import datatypes
 from eap.errors import ConfigError
+from eap.ids import ObjectId
 from eap.od import notation
-from eap.od.abort import entry_name
 
 _LINE = re.compile(r"(?P<entry>\w+(?::\w+)?)\s*=\s*(?P<type>\S+)(?:\s+(?P<rest>.*))?", re.ASCII)
 _REMARK = re.compile(r"(?:^|\s)#.*$")
@@ -34,7 +33,7 @@ def dump_lines(target: str, rows: Iterable[Row]) -> Iterator[str]:
             yield object_line(row)
         if row["data"] is None:
             reason = row.get("error") or "cannot be read"
-            yield f"# {entry_name(index, row['subindex'])}: {reason}  # {row['name']}"
+            yield f"# {ObjectId(index, row['subindex'])}: {reason}  # {row['name']}"
         else:
             yield f"{'' if 'w' in row['access'] else '# '}{value_line(row)}"
 
@@ -76,21 +75,12 @@ def _from_text(line: str) -> Download:
     match = _LINE.fullmatch(line)
     if match is None:
         raise ValueError(f"{line!r} is not INDEX:SUB = TYPE VALUE, such as 0xD000:07 = UDINT 10000")
-    index, subindex = _entry(match["entry"])
+    index, subindex = ObjectId.parse(match["entry"])
     rest = match["rest"] or ""
     value = _quoted(rest) if rest.startswith('"') else _REMARK.sub("", rest).strip()
     if match["type"] == RAW:
         return index, subindex, bytes.fromhex(value)
     return index, subindex, notation.parse(datatypes.parse(match["type"]), value)
-
-
-def _entry(text: str) -> tuple[int, int]:
-    import click
-
-    try:
-        return parse_entry(text)
-    except click.BadParameter as exc:
-        raise ValueError(exc.message) from None
 
 
 def _quoted(text: str) -> str:

@@ -14,8 +14,8 @@ from typing import Any, TypeAlias
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
+from eap.ids import ObjectId
 from eap.od import notation
-from eap.od.abort import entry_name
 
 Row: TypeAlias = dict[str, Any]
 
@@ -27,7 +27,7 @@ _FROM = 10
 def value_line(row: Row) -> str:
     """Return an entry with its value."""
     remarks = ", ".join(filter(None, [row.get("name"), row.get("unit"), _hexadecimal(row)]))
-    line = f"{entry_name(row['index'], row['subindex'])} = {_literal(row)}"
+    line = f"{ObjectId(row['index'], row['subindex'])} = {_literal(row)}"
     return f"{line}  # {remarks}" if remarks else line
 
 

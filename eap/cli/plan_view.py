@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from eap.cli.words import count
-from eap.od.abort import entry_name
+from eap.ids import ObjectId
 
 if TYPE_CHECKING:
     from eap.appliance.commands.plant_change import Done
@@ -58,7 +58,7 @@ def change_line(change: dict[str, Any]) -> str:
     old, new = change["old"], change["new"]
     values = f"{old or _EMPTY} -> {new or _EMPTY}" if kind == "changed" else new
     unit = f" {change['unit']}" if values and change["unit"] else ""
-    what = f"{_SIGNS[kind]} {entry_name(change['index'], change['subindex'])} {change['name']}"
+    what = f"{_SIGNS[kind]} {ObjectId(change['index'], change['subindex'])} {change['name']}"
     return f"{what}  {values}{unit}".rstrip()
 
 

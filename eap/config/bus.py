@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeAlias
 import msgspec
 
 from eap.config.finding import Finding
+from eap.ids import ObjectId
 from eap.pd.spec import BusEntrySpec, BusSlaveSpec
 
 FIRST_STATION = 1001
@@ -119,7 +120,7 @@ def _variables(
 ) -> Iterator[tuple[str, BusVariable]]:
     for entry, spec in zip(entries, specs, strict=True):
         if spec.variable:
-            comment = f"{'output' if is_output else 'input'} {spec.index:04X}:{spec.subindex:02X}"
+            comment = f"{'output' if is_output else 'input'} {ObjectId(spec.index, spec.subindex)}"
             yield spec.variable, BusVariable(entry.type, is_output, comment)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from ipaddress import IPv4Network
 
@@ -12,18 +11,15 @@ from eap.config.index import Index
 from eap.config.reach import WHOLE, net_ids_of
 from eap.config.routes import MisfitError
 from eap.config.structs import Access, Port, Station
-from eap.ids import STATION_OCTETS, MacAddr, NetId
+from eap.ids import STATION_OCTETS, MacAddr, NetId, ObjectId
 from eap.near import near
 from eap.pd.spec import PortKind
 
 ALL = "all"
 SERVICES = (ALL, *map(str, AccessService))
 TARGET = "STATION, STATION/PORT, STATION/PORT/SLAVE, or four to six numbers of a NetID and :PORT"
-OBJECTS = "0xINDEX, 0xINDEX:SUB or 0xFIRST-0xLAST"
+OBJECTS = "INDEX, INDEX:SUB or FIRST-LAST in hexadecimal, such as 0x8000:01"
 _WRITES = tuple(each for each in AccessService if each is not AccessService.READ)
-_OBJECT = re.compile(r"(?:0x([0-9A-Fa-f]{1,4})|(\d{1,5}))")
-_TOP_INDEX = 0xFFFF
-_TOP_SUBINDEX = 0xFF
 _TOP_PORT = 0xFFFF
 _MAC_COLONS = 5
 
@@ -104,26 +100,18 @@ def parse_target(index: Index, text: str, loose: set[str]) -> list[AccessTarget]
 
 def parse_objects(text: str) -> ObjectRange:
     """Return the objects that *text* stands for."""
-    first, dash, last = text.partition("-")
-    if dash:
-        low, high = _number(first, _TOP_INDEX, text), _number(last, _TOP_INDEX, text)
-        if low > high:
-            raise MisfitError("", f"{text!r} ends before it begins", OBJECTS)
-        return ObjectRange(low, high)
-    index, colon, sub = text.partition(":")
-    number = _number(index, _TOP_INDEX, text)
-    if not colon:
-        return ObjectRange(number, number)
-    subindex = _number(sub, _TOP_SUBINDEX, text)
-    return ObjectRange(number, number, subindex, subindex)
-
-
-def _number(text: str, top: int, whole: str) -> int:
-    match = _OBJECT.fullmatch(text.strip())
-    number = -1 if match is None else int(match[1], 16) if match[1] else int(match[2])
-    if not 0 <= number <= top:
-        raise MisfitError("", f"{whole!r} names no objects", OBJECTS)
-    return number
+    first, dash, last = (part.strip() for part in text.partition("-"))
+    if dash and ":" in text:
+        raise MisfitError("", f"{text!r} names no objects", OBJECTS)
+    try:
+        low, high = ObjectId.parse(first), ObjectId.parse(last if dash else first)
+    except ValueError:
+        raise MisfitError("", f"{text!r} names no objects", OBJECTS) from None
+    if low > high:
+        raise MisfitError("", f"{text!r} ends before it begins", OBJECTS)
+    if ":" in text:
+        return ObjectRange(low.object_index, low.object_index, low.subindex, low.subindex)
+    return ObjectRange(low.object_index, high.object_index)
 
 
 def _parts(text: str) -> tuple[str, str, str]:

@@ -20,6 +20,7 @@ from eap.device.eap_mapping import check_mapped, data_budget, frame_budget, plac
 from eap.device.eap_objects import DEFAULT_TYPE
 from eap.device.fault import DeviceFault
 from eap.device.live import LiveValues
+from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary, check_value, take_bits
 from eap.od.model import Access, Entry, OdObject, OdState
@@ -233,7 +234,7 @@ class EapDictionary(EapContent):
         if user is not None:
             is_mapped = profile.row_of(index) in profile.VARIABLES
             code = AbortCode.MAPPED if is_mapped else AbortCode.PARAMETER
-            detail = f"0x{user[0]:04X}:{user[1]:02X} refers to it"
+            detail = f"{ObjectId(*user)} refers to it"
             raise SdoAbortError(code, index, subindex, detail)
 
     def _settle(self, row: ObjectRange, index: int, written: list[int], state: OdState) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from eap.codec.datatypes import DataType
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME, EtherCatHeader
 from eap.codec.pd import FIRST_PD, PdHeader
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Access, OdObject
@@ -108,7 +108,7 @@ def check_mapped(
         entry = dictionary.entry(mapped.target, mapped.subindex)
     except SdoAbortError as exc:
         raise SdoAbortError(exc.code, index, subindex, f"maps {exc}") from None
-    what = f"0x{mapped.target:04X}:{mapped.subindex:02X} ({entry.name})"
+    what = f"{ObjectId(mapped.target, mapped.subindex)} ({entry.name})"
     if not entry.access & right:
         raise SdoAbortError(AbortCode.NOT_MAPPABLE, index, subindex, what)
     expected = min(entry.kind.bit_length, WHOLE)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from eap.errors import ConfigError
+from eap.ids import ObjectId
 
 
 class FaultCode(IntEnum):
@@ -92,7 +93,7 @@ class DeviceFault(ConfigError):  # noqa: N818  what the standard calls it
     def __init__(
         self, code: FaultCode, detail: str = "", index: int = 0, subindex: int = 0, port: str = ""
     ) -> None:
-        where = f"0x{index:04X}:{subindex:02X}: " if index else ""
+        where = f"{ObjectId(index, subindex)}: " if index else ""
         reason = f": {detail}" if detail else ""
         super().__init__(f"{where}{FAULT_TEXTS[code]}{reason}")
         self.code = code

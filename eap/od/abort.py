@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from eap.errors import EapError
+from eap.ids import ObjectId
 
 
 class AbortCode(IntEnum):
@@ -96,20 +97,12 @@ def name_of(code: int) -> str:
         return "abort code of the vendor"
 
 
-def entry_name(index: int, subindex: int) -> str:
-    """Return index and subindex as people write them, and as commands read them again.
-
-    A subindex that decimal and hexadecimal digits would tell apart says that it is hexadecimal.
-    """
-    return f"0x{index:04X}:{subindex:02X}" if subindex < 10 else f"0x{index:04X}:0x{subindex:02X}"
-
-
 class SdoAbortError(EapError):
     """An SDO transfer was refused; *code* says why, by us or by the peer."""
 
     def __init__(self, code: int, index: int, subindex: int, detail: str = "") -> None:
         reason = f": {detail}" if detail else ""
-        super().__init__(f"{entry_name(index, subindex)}: {name_of(code)} (0x{code:08X}){reason}")
+        super().__init__(f"{ObjectId(index, subindex)}: {name_of(code)} (0x{code:08X}){reason}")
         self.code = code
         self.index = index
         self.subindex = subindex

@@ -43,7 +43,7 @@ _KNOWN = (
         Form.MAPPING,
         "UDINT",
         re.compile(r"Mapping \d+"),
-        re.compile(r"[0-9A-Fa-f]{1,4}:[0-9A-Fa-f]{1,2}/\d+", re.ASCII),
+        re.compile(r"(0x)?[0-9A-Fa-f]+:(0x)?[0-9A-Fa-f]+/\d+", re.ASCII | re.IGNORECASE),
     ),
     _Known(
         Form.INDEX,

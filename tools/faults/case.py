@@ -11,6 +11,7 @@ from devicebus.mailbox.coe_client import upload
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.sim.spec import FaultKind, FaultSpec
+from eap.ids import ObjectId
 
 FILE = "firmware.bin"
 FILE_SIZE = 20_000
@@ -54,7 +55,7 @@ class Case(NamedTuple):
 
 
 def _read(station: int, index: int = 0x1018, subindex: int = 1) -> Request:
-    what = f"read 0x{index:04X}:{subindex:02X}"
+    what = f"read {ObjectId(index, subindex)}"
     return Request(what, station, lambda sizes: upload(index, subindex))
 
 

@@ -21,6 +21,7 @@ from devicebus.sim.faultydictionary import FaultyDictionary
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec, SlaveSpec
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
+from eap.ids import ObjectId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import (
     RO,
@@ -47,32 +48,16 @@ _SM_TYPES = (1, 2, 3, 4)
 _IDENTITY_TYPE = 0x23
 
 
-class ObjectNumberError(ValueError):
-    """A text names no entry."""
-
-
-def parse_entry(text: str) -> tuple[int, int]:
-    """Read ``INDEX[:SUBINDEX]`` in hex or decimal; raise ObjectNumberError otherwise."""
-    index, _, subindex = text.partition(":")
-    try:
-        numbers = int(index, 0), int(subindex or "0", 0)
-    except ValueError:
-        raise ObjectNumberError(f"{text!r} is not an entry (such as 0x6041:0)") from None
-    if not 0 <= numbers[0] <= 0xFFFF or not 0 <= numbers[1] <= 0xFF:
-        raise ObjectNumberError(f"{text!r} is not an entry (0x0000:0 to 0xFFFF:255)")
-    return numbers
-
-
-def places(channels: Sequence[ChannelSpec], base: int) -> list[tuple[int, int]]:
+def places(channels: Sequence[ChannelSpec], base: int) -> list[ObjectId]:
     """Return the entry of each of *channels*; those that name none count up from *base*:01."""
     found = []
     free = 0
     for channel in channels:
         if channel.object:
-            found.append(parse_entry(channel.object))
+            found.append(ObjectId.parse(channel.object))
         else:
             free += 1
-            found.append((base + 0x10 * ((free - 1) // 200), (free - 1) % 200 + 1))
+            found.append(ObjectId(base + 0x10 * ((free - 1) // 200), (free - 1) % 200 + 1))
     return found
 
 

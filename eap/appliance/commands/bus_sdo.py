@@ -16,7 +16,8 @@ from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.sdoinfo import EntryDescription
 from eap.errors import ConfigError, EapError
-from eap.od.abort import AbortCode, SdoAbortError, entry_name
+from eap.ids import ObjectId
+from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, ObjectCode
 
 _TEXT, _OCTETS = 0x09, 0x0A
@@ -142,7 +143,7 @@ def _dumped(bus: SlaveBus, unit: Slave, index: int, subindex: int) -> dict[str, 
 
 
 def _name(index: int, subindex: int | None = None) -> str:
-    return f"0x{index:04X}" if subindex is None else entry_name(index, subindex)
+    return f"0x{index:04X}" if subindex is None else str(ObjectId(index, subindex))
 
 
 def _access(entry: EntryDescription) -> str:

@@ -11,8 +11,8 @@ from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo, OdD
 from eap.codec import pdo
 from eap.codec.datatypes import DataType
 from eap.errors import ConfigError
+from eap.ids import ObjectId
 from eap.od import notation
-from eap.od.abort import entry_name
 from eap.od.dictionary import take_bits
 
 _PLAIN_SIZES = (1, 2, 4, 8)
@@ -58,7 +58,7 @@ def write_entry(
         ConfigError: *text* is no value of the type, or nobody knows the type.
         SdoAbortError, ControlError: the device refuses.
     """
-    name = entry_name(index, subindex)
+    name = str(ObjectId(index, subindex))
     entry = device.entry(index, subindex) or EntryInfo(subindex, "", None, "")
     kind = kind or entry.kind
     if kind is None:

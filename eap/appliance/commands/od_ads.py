@@ -12,7 +12,7 @@ from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.errors import CodecError, ControlError
-from eap.od.abort import entry_name
+from eap.ids import ObjectId
 from eap.od.info import ListType, ValueInfo
 
 _ROOM = 0x20002
@@ -48,7 +48,7 @@ class AdsOd:
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
         """Return what the device says of an entry; None if it says nothing."""
         offset = index << 16 | int(~ValueInfo(0)) << 8 | subindex
-        name = entry_name(index, subindex)
+        name = str(ObjectId(index, subindex))
         try:
             body = self._read(IndexGroup.ENTRY_DESCRIPTION, offset, name)
             found = EntryDescription.decode(body)
@@ -62,7 +62,7 @@ class AdsOd:
 
     def read(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Return the octets of an entry or of an object."""
-        name = entry_name(index, subindex)
+        name = str(ObjectId(index, subindex))
         if not complete:
             return self._read(IndexGroup.SDO, index << 16 | subindex, name)
         octets = self._read(IndexGroup.SDO, index << 16 | _COMPLETE, name)
@@ -70,7 +70,7 @@ class AdsOd:
 
     def write(self, index: int, subindex: int, octets: bytes, *, complete: bool = False) -> None:
         """Write an entry or an object."""
-        name = entry_name(index, subindex)
+        name = str(ObjectId(index, subindex))
         if complete and subindex:
             raise ControlError(f"{name}: by ADS a whole object is written from subindex 0 on")
         offset = index << 16 | (_COMPLETE if complete else subindex)

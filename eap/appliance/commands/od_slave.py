@@ -11,7 +11,8 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.commands.bus_slave import SlaveBus
 from eap.appliance.commands.od_described import entry_info, object_info, read_all, with_entries
 from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
-from eap.od.abort import AbortCode, SdoAbortError, entry_name
+from eap.ids import ObjectId
+from eap.od.abort import AbortCode, SdoAbortError
 
 _NOT_THERE = {AbortCode.NO_SUBINDEX, AbortCode.NO_OBJECT, AbortCode.NOT_STORED}
 
@@ -40,7 +41,7 @@ class SlaveOd:
 
     def entry(self, index: int, subindex: int) -> EntryInfo | None:
         """Return what the slave says of an entry; None if it says nothing."""
-        name = entry_name(index, subindex)
+        name = str(ObjectId(index, subindex))
         try:
             found = self._bus.converse(
                 self._slave, lambda _: coeinfo_client.entry_description(index, subindex), name
@@ -58,7 +59,7 @@ class SlaveOd:
         return self._bus.converse(
             self._slave,
             lambda _: coe_client.upload(index, subindex, complete=complete),
-            entry_name(index, subindex),
+            str(ObjectId(index, subindex)),
         )
 
     def write(self, index: int, subindex: int, octets: bytes, *, complete: bool = False) -> None:
@@ -67,7 +68,7 @@ class SlaveOd:
         def begin(sizes: MailboxSizes) -> Conversation[None]:
             return coe_client.download(index, subindex, octets, sizes, complete=complete)
 
-        self._bus.converse(self._slave, begin, entry_name(index, subindex))
+        self._bus.converse(self._slave, begin, str(ObjectId(index, subindex)))
 
     def contents(self) -> Iterator[Content]:
         """Return all entries of all objects, as they come in."""

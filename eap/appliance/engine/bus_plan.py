@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeAlias
 from devicebus.master.layout import Layout, Variable
 from eap.codec import datatypes
 from eap.codec.pd import PdHeader
+from eap.ids import ObjectId
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.layout import ImageLayout
 from eap.pd.spec import BusEntrySpec, BusSlaveSpec, Writer
@@ -92,7 +93,7 @@ def _missing(
     what = "output" if is_output else "input"
     has = f"one of {known[-1].bit_length} bits" if known else "none"
     return (
-        f"{slave.name} (station {slave.station}) has no {what} 0x{entry.index:04X}:"
-        f"{entry.subindex:02X} of {entry.bit_length} bits, but {has}: {entry.variable} stays as it"
-        " is"
+        f"{slave.name} (station {slave.station}) has no {what}"
+        f" {ObjectId(entry.index, entry.subindex)} of {entry.bit_length} bits, but {has}:"
+        f" {entry.variable} stays as it is"
     )

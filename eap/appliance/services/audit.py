@@ -27,7 +27,7 @@ from eap.aoe.directory import Directory
 from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.appliance.services.allowance import Allowance
 from eap.codec.ads import AdsError, IndexGroup
-from eap.od.abort import entry_name
+from eap.ids import ObjectId
 
 MAX_OCTETS = 8 << 20
 """Of the file before it is put aside."""
@@ -211,7 +211,7 @@ def operation_words(operation: Operation | AddRoute) -> Iterator[tuple[str, Any]
         yield "offset", f"0x{offset:X}"
     if group == IndexGroup.SDO:
         whole = " (complete access)" if offset & _COMPLETE else ""
-        yield "object", entry_name(offset >> 16, offset & 0xFF) + whole
+        yield "object", str(ObjectId(offset >> 16, offset & 0xFF)) + whole
     if isinstance(operation, WriteControl):
         yield "states", [operation.ads_state, operation.device_state]
     data = getattr(operation, "data", None)

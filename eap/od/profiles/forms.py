@@ -8,7 +8,7 @@ from enum import StrEnum
 from ipaddress import IPv4Address
 
 from eap.codec.datatypes import DataType
-from eap.ids import MacAddr, NetId
+from eap.ids import MacAddr, NetId, ObjectId
 
 
 class Form(StrEnum):
@@ -20,7 +20,7 @@ class Form(StrEnum):
     INDEX = "index"
     """Of another object; 0 is none."""
     MAPPING = "mapping"
-    """Index, sub-index and bit length, as ``6000:01/16``."""
+    """Entry and bit length, as ``0x6000:01/16``."""
     MAC = "mac"
     NET_ID = "net_id"
     IP = "ip"
@@ -32,7 +32,7 @@ def to_text(form: Form, kind: DataType, octets: bytes) -> str:
         return _BLOCKS[form][0](octets)
     value = kind.decode(octets.ljust(kind.size, b"\0"), 0)
     if form is Form.MAPPING and isinstance(value, int):
-        return f"{value >> 16:04X}:{value >> 8 & 0xFF:02X}/{value & 0xFF}"
+        return f"{ObjectId(value >> 16, value >> 8 & 0xFF)}/{value & 0xFF}"
     if form in {Form.HEX, Form.INDEX} and isinstance(value, int):
         return f"0x{value:0{2 * kind.size}X}"
     if isinstance(value, bytes):
@@ -51,16 +51,16 @@ def from_text(form: Form, kind: DataType, text: str) -> bytes:
     if form in _BLOCKS:
         return _BLOCKS[form][1](text)
     if form is Form.MAPPING and "/" in text:
-        match = _MAPPING.fullmatch(text.strip())
-        if match is None:
-            raise ValueError(f"{text!r} is no mapping such as 6000:01/16")
-        word = int(match[1], 16) << 16 | int(match[2], 16) << 8 | int(match[3])
-        return kind.encode(word)
+        entry, _, bits = text.strip().partition("/")
+        if ":" not in entry or not _BITS.fullmatch(bits):
+            raise ValueError(f"{text!r} is no mapping such as 0x6000:01/16")
+        index, subindex = ObjectId.parse(entry)
+        return kind.encode(index << 16 | subindex << 8 | int(bits))
     octets = kind.encode(kind.parse_text(text))
     return octets.rstrip(b"\0") if kind.is_text else octets
 
 
-_MAPPING = re.compile(r"([0-9A-Fa-f]{1,4}):([0-9A-Fa-f]{1,2})/(\d{1,2}|1\d\d|2[0-4]\d|25[0-5])")
+_BITS = re.compile(r"\d{1,2}|1\d\d|2[0-4]\d|25[0-5]", re.ASCII)
 _BLOCKS: dict[Form, tuple[Callable[[bytes], str], Callable[[str], bytes]]] = {
     Form.MAC: (lambda octets: str(MacAddr(octets)), lambda text: bytes(MacAddr.parse(text))),
     Form.NET_ID: (lambda octets: str(NetId(octets)), lambda text: bytes(NetId.parse(text))),

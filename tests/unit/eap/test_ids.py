@@ -14,6 +14,7 @@ from eap.ids import (
     InterfaceUri,
     MacAddr,
     NetId,
+    ObjectId,
     parse_host,
     prefix_text,
 )
@@ -182,3 +183,28 @@ def test_a_host_has_a_name_or_an_address(text: str, host: str, port: int) -> Non
 def test_what_is_no_host_says_why(text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=re.escape(reason)):
         parse_host(text, 1)
+
+
+@given(st.integers(0, 0xFFFF), st.integers(0, 0xFF))
+def test_object_id_round_trip(index: int, subindex: int) -> None:
+    object_id = ObjectId(index, subindex)
+    assert ObjectId.parse(str(object_id)) == object_id == (index, subindex)
+    assert ObjectId.parse(f"{index:x}:{subindex:x}") == object_id
+    assert ObjectId.parse(f"0x{index:04X}:0x{subindex:02X}") == object_id
+
+
+@pytest.mark.parametrize(
+    ("text", "object_id"),
+    [("1000:0", (0x1000, 0)), ("4120", (0x4120, 0)), ("0X1018:10", (0x1018, 16)), ("0", (0, 0))],
+)
+def test_object_id_without_prefix_is_hexadecimal(text: str, object_id: tuple[int, int]) -> None:
+    assert ObjectId.parse(text) == object_id
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", ":1", "x", "0x", "10000", "1018:", "1018:100", "1018:1:2", "-1", " 1018", "1_0", "१:1"],
+)
+def test_object_id_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="such as 0x1018:01"):
+        ObjectId.parse(text)

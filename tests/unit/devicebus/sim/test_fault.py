@@ -142,7 +142,7 @@ def test_fault_inside_a_slave():
     [
         (fault("cut", slave="x"), r"no slave 'x' \(one of a, b, c\)"),
         (fault("corrupt"), "fault corrupt: it needs a slave"),
-        (fault("sdo", slave="a", object="x"), "not an entry"),
+        (fault("sdo", slave="a", object="x"), "not INDEX"),
         (fault("refuse", slave="a", state="RUN"), "no state 'RUN'"),
     ],
 )

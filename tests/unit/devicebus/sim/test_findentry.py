@@ -31,7 +31,8 @@ def device():
         ("valve", (0x7000, 2)),
         ("gain", (0x8000, 2)),
         ("0x8000:3", (0x8000, 3)),
-        ("32769", (0x8001, 0)),
+        ("8001", (0x8001, 0)),
+        ("8000:03", (0x8000, 3)),
     ],
 )
 def test_entry_is_found(device, text, place):
@@ -42,10 +43,10 @@ def test_entry_is_found(device, text, place):
     ("text", "reason"),
     [
         ("speeed", "no entry 'speeed' .inputs and outputs: level, limit, speed, valve"),
-        ("twice", "several entries 'twice': 0x8000:3, 0x8001:0"),
-        ("0x8000:9", "no entry 0x8000:9"),
-        ("0x9000", "no entry 0x9000:0"),
-        ("0xZZ", "is not an entry"),
+        ("twice", "several entries 'twice': 0x8000:03, 0x8001:00"),
+        ("0x8000:9", "no entry 0x8000:09"),
+        ("0x9000", "no entry 0x9000:00"),
+        ("0xZZ", "is not INDEX.:SUB. in hexadecimal"),
         ("", "no entry ''"),
     ],
 )

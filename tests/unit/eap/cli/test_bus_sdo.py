@@ -22,7 +22,7 @@ def command(monkeypatch):
 
 def test_read(command):
     assert command("read", "1003", "0x1018:1").output == "0x1018:01 = UDINT 3674 (0x00000E5A)\n"
-    row = json.loads(command("read", "sensor", "4120:1", "--type", "UINT", "--json").output)
+    row = json.loads(command("read", "sensor", "1018:1", "--type", "UINT", "--json").output)
     assert (row["type"], row["value"], row["data"]) == ("UINT", None, "5a0e0000")
 
 

@@ -68,12 +68,12 @@ def test_list(command, stub):
     ("entry", "line"),
     [
         ("0x1000", "0x1000:00 = UDINT 65541001  # Device type, 0x3E81389"),
-        ("4104", '0x1008:00 = STRING(32) "mixer #1"  # Device name'),
+        ("1008", '0x1008:00 = STRING(32) "mixer #1"  # Device name'),
         ("0xD000:07", "0xD000:07 = UDINT 10000  # Cycle time, us, 0x2710"),
         ("0xD000:7", "0xD000:07 = UDINT 10000  # Cycle time, us, 0x2710"),
         ("0x6000:8", "0x6000:08 = BOOL true  # Default given"),
-        ("0x8000:16", "0x8000:0x10 = UINT 0xD000  # TxPD 1, 0xD000"),
-        ("0x8000:0x10", "0x8000:0x10 = UINT 0xD000  # TxPD 1, 0xD000"),
+        ("0x8000:10", "0x8000:10 = UINT 0xD000  # TxPD 1, 0xD000"),
+        ("8000:0x10", "0x8000:10 = UINT 0xD000  # TxPD 1, 0xD000"),
         ("0x8000:3", "0x8000:03 = BLOCK(6) 01:01:05:04:00:00  # Destination MAC"),
         ("0x8000:4", "0x8000:04 = BLOCK(6) 127.0.1.2.2.1  # Destination NetID"),
         ("0x8000:5", "0x8000:05 = BLOCK(4) 127.0.1.2  # Destination IP"),
@@ -108,7 +108,7 @@ def test_whole_objects(command):
     assert command("read", "mixer", "0x1A00", "--complete").output.splitlines() == [
         "# 0x1A00 TxPDO mapping 0",
         "0x1A00:00 = USINT 1  # SubIndex 000",
-        "0x1A00:01 = UDINT 6000:01/32  # Mapping 1, 0x60000120",
+        "0x1A00:01 = UDINT 0x6000:01/32  # Mapping 1, 0x60000120",
     ]
     row = json.loads(command("read", "mixer", "0xD000:1", "--complete", "--json").output)
     assert (row["data"], row["complete"]) == ("10270000", True)
@@ -155,7 +155,7 @@ def test_write_of_octets(command, device):
         (("write", "mixer", "0xD000:7"), "say the value once"),
         (("write", "mixer", "0xD000:7", "1", "--hex", "01"), "say the value once"),
         (("write", "mixer", "0xD000:1", "1", "--complete"), "--complete writes octets"),
-        (("write", "mixer", "0xD000:x", "1"), "such as 0x1018:1"),
+        (("write", "mixer", "0xD000:x", "1"), "such as 0x1018:01"),
         (("write", "mixer", "1", "--from", "x"), "leave the rest out"),
         (("read", "mixer//eap0", "1"), "is no STATION, STATION/PORT or STATION/PORT/SLAVE"),
         (("write", "mixer", "0xD000:7", "fast"), "0xD000:07: 'fast' is not a value of UDINT"),
@@ -173,7 +173,7 @@ def test_aborts_are_said_in_words(command, device):
         1,
         "0xD005:00: object does not exist (0x06020000)\n",
     )
-    assert "subindex does not exist" in command("write", "mixer", "0xD000:99", "1").stderr
+    assert "subindex does not exist" in command("write", "mixer", "0xD000:63", "1").stderr
     result = command("read", "mixer", "0xD000:9")
     assert (result.exit_code, result.stderr) == (
         1,

@@ -19,7 +19,7 @@ TEXT = """\
 0x6000:06 = STRING(255) degC  # Unit
   0x6000:07 = STRING(9) ""
 0x6000:09 = hex 0000 c07f   # Default
-53248 = USINT 5
+D000 = USINT 5
 0xF920:1 = BLOCK(6) 1.2.3.4.5.6
 # 0xD000:02 = UINT 4  # PDO length
 """
@@ -45,6 +45,21 @@ def test_text(tmp_path):
     ]
 
 
+def test_dump_of_the_version_before_reads_as_it_was_written(tmp_path):
+    before = """\
+0x8000:09 = UINT 1  # decimal digits
+0x8000:0x0A = UINT 2  # from 10 on they said that they are hexadecimal
+0x8000:0x10 = UINT 3
+0x1A00:01 = UDINT 6000:01/32  # Mapping 0, 0x60000120
+"""
+    assert read_file(written(tmp_path, before)) == [
+        (0x8000, 9, b"\1\0"),
+        (0x8000, 10, b"\2\0"),
+        (0x8000, 16, b"\3\0"),
+        (0x1A00, 1, bytes.fromhex("20010060")),
+    ]
+
+
 def test_json(tmp_path):
     lines = [
         '{"index":53248,"subindex":7,"access":"rw","type":"UDINT","data":"10270000"}',
@@ -67,7 +82,7 @@ def test_stdin(monkeypatch):
     ("line", "reason"),
     [
         ("D000 7 10", "'D000 7 10' is not INDEX:SUB = TYPE VALUE"),
-        ("0xD000:x = UINT 1", "such as 0x1018:1"),
+        ("0xD000:x = UINT 1", "such as 0x1018:01"),
         ("0xD000:1 = UNIT 1", "did you mean UINT"),
         ("0xD000:1 = UINT", "'' is not a value of UINT"),
         ("0xD000:1 = UINT 65536", "0 to 65535"),

@@ -23,7 +23,7 @@ def change(kind, old="", new="", subindex=0, unit=""):
         (change("removed", "10"), "- 0x6003:00 Tx variable 3 (speed)"),
         (change("changed", "", "bar", 6), '~ 0x6003:06 Tx variable 3 (speed)  "" -> bar'),
         (change("changed", "1", "2", 7, "us"), "~ 0x6003:07 Tx variable 3 (speed)  1 -> 2 us"),
-        (change("changed", "1", "2", 16), "~ 0x6003:0x10 Tx variable 3 (speed)  1 -> 2"),
+        (change("changed", "1", "2", 16), "~ 0x6003:10 Tx variable 3 (speed)  1 -> 2"),
     ],
 )
 def test_signs(given, line):

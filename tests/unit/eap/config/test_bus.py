@@ -41,8 +41,8 @@ def test_variables_come_with_type_and_direction():
         "b.a.valve": ("BOOL", True),
         "b.a.level": ("INT", False),
     }
-    assert bus.variables["b.a.valve"].comment == "output 7000:01"
-    assert bus.variables["b.a.level"].comment == "input 6000:03"
+    assert bus.variables["b.a.valve"].comment == "output 0x7000:01"
+    assert bus.variables["b.a.level"].comment == "input 0x6000:03"
 
 
 def test_slaves_keep_identity_order_and_padding():

@@ -21,7 +21,7 @@ def access(*items, key="access"):
         (["allow: [all], from: [me]"], "8: from: 'me' is no IPv4 network and no MAC address; a"),
         (["allow: [all], net_ids: [rihgt]"], "8: net_ids: 'rihgt' is no NetID, nor the first num"),
         (["allow: [all], to: [right/eap1]"], "8: to: station right has no port 'eap1', did you me"),
-        (["allow: [all], objects: [x]"], "8: objects: 'x' names no objects; 0xINDEX, 0xINDEX:SUB"),
+        (["allow: [all], objects: [x]"], "8: objects: 'x' names no objects; INDEX, INDEX:SUB"),
         (["allow: [all], doors: [upd]"], "8: doors: no door 'upd', did you mean udp?; one of ud"),
         (["allow: [all], doors: [mqtt:x]"], "8: doors: no door 'mqtt:x'"),
         (["name: a, allow: [read], doors: [udp]", "name: a, allow: [all]"],

@@ -110,10 +110,12 @@ def test_a_target_that_there_is_not_says_so(plant, text, message):
     ("text", "objects"),
     [
         ("0x6040", (0x6040, 0x6040)),
-        ("24640", (0x6040, 0x6040)),
+        ("6040", (0x6040, 0x6040)),
         ("0x8000:1", (0x8000, 0x8000, 1, 1)),
         ("0x8000:0xFF", (0x8000, 0x8000, 0xFF, 0xFF)),
         ("0x6000-0x6FFF", (0x6000, 0x6FFF)),
+        ("6000 - 6fff", (0x6000, 0x6FFF)),
+        ("0x8000:10", (0x8000, 0x8000, 0x10, 0x10)),
     ],
 )
 def test_objects_are_one_or_many(text, objects):
@@ -125,8 +127,9 @@ def test_objects_are_one_or_many(text, objects):
     [
         ("", "'' names no objects"),
         ("6040h", "'6040h' names no objects"),
-        ("65536", "'65536' names no objects"),
-        ("0x8000:256", "'0x8000:256' names no objects"),
+        ("10000", "'10000' names no objects"),
+        ("0x6000:1-0x6000:2", "'0x6000:1-0x6000:2' names no objects"),
+        ("0x8000:100", "'0x8000:100' names no objects"),
         ("0x6000-0x5000", "'0x6000-0x5000' ends before it begins"),
     ],
 )

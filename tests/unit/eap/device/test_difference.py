@@ -78,8 +78,8 @@ def test_a_variable_more_in_a_pd_empties_its_mapping_first(udp):
         ("changed", "TxPDO mapping 0: number of entries", "1", "0", True),
         ("added", "Tx variable 1 (more): Type name", "", "REAL", False),
         ("added", "Tx variable 1 (more): Name", "", "more", False),
-        ("changed", "TxPDO mapping 0: Mapping 0", "6000:01/16", "6000:01/16", True),
-        ("added", "TxPDO mapping 0: Mapping 1", "", "6001:01/32", False),
+        ("changed", "TxPDO mapping 0: Mapping 0", "0x6000:01/16", "0x6000:01/16", True),
+        ("added", "TxPDO mapping 0: Mapping 1", "", "0x6001:01/32", False),
         ("changed", "TxPDO mapping 0: number of entries", "1", "2", False),
     ]
 

@@ -64,7 +64,8 @@ def test_numbers_are_shown_with_as_many_digits_as_they_have(kind, value, text):
         ("UDINT", "0x1A00", "001a0000"),
         ("BOOL", "on", "01"),
         ("UINT[2]", "1,2", "01000200"),
-        ("UDINT", "6000:01/32", "20010060"),
+        ("UDINT", "0x6000:01/32", "20010060"),
+        ("UDINT", "6000:01/32", "20010060"),  # as dumps had it before
         ("UINT", "0x1A00", "001a"),
     ],
 )
@@ -107,7 +108,7 @@ def test_what_is_shown_reads_as_it_was(text, octets, name):
 @pytest.mark.parametrize(
     ("kind", "name", "octets", "text"),
     [
-        ("UDINT", "Mapping 3", "20010060", "6000:01/32"),
+        ("UDINT", "Mapping 3", "20010060", "0x6000:01/32"),
         ("UDINT", "Cycle time", "10270000", "10000"),
         ("UINT", "PDO index", "001a", "0x1A00"),
         ("UINT", "TxPD 1", "00d0", "0xD000"),

@@ -4,25 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.sim.devices.objects import ObjectNumberError, build_dictionary, parse_entry, places
+from devicebus.sim.devices.objects import build_dictionary, places
 from devicebus.sim.spec import AccessKind, ChannelSpec, EntrySpec, ObjectSpec
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
 from tests.support.bus import generic
-
-
-@pytest.mark.parametrize(
-    ("text", "entry"),
-    [("0x6041:0", (0x6041, 0)), ("24641", (0x6041, 0)), ("0x8000:0x10", (0x8000, 16))],
-)
-def test_entry_is_read_from_text(text, entry):
-    assert parse_entry(text) == entry
-
-
-@pytest.mark.parametrize("text", ["", "x:1", "0x10000:0", "0x1000:256", "0x1000:-1", "0x1000:1:2"])
-def test_text_that_is_no_entry(text):
-    with pytest.raises(ObjectNumberError, match="not an entry"):
-        parse_entry(text)
 
 
 def test_channels_without_an_entry_count_up():

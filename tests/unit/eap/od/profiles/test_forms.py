@@ -19,7 +19,7 @@ from eap.od.profiles.forms import Form, from_text, to_text
         (Form.HEX, "UDINT", b"\x89\x13\xe8\x03", "0x03E81389"),
         (Form.INDEX, "UINT", b"\x00\x1a", "0x1A00"),
         (Form.INDEX, "UINT", b"\0\0", "0x0000"),
-        (Form.MAPPING, "UDINT", b"\x10\x01\x00\x60", "6000:01/16"),
+        (Form.MAPPING, "UDINT", b"\x10\x01\x00\x60", "0x6000:01/16"),
         (Form.MAC, "BLOCK(6)", b"\1\1\5\4\0\0", "01:01:05:04:00:00"),
         (Form.NET_ID, "BLOCK(6)", b"\1\2\3\4\5\6", "1.2.3.4.5.6"),
         (Form.IP, "BLOCK(4)", b"\x0a\0\0\1", "10.0.0.1"),
