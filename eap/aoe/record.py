@@ -87,6 +87,13 @@ def _is_life(trace: Trace) -> bool:
     )
 
 
+def reason_of(trace: Trace) -> str:
+    """Return the text of a trace without the request that it is about."""
+    if trace.header is None:
+        return trace.text
+    return trace.text.removeprefix(f"{describe(trace.header, trace.came_by)}: ")
+
+
 def describe(header: AmsHeader, way: Way | None = None) -> str:
     """Return a request in words: service, target and source."""
     where = f" ({way})" if way is not None else ""

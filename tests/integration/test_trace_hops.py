@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -69,8 +70,11 @@ def test_every_hop_is_named_and_the_one_that_fails(line: Row) -> None:
     stations = json.loads(run_eapctl(runtime, "scan", "--json").stdout)["stations"]
     assert [each["error"][:6] for each in stations] == ["", "a: b (", "a: b ("]
     log = line.appliances["a"].stop()[2]
-    assert ": b (" in log
     assert " c (" not in log
+    first, *repeats = [each for each in log.splitlines() if ": interface east0 has no link" in each]
+    assert ": b (" in first
+    assert len(repeats) == 1, "three commands asked by the dead hop"
+    assert re.search(r"; repeated \d+ times in \d+ s$", repeats[0])
 
 
 def test_rules_that_refuse_are_named(line: Row) -> None:

@@ -42,6 +42,7 @@ from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.gateway.gateway_methods import GatewayMethods
 from eap.appliance.services.gateway.opening import open_desks, open_gateways
+from eap.appliance.services.log_limits import LimitedLogHandler
 from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
@@ -70,9 +71,16 @@ _IMAGE_PAUSE_S = 0.01
 class Services:
     """The objects of one services process, from its start to its end."""
 
-    def __init__(self, handover: Handover, startup: Startup, resources: ExitStack) -> None:
+    def __init__(
+        self,
+        handover: Handover,
+        startup: Startup,
+        log: LimitedLogHandler,
+        resources: ExitStack,
+    ) -> None:
         self._handover = handover
         self._startup = startup
+        self._log = log
         self._resources = resources
         self._folder = ApplianceFolder(Path(handover.folder))
         self._directory = Directory(handover.directory)
@@ -115,6 +123,7 @@ class Services:
             tasks += [group.create_task(door.serve()) for door in (*doors, *brokers)]
             tasks.append(group.create_task(devices.serve()))
             tasks.append(group.create_task(audit.serve()))
+            tasks.append(group.create_task(self._log.serve()))
             watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
             tasks.append(group.create_task(watch.run()))
             self._startup.finish({})
@@ -241,15 +250,18 @@ def main(handover_fd: int, startup: Startup) -> int:
     """Return the exit code: 2 for what this machine or the specification lacks."""
     handover = Handover.from_descriptor(handover_fd)
     realtime.die_with_parent(handover.supervisor)
-    logging.basicConfig(format="services: %(message)s", level=logging.INFO)
+    log = LimitedLogHandler()
+    logging.basicConfig(format="services: %(message)s", level=logging.INFO, handlers=[log])
     try:
         with ExitStack() as resources:
-            asyncio.run(_serve(handover, startup, resources))
+            asyncio.run(_serve(handover, startup, log, resources))
     except EapError as exc:
         sys.stderr.write(f"services: {exc}\n")
         return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
     return 0
 
 
-async def _serve(handover: Handover, startup: Startup, resources: ExitStack) -> None:
-    await Services(handover, startup, resources).run()
+async def _serve(
+    handover: Handover, startup: Startup, log: LimitedLogHandler, resources: ExitStack
+) -> None:
+    await Services(handover, startup, log, resources).run()

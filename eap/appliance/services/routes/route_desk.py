@@ -19,6 +19,7 @@ from eap.aoe.routes import Origin, RouteTable
 from eap.aoe.spec import AccessService, AmsUser, DoorKind, HopSpec, RouteSpec
 from eap.aoe.way import Way
 from eap.appliance.services.allowance import Rate, SourceRateLimiter, SourceRates
+from eap.appliance.services.log_limits import caused_by
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.codec.ads import AdsError
 from eap.codec.ams import SYSTEM_PORT, AmsHeader
@@ -87,7 +88,8 @@ class RouteDesk:
         for station in self._stations:
             result, why = await _decide(station, question, sender, is_this_host=is_this_host)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
-            logger.log(level, "route %r asked for by %s: %s", name, sender, why)
+            cause = caused_by((station.router.net_id, name, sender, why), sender)
+            logger.log(level, "route %r asked for by %s: %s", name, sender, why, extra=cause)
             entry = _audited(station.router.net_id, question, sender, result, why)
             for write in station.router.on_audit:
                 write(entry)
@@ -158,7 +160,8 @@ def _password(user: AmsUser) -> bytes | None:
     except EnvironmentalError as exc:
         password, reason = b"", str(exc)
     if reason:
-        logger.warning("password of user %s: %s", user.name, reason)
+        cause = caused_by((user.name, reason), f"user {user.name}")
+        logger.warning("password of user %s: %s", user.name, reason, extra=cause)
     return password or None
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from time import monotonic_ns, time
 
 from eap.aoe.action import Outcome, Trace
-from eap.aoe.record import describe
+from eap.aoe.record import reason_of
 from eap.aoe.report import ConnectionReport, RouteReport
 from eap.aoe.routes import Origin, Route
 from eap.appliance.control_routes import (
@@ -131,14 +131,11 @@ def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
 def request_row(trace: Trace, now_ns: int) -> RequestRow:
     """Return what became of a packet in plain values."""
     header, hop = trace.header, trace.hop
-    text = trace.text
     known = {} if header is None else {
         "service": AmsCommand.name_of(header.command),
         "target": f"{header.target}:{header.target_port}",
         "source": f"{header.source}:{header.source_port}",
     }  # fmt: skip
-    if header is not None:
-        text = text.removeprefix(f"{describe(header, trace.came_by)}: ")
     return RequestRow(
         at=round(time() - (now_ns - trace.at_ns) / _S, 3),
         outcome=trace.outcome,
@@ -147,7 +144,7 @@ def request_row(trace: Trace, now_ns: int) -> RequestRow:
         address="" if hop is None else hop.connection,
         error=trace.error_code,
         took_us=trace.took_ns // 1000,
-        text=text,
+        text=reason_of(trace),
         **known,
     )
 

@@ -198,6 +198,10 @@ async def _follow(
             why = _explain(report)
             opaque = HopReport(station=_next_name(report), net_id=report.next_net_id)
             hops.append(Hop(opaque, took_ns, is_opaque=True))
+        elif report.why and hops and report.net_id == hops[-1].report.net_id:
+            # It handed the question before this one on, and has lost its next hop since.
+            why = f"{report.station}: {report.why}"
+            hops[-1] = Hop(report, took_ns)
         elif any(report.net_id == each.report.net_id for each in hops):
             why = f"{report.station}: the routes run in a circle, it was on the way already"
         else:

@@ -1,20 +1,15 @@
-"""Log lines for what a router did not simply answer: each kind with its level, and not too many."""
+"""Log lines for what a router did not simply answer, with the cause of each."""
 
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict
+from collections.abc import Hashable
 
 from eap.aoe.access import host_of
 from eap.aoe.action import Outcome, Trace
-from eap.appliance.services.allowance import Allowance
+from eap.aoe.record import reason_of
+from eap.appliance.services.log_limits import caused_by
 
-LINES_PER_S = 5
-"""On the average; what is more is only counted."""
-BURST = 20
-"""Lines at once."""
-MAX_CLIENTS = 256
-"""Whose refusals are counted apart."""
 _LEVELS = {
     Outcome.ANSWERED: logging.INFO,
     Outcome.FAILED: logging.WARNING,
@@ -28,40 +23,33 @@ logger = logging.getLogger(__name__)
 
 
 class TraceLog:
-    """The lines of one *station*.
-
-    Each client that is refused something has an allowance of its own: one that goes on trying
-    hides no other.
-    """
+    """The lines of one *station*."""
 
     def __init__(self, station: str) -> None:
         self._station = station
-        self._allowances: OrderedDict[tuple[str, str], Allowance] = OrderedDict()
 
     def write(self, trace: Trace) -> None:
-        """Say what became of a packet, unless too much was said just now."""
+        """Log what became of a packet."""
         level = _LEVELS[trace.outcome]
         if not logger.isEnabledFor(level):
             return
-        allowance = self._allowance(trace)
-        if not allowance.take(trace.at_ns / 1e9):
-            allowance.skipped += 1
-            return
-        if allowance.skipped:
-            text = "%s: %d more packets met errors"
-            logger.warning(text, self._station, allowance.skipped)
-            allowance.skipped = 0
+        host = "" if trace.came_by is None else host_of(trace.came_by)
+        door = "" if trace.came_by is None else trace.came_by.door
         # Results inside an answer are in the text.
         code = f" (0x{trace.error_code:x})" if trace.error_code else ""
-        logger.log(level, "%s: %s%s", self._station, trace.text, code)
+        extra = caused_by((self._station, *_cause(trace, host)), f"{self._station} {door} {host}")
+        logger.log(level, "%s: %s%s", self._station, trace.text, code, extra=extra)
 
-    def _allowance(self, trace: Trace) -> Allowance:
-        whose = "", ""
-        if trace.outcome is Outcome.DENIED and trace.came_by is not None:
-            whose = trace.came_by.door, host_of(trace.came_by)
-        allowance = self._allowances.pop(whose, None)
-        allowance = allowance or Allowance(BURST, LINES_PER_S, trace.at_ns / 1e9)
-        if len(self._allowances) >= MAX_CLIENTS:
-            self._allowances.popitem(last=False)
-        self._allowances[whose] = allowance
-        return allowance
+
+def _cause(trace: Trace, host: str) -> tuple[Hashable, ...]:
+    """Return what is equal for packets that met the same obstacle.
+
+    A hop that is down is one cause, whatever is asked by it, and by whom.  Elsewhere clients and
+    targets are told apart, and connections and AMS ports of clients are not.
+    """
+    reason = reason_of(trace)
+    if trace.outcome is Outcome.FAILED and trace.hop is not None:
+        return trace.outcome, trace.hop, trace.error_code, reason
+    header = trace.header
+    what = None if header is None else (header.target, header.target_port, header.command)
+    return trace.outcome, what, host, trace.error_code, reason

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 from itertools import count
+from typing import Any
 
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule
@@ -116,6 +117,23 @@ def test_trace_several_stations_known_to_be_dead_names_the_first() -> None:
     first.router.hop_down("link", "island-02", "it does not answer", 1)
     why = "island-01: island-02 (island-02 by link) is down: it does not answer"
     assert follow(first, LAST).why == why
+
+
+def test_trace_hop_that_is_lost_meanwhile_is_named_and_no_circle() -> None:
+    line, first = line_of_three()
+    second = line.stations["island-02"]
+    ask, asked = first.ask, count()
+
+    async def ask_while_it_is_lost(*words: Any, **more: float) -> AmsAnswer:
+        if next(asked):
+            second.router.hop_down("link", "island-03", "it does not answer", 1)
+        return await ask(*words, **more)
+
+    first.ask = ask_while_it_is_lost  # type: ignore[method-assign]
+    traced = follow(first)
+    assert names(traced) == ["island-01", "island-02"]
+    assert traced.hops[-1].report.state == "down"
+    assert traced.why == "island-02: island-03 (island-03 by link) is down: it does not answer"
 
 
 def test_a_missing_route_and_a_missing_port() -> None:
