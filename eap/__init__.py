@@ -5,8 +5,7 @@ User programs need one name: ``eap.attach("station")`` gives the variables of a 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False  # as in typing, which a child process has no time to import first
 if TYPE_CHECKING:
     from eap.appliance.attach import AttachedStation
 

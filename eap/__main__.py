@@ -1,8 +1,21 @@
-"""``python -m eap`` is ``eapctl``."""
+"""``eapctl``, and ``python -m eap``, which is the same."""
 
 from __future__ import annotations
 
-from eap.cli import main
+import signal
+
+
+def main() -> None:
+    """Run one command; SIGINT ends the process without a traceback while modules are imported."""
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if is_default:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from eap.cli import main as eapctl
+
+    if is_default:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    eapctl(prog_name="eapctl")
+
 
 if __name__ == "__main__":
-    main(prog_name="eapctl")
+    main()
