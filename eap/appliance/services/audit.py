@@ -2,22 +2,21 @@
 
 Rule 1: a line is in the file before its client has its answer, so a kill loses the request in hand.
 Rule 2: who floods is told of by numbers, and others' lines are written all the same.
-Rule 3: the file never has more than a few megabytes more than it may; the oldest goes.
+Rule 3: lines that cannot be written are counted: `status` and the log say so, and the file itself
+as soon as it can be written again.
 """
 
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import logging
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 from time import monotonic, time
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -26,13 +25,10 @@ from eap.aoe.ads_operation import Operation, WriteControl
 from eap.aoe.directory import Directory
 from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.appliance.services.allowance import Allowance
+from eap.appliance.services.audit_file import AuditFile
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import ObjectId
 
-MAX_OCTETS = 8 << 20
-"""Of the file before it is put aside."""
-KEPT = 4
-"""Older files."""
 BURST, PER_S = 500, 50
 """Lines that a client may cause at once, and in each second for long."""
 DOOR_BURST, DOOR_PER_S = 5000, 500
@@ -51,37 +47,60 @@ _Client: TypeAlias = tuple[str, str, str]
 logger = logging.getLogger(__name__)
 
 
+class Lost(NamedTuple):
+    """Lines that could not be written."""
+
+    lines: int
+    since: str
+    """When the first one was lost; empty if none was."""
+    until: str
+    """When the last one was lost."""
+    error: str
+    """Why nothing can be written now; empty if it can."""
+
+
 class Audit:
     """The audit of a plant's stations on this host.
 
     Args:
-        path: Of the file; older ones lie beside it, with ``.1`` and so on behind their names.
+        file: Where lines go.
         directory: Names of targets.
         clock: In seconds, for rates.
         now: Unix time in seconds.
+
+    Attributes:
+        lost: What could not be written since this process began.
     """
 
     def __init__(
         self,
-        path: Path,
+        file: AuditFile,
         directory: Directory,
         *,
         clock: Callable[[], float] = monotonic,
         now: Callable[[], float] = time,
     ) -> None:
-        self.path = path
+        self.lost = Lost(0, "", "", "")
+        self._file = file
         self._directory = directory
         self._clock = clock
         self._now = now
         self._clients: OrderedDict[_Client, Allowance] = OrderedDict()
         self._doors: dict[tuple[str, str], Allowance] = {}
-        self._is_failing = False
+        self._untold = 0
+        self._untold_since = ""
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self._file.path
 
     async def serve(self) -> None:
-        """Tell what was left out, until cancelled."""
+        """Write what was left out and what was lost, until cancelled."""
         while True:
             await asyncio.sleep(_TELL_AFTER_S)
             self.tell_skipped()
+            self.tell_lost()
 
     def write(self, station: str, entry: AuditEntry) -> None:
         """Write down what a station did, or refused."""
@@ -149,43 +168,44 @@ class Audit:
     def _time(self) -> str:
         return datetime.fromtimestamp(self._now(), UTC).isoformat(timespec="milliseconds")
 
-    def _append(self, lines: list[dict[str, Any]]) -> None:
-        data = b"".join(msgspec.json.encode(line) + b"\n" for line in lines)
+    def tell_lost(self) -> None:
+        """Write how many lines were lost, if there are such, and the file can be written again."""
+        if self._untold:
+            self._append([])
+
+    def _append(self, lines: list[dict[str, Any]]) -> bool:
+        """Write all of *lines*, or none; say which."""
+        head = [self._lost_line()] if self._untold else []
+        data = b"".join(msgspec.json.encode(line) + b"\n" for line in (*head, *lines))
         try:
-            self._write(data)
+            self._file.append(data)
         except OSError as exc:
-            if not self._is_failing:
-                logger.warning("audit %s cannot be written: %s", self.path, exc.strerror)
-            self._is_failing = True
-        else:
-            self._is_failing = False
+            self._lose(len(lines), exc.strerror or str(exc))
+            return False
+        if self._untold:
+            logger.warning("audit %s: written again; %d lines are lost", self.path, self._untold)
+        self._untold = 0
+        self.lost = self.lost._replace(error="")
+        return True
 
-    def _write(self, data: bytes) -> None:
-        """Append *data*; the file is opened each time, for it may have been moved away."""
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        try:
-            fd = os.open(self.path, flags, 0o640)
-        except FileNotFoundError:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            fd = os.open(self.path, flags, 0o640)
-        with os.fdopen(fd, "wb", buffering=0) as file:
-            file.write(data)
-            if os.fstat(fd).st_size >= MAX_OCTETS:
-                self._rotate(fd)
+    def _lose(self, count: int, error: str) -> None:
+        if not self.lost.error:
+            logger.error("audit %s: changes are not recorded: %s", self.path, error)
+        self.lost = self.lost._replace(error=error)
+        if count:
+            now = self._time()
+            self._untold_since = self._untold_since if self._untold else now
+            self._untold += count
+            self.lost = Lost(self.lost.lines + count, self.lost.since or now, now, error)
 
-    def _rotate(self, fd: int) -> None:
-        """Put the file aside, unless another appliance of the plant does just that."""
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return
-        if os.fstat(fd).st_ino != self.path.stat().st_ino:
-            return
-        names = [self.path.with_name(f"{self.path.name}.{number}") for number in range(1, KEPT + 1)]
-        for older, newer in zip(reversed(names[1:]), reversed(names[:-1]), strict=True):
-            if newer.exists():
-                newer.replace(older)
-        self.path.replace(names[0])
+    def _lost_line(self) -> dict[str, Any]:
+        return {
+            "time": self._time(),
+            "lost": self._untold,
+            "since": self._untold_since,
+            "until": self.lost.until,
+            "error": self.lost.error,
+        }
 
 
 def _words(each: AuditedOperation) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from eap.appliance.handover import (
 )
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.services.audit import Audit
+from eap.appliance.services.audit_file import AuditFile
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.bus_methods import Buses
 from eap.appliance.services.bus.segment_link import SegmentLink
@@ -211,7 +212,7 @@ class Services:
     def _audit(
         self, routers: Mapping[str, StationRouter], gateways: Mapping[PortName, MailboxGateway]
     ) -> Audit:
-        audit = Audit(Store(self._handover.plant).path / "audit.jsonl", self._directory)
+        audit = Audit(AuditFile(Store(self._handover.plant).path / "audit.jsonl"), self._directory)
         for name, router in routers.items():
             router.on_audit.append(partial(audit.write, name))
         for owner, gateway in gateways.items():

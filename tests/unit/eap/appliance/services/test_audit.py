@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,9 @@ from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService, DirectoryPort, DirectoryStation
 from eap.aoe.way import Way
 from eap.appliance.services import audit as module
-from eap.appliance.services.audit import BURST, KEPT, Audit
+from eap.appliance.services import audit_file
+from eap.appliance.services.audit import BURST, Audit
+from eap.appliance.services.audit_file import KEPT, AuditFile
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
@@ -52,7 +53,7 @@ def clock() -> Clock:
 @pytest.fixture
 def audit(tmp_path: Path, clock: Clock) -> Audit:
     path = tmp_path / "plant" / "audit.jsonl"
-    return Audit(path, NAMES, clock=clock, now=lambda: 1_700_000_000.25)
+    return Audit(AuditFile(path), NAMES, clock=clock, now=lambda: 1_700_000_000.25)
 
 
 def entry(
@@ -188,7 +189,7 @@ def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None
 
 
 def test_old_files_go(audit: Audit, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_OCTETS", 1000)
+    monkeypatch.setattr(audit_file, "MAX_BYTES", 1000)
     for number in range(20):
         audit.write(f"island-{number}", entry())
     names = sorted(path.name for path in audit.path.parent.iterdir())
@@ -199,12 +200,41 @@ def test_old_files_go(audit: Audit, monkeypatch: pytest.MonkeyPatch) -> None:
     assert numbers == sorted(numbers, reverse=True)
 
 
-def test_a_disk_that_is_full_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    (tmp_path / "plant").mkdir()
-    audit = Audit(tmp_path / "plant", NAMES)
-    with caplog.at_level(logging.WARNING):
-        audit.write("island-01", entry())
-        audit.write("island-01", entry())
-    assert [each.getMessage() for each in caplog.records] == [
-        f"audit {tmp_path / 'plant'} cannot be written: Is a directory"
+class FullDisk(AuditFile):
+    """A file on a disk that takes nothing until *error* is cleared."""
+
+    error = "No space left on device"
+
+    def append(self, lines: bytes) -> None:
+        if self.error:
+            raise OSError(28, self.error)
+        super().append(lines)
+
+
+def test_audit_counts_what_cannot_be_written_and_says_so_when_it_can_again(
+    tmp_path: Path, clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = FullDisk(tmp_path / "plant" / "audit.jsonl")
+    audit = Audit(file, NAMES, clock=clock, now=lambda: 1_700_000_000.0 + clock.now)
+    audit.write("island-01", entry(count=2))
+    clock.now += 5
+    audit.write("island-01", entry())
+    times = "2023-11-14T22:15:00.000+00:00", "2023-11-14T22:15:05.000+00:00"
+    assert audit.lost == (3, *times, "No space left on device")
+    audit.tell_lost()
+    assert audit.lost.lines == 3
+    file.error = ""
+    clock.now += 5
+    audit.tell_lost()
+    assert audit.lost == (3, *times, "")
+    audit.write("island-01", entry())
+    first, second = lines(audit)
+    assert first == {
+        "time": "2023-11-14T22:15:10.000+00:00", "lost": 3, "since": times[0], "until": times[1],
+        "error": "No space left on device",
+    }  # fmt: skip
+    assert second["operation"] == "Write"
+    assert caplog.messages == [
+        f"audit {file.path}: changes are not recorded: No space left on device",
+        f"audit {file.path}: written again; 3 lines are lost",
     ]

@@ -1,0 +1,95 @@
+"""Lines of the audit are in its file as a whole, or not at all."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import resource
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from eap.appliance.services import audit_file as module
+from eap.appliance.services.audit_file import AuditFile
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> AuditFile:
+    return AuditFile(tmp_path / "plant" / "audit.jsonl")
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Let the kernel take *size* bytes of a file at most: the write that reaches it is short."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_append_makes_the_folder_for_its_owner_alone(file: AuditFile) -> None:
+    file.append(b"one\n")
+    assert stat.S_IMODE(file.path.parent.stat().st_mode) == 0o700
+    assert file.path.read_bytes() == b"one\n"
+
+
+def test_append_takes_a_short_write_back(file: AuditFile) -> None:
+    file.append(b"one\n")
+    with largest_file(8), pytest.raises(OSError, match="File too large"):
+        file.append(b"two is longer\n")
+    assert file.path.read_bytes() == b"one\n"
+    file.append(b"three\n")
+    assert file.path.read_bytes() == b"one\nthree\n"
+
+
+def test_append_ends_a_line_that_was_broken_off(file: AuditFile) -> None:
+    file.append(b"one\n")
+    with file.path.open("ab") as other:
+        other.write(b'{"half')
+    file.append(b"two\n")
+    assert file.path.read_bytes() == b'one\n{"half\ntwo\n'
+
+
+def test_append_follows_a_file_that_was_moved_away(file: AuditFile) -> None:
+    file.append(b"one\n")
+    file.path.rename(file.path.with_suffix(".old"))
+    file.append(b"two\n")
+    assert file.path.read_bytes() == b"two\n"
+
+
+def test_append_fails_while_another_process_holds_the_lock(
+    file: AuditFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_TRIES", 2)
+    file.append(b"one\n")
+    other = os.open(file.path, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    with pytest.raises(OSError, match="another process holds its lock"):
+        file.append(b"two\n")
+    os.close(other)
+    file.append(b"three\n")
+    assert file.path.read_bytes() == b"one\nthree\n"
+
+
+def test_append_does_not_follow_a_link(file: AuditFile, tmp_path: Path) -> None:
+    file.path.parent.mkdir()
+    file.path.symlink_to(tmp_path / "target")
+    with pytest.raises(OSError, match="symbolic links"):
+        file.append(b"one\n")
+    assert not (tmp_path / "target").exists()
+
+
+def test_full_file_is_put_aside(file: AuditFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_BYTES", 8)
+    for number in range(module.KEPT + 2):
+        file.append(f"line {number}\nmore\n".encode())
+    assert not file.path.exists()
+    names = sorted(each.name for each in file.path.parent.iterdir())
+    assert names == [f"audit.jsonl.{number}" for number in range(1, module.KEPT + 1)]
+    newest = file.path.with_name("audit.jsonl.1").read_text()
+    assert newest == f"line {module.KEPT + 1}\nmore\n"
