@@ -6,8 +6,9 @@ Whoever keeps an audit takes from here what was changed and what was refused.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
-from eap.aoe.access import LOOKUPS, AccessList, Grants
+from eap.aoe.access import LOOKUPS, AccessList
 from eap.aoe.action import Outcome, Trace
 from eap.aoe.ads_operation import AdsRefusedError, OperationOutcome
 from eap.aoe.ads_part import has_results
@@ -59,10 +60,13 @@ class Gate:
 
     Attributes:
         access: The rules, which may become others.
+        before_change: Called with each change before it goes in or on, where changes that cannot
+            be recorded are refused: returns why it cannot be, empty if it was.
     """
 
     def __init__(self, access: AccessList, record: Record) -> None:
         self.access = access
+        self.before_change: Callable[[AuditEntry], str] | None = None
         self._record = record
         self._entries: deque[AuditEntry] = deque(maxlen=MAX_ENTRIES)
 
@@ -107,9 +111,13 @@ class Gate:
         try:
             request = parse_request(header.command, data[AmsHeader.SIZE :])
         except AdsRefusedError as exc:
-            return _judge_unreadable(header, grants, exc) or (data, None)
+            is_recorded = self.before_change is not None
+            may_pass = grants.may(AccessService.RAW) and not is_recorded
+            return (data, None) if may_pass else _refuse_unreadable(header, exc)
         verdicts = tuple(map(grants.judge, request.operations))
         judged = Judged(way, header, route, request, verdicts)
+        if why := self._record_first(judged):
+            judged = judged.refuse_changes(why)
         if judged.refused:
             return self._refuse(judged, now_ns) or (
                 exchange_body(data, judged.encode_part()),
@@ -127,6 +135,13 @@ class Gate:
     def give_up(self, judged: Judged, error_code: int | None = None) -> None:
         """Take note that nothing came back; *error_code* is what the client got, if anything."""
         self._enter(judged.give_up(error_code))
+
+    def _record_first(self, judged: Judged) -> str:
+        """Record what a request is going to change, where that is required; return why not."""
+        if self.before_change is None:
+            return ""
+        changes = judged.changes
+        return self.before_change(changes) if changes.operations else ""
 
     def _refuse(self, judged: Judged, now_ns: int) -> Refusal | None:
         """Refuse a request as a whole, unless some of its items may be done."""
@@ -154,10 +169,11 @@ def exchange_body(data: bytes, body: bytes) -> bytes:
     return data[:_LENGTH] + length + data[_LENGTH + 4 : AmsHeader.SIZE] + body
 
 
-def _judge_unreadable(header: AmsHeader, grants: Grants, why: AdsRefusedError) -> Refusal | None:
-    """Let through what nobody here understands, for those who may send anything."""
-    if grants.may(AccessService.RAW):
-        return None
+def _refuse_unreadable(header: AmsHeader, why: AdsRefusedError) -> Refusal:
+    """Return the refusal of a request that nobody here understands.
+
+    Only clients that may send anything get it through, and nobody where changes are recorded.
+    """
     text = "the request cannot be read"
     if why.result is AdsError.COMMAND:
         return Refusal(why.result, text)

@@ -73,6 +73,24 @@ class Judged(NamedTuple):
         """The verdicts on what may not be done."""
         return [each for each in self.verdicts if not each.is_allowed]
 
+    @property
+    def changes(self) -> AuditEntry:
+        """What of the request changes something, and may be done: none of it has been yet."""
+        entry = self._entry([None] * len(self.verdicts))
+        allowed = tuple(each for each in entry.operations if each.verdict.is_allowed)
+        return entry._replace(operations=allowed)
+
+    def refuse_changes(self, why: str) -> Judged:
+        """Return the request with all that changes something refused."""
+        return self._replace(
+            verdicts=tuple(
+                each
+                if each.service is AccessService.READ or not each.is_allowed
+                else each._replace(is_allowed=False, why=why)
+                for each in self.verdicts
+            )
+        )
+
     def encode_part(self) -> bytes:
         """Return the body of a sum command with what may be done."""
         return encode_sum(self._part())

@@ -155,6 +155,8 @@ class Handover(Handed, frozen=True):
     """What the router of each station is told; nothing for one that is not here."""
     directory: tuple[DirectoryStation, ...] = ()
     """The names of everything in the plant, of the stations that run elsewhere too."""
+    audit_required: bool = False
+    """Whether changes that cannot be recorded are refused."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

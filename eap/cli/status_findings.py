@@ -140,6 +140,8 @@ def _of_appliance(appliance: Row) -> Iterator[Finding]:
             yield _error(f"{plant} {name}", "not running", "it is being started again")
         elif step := process.get("step"):
             yield _warning(f"{plant} {name}", f"starting: {step}")
+    if audit := appliance.get("audit"):
+        yield from _of_audit(f"{plant} audit", audit)
     engine = processes["engine"]
     refused = [
         f"{name.replace('_', ' ')} ({outcome.removeprefix('other: ')})"
@@ -151,6 +153,16 @@ def _of_appliance(appliance: Row) -> Iterator[Finding]:
         yield _warning(f"{plant} engine", f"no realtime: {', '.join(refused)}", advice)
     if counts := _counts(engine.get("bus_requests", {})):
         yield _info(f"{plant} engine", f"requests to buses: {counts}")
+
+
+def _of_audit(where: str, audit: Row) -> Iterator[Finding]:
+    lost, error = words.count(audit["lines"], "line"), audit["error"]
+    if error:
+        effect = "changes are refused" if audit["required"] else "changes are not recorded"
+        advice = f"{lost} lost; make room for {audit['file']}, or its folder writable"
+        yield _error(where, f"cannot be written: {error}; {effect}", advice, audit["since"])
+    elif audit["lines"]:
+        yield _warning(where, f"{lost} lost, written again", since=audit["since"])
 
 
 def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[Finding]:

@@ -26,6 +26,7 @@ from eap.config.document import read
 from eap.config.finding import Finding, Report
 from eap.config.follow_routes import follow_routes
 from eap.config.index import Index
+from eap.config.structs import AuditDuty
 from eap.pd.spec import StationSpec
 
 
@@ -38,6 +39,8 @@ class Plant(msgspec.Struct, frozen=True):
     """What the router of each station is told."""
     directory: tuple[DirectoryStation, ...] = ()
     """The names of everything in the plant."""
+    audit_required: bool = False
+    """Whether changes that cannot be recorded are refused."""
 
 
 class LoadResult(msgspec.Struct, frozen=True):
@@ -78,5 +81,6 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
         derive(index, path.parent),
         derive_routing(index, path.parent),
         derive_directory(index),
+        audit_required=plant_file.access.audit is AuditDuty.REQUIRED,
     )
     return LoadResult(plant, (), report.lines, follow_routes(index, plant.routing, report))

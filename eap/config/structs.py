@@ -6,6 +6,7 @@ Units are in the names.  Every section knows its path in the file, for findings.
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Annotated, ClassVar, TypeAlias
 
 import msgspec
@@ -289,9 +290,25 @@ class Defaults(Section, frozen=True):
     cycle_us: DeviceCycle = 10_000
 
 
+class AuditDuty(StrEnum):
+    """What becomes of changes that the audit cannot record."""
+
+    OPTIONAL = "optional"
+    """They are made; what is lost is counted."""
+    REQUIRED = "required"
+    """They are refused."""
+
+
+class PlantAccess(Section, frozen=True):
+    """What holds for the access to all stations; the rules themselves are those of each."""
+
+    audit: AuditDuty = AuditDuty.OPTIONAL
+
+
 class PlantFile(Section, frozen=True):
     """The whole file; top-level keys that begin with ``x-`` are free for anchors."""
 
     plant: str
     stations: tuple[Station, ...]
     defaults: Defaults = Defaults()
+    access: PlantAccess = PlantAccess()

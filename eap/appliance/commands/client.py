@@ -167,7 +167,7 @@ def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return one answer for several appliances.
 
     *processes* are those of the first; *appliances* lists all, each with its plant, its stations'
-    names, its processes and its findings.  Each station has the name of its plant.
+    names, its processes, its findings and its audit.  Each station has the name of its plant.
     """
     appliances = [
         {
@@ -175,6 +175,7 @@ def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "stations": [station["name"] for station in answer["stations"]],
             "processes": answer["processes"],
             "findings": answer.get("findings", []),
+            "audit": answer.get("audit"),
         }
         for answer in answers
     ]

@@ -35,6 +35,7 @@ DOOR_BURST, DOOR_PER_S = 5000, 500
 """Likewise, of all clients of a door, whose addresses may be made up."""
 CONTROL = "control"
 """Stands for a door in lines about clients of the control socket."""
+TOO_MANY = f"the audit is required, and records {PER_S} changes a second of a client for long"
 _MAX_CLIENTS = 1024
 _PLAIN = 8
 """Octets of a value that is written as it is; of longer ones there is a digest."""
@@ -51,10 +52,10 @@ class Lost(NamedTuple):
     """Lines that could not be written."""
 
     lines: int
-    since: str
-    """When the first one was lost; empty if none was."""
-    until: str
-    """When the last one was lost."""
+    since: float | None
+    """Unix time at which the first one was lost."""
+    until: float | None
+    """Unix time at which the last one was lost."""
     error: str
     """Why nothing can be written now; empty if it can."""
 
@@ -65,6 +66,8 @@ class Audit:
     Args:
         file: Where lines go.
         directory: Names of targets.
+        is_required: Whether changes that cannot be recorded are refused: each has a line before it
+            is done, too.
         clock: In seconds, for rates.
         now: Unix time in seconds.
 
@@ -77,10 +80,12 @@ class Audit:
         file: AuditFile,
         directory: Directory,
         *,
+        is_required: bool = False,
         clock: Callable[[], float] = monotonic,
         now: Callable[[], float] = time,
     ) -> None:
-        self.lost = Lost(0, "", "", "")
+        self.lost = Lost(0, None, None, "")
+        self.is_required = is_required
         self._file = file
         self._directory = directory
         self._clock = clock
@@ -88,7 +93,7 @@ class Audit:
         self._clients: OrderedDict[_Client, Allowance] = OrderedDict()
         self._doors: dict[tuple[str, str], Allowance] = {}
         self._untold = 0
-        self._untold_since = ""
+        self._untold_since = 0.0
 
     @property
     def path(self) -> Path:
@@ -102,6 +107,39 @@ class Audit:
             self.tell_skipped()
             self.tell_lost()
 
+    def report(self) -> dict[str, Any]:
+        """Return what ``status`` says."""
+        return {"file": str(self.path), "required": self.is_required, **self.lost._asdict()}
+
+    def begin(self, station: str, entry: AuditEntry) -> str:
+        """Write down what a station is going to change; return why that cannot be done."""
+        client = self._client(station, entry.way.door, host_of(entry.way))
+        door = self._door(station, entry.way.door)
+        now = self._clock()
+        if not all(client.take(now) and door.take(now) for _ in entry.operations):
+            return TOO_MANY
+        head = self._head(station, entry)
+        lines = [head | _begins(each) for each in entry.operations]
+        return "" if self._append(lines, are_counted=False) else self._why_required()
+
+    def begin_request(self, who: str, station: str, words: dict[str, Any]) -> str:
+        """Write down what a client of the control socket changes, if that is required.
+
+        Returns:
+            Why it cannot be recorded, and hence not be done; empty if it can.
+        """
+        if not self.is_required:
+            return ""
+        now = self._clock()
+        if not self._client(station, CONTROL, who).take(now):
+            return TOO_MANY
+        head = {"time": self._time(), "station": station, "door": CONTROL, "from": who}
+        line = head | words | {"begins": True}
+        return "" if self._append([line], are_counted=False) else self._why_required()
+
+    def _why_required(self) -> str:
+        return f"the audit is required and cannot be written: {self.lost.error}"
+
     def write(self, station: str, entry: AuditEntry) -> None:
         """Write down what a station did, or refused."""
         client = self._client(station, entry.way.door, host_of(entry.way))
@@ -110,7 +148,8 @@ class Audit:
         now = self._clock()
         lines = []
         for each in entry.operations:
-            if client.take(now) and door.take(now):
+            has_begun = self.is_required and each.verdict.is_allowed
+            if has_begun or (client.take(now) and door.take(now)):
                 lines.append(head | _words(each))
             else:
                 client.skipped += 1
@@ -121,7 +160,7 @@ class Audit:
         """Write down what a client of the control socket did, or was refused."""
         client = self._client(station, CONTROL, who)
         now = self._clock()
-        if client.take(now) and self._door(station, CONTROL).take(now):
+        if self.is_required or (client.take(now) and self._door(station, CONTROL).take(now)):
             head = {"time": self._time(), "station": station, "door": CONTROL, "from": who}
             self._append([head | words])
         else:
@@ -166,21 +205,27 @@ class Audit:
         }
 
     def _time(self) -> str:
-        return datetime.fromtimestamp(self._now(), UTC).isoformat(timespec="milliseconds")
+        return _text_of(self._now())
 
     def tell_lost(self) -> None:
         """Write how many lines were lost, if there are such, and the file can be written again."""
         if self._untold:
             self._append([])
 
-    def _append(self, lines: list[dict[str, Any]]) -> bool:
-        """Write all of *lines*, or none; say which."""
+    def _append(self, lines: list[dict[str, Any]], *, are_counted: bool = True) -> bool:
+        """Write all of *lines*, or none; say which.
+
+        Args:
+            lines: One object each.
+            are_counted: Whether they are lost when they cannot be written: a change has been made,
+                or refused, that is not recorded.
+        """
         head = [self._lost_line()] if self._untold else []
         data = b"".join(msgspec.json.encode(line) + b"\n" for line in (*head, *lines))
         try:
             self._file.append(data)
         except OSError as exc:
-            self._lose(len(lines), exc.strerror or str(exc))
+            self._lose(len(lines) if are_counted else 0, exc.strerror or str(exc))
             return False
         if self._untold:
             logger.warning("audit %s: written again; %d lines are lost", self.path, self._untold)
@@ -193,7 +238,7 @@ class Audit:
             logger.error("audit %s: changes are not recorded: %s", self.path, error)
         self.lost = self.lost._replace(error=error)
         if count:
-            now = self._time()
+            now = self._now()
             self._untold_since = self._untold_since if self._untold else now
             self._untold += count
             self.lost = Lost(self.lost.lines + count, self.lost.since or now, now, error)
@@ -202,10 +247,20 @@ class Audit:
         return {
             "time": self._time(),
             "lost": self._untold,
-            "since": self._untold_since,
-            "until": self.lost.until,
+            "since": _text_of(self._untold_since),
+            "until": _text_of(self.lost.until or 0.0),
             "error": self.lost.error,
         }
+
+
+def _text_of(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds")
+
+
+def _begins(each: AuditedOperation) -> dict[str, Any]:
+    verdict = each.verdict
+    said = {"service": verdict.service, "allowed": True, "why": verdict.why, "begins": True}
+    return dict(operation_words(each.operation)) | said
 
 
 def _words(each: AuditedOperation) -> dict[str, Any]:

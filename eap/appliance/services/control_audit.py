@@ -25,6 +25,8 @@ from eap.od.abort import SdoAbortError
 
 TellChange: TypeAlias = Callable[[str, str, dict[str, Any]], None]
 """Called with who it was, station, and what is told of the change."""
+BeginChange: TypeAlias = Callable[[str, str, dict[str, Any]], str]
+"""Called likewise before a change; returns why it may not be done, empty if it may."""
 _CHANGES = frozenset(
     (
         *("write", "stop", "od_write", "request_state", "apply", "rollback"),

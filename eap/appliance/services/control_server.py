@@ -38,7 +38,13 @@ from eap.appliance.control import (
 from eap.appliance.control_bus import BUS_METHODS
 from eap.appliance.services.accepting import accept_connections
 from eap.appliance.services.bus.bus_methods import BusConnection, Buses
-from eap.appliance.services.control_audit import TellChange, change_of, peer_of, refusal_in
+from eap.appliance.services.control_audit import (
+    BeginChange,
+    TellChange,
+    change_of,
+    peer_of,
+    refusal_in,
+)
 from eap.appliance.services.methods import Methods, Watch
 from eap.errors import ControlError, EapError, ImageError
 from eap.od.abort import SdoAbortError
@@ -55,11 +61,13 @@ class ControlServer:
         buses: Buses,
         tell: TellChange | None = None,
         *,
+        begin: BeginChange | None = None,
         slow_reader_s: float = SLOW_READER_S,
     ) -> None:
         self._methods = methods
         self._buses = buses
         self._tell = tell
+        self._begin = begin
         self._slow_reader_s = slow_reader_s
         self._clients = 0
 
@@ -80,8 +88,10 @@ class ControlServer:
         self._clients += 1
         bus = BusConnection(self._buses)
         try:
-            tell = self._tell and partial(self._tell, peer_of(connection))
-            client = _Client(self._methods, bus, writer, self._slow_reader_s, tell)
+            peer = peer_of(connection)
+            tell = self._tell and partial(self._tell, peer)
+            begin = self._begin and partial(self._begin, peer)
+            client = _Client(self._methods, bus, writer, self._slow_reader_s, tell, begin)
             if self._clients > MAX_CLIENTS:
                 reason = f"{MAX_CLIENTS} clients are connected, which is all there is room for"
                 await client.send(encode_error(None, ControlError(reason, code=ErrorCode.BUSY)))
@@ -142,8 +152,10 @@ class _Client:
         writer: asyncio.StreamWriter,
         slow_reader_s: float,
         tell: Callable[[str, dict[str, Any]], None] | None,
+        begin: Callable[[str, dict[str, Any]], str] | None,
     ) -> None:
         self._methods = methods
+        self._begin = begin
         self._tell = tell
         self._bus = bus
         self._writer = writer
@@ -218,6 +230,8 @@ class _Client:
             talk = self._bus.opened(request.params["conversation"])
         error: str | None = None  # as long as nobody knows
         try:
+            if self._begin is not None and (why := self._begin(station, words)):
+                raise ControlError(why, code=ErrorCode.REFUSED)
             result = await self._call(request)
             error = refusal_in(result, talk)
         except EapError as exc:

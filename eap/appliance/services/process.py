@@ -117,8 +117,8 @@ class Services:
         brokers = open_mqtt_doors(self._handover.routing, devices.routers, self._counters)
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(client, devices, desks)
-        methods = self._methods(images, buses, devices, gateways)
-        server = ControlServer(methods, buses, audit.write_request)
+        methods = self._methods(images, buses, devices, gateways, audit)
+        server = ControlServer(methods, buses, audit.write_request, begin=audit.begin_request)
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(server.serve(self._listener))]
             tasks += [group.create_task(door.serve()) for door in (*doors, *brokers)]
@@ -170,6 +170,7 @@ class Services:
         buses: Buses,
         devices: Devices,
         gateways: Mapping[PortName, MailboxGateway],
+        audit: Audit,
     ) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
@@ -185,7 +186,7 @@ class Services:
                 (engine.stats(), self._counters.stats()),
                 meter,
                 reports,
-            )
+            ) | {"audit": audit.report()}
 
         return Methods(
             identity,
@@ -212,11 +213,17 @@ class Services:
     def _audit(
         self, routers: Mapping[str, StationRouter], gateways: Mapping[PortName, MailboxGateway]
     ) -> Audit:
-        audit = Audit(AuditFile(Store(self._handover.plant).path / "audit.jsonl"), self._directory)
+        file = AuditFile(Store(self._handover.plant).path / "audit.jsonl")
+        is_required = self._handover.audit_required
+        audit = Audit(file, self._directory, is_required=is_required)
         for name, router in routers.items():
             router.on_audit.append(partial(audit.write, name))
+            if is_required:
+                router.require_record(partial(audit.begin, name))
         for owner, gateway in gateways.items():
             gateway.guard.on_audit.append(partial(audit.write, owner.station))
+            if is_required:
+                gateway.guard.before_change = partial(audit.begin, owner.station)
         return audit
 
     def _ams_addresses(self) -> dict[str, str]:

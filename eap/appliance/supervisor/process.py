@@ -191,6 +191,7 @@ class Supervisor:
             first_state=first_state,
             routing=_own_routing(plant),
             directory=plant.directory,
+            audit_required=plant.audit_required,
         )
         self._given = _given_to_segments(self._segments, common)
         self._given[self._engine] = (

@@ -58,6 +58,9 @@ class _Router:
     def add_route(self, route: Route) -> bool:
         return self.table.add(route)
 
+    def why_not_recorded(self, entry: AuditEntry) -> str:
+        return ""
+
     def remove_route(self, net_id: NetId, hop: Way) -> bool:
         return self.table.remove(net_id, hop)
 

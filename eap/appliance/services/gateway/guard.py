@@ -74,10 +74,13 @@ class Guard:
 
     Attributes:
         on_audit: Called with what was changed, and what was refused.
+        before_change: Called with each change before it is done, where changes that cannot be
+            recorded are refused: returns why it cannot be, empty if it was.
     """
 
     def __init__(self, access: Callable[[], AccessList]) -> None:
         self.on_audit: list[Callable[[AuditEntry], None]] = []
+        self.before_change: Callable[[AuditEntry], str] | None = None
         self._access = access
 
     def may_read(self, way: Way, target: Target, operation: Operation) -> bool:
@@ -94,7 +97,18 @@ class Guard:
         if by_rule and verdict.service is not AccessService.READ and not verdict.is_by_rule:
             why = "only a rule allows it for several slaves at once"
             return verdict._replace(is_allowed=False, why=why)
-        return verdict
+        return self._record_first(way, target, operation, verdict)
+
+    def _record_first(
+        self, way: Way, target: Target, operation: Operation, verdict: Verdict
+    ) -> Verdict:
+        """Return the verdict on a change when it has been recorded, where that is required."""
+        change = AuditedOperation(operation, verdict, None)
+        is_change = verdict.is_allowed and change.is_told
+        if self.before_change is None or not is_change:
+            return verdict
+        why = self.before_change(_entry(way, target, change))
+        return verdict._replace(is_allowed=False, why=why) if why else verdict
 
     def tell(
         self, way: Way, target: Target, operation: Operation, verdict: Verdict, result: int | None
@@ -112,9 +126,12 @@ class Guard:
             result = AdsError.ACCESS_DENIED
         audited = AuditedOperation(operation, verdict, result)
         if audited.is_told:
-            entry = AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
             for write in self.on_audit:
-                write(entry)
+                write(_entry(way, target, audited))
+
+
+def _entry(way: Way, target: Target, audited: AuditedOperation) -> AuditEntry:
+    return AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
 
 
 def result_of(replies: Sequence[Reply]) -> int | None:

@@ -86,7 +86,11 @@ class RouteDesk:
         name = decode_text(question.find(Tag.ROUTE_NAME) or b"")[:_SHOWN]
         results = []
         for station in self._stations:
-            result, why = await _decide(station, question, sender, is_this_host=is_this_host)
+            wanted = _audited(station.router.net_id, question, sender, AdsError.NONE, "")
+            if why := station.router.why_not_recorded(wanted):
+                result = AdsError.ACCESS
+            else:
+                result, why = await _decide(station, question, sender, is_this_host=is_this_host)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
             cause = caused_by((station.router.net_id, name, sender, why), sender)
             logger.log(level, "route %r asked for by %s: %s", name, sender, why, extra=cause)

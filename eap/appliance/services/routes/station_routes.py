@@ -43,6 +43,9 @@ class RoutedStation(Protocol):
     on_audit: list[Callable[[AuditEntry], None]]
     """Called with what was changed, or refused."""
 
+    def why_not_recorded(self, entry: AuditEntry) -> str:
+        """Record a change before it is done, where that is required; return why it cannot be."""
+
     @property
     def table(self) -> RouteTable:
         """Its routes, to be read."""

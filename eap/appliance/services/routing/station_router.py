@@ -124,6 +124,15 @@ class StationRouter:
         """Judge requests by other rules from now on."""
         self._router.gate.access = access
 
+    def require_record(self, record: Callable[[AuditEntry], str]) -> None:
+        """Refuse changes that cannot be recorded: *record* returns why, empty for one that was."""
+        self._router.gate.before_change = record
+
+    def why_not_recorded(self, entry: AuditEntry) -> str:
+        """Record a change before it is done, where that is required; return why it cannot be."""
+        record = self._router.gate.before_change
+        return record(entry) if record is not None else ""
+
     def stats(self) -> Stats:
         """Return what is going on, and what was."""
         return self._router.stats()

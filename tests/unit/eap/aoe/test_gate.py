@@ -4,7 +4,7 @@ import struct
 from collections.abc import Iterator
 
 from eap.aoe.action import Deliver, Forward, Outcome
-from eap.aoe.ads_operation import Operation, Read, Write
+from eap.aoe.ads_operation import Operation, Read, ReadWrite, Write
 from eap.aoe.ads_part import encode_sum
 from eap.aoe.ads_request import AdsRequest
 from eap.aoe.answer import AmsAnswer
@@ -175,6 +175,39 @@ class TestSums:
         body = sum_body(G.SUM_READ, (Read(G.SDO, 0x1018_0001, 4),) * 3)
         here.delivered(ask(READ_WRITE, body), LAPTOP)
         assert not list(entries(here))
+
+
+class TestRequiredRecord:
+    """Changes that have to be recorded before they are done."""
+
+    def test_change_goes_in_when_it_was_recorded(self) -> None:
+        here, recorded = station(DRIVES), []
+        here.router.gate.before_change = lambda entry: recorded.append(entry) or ""
+        assert isinstance(here.give(ask(WRITE, SDO_WRITE), LAPTOP)[0], Deliver)
+        assert isinstance(here.give(ask(READ, SDO_WRITE[:12]), LAPTOP)[0], Deliver)
+        assert [results(each) for each in recorded] == [[None]]
+
+    def test_change_that_cannot_be_recorded_is_refused_here_and_at_hops(self) -> None:
+        here = station(DRIVES)
+        here.router.gate.before_change = lambda _: "the audit cannot be written"
+        for target in (DEVICE, FAR_DEVICE):
+            assert here.replied(ask(WRITE, SDO_WRITE, target), LAPTOP)[1].error == 0x723
+        assert here.events()[0][1].endswith("write refused: the audit cannot be written")
+        assert [results(each) for each in entries(here)] == [[0x723], [0x723]]
+
+    def test_sum_command_keeps_its_reads(self) -> None:
+        here = station(DRIVES, AccessRule("all"))
+        here.router.gate.before_change = lambda _: "the audit cannot be written"
+        body = sum_body(G.SUM_READ_WRITE, (
+            ReadWrite(G.SYMBOL_HANDLE, 0, 4, b"x"), ReadWrite(G.SDO, 0x8000_0001, 4, b"\1"),
+        ))  # fmt: skip
+        delivered = here.delivered(ask(READ_WRITE, body), LAPTOP)
+        assert len(delivered.body) < len(body)
+
+    def test_request_that_cannot_be_read_cannot_be_recorded(self) -> None:
+        here = station(AccessRule("anything"))
+        here.router.gate.before_change = lambda _: ""
+        assert here.replied(ask(77, b""), LAPTOP)[1].error == 8
 
 
 class TestFiles:

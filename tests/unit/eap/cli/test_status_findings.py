@@ -108,6 +108,34 @@ def test_requests_to_buses_that_were_lost_are_a_remark() -> None:
     assert found(status) == [("info", "line engine: requests to buses: 3 dropped")]
 
 
+@pytest.mark.parametrize(
+    ("required", "effect"), [(False, "changes are not recorded"), (True, "changes are refused")]
+)
+def test_audit_that_cannot_be_written_is_an_error(required: bool, effect: str) -> None:
+    status = document()
+    status["appliances"][0]["audit"] = {
+        "file": "/state/audit.jsonl", "required": required, "lines": 7, "since": NOW_S - 5,
+        "until": NOW_S, "error": "No space left on device",
+    }  # fmt: skip
+    text = (
+        f"line audit: cannot be written: No space left on device; {effect}, since"
+        f" {clock(NOW_S - 5)} (5.0 s); 7 lines lost; make room for /state/audit.jsonl, or its"
+        " folder writable"
+    )
+    assert found(status) == [("error", text)]
+
+
+def test_audit_that_is_written_again_is_a_warning_when_lines_are_lost() -> None:
+    status = document()
+    audit = {"file": "/a", "required": False, "lines": 1, "since": NOW_S - 5, "until": NOW_S}
+    status["appliances"][0]["audit"] = audit | {"error": ""}
+    assert found(status) == [
+        ("warning", f"line audit: 1 line lost, written again, since {clock(NOW_S - 5)} (5.0 s)")
+    ]
+    status["appliances"][0]["audit"] = audit | {"lines": 0, "since": None, "error": ""}
+    assert found(status) == []
+
+
 def test_findings_of_the_services_are_taken_over() -> None:
     status = document()
     alarm = Finding(Severity.ERROR, "line audit", "changes not recorded: disk full", "free space")

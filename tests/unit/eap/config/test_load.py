@@ -92,6 +92,15 @@ def test_all_findings_come_at_once_in_the_order_of_the_file(load_plant):
     assert [finding.line for finding in result.findings] == [9, 13, 19, 21]
 
 
+@pytest.mark.parametrize(
+    ("access", "required"),
+    [("", False), ("access: {audit: optional}\n", False), ("access: {audit: required}\n", True)],
+)
+def test_plant_says_whether_the_audit_is_required(load_plant, access, required):
+    plant = load_plant(("stations:\n", f"{access}stations:\n")).plant
+    assert plant.audit_required is required
+
+
 WORDS = (PLANTS / "demo.yaml").read_text().split(" ")
 ODD = [
     "-1",

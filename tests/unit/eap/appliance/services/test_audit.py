@@ -220,13 +220,14 @@ def test_audit_counts_what_cannot_be_written_and_says_so_when_it_can_again(
     clock.now += 5
     audit.write("island-01", entry())
     times = "2023-11-14T22:15:00.000+00:00", "2023-11-14T22:15:05.000+00:00"
-    assert audit.lost == (3, *times, "No space left on device")
+    unix = 1_700_000_100.0, 1_700_000_105.0
+    assert audit.lost == (3, *unix, "No space left on device")
     audit.tell_lost()
     assert audit.lost.lines == 3
     file.error = ""
     clock.now += 5
     audit.tell_lost()
-    assert audit.lost == (3, *times, "")
+    assert audit.lost == (3, *unix, "")
     audit.write("island-01", entry())
     first, second = lines(audit)
     assert first == {
@@ -238,3 +239,46 @@ def test_audit_counts_what_cannot_be_written_and_says_so_when_it_can_again(
         f"audit {file.path}: changes are not recorded: No space left on device",
         f"audit {file.path}: written again; 3 lines are lost",
     ]
+
+
+def required(file: AuditFile, clock: Clock) -> Audit:
+    return Audit(file, NAMES, is_required=True, clock=clock, now=lambda: 1_700_000_000.0)
+
+
+def test_required_audit_has_a_line_before_and_after_each_change(
+    tmp_path: Path, clock: Clock
+) -> None:
+    audit = required(AuditFile(tmp_path / "audit.jsonl"), clock)
+    assert audit.begin("island-01", entry(result=None)) == ""
+    audit.write("island-01", entry())
+    assert audit.begin_request("uid 0, pid 7", "island-01", {"operation": "od_write"}) == ""
+    audit.write_request("uid 0, pid 7", "island-01", {"operation": "od_write", "error": ""})
+    first, second, third, last = lines(audit)
+    assert first["begins"]
+    assert first | {"result": 0, "error": ""} == second | {"begins": True}
+    assert third | {"error": ""} == last | {"begins": True}
+
+
+def test_required_audit_says_why_a_change_cannot_be_recorded(tmp_path: Path, clock: Clock) -> None:
+    file = FullDisk(tmp_path / "audit.jsonl")
+    audit = required(file, clock)
+    why = "the audit is required and cannot be written: No space left on device"
+    assert audit.begin("island-01", entry()) == why
+    assert audit.begin_request("uid 0, pid 7", "island-01", {}) == why
+    assert audit.lost == (0, None, None, "No space left on device")  # nothing was changed
+    file.error = ""
+    assert audit.begin("island-01", entry()) == ""
+    assert audit.lost.error == ""
+
+
+def test_required_audit_refuses_what_is_more_than_it_records(tmp_path: Path, clock: Clock) -> None:
+    audit = required(AuditFile(tmp_path / "audit.jsonl"), clock)
+    assert audit.begin("island-01", entry(count=BURST)) == ""
+    assert audit.begin("island-01", entry()) == module.TOO_MANY
+    audit.write("island-01", entry(count=BURST))
+    assert len(lines(audit)) == 2 * BURST  # what was begun is told to its end
+
+
+def test_audit_that_is_not_required_begins_nothing(audit: Audit) -> None:
+    assert audit.begin_request("uid 0, pid 7", "island-01", {}) == ""
+    assert not audit.path.exists()

@@ -115,6 +115,26 @@ def test_changes_are_told_before_they_are_answered(images):
     }  # fmt: skip
 
 
+def test_change_that_cannot_be_recorded_is_refused(images):
+    done, told = [], []
+    methods = Methods(
+        {}, images, status=torn, stop=lambda: None, more={"od_write": lambda params: done.append(1)}
+    )
+
+    async def talk():
+        server = ControlServer(
+            methods, NO_BUSES, lambda *line: told.append(line), begin=lambda *_: "the disk is full"
+        )
+        async with Talk(server) as client:
+            await client.ask("hello")
+            return await client.ask("od_write", target="left")
+
+    error = asyncio.run(talk())["error"]
+    assert (error["code"], error["message"]) == ("refused", "the disk is full")
+    assert not done
+    assert told[0][2]["error"] == "the disk is full"
+
+
 def test_refusals_of_dictionaries_carry_their_abort_code(images):
     def refuse(params):
         raise SdoAbortError(AbortCode.NO_OBJECT, 0x2000, 1)

@@ -45,6 +45,17 @@ def test_the_audit_is_told_of_changes_and_refusals() -> None:
     ]
 
 
+def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
+    guard = Guard(AccessList)
+    recorded: list[AuditEntry] = []
+    guard.before_change = lambda entry: recorded.append(entry) or "the audit cannot be written"  # type: ignore[func-returns-value]
+    verdict = guard.judge(HERE, TARGET, WRITE)
+    assert (verdict.is_allowed, verdict.why) == (False, "the audit cannot be written")
+    assert guard.judge(HERE, TARGET, READ).is_allowed
+    assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
+    assert [each.operations[0].operation for each in recorded] == [WRITE]
+
+
 @pytest.mark.parametrize(
     ("kind", "body", "result"),
     [

@@ -1,0 +1,138 @@
+"""The disk of the audit is full: nothing is half written, and what is not recorded is known."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from shutil import copy
+from typing import Any
+
+import pytest
+
+from eap.errors import ControlError
+from tests.support import aoe
+from tests.support.amsclient import AmsClient
+from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.gatewaywire import COE, wire
+
+pytestmark = [pytest.mark.net, pytest.mark.root]
+
+STATION, BUS, DRIVE = "127.9.98.1", "127.9.98.1.3.1", 1001
+VALUE = 0x6065_0000
+PLANT = f"""\
+plant: disk
+ACCESS
+stations:
+  - name: press
+    net_id: 127.9.98.1.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{STATION}", net_id: 127.9.98.1.2.1}}
+      - {{name: bus0, kind: bus, interface: "sim://drive.yaml", net_id: {BUS}}}
+"""
+BUSES = Path(__file__).parents[2] / "config" / "buses"
+
+
+@pytest.fixture
+def disk(farm: Plants, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = farm.folder / "state"
+    folder.mkdir()
+    options = "size=64k,mode=0700"
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=True)
+    monkeypatch.setenv("EAP_STATE_DIR", str(folder))
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def start(farm: Plants, access: str) -> Appliance:
+    copy(BUSES / "drive.yaml", farm.folder / "drive.yaml")
+    appliance = farm.run(farm.write(PLANT.replace("ACCESS", access)))
+    wait_until(lambda: appliance.request("trace", target="press/bus0/1001")["answer"])
+    return appliance
+
+
+def fill(disk: Path) -> Path:
+    filler = disk / "filler"
+    with filler.open("wb", buffering=0) as file:
+        try:
+            while file.write(b"." * 100):
+                pass
+        except OSError:
+            return filler
+    raise AssertionError("the disk is never full")
+
+
+def write(client: AmsClient, value: int) -> int:
+    """Return the error or the result of a write to the drive by ADS."""
+    body = aoe.write_body(VALUE, struct.pack("<I", value))
+    error, data = client.ask(BUS, aoe.WRITE, body, port=DRIVE)
+    return error or int.from_bytes(data, "little")
+
+
+def read(client: AmsClient) -> int:
+    _, data = client.ask(BUS, aoe.READ, aoe.read_body(VALUE, 4), port=DRIVE)
+    return int.from_bytes(data[8:], "little")
+
+
+def audit_of(appliance: Appliance) -> dict[str, Any]:
+    found: dict[str, Any] = appliance.status()["audit"]
+    return found
+
+
+def lines(disk: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (disk / "disk" / "audit.jsonl").read_text().splitlines()]
+
+
+def test_changes_on_a_full_disk_are_made_counted_and_told(farm: Plants, disk: Path) -> None:
+    appliance = start(farm, "")
+    with AmsClient(STATION, socket.socket()) as client:
+        assert write(client, 1) == 0
+        assert (disk / "disk").stat().st_mode & 0o777 == 0o700
+        filler = fill(disk)
+        count = 0
+        while not audit_of(appliance)["lines"]:  # the file's last page has room for some
+            assert write(client, count) == 0
+            count += 1
+        assert read(client) == count - 1
+        assert audit_of(appliance)["error"] == "No space left on device"
+        shown = appliance.command("status")
+        assert "changes are not recorded" in " ".join(shown.split())
+        written = len(lines(disk))
+        filler.unlink()
+        wait_until(lambda: not audit_of(appliance)["error"])
+        told = lines(disk)[written]
+        assert (told["lost"], told["error"]) == (1, "No space left on device")
+        assert write(client, 7) == 0
+    log = appliance.stop()[2]
+    assert "changes are not recorded: No space left on device" in log
+
+
+def test_changes_on_a_full_disk_are_refused_where_the_audit_is_required(
+    farm: Plants, disk: Path
+) -> None:
+    appliance = start(farm, "access: {audit: required}")
+    download = bytes.fromhex("0020 23 6560 00 d2040000")
+    with AmsClient(STATION, socket.socket()) as client, wire(STATION) as gateway:
+        assert write(client, 4711) == 0
+        assert [line.get("begins", False) for line in lines(disk)] == [True, False]
+        filler = fill(disk)
+        value, result = 1, 0
+        while not result:  # the file's last page has room for some
+            result = write(client, value)
+            value += 1
+        assert result == 0x723
+        before = read(client)
+        assert before != value - 1
+        assert gateway.talk(COE, DRIVE, download)[1][2] == 0x80
+        with pytest.raises(ControlError, match="the audit is required and cannot be written: No"):
+            appliance.request("request_state", target="press", state="SAFEOP")
+        assert read(client) == before
+        assert appliance.station("press")["state"] == "OP"
+        assert "changes are refused" in " ".join(appliance.command("status").split())
+        filler.unlink()
+        assert gateway.talk(COE, DRIVE, download)[1][2] == 0x60
+        assert read(client) == 1234
+        lines(disk)
