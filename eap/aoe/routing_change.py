@@ -21,16 +21,24 @@ def describe_routing(old: RoutingSpec, new: RoutingSpec) -> list[str]:
     if before != after and sorted(before) == sorted(after):
         found.append("access rules: in another order")
     if old.learn != new.learn:
-        found.append(f"routes are {'' if new.learn else 'not '}learned")
+        found.append(f"routes are learned from {_sources(new.learn)}")
     return found
 
 
 def routing_needs_new_start(old: RoutingSpec, new: RoutingSpec) -> list[str]:
     """Return what differs and cannot change while a station runs, one line each."""
     lines = list(_differences(_brokers(old.mqtt), _brokers(new.mqtt)))
-    if old.learn != new.learn and new.mqtt:
+    if any(
+        old.learns_by_mqtt(each.network) != new.learns_by_mqtt(each.network) for each in new.mqtt
+    ):
         lines.append("routes by MQTT: learn is another one")
     return [f"{line}: {_NEW_START}" for line in lines]
+
+
+def _sources(learn: bool | tuple[str, ...]) -> str:
+    if isinstance(learn, bool):
+        return "anywhere" if learn else "nowhere"
+    return ", ".join(learn) or "nowhere"
 
 
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:

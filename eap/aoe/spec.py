@@ -7,6 +7,7 @@ empty text or tuple stands for "none" or "any" where a field says so.
 from __future__ import annotations
 
 from enum import StrEnum
+from ipaddress import IPv4Address, IPv4Network
 
 import msgspec
 
@@ -231,14 +232,28 @@ class RoutingSpec(Record, frozen=True, kw_only=True):
         mqtt: Brokers.
         access: Rules; behind them stand the usual ones: this host may do anything, others read.
         users: Who may add routes by UDP 48899; without any only who is on this host.
-        learn: Whether routes are learned from what stations tell by MQTT, and from scans.
+        learn: From where routes are learned: ``mqtt:NETWORK``, from what routers tell there by
+            MQTT, and IPv4 networks, from answers to scans; true for all of these, false for none.
     """
 
     routes: tuple[RouteSpec, ...] = ()
     mqtt: tuple[MqttSpec, ...] = ()
     access: tuple[AccessRule, ...] = ()
     users: tuple[AmsUser, ...] = ()
-    learn: bool = True
+    learn: bool | tuple[str, ...] = True
+
+    def learns_by_mqtt(self, network: str) -> bool:
+        """Say whether routes are learned from what routers tell in an MQTT network."""
+        if isinstance(self.learn, bool):
+            return self.learn
+        return f"{DoorKind.MQTT}:{network}" in self.learn
+
+    def learns_from(self, address: str) -> bool:
+        """Say whether routes are learned from a router that answers a scan at an IPv4 address."""
+        if isinstance(self.learn, bool):
+            return self.learn
+        networks = (each for each in self.learn if not each.startswith(f"{DoorKind.MQTT}:"))
+        return any(IPv4Address(address) in IPv4Network(each) for each in networks)
 
 
 class DirectoryPort(Record, frozen=True):

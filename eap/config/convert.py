@@ -99,10 +99,23 @@ class _Converter:
         if len(structs) == len(kinds):
             return self._tagged(node, structs, path, key)
         if structs:
-            if isinstance(node.value, dict):
-                return self._struct(node, structs[0], path, key)
-            return self._scalar(node, inspect.StrType(), path, key)
-        return self._plain(node, path, key)
+            is_struct = isinstance(node.value, dict)
+            return self.value(node, structs[0] if is_struct else inspect.StrType(), path, key)
+        lists = [each for each in kinds if isinstance(each, inspect.VarTupleType)]
+        return (
+            self._flag_or_items(node, lists[0], path, key)
+            if lists
+            else self._plain(node, path, key)
+        )
+
+    def _flag_or_items(
+        self, node: Node, kind: inspect.VarTupleType, path: str, key: str
+    ) -> bool | tuple[Any, ...]:
+        if isinstance(node.value, bool):
+            return node.value
+        if not isinstance(node.value, list):
+            raise self._refuse(node, path, key, "true, false or a list")
+        return self._items(node, kind.item_type, path, key)
 
     def _tagged(self, node: Node, structs: list[inspect.StructType], path: str, key: str) -> Any:
         tags = {str(each.tag): each for each in structs}

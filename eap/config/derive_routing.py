@@ -16,6 +16,7 @@ from eap.aoe.spec import (
 )
 from eap.config.brokers import broker_spec, brokers_of, shared_network
 from eap.config.index import Index
+from eap.config.learning import learn_sources
 from eap.config.neighbours import find_hop
 from eap.config.reach import net_ids_of, reach, without_prefix
 from eap.config.routes import next_hop
@@ -38,7 +39,7 @@ def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
                 AmsUser(user.name, str((folder / user.password_file).resolve()))
                 for user in station.users
             ),
-            learn=station.learn,
+            learn=learn_sources(station),
         )
         for station in index.plant.stations
     }

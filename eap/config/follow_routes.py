@@ -80,7 +80,8 @@ class _Plant:
 
     def may_learn(self, station: str) -> bool:
         """Tell whether others make routes known to a station."""
-        return self.routing[station].learn and bool(self.routing[station].mqtt)
+        routing = self.routing[station]
+        return any(routing.learns_by_mqtt(each.network) for each in routing.mqtt)
 
     def table(self, station: str) -> RouteTable:
         """Return the routes of a station."""

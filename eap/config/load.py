@@ -26,6 +26,7 @@ from eap.config.document import read
 from eap.config.finding import Finding, Report
 from eap.config.follow_routes import follow_routes
 from eap.config.index import Index
+from eap.config.learning import check_learning, warn_of_open_brokers
 from eap.config.structs import AuditDuty
 from eap.pd.spec import StationSpec
 
@@ -73,6 +74,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     check_polls(index, report)
     check_links(index, report)
     check_routes(index, report, path.parent)
+    check_learning(index, report)
     check_access(index, report, path.parent)
     if findings := report.findings():
         return LoadResult(None, findings)
@@ -83,4 +85,5 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
         derive_directory(index),
         audit_required=plant_file.access.audit is AuditDuty.REQUIRED,
     )
-    return LoadResult(plant, (), report.lines, follow_routes(index, plant.routing, report))
+    warnings = (*follow_routes(index, plant.routing, report), *warn_of_open_brokers(index, report))
+    return LoadResult(plant, (), report.lines, warnings)

@@ -279,7 +279,7 @@ class Station(Section, frozen=True):
     subscribe: tuple[Subscribe, ...] = ()
     links: tuple[Link, ...] = ()
     routes: tuple[Route, ...] = ()
-    learn: bool = True
+    learn: bool | tuple[str, ...] = True
     access: tuple[Access, ...] = ()
     users: tuple[User, ...] = ()
 

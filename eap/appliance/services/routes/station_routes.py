@@ -156,7 +156,7 @@ class StationRoutes:
         It is gone after ten minutes, and never before a route that somebody wrote or added.
         """
         found = self.router.table.find(net_id)
-        if not self._spec.learn or self.has(net_id.station):
+        if not self._spec.learns_from(address) or self.has(net_id.station):
             return False
         if found is not None:
             known, octets = found

@@ -53,7 +53,12 @@ def open_mqtt_doors(
         EnvironmentalError: there are some, and MQTT is not installed.
     """
     return [
-        MqttDoor(spec, routers[station], partial(counters.count, station), learns=told.learn)
+        MqttDoor(
+            spec,
+            routers[station],
+            partial(counters.count, station),
+            learns=told.learns_by_mqtt(spec.network),
+        )
         for station, told in routing.items()
         for spec in told.mqtt
     ]

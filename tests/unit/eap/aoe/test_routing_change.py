@@ -35,9 +35,11 @@ def test_each_thing_that_differs_is_one_line():
         "access rule b: changed",
         "access rule c: added",
         "user me: removed",
-        "routes are not learned",
+        "routes are learned from nowhere",
     ]
-    assert "routes are learned" in describe_routing(new, OLD)
+    assert "routes are learned from anywhere" in describe_routing(new, OLD)
+    some = replace(OLD, learn=("mqtt:n", "10.0.0.0/24"))
+    assert describe_routing(OLD, some) == ["routes are learned from mqtt:n, 10.0.0.0/24"]
 
 
 def test_the_order_of_rules_matters():
@@ -52,5 +54,6 @@ def test_brokers_need_a_new_start():
     assert routing_needs_new_start(OLD, replace(OLD, learn=False)) == [
         "routes by MQTT: learn is another one: this needs a new start of the appliance"
     ]
+    assert routing_needs_new_start(OLD, replace(OLD, learn=("mqtt:n",))) == []
     without = replace(OLD, mqtt=())
     assert routing_needs_new_start(without, replace(without, learn=False)) == []

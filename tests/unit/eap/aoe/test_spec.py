@@ -44,3 +44,22 @@ def test_what_a_router_is_told_comes_out_of_json_as_it_went_in():
         learn=False,
     )
     assert msgspec.json.decode(msgspec.json.encode(whole), type=RoutingSpec) == whole
+
+
+@pytest.mark.parametrize(
+    ("learn", "by_mqtt", "from_host"),
+    [
+        (True, True, True),
+        (False, False, False),
+        ((), False, False),
+        (("mqtt:line",), True, False),
+        (("mqtt:other", "10.0.0.0/24"), False, True),
+        (("10.0.1.0/24", "10.0.0.9/32"), False, True),
+        (("10.0.1.0/24",), False, False),
+    ],
+)
+def test_learn_names_networks_and_brokers(learn, by_mqtt, from_host):
+    told = RoutingSpec(learn=learn)
+    assert told.learns_by_mqtt("line") is by_mqtt
+    assert told.learns_from("10.0.0.9") is from_host
+    assert msgspec.json.decode(msgspec.json.encode(told), type=RoutingSpec) == told

@@ -42,7 +42,7 @@ def warnings(tmp_path):
         {"west": [f"{NORTH}, via: middle/eap0"], "middle": ["to: default, via: 127.0.9.77"]},
         {"west": [f"{NORTH}, via: 127.0.9.77"]},
         {"west": ["to: default, via: middle/eap0"]},
-        {"west": [f"{NORTH}, via: middle/eap0"], "middle": ["mqtt: mqtt://b, network: n"]},
+        {"west": [f"{NORTH}, via: middle/eap0"], "middle": ["mqtt: mqtt://b, network: n, user: a"]},
         {"west": ["to: north, net_id: 9.9.9.9.1.1, virtual: 8.8.8.8.1.1, via: middle/eap0"],
          "middle": [f"{NORTH}, ams_tcp: north"]},
     ],

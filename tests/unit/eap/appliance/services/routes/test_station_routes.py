@@ -233,6 +233,13 @@ def test_nothing_is_learned_where_that_is_switched_off():
     assert not learned(House(RoutingSpec(learn=False)))
 
 
+def test_learn_sources_decide_which_answers_to_scans_are_learned():
+    assert learned(House(RoutingSpec(learn=("mqtt:n", "10.0.0.0/24"))))
+    assert not learned(House(RoutingSpec(learn=("mqtt:n", "10.0.1.0/24"))))
+    assert not learned(House(RoutingSpec(learn=("mqtt:n",))))
+    assert not learned(House(RoutingSpec(learn=())))
+
+
 def test_a_default_route_is_no_reason_not_to_learn():
     house = House()
     asyncio.run(house.routes.add(replace(PLC, name="default", net_id="0.0.0.0.0.0", octets=0)))

@@ -248,3 +248,22 @@ def test_stations_get_the_doors_of_their_plant_file(tmp_path):
         assert routers["a"].is_down(Way("mqtt:x", "6.1.1.1.1.1"))
 
     asyncio.run(story())
+
+
+def test_mqtt_door_learns_in_the_networks_that_the_plant_file_names(tmp_path):
+    async def story():
+        one, two = station("5.1.1.1.2.1"), Place(TWO, spec("y"), spec("x"))
+        told = RoutingSpec(mqtt=(spec("x"), spec("y")), learn=("mqtt:y",))
+        with DiscardCounters(tmp_path / "counters", ["a"]) as counters:
+            doors = open_mqtt_doors({"a": told}, {"a": one}, counters)
+            tasks = [asyncio.ensure_future(door.serve()) for door in doors]
+            async with running(two):
+                await until(lambda: len([*one.table]) == 1)
+                await until(lambda: len([*two.router.table]) == 2)
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        assert [each.hop.door for each in one.table] == ["mqtt:y"]
+
+    with broker(tmp_path, ADDRESS):
+        asyncio.run(story())
