@@ -8,6 +8,7 @@ EapError
     ├── AlStatusError           a slave refused a state
     ├── StateTimeoutError       a slave did not reach a state in time
     ├── SiiError                an EEPROM cannot be read, written or understood
+    ├── MailboxClosedError      a slave's mailbox is closed for now, it is being brought back
     ├── MailboxSizeError        a message does not fit a slave's mailbox
     ├── MailboxTimeoutError     a slave did not answer in its mailbox
     ├── MailboxRefusedError     a slave answered with a mailbox error
@@ -60,6 +61,10 @@ class StateTimeoutError(BusError):
 
 class SiiError(BusError):
     """An EEPROM cannot be read, written or understood."""
+
+
+class MailboxClosedError(BusError):
+    """A slave's mailbox is closed while the slave is lost or being brought back."""
 
 
 class MailboxSizeError(BusError):

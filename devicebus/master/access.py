@@ -6,18 +6,21 @@ from typing import NamedTuple
 
 from devicebus.wire.datagram import Command
 
-TRIES = 3
-"""How often a datagram is sent at most, unless sending it twice would do harm."""
+AS_SET = 0
+"""Tries of a datagram that is sent as often as the master's settings say."""
 
 
 class Access(NamedTuple):
-    """One datagram to send; *data* is what is written, or zeros where the reply goes."""
+    """One datagram to send; *data* is what is written, or zeros where the reply goes.
+
+    *tries* is 1 where sending it twice would do harm.
+    """
 
     command: Command
     adp: int
     ado: int
     data: bytes
-    tries: int = TRIES
+    tries: int = AS_SET
 
 
 class Reply(NamedTuple):
@@ -39,12 +42,12 @@ def apwr(position: int, ado: int, data: bytes) -> Access:
     return Access(Command.APWR, -position & 0xFFFF, ado, data)
 
 
-def fprd(station: int, ado: int, size: int, *, tries: int = TRIES) -> Access:
+def fprd(station: int, ado: int, size: int, *, tries: int = AS_SET) -> Access:
     """Read from the slave with a station address."""
     return Access(Command.FPRD, station, ado, bytes(size), tries)
 
 
-def fpwr(station: int, ado: int, data: bytes, *, tries: int = TRIES) -> Access:
+def fpwr(station: int, ado: int, data: bytes, *, tries: int = AS_SET) -> Access:
     """Write to the slave with a station address."""
     return Access(Command.FPWR, station, ado, data, tries)
 

@@ -42,12 +42,16 @@ def bring(bus: Bus, unit: Unit, target: AlState) -> Procedure[None]:
     if unit.found.fault:
         raise SiiError(unit.found.fault)
     unit.state = current = yield from acknowledge(unit.station)
+    if current is AlState.INIT:
+        bus.close_mailbox(unit)
     for step in path(current, target):
         yield from _prepare(bus, unit, current, step)
         yield from change_state(unit.station, step)
-        if current in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
+        before, unit.state, current = current, step, step
+        if step is AlState.INIT:
+            bus.close_mailbox(unit)  # not before: the slave may have stayed where it has one
+        if before in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
             yield from _end_process_data(bus, unit)
-        unit.state = current = step
         unit.is_set_up = step in _WITH_PROCESS_DATA
         if step in _WITH_PROCESS_DATA:
             bus.set_presence(unit, Presence.PRESENT)
@@ -87,9 +91,7 @@ def _prepare(bus: Bus, unit: Unit, current: AlState, step: AlState) -> Procedure
     """Set up what the slave checks on its way to *step*."""
     if current in _WITH_PROCESS_DATA and step not in _WITH_PROCESS_DATA:
         bus.set_presence(unit, Presence.UNSURE)
-    if step is AlState.INIT:
-        bus.close_mailbox(unit)
-    elif current is AlState.INIT:
+    if current is AlState.INIT:
         yield from _prepare_mailbox(bus, unit, step)
     elif current is AlState.PREOP and step is AlState.SAFEOP:
         yield from _prepare_process_data(bus, unit)

@@ -13,10 +13,11 @@ from devicebus.master.cycle import Cycle, Presence
 from devicebus.master.event import Event
 from devicebus.master.expected import ExpectedSlave
 from devicebus.master.image import BusImage
-from devicebus.master.link import TIMEOUT_NS, Link
+from devicebus.master.link import RETRIES, Link
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.pdo import Channel, PdoChoice
+from devicebus.master.roundtrip import CEILING_NS
 from devicebus.master.runner import Runner
 from devicebus.master.scan import FIRST_STATION, FoundSlave
 from devicebus.master.task import Task
@@ -34,7 +35,10 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     choices: Mapping[int, PdoChoice] = {}
     """PDOs by station address; other slaves keep what they come with."""
     first_station: int = FIRST_STATION
-    frame_timeout_ns: int = TIMEOUT_NS
+    frame_timeout_ns: int = CEILING_NS
+    """How long a frame may be under way at most; the time-out follows the round trip up to this."""
+    frame_retries: int = RETRIES
+    """How often an access is sent again when its frame is overdue."""
     acyclic_octets: int = 1536
     """Budget of acyclic datagrams in a cycle."""
     watchdog_ms: int | None = None
@@ -59,7 +63,7 @@ class Unit:
         channels: Its process data.
         mailbox: Open in the states that have one.
         missed_ns: Since when it is not where it belongs; None while it is.
-        is_lost: Whether it does not answer.
+        is_lost: Whether it has not answered and was not set up anew since.
         work: What is going on to bring it somewhere.
         retry_ns: Not tried again before then.
     """
@@ -80,8 +84,8 @@ class Unit:
 
     @property
     def al_state(self) -> int:
-        """AL state to be shown, 0 while it is not known."""
-        return int(self.state or 0)
+        """AL state to be shown, 0 while it is not known or the slave is not set up anew."""
+        return 0 if self.is_lost else int(self.state or 0)
 
     @property
     def is_busy(self) -> bool:
@@ -102,14 +106,16 @@ class Bus:
         units: By station address, in the order of the line.
         image, cycle: None until process data is laid out.
         reference: Station address of the slave whose clock the others follow.
-        is_lost: No frame comes back.
+        is_lost: No frame comes back, so that nothing is known about any slave.
         is_troubled: The last cycle was not as expected: look at the slaves soon.
     """
 
     def __init__(self, settings: MasterSettings) -> None:
         self.settings = settings
         self.link = Link(
-            timeout_ns=settings.frame_timeout_ns, acyclic_octets=settings.acyclic_octets
+            ceiling_ns=settings.frame_timeout_ns,
+            retries=settings.frame_retries,
+            acyclic_octets=settings.acyclic_octets,
         )
         self.runner = Runner(self.link)
         self.units: dict[int, Unit] = {}

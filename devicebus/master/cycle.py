@@ -6,6 +6,7 @@ the others' inputs stay valid while one is missing.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from enum import Enum, auto
 from typing import NamedTuple
@@ -16,8 +17,11 @@ from devicebus.errors import FrameLostError
 from devicebus.master.access import Access, Reply, logical
 from devicebus.master.image import BusImage
 from devicebus.master.layout import Group, Place
-from devicebus.master.link import Link
+from devicebus.master.link import Exchange, Link
 from devicebus.wire.datagram import Command
+
+MAX_UNDER_WAY = 4
+"""Cycles under way at once: more would only make those behind them late, acyclic frames too."""
 
 
 class Presence(Enum):
@@ -30,14 +34,19 @@ class Presence(Enum):
     PRESENT = auto()
 
 
-class CycleStats(msgspec.Struct, frozen=True):
+class CycleStats(msgspec.Struct, frozen=True, kw_only=True):
     """Counters since process data runs; times in nanoseconds."""
 
     cycles: int
     good: int
     """Cycles that came back with the expected working counters."""
     wkc_errors: int
+    late: int
+    """Cycles that came back after their time-out; their inputs were taken all the same."""
     lost: int
+    """Cycles that never came back."""
+    skipped: int
+    """Cycles that were not sent, because MAX_UNDER_WAY were under way already."""
     expected_wkc: int
     received_wkc: int
     """Both of the last cycle, over all datagrams."""
@@ -82,17 +91,27 @@ class Cycle:
             for number, group in enumerate(image.layout.groups)
             for part in _parts(number, group, knows_lrw=knows_lrw)
         )
-        self._allowed: tuple[frozenset[int], ...] = ()
-        self._judge()
+        self._members = [
+            [place for place in image.layout.places.values() if place.group == number]
+            for number in range(len(image.layout.groups))
+        ]
+        self._is_whole = [False] * len(self._members)
+        self._allowed = (0,) * len(self._parts)
+        self._expected = 0
+        for number in range(len(self._members)):
+            self._judge(number)
         self.is_good = False
-        self._cycles = self._good = self._wkc_errors = self._lost = 0
+        self._under_way: deque[Exchange] = deque()
+        self._newest = 0
+        self._cycles = self._good = self._wkc_errors = 0
+        self._late = self._lost = self._skipped = 0
         self._received = self._trip_ns = self._max_trip_ns = 0
 
     def set_presence(self, station: int, presence: Presence) -> None:
         """A slave comes or goes."""
         if station in self._presence and self._presence[station] is not presence:
             self._presence[station] = presence
-            self._judge()
+            self._judge(self._image.layout.places[station].group)
 
     def presence(self, station: int) -> Presence:
         """Whether a slave takes part."""
@@ -104,38 +123,50 @@ class Cycle:
         return self.is_good and self._received == self._expected > 0
 
     def start(self, now_ns: int) -> None:
-        """Queue this cycle's datagrams."""
+        """Queue this cycle's datagrams, unless so many are under way that they would only wait."""
         self._link.start_cycle()
+        under_way = self._under_way
+        while under_way and (not under_way[0].missing or under_way[0].is_overdue):
+            under_way.popleft()
+        if len(under_way) >= MAX_UNDER_WAY:
+            self._skipped += 1
+            return
         accesses = [self._access(part) for part in self._parts]
         accesses += self.extra
         if not accesses:
             return
         self._cycles += 1
+        number = self._cycles
         self.is_good = False
         allowed = self._allowed
 
         def done(outcome: list[Reply] | FrameLostError, done_ns: int) -> None:
             if isinstance(outcome, FrameLostError):
                 self._lost += 1
-                self._trouble(done_ns)
                 return
+            self._late += exchange.is_overdue
             self._trip_ns = done_ns - now_ns
             self._max_trip_ns = max(self._max_trip_ns, self._trip_ns)
-            self._take(outcome, allowed, done_ns)
+            if number > self._newest:  # an overdue frame may be overtaken
+                self._newest = number
+                self._take(outcome, allowed, done_ns)
 
-        self._link.submit(accesses, done, cyclic=True)
+        exchange = self._link.submit(accesses, done, cyclic=True)
+        under_way.append(exchange)
 
     def stats(self) -> CycleStats:
         """Return a snapshot of the counters."""
         return CycleStats(
-            self._cycles,
-            self._good,
-            self._wkc_errors,
-            self._lost,
-            self._expected,
-            self._received,
-            self._trip_ns,
-            self._max_trip_ns,
+            cycles=self._cycles,
+            good=self._good,
+            wkc_errors=self._wkc_errors,
+            late=self._late,
+            lost=self._lost,
+            skipped=self._skipped,
+            expected_wkc=self._expected,
+            received_wkc=self._received,
+            trip_ns=self._trip_ns,
+            max_trip_ns=self._max_trip_ns,
         )
 
     def _access(self, part: _Part) -> Access:
@@ -147,10 +178,10 @@ class Cycle:
             data += bytes(group.inputs_size)
         return logical(part.command, part.address, data)
 
-    def _take(self, replies: list[Reply], allowed: tuple[frozenset[int], ...], now_ns: int) -> None:
+    def _take(self, replies: list[Reply], allowed: tuple[int, ...], now_ns: int) -> None:
         is_good = True
         for part, reply, counts in zip(self._parts, replies, allowed, strict=False):
-            if reply.wkc in counts:
+            if counts >> reply.wkc & 1:
                 self._take_inputs(part, reply.data)
             else:
                 is_good = False
@@ -173,34 +204,30 @@ class Cycle:
         if self._is_whole[part.group]:
             inputs[group.inputs : group.inputs + group.inputs_size] = data[begin:]
             return
-        for place in self._members(part.group):
+        for place in self._members[part.group]:
             if self._presence[place.station] is Presence.PRESENT:
                 start = begin + place.inputs - group.inputs
                 end = start + place.inputs_size
                 inputs[place.inputs : place.inputs + place.inputs_size] = data[start:end]
 
-    def _members(self, group: int) -> list[Place]:
-        return [place for place in self._image.layout.places.values() if place.group == group]
-
-    def _judge(self) -> None:
-        """Work out anew what the working counters have to be."""
-        allowed = []
-        for part in self._parts:
-            counts = {0}
-            for place in self._members(part.group):
-                presence = self._presence[place.station]
-                more = {each + _count(part.command, place) for each in counts}
+    def _judge(self, number: int) -> None:
+        """Work out anew which working counters the datagrams of a group may have, as bits."""
+        members = self._members[number]
+        presences = [self._presence[place.station] for place in members]
+        self._is_whole[number] = all(each is Presence.PRESENT for each in presences)
+        allowed = list(self._allowed)
+        for at, part in enumerate(self._parts):
+            if part.group != number:
+                continue
+            counts = 1
+            for place, presence in zip(members, presences, strict=True):
                 if presence is Presence.PRESENT:
-                    counts = more
+                    counts <<= _count(part.command, place)
                 elif presence is Presence.UNSURE:
-                    counts |= more
-            allowed.append(frozenset(counts))
+                    counts |= counts << _count(part.command, place)
+            allowed[at] = counts
         self._allowed = tuple(allowed)
-        self._expected = sum(map(max, allowed))
-        self._is_whole = [
-            all(self._presence[each.station] is Presence.PRESENT for each in self._members(number))
-            for number in range(len(self._image.layout.groups))
-        ]
+        self._expected = sum(counts.bit_length() - 1 for counts in allowed)
 
 
 def _parts(number: int, group: Group, *, knows_lrw: bool) -> list[_Part]:

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Hashable, Iterator
 from typing import Any
 
-from devicebus.errors import BusError
+from devicebus.errors import MailboxClosedError
 from devicebus.mailbox.conversation import Ask, Conversation
 from devicebus.master.late import ReplyJudge
 from devicebus.master.task import Task
@@ -116,4 +116,4 @@ class Lanes:
             for job in list(lane):
                 if not job.task.is_done:
                     job.conversation.close()
-                    job.task.fail(BusError(f"{job.task.name}: {reason}"))
+                    job.task.fail(MailboxClosedError(f"{job.task.name}: {reason}"))

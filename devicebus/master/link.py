@@ -1,8 +1,13 @@
 """Accesses become datagrams, datagrams frames, and frames that come back answers.
 
 Every datagram of a frame carries the frame's index; a frame that comes back is taken only if its
-index is awaited and each datagram is the one that was sent, so that late, foreign and damaged
-frames never answer anything.
+index is awaited and each datagram is the one that was sent, so that foreign and damaged frames
+never answer anything.
+
+A frame is overdue after a time-out that follows the measured round trip (:mod:`roundtrip`), and is
+sent again then.  It is not given up: for LINGER_NS its index belongs to it alone, and if it comes
+back it is late and still answers what nothing else has answered.  Only then it counts as lost.  A
+busy machine therefore makes frames late, and nothing fails by that.
 
 Cyclic accesses go first; a few short acyclic ones may ride along, which spares a frame.  Once
 cycles run, acyclic ones share a budget that each cycle refills: a cycle sends at most the budget
@@ -19,11 +24,16 @@ import msgspec
 
 from devicebus.errors import FrameLostError
 from devicebus.master.access import Access, Reply
+from devicebus.master.roundtrip import CEILING_NS, RoundTrip
 from devicebus.wire.datagram import OVERHEAD, Command, DatagramHeader
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.wire import Buffer
 
-TIMEOUT_NS = 2_000_000
+RETRIES = 4
+"""How often an access is sent again unless the plant file says otherwise."""
+LINGER_NS = 1_000_000_000
+"""How long an overdue frame may still come back; then it is lost."""
+INDEXES = 256
 MAX_DATAGRAMS = 15
 """Datagrams of a frame; some slaves and masters know no more."""
 MAX_BODY = 1498
@@ -47,58 +57,85 @@ _BY_STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW)
 _FIXED_ADP = _BY_STATION | {Command.LRD, Command.LWR, Command.LRW}
 
 
-class LinkStats(msgspec.Struct, frozen=True):
-    """Counters since the start."""
+class LinkStats(msgspec.Struct, frozen=True, kw_only=True):
+    """Counters of frames since the start, and the time-out as it is now."""
 
     sent: int
-    """Frames."""
     received: int
-    """Frames that answered something."""
-    lost: int
-    """Frames that did not come back in time."""
+    """Frames that came back, in time or late."""
     late: int
-    """Frames that nobody waited for any more, or that nobody sent."""
+    """Frames that came back after their time-out."""
+    lost: int
+    """Frames that have not come back for LINGER_NS."""
+    retried: int
+    """Frames in which something was sent again."""
+    unexpected: int
+    """Frames that nobody has sent, or that came twice, or after they counted as lost."""
     malformed: int
     """Frames that came back as something else."""
+    timeout_ns: int
+    """How long the next frame may be under way."""
+    round_trip_ns: int
+    """Mean of the latest round trips, 0 before the first."""
     max_acyclic_octets: int = 0
     """Most octets of acyclic datagrams that one cycle has sent, headers included."""
 
 
 class Exchange:
-    """Accesses that are answered together."""
+    """Accesses that are answered together.
 
-    __slots__ = ("cancelled", "done", "missing", "replies")
+    Attributes:
+        missing: How many are not answered yet.
+        is_overdue: Whether a cyclic frame of it has not come back in time.
+    """
 
-    def __init__(self, count: int, done: Done) -> None:
+    __slots__ = ("cancelled", "done", "is_cyclic", "is_overdue", "missing", "replies")
+
+    def __init__(self, count: int, done: Done, *, is_cyclic: bool) -> None:
         self.done = done
+        self.is_cyclic = is_cyclic
         self.missing = count
         self.replies: list[Reply] = [Reply(b"", 0)] * count
         self.cancelled = False
+        self.is_overdue = False
 
     def cancel(self) -> None:
         """Forget it: nothing more is sent, and *done* is not called."""
         self.cancelled = True
 
+    def fail(self, error: FrameLostError, now_ns: int) -> None:
+        """Report that it will not be answered, unless it was cancelled."""
+        if not self.cancelled:
+            self.cancelled = True
+            self.done(error, now_ns)
+
 
 class _Item:
     """One access on its way."""
 
-    __slots__ = ("access", "exchange", "number", "tries")
+    __slots__ = ("access", "exchange", "is_answered", "limit", "number", "tries")
 
-    def __init__(self, access: Access, exchange: Exchange, number: int) -> None:
+    def __init__(self, access: Access, exchange: Exchange, number: int, limit: int) -> None:
         self.access = access
         self.exchange = exchange
         self.number = number
+        self.limit = limit
         self.tries = 0
+        self.is_answered = False
+
+    @property
+    def is_over(self) -> bool:
+        return self.is_answered or self.exchange.cancelled
 
 
 class _Flight:
-    """A frame that is under way."""
+    """A frame that is under way, or overdue."""
 
-    __slots__ = ("cyclic", "deadline_ns", "items")
+    __slots__ = ("cyclic", "deadline_ns", "items", "sent_ns")
 
-    def __init__(self, items: list[_Item], deadline_ns: int, *, cyclic: bool) -> None:
+    def __init__(self, items: list[_Item], sent_ns: int, deadline_ns: int, *, cyclic: bool) -> None:
         self.items = items
+        self.sent_ns = sent_ns
         self.deadline_ns = deadline_ns
         self.cyclic = cyclic
 
@@ -107,35 +144,51 @@ class Link:
     """The wire as its users see it.
 
     Args:
-        timeout_ns: How long a frame may be under way.
+        ceiling_ns: How long a frame may be under way at most.
+        retries: How often an access is sent again that does not say otherwise.
         acyclic_octets: Budget of acyclic accesses in a cycle, datagram headers included.
     """
 
-    def __init__(self, *, timeout_ns: int = TIMEOUT_NS, acyclic_octets: int = 1536) -> None:
-        self._timeout_ns = timeout_ns
+    def __init__(
+        self,
+        *,
+        ceiling_ns: int = CEILING_NS,
+        retries: int = RETRIES,
+        acyclic_octets: int = 1536,
+    ) -> None:
+        self._round_trip = RoundTrip(ceiling_ns)
+        self._tries = 1 + retries
         self._budget = acyclic_octets
         self._credit: int | None = None  # None while no cycles run
         self._cyclic: deque[_Item] = deque()
         self._acyclic: deque[_Item] = deque()
-        self._flights: dict[int, _Flight] = {}  # in the order of sending, so of deadlines
+        self._flights: dict[int, _Flight] = {}
+        self._overdue: dict[int, _Flight] = {}  # the oldest first
         self._acyclic_flights = 0
         self._index = 0
         self._spent = self._max_spent = 0
-        self._sent = self._received = self._lost = self._late = self._malformed = 0
+        self._sent = self._received = self._late = self._lost = self._retried = 0
+        self._unexpected = self._malformed = 0
 
     def submit(self, accesses: Sequence[Access], done: Done, *, cyclic: bool = False) -> Exchange:
         """Queue accesses; *done* is called once with all replies, or with what went wrong.
 
-        They go out in order, as many as fit in one frame; a frame that is lost is sent again.
+        They go out in order, as many as fit in one frame.  Acyclic ones are sent again when their
+        frame is overdue.  Cyclic ones are sent once: *done* is called with the replies of a late
+        frame too, and with FrameLostError when that counts as lost.
 
         Raises:
             ValueError: there is none, or one does not fit a frame.
         """
         if not accesses or max(len(access.data) for access in accesses) > MAX_DATA:
             raise ValueError(f"accesses of at most {MAX_DATA} octets are needed, at least one")
-        exchange = Exchange(len(accesses), done)
+        exchange = Exchange(len(accesses), done, is_cyclic=cyclic)
         queue = self._cyclic if cyclic else self._acyclic
-        queue.extend(_Item(access, exchange, n) for n, access in enumerate(accesses))
+        tries = self._tries
+        queue.extend(
+            _Item(access, exchange, number, access.tries or tries)
+            for number, access in enumerate(accesses)
+        )
         return exchange
 
     def start_cycle(self) -> None:
@@ -153,7 +206,7 @@ class Link:
     def frames_to_send(self, now_ns: int) -> list[bytes]:
         """Take the frames that are ready to go out."""
         frames: list[bytes] = []
-        while self._cyclic and len(self._flights) < 256:
+        while self._cyclic and len(self._flights) < INDEXES:
             self._send(self._cyclic, frames, now_ns, cyclic=True)
         while self._may_send_acyclic():
             self._send(self._acyclic, frames, now_ns, cyclic=False)
@@ -162,76 +215,118 @@ class Link:
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
         """Take a frame that came back; one that answers nothing is counted."""
         index = data[3] if len(data) > EtherCatHeader.SIZE + DatagramHeader.SIZE else -1
-        flight = self._flights.get(index)
+        flight = self._flights.get(index) or self._overdue.get(index)
         if flight is None:
-            self._late += 1
+            self._unexpected += 1
             return
         results = _match(data, index, flight.items)
         if results is None:
             self._malformed += 1
             return
         self._received += 1
-        self._land(index)
+        if self._overdue.pop(index, None) is None:
+            self._land(index)
+        else:
+            self._late += 1
+        self._round_trip.measure(now_ns - flight.sent_ns)
         for item, (reply, wkc) in zip(flight.items, results, strict=True):
+            if item.is_over:
+                continue
+            item.is_answered = True
             exchange = item.exchange
             exchange.replies[item.number] = Reply(reply, wkc, item.tries)
             exchange.missing -= 1
-            if not exchange.missing and not exchange.cancelled:
+            if not exchange.missing:
                 exchange.done(exchange.replies, now_ns)
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a frame is under way."""
-        return bool(self._flights)
+        """Whether a frame may come back."""
+        return bool(self._flights or self._overdue)
 
     def next_timeout(self) -> int | None:
-        """When the oldest frame under way counts as lost."""
-        for flight in self._flights.values():
-            return flight.deadline_ns
-        return None
+        """When the next frame under way is overdue."""
+        return min([flight.deadline_ns for flight in self._flights.values()], default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Send lost frames again, or give them up."""
+        """Send again what overdue frames held, or give it up."""
+        while self._overdue:
+            index, oldest = next(iter(self._overdue.items()))
+            if now_ns - oldest.deadline_ns < LINGER_NS:
+                break
+            self._lose(index, now_ns)
         due = [index for index, each in self._flights.items() if each.deadline_ns <= now_ns]
         again: list[_Item] = []
         for index in due:
-            flight = self._land(index)
-            self._lost += 1
+            flight = self._overdue[index] = self._land(index)
             for item in flight.items:
-                if item.tries < item.access.tries:
+                if item.is_over:
+                    continue
+                if item.exchange.is_cyclic:
+                    item.exchange.is_overdue = True
+                elif item.tries < item.limit:
                     again.append(item)
-                elif not item.exchange.cancelled:
-                    item.exchange.cancel()
-                    item.exchange.done(_lost(item), now_ns)
+                else:
+                    item.exchange.fail(_lost(item), now_ns)
         self._acyclic.extendleft(reversed(again))
 
     def stats(self) -> LinkStats:
         """Return a snapshot of the counters."""
         return LinkStats(
-            self._sent, self._received, self._lost, self._late, self._malformed,
-            max(self._max_spent, self._spent),
-        )  # fmt: skip
+            sent=self._sent,
+            received=self._received,
+            late=self._late,
+            lost=self._lost,
+            retried=self._retried,
+            unexpected=self._unexpected,
+            malformed=self._malformed,
+            timeout_ns=self._round_trip.timeout_ns,
+            round_trip_ns=self._round_trip.smoothed_ns,
+            max_acyclic_octets=max(self._max_spent, self._spent),
+        )
 
     def _may_send_acyclic(self) -> bool:
         return (
             bool(self._acyclic)
             and self._acyclic_flights < MAX_ACYCLIC_FRAMES
             and (self._credit is None or self._credit > 0)
-            and len(self._flights) < 256
+            and len(self._flights) < INDEXES
         )
 
     def _send(self, queue: deque[_Item], frames: list[bytes], now_ns: int, *, cyclic: bool) -> None:
         items = self._take(queue, cyclic=cyclic)
         if not items:
             return
-        while self._index in self._flights:
-            self._index = (self._index + 1) & 0xFF
-        index = self._index
-        self._index = (index + 1) & 0xFF
-        self._flights[index] = _Flight(items, now_ns + self._timeout_ns, cyclic=cyclic)
+        index = self._free_index(now_ns)
+        timeout_ns = self._round_trip.timeout_ns
+        if not cyclic or len(items) > 1:
+            tries, limit = max((item.tries, item.limit) for item in items)
+            if tries > 1:
+                self._retried += 1
+                timeout_ns = self._round_trip.timeout_of(tries, limit)
+        self._flights[index] = _Flight(items, now_ns, now_ns + timeout_ns, cyclic=cyclic)
         self._acyclic_flights += not cyclic
         self._sent += 1
         frames.append(_encode(items, index))
+
+    def _free_index(self, now_ns: int) -> int:
+        """Return an index that no frame has; the oldest overdue frame may have to give its own."""
+        flights, overdue = self._flights, self._overdue
+        if len(flights) + len(overdue) >= INDEXES:
+            self._lose(next(iter(overdue)), now_ns)
+        index = self._index
+        while index in flights or index in overdue:
+            index = (index + 1) % INDEXES
+        self._index = (index + 1) % INDEXES
+        return index
+
+    def _lose(self, index: int, now_ns: int) -> None:
+        """Count an overdue frame as lost."""
+        flight = self._overdue.pop(index)
+        self._lost += 1
+        for item in flight.items:
+            if item.exchange.is_cyclic and not item.is_answered:
+                item.exchange.fail(_lost(item), now_ns)
 
     def _take(self, queue: deque[_Item], *, cyclic: bool) -> list[_Item]:
         items: list[_Item] = []
@@ -249,7 +344,7 @@ class Link:
             if size + octets > room:
                 break
             item = queue.popleft()
-            if item.exchange.cancelled:
+            if item.is_over:
                 continue
             item.tries += 1
             items.append(item)
@@ -301,8 +396,8 @@ def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, in
 
 
 def _lost(item: _Item) -> FrameLostError:
-    command, adp, ado, _, tries = item.access
+    command, adp, ado, _, _ = item.access
     return FrameLostError(
-        f"{command.name} 0x{adp:04X}:0x{ado:04X}: no frame came back, sent {tries} times;"
+        f"{command.name} 0x{adp:04X}:0x{ado:04X}: no frame came back, sent {item.tries} times;"
         " check the cable to the first slave and its power"
     )

@@ -12,6 +12,8 @@ from typing import NamedTuple, TypeAlias, TypeVar
 
 from devicebus.errors import (
     BusError,
+    FrameLostError,
+    MailboxClosedError,
     MailboxProtocolError,
     MailboxRefusedError,
     MailboxSizeError,
@@ -22,7 +24,7 @@ from devicebus.mailbox.counter import CounterWatch, next_counter
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.lane import Job, Lanes
 from devicebus.master.late import is_unsolicited
-from devicebus.master.mailboxport import MailboxArea, MailboxPort
+from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted
 from devicebus.master.mailstats import MailboxStats, Tally
 from devicebus.master.procedure import Procedure, Sleep
 from devicebus.master.runner import Runner
@@ -126,7 +128,7 @@ class Mailbox:
         self._is_open = False
         if self._work is not None:
             self._work.cancel()
-        self._lanes.fail_all("the slave's mailbox was closed")
+        self._lanes.fail_all("the slave's mailbox was closed, for it is set up anew")
 
     def stats(self) -> MailboxStats:
         """Return a snapshot of the counters."""
@@ -137,7 +139,7 @@ class Mailbox:
     def _refusal_of(self, ask: Ask, who: str) -> BusError | None:
         """Why a request cannot be sent."""
         if not self._is_open:
-            return BusError(f"{who}: the slave's mailbox is closed")
+            return MailboxClosedError(f"{who}: the slave's mailbox is closed")
         size = MailboxHeader.SIZE + len(ask.request)
         if ask.listen or size <= self.sizes.to_slave:
             return None
@@ -223,7 +225,7 @@ class Mailbox:
                     f" {ask.timeout_ns // 1_000_000} ms"
                 )
             pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)
-            is_full = yield from self._port.is_full()
+            is_full = yield from self._is_full(deadline_ns)
 
     def _send(self, ask: Ask, deadline_ns: int) -> Procedure[Message | None]:
         """Write a request; return its reply if that came while it was written again."""
@@ -233,12 +235,12 @@ class Mailbox:
         message = encode_message(header, ask.request)
         maybe_there = False
         while True:
-            posted = yield from self._port.post(message)
+            posted = yield from self._post(message, deadline_ns)
             if posted.is_taken:
                 self._tally.sent += 1
                 return None
             maybe_there = maybe_there or posted.is_ambiguous
-            if (yield from self._port.is_full()):
+            if (yield from self._is_full(deadline_ns)):
                 reply = yield from self._receive(ask if maybe_there else None)
                 if reply is not None:
                     return reply
@@ -248,6 +250,30 @@ class Mailbox:
                     f"slave {self.station}: its mailbox is still full, the slave does not take"
                     " messages"
                 )
+
+    def _post(self, message: bytes, deadline_ns: int) -> Procedure[Posted]:
+        """Write a request, also after the bus was silent for a while."""
+        was_silent = False
+        while True:
+            try:
+                posted = yield from self._port.post(message)
+            except FrameLostError:
+                was_silent = True
+                _, now_ns = yield Sleep(MAX_PAUSE_NS)
+                if now_ns >= deadline_ns:
+                    raise
+            else:
+                return posted._replace(is_ambiguous=posted.is_ambiguous or was_silent)
+
+    def _is_full(self, deadline_ns: int) -> Procedure[bool]:
+        """Return whether the slave has a message, also after the bus was silent for a while."""
+        while True:
+            try:
+                return (yield from self._port.is_full())
+            except FrameLostError:
+                _, now_ns = yield Sleep(MAX_PAUSE_NS)
+                if now_ns >= deadline_ns:
+                    raise
 
     def _receive(self, ask: Ask | None) -> Procedure[Message | None]:
         """Read one message; return it if it is the reply to *ask*."""

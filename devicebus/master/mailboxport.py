@@ -18,8 +18,6 @@ from devicebus.wire.register import Register, SmStatus, SyncManager
 REPEAT_TIMEOUT_NS = 100_000_000
 """How long a slave may take to repeat; one that never does has forgotten the message."""
 POLL_NS = 200_000
-TRIES = 8
-"""How often a frame is sent at most: a message that is half done is worth some patience."""
 
 FIRST_MEMORY = 0x1000
 """Where registers end and memory begins."""
@@ -80,6 +78,7 @@ class MailboxPort:
         self.area = area
         self.repeats = 0
         self._repeat = 0
+        self._has_to_repeat = False
 
     def post(self, message: bytes) -> Procedure[Posted]:
         """Write a message, once its mailbox is empty.
@@ -88,44 +87,48 @@ class MailboxPort:
             FrameLostError: nothing comes back.
         """
         padded = message.ljust(self.area.to_slave_size, b"\0")
-        (reply,), _ = yield [fpwr(self.station, self.area.to_slave, padded, tries=TRIES)]
+        (reply,), _ = yield [fpwr(self.station, self.area.to_slave, padded)]
         return Posted(reply.wkc == 1, reply.tries > 1)
 
     def is_full(self) -> Procedure[bool]:
-        """Say whether the slave has a message."""
-        (status,) = yield from read(self.station, STATUS, 1, "mailbox status", tries=TRIES)
-        return bool(status & SmStatus.MAILBOX_FULL)
-
-    def fetch(self) -> Procedure[bytes | None]:
-        """Read the slave's message, None if there is none or it has to be fetched again.
+        """Return whether the slave has a message, which it repeats first if one was lost.
 
         Raises:
             FrameLostError: nothing comes back.
             WorkingCounterError: the slave does not answer.
         """
+        if self._has_to_repeat:
+            yield from self._ask_again()
+        (status,) = yield from read(self.station, STATUS, 1, "mailbox status")
+        return bool(status & SmStatus.MAILBOX_FULL)
+
+    def fetch(self) -> Procedure[bytes | None]:
+        """Read the slave's message, None if there is none or the frame is lost.
+
+        The read has emptied the mailbox all the same: :meth:`is_full` has the message repeated.
+        """
         area = self.area
         try:
             (reply,), _ = yield [fprd(self.station, area.to_master, area.to_master_size, tries=1)]
         except FrameLostError:
-            yield from self._ask_again()
+            self._has_to_repeat = True
+            self._repeat ^= 1
+            self.repeats += 1
             return None
         return reply.data if reply.wkc else None
 
     def _ask_again(self) -> Procedure[None]:
-        """Toggle the repeat bit and wait until the slave has copied it."""
-        self._repeat ^= 1
-        self.repeats += 1
+        """Hand the toggled repeat bit to the slave and wait until it has copied it."""
         octet = bytes((1 | self._repeat << 1,))
-        yield from write(self.station, _ACTIVATE, octet, "repeat request", tries=TRIES)
+        yield from write(self.station, _ACTIVATE, octet, "repeat request")
         _, now_ns = yield Sleep(0)
         deadline_ns = now_ns + REPEAT_TIMEOUT_NS
         while now_ns < deadline_ns:
-            (copied,) = yield from read(
-                self.station, _PDI_CONTROL, 1, "repeat acknowledge", tries=TRIES
-            )
+            (copied,) = yield from read(self.station, _PDI_CONTROL, 1, "repeat acknowledge")
             if copied >> 1 & 1 == self._repeat:
-                return
+                break
             _, now_ns = yield Sleep(POLL_NS)
+        self._has_to_repeat = False
 
 
 def configure(station: int, area: MailboxArea) -> Procedure[None]:

@@ -7,10 +7,11 @@ from typing import TypeVar
 
 import msgspec
 
-from devicebus.errors import BusError
+from devicebus.errors import BusError, MailboxClosedError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.master.bring import bring
 from devicebus.master.bus import Bus, MasterSettings, Unit
+from devicebus.master.configure import standard_mailbox
 from devicebus.master.cycle import Cycle, CycleStats
 from devicebus.master.event import Event
 from devicebus.master.image import BusImage
@@ -26,6 +27,8 @@ from devicebus.wire.alstatus import AlState
 from eap.codec.wire import Buffer
 
 T = TypeVar("T")
+
+_WITH_MAILBOX = frozenset((AlState.PREOP, AlState.SAFEOP, AlState.OP))
 
 LOOK_NS = 10_000_000
 """How often idle mailboxes are looked into for unsolicited messages."""
@@ -127,7 +130,7 @@ class Master:
         unit = self._unit(station)
         if unit.mailbox is None:
             conversation.close()
-            raise BusError(f"slave {station} ({unit.name}) {_why_closed(unit)}")
+            raise _no_mailbox(unit)
         return unit.mailbox.converse(conversation, now_ns, name=name, requester=requester)
 
     def run(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
@@ -192,6 +195,11 @@ class Master:
     def _has_mailbox(self) -> bool:
         return any(unit.mailbox is not None for unit in self._bus.units.values())
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether no frame comes back, so that nothing is known about any slave."""
+        return self._bus.is_lost
+
     def _unit(self, station: int) -> Unit:
         try:
             return self._bus.units[station]
@@ -200,10 +208,18 @@ class Master:
             raise BusError(f"there is no slave {station}; known are {known}") from None
 
 
-def _why_closed(unit: Unit) -> str:
-    """Return why a slave has no open mailbox."""
+def _no_mailbox(unit: Unit) -> BusError:
+    """Return why nothing can be asked of a slave's mailbox."""
+    who = f"slave {unit.station} ({unit.name})"
     if unit.is_lost:
-        return "does not answer"
+        return MailboxClosedError(f"{who} does not answer")
+    if unit.found.fault or not standard_mailbox(unit.found.sii.fixed).is_there:
+        return BusError(f"{who} has no mailbox: its EEPROM names none")
     if unit.state is None:
-        return "answers again and is being identified: its mailbox is not open yet"
-    return f"has no mailbox in {unit.state.name}"
+        return MailboxClosedError(f"{who} is being identified: its mailbox is not open yet")
+    if unit.target in _WITH_MAILBOX:
+        return MailboxClosedError(
+            f"{who} is in {unit.state.name} and being brought to {unit.target.name}: its mailbox"
+            " is closed until PREOP"
+        )
+    return BusError(f"{who} has no mailbox in {unit.state.name}")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Generic, NamedTuple, TypeAlias, TypeVar
 
 from devicebus.errors import FrameLostError, WorkingCounterError
-from devicebus.master.access import TRIES, Access, Reply, fprd, fpwr
+from devicebus.master.access import AS_SET, Access, Reply, fprd, fpwr
 from eap.errors import EapError
 
 T = TypeVar("T")
@@ -40,7 +40,7 @@ Procedure: TypeAlias = Generator[Step, Answer, T]
 
 
 def read(
-    station: int, ado: int, size: int, what: str = "", *, tries: int = TRIES
+    station: int, ado: int, size: int, what: str = "", *, tries: int = AS_SET
 ) -> Procedure[bytes]:
     """Read registers or memory of one slave.
 
@@ -55,7 +55,7 @@ def read(
 
 
 def write(
-    station: int, ado: int, data: bytes, what: str = "", *, tries: int = TRIES
+    station: int, ado: int, data: bytes, what: str = "", *, tries: int = AS_SET
 ) -> Procedure[None]:
     """Write registers or memory of one slave; raises as :func:`read` does."""
     (reply,), _ = yield [fpwr(station, ado, data, tries=tries)]
@@ -67,6 +67,9 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
     """Run procedures in step, so that their accesses share frames.
 
     Returns what each returned, or the error that ended it.
+
+    Raises:
+        FrameLostError: nothing comes back, which says nothing about any slave.
     """
     _, now_ns = yield Sleep(0)
     children = [_Child(procedure, now_ns) for procedure in procedures]
@@ -74,7 +77,7 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
         while running := [child for child in children if child.is_running]:
             asking = [child for child in running if child.accesses]
             if asking:
-                now_ns = yield from _ask_for(asking, now_ns)
+                now_ns = yield from _ask_for(asking)
             else:
                 pause_ns = min(child.wake_ns for child in running) - now_ns
                 _, now_ns = yield Sleep(pause_ns)
@@ -101,15 +104,15 @@ class _Child(Generic[T]):
     def resume(self, answer: Answer) -> None:
         self._advance(lambda: self.procedure.send(answer), answer.now_ns)
 
-    def fail(self, error: EapError, now_ns: int) -> None:
-        self._advance(lambda: self.procedure.throw(error), now_ns)
-
     def _advance(self, action: Callable[[], Step], now_ns: int) -> None:
         self.accesses = ()
         try:
             step = action()
         except StopIteration as end:
             self.is_running, self.result = False, end.value
+        except FrameLostError:
+            self.is_running = False
+            raise
         except EapError as error:
             self.is_running, self.result = False, error
         else:
@@ -119,14 +122,9 @@ class _Child(Generic[T]):
                 self.accesses = step
 
 
-def _ask_for(asking: Sequence[_Child[T]], now_ns: int) -> Procedure[int]:
+def _ask_for(asking: Sequence[_Child[T]]) -> Procedure[int]:
     """Send what the children want and tell them what came back; return the time."""
-    try:
-        replies, now_ns = yield [access for child in asking for access in child.accesses]
-    except FrameLostError as error:
-        for child in asking:
-            child.fail(error, now_ns)
-        return now_ns
+    replies, now_ns = yield [access for child in asking for access in child.accesses]
     start = 0
     for child in asking:
         end = start + len(child.accesses)

@@ -151,7 +151,7 @@ class _Crew:
         self.errors: list[tuple[Unit, EapError]] = []
 
     def do(self, work: Callable[[Unit], Procedure[None]]) -> Procedure[None]:
-        """Let all that are left do something together."""
+        """Let all that are left do something together; raises FrameLostError."""
         results = yield from together([work(unit) for unit in self.fit])
         done = list(zip(self.fit, results, strict=True))
         self.errors += [(unit, error) for unit, error in done if isinstance(error, EapError)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from devicebus.errors import FrameLostError, IdentityError
+from devicebus.errors import FrameLostError, IdentityError, WorkingCounterError
 from devicebus.master.access import Reply, fprd, fpwr
 from devicebus.master.bring import bring, set_clocks
 from devicebus.master.bus import Bus, Unit
@@ -26,8 +26,9 @@ SLICE_NS = 5_000_000
 """After trouble in the cycle the next look comes this soon."""
 RETRY_NS = 1_000_000_000
 """Before a slave that could not be brought back is tried again."""
-_PER_STEP = 15
-_WITH_MAILBOX = frozenset((AlState.SAFEOP, AlState.OP))
+_PER_STEP = 60
+"""Slaves whose states are read together."""
+_WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
 
 
 def watch(bus: Bus) -> Procedure[None]:
@@ -38,7 +39,11 @@ def watch(bus: Bus) -> Procedure[None]:
             count = yield from count_slaves()
             replies = yield from _read_states(list(bus.units))
         except FrameLostError:
-            _lose_all(bus, now_ns)
+            if not bus.is_lost:
+                bus.is_lost = True
+                for unit in bus.units.values():
+                    unit.state = None
+                bus.emit(BusLost(now_ns))
             continue
         if bus.is_lost:
             bus.is_lost = False
@@ -72,23 +77,16 @@ def _read_states(stations: Sequence[int]) -> Procedure[list[Reply]]:
     return replies
 
 
-def _lose_all(bus: Bus, now_ns: int) -> None:
-    if not bus.is_lost:
-        bus.is_lost = True
-        bus.emit(BusLost(now_ns))
-    for unit in bus.units.values():
-        _lose(bus, unit, now_ns)
-
-
 def _lose(bus: Bus, unit: Unit, now_ns: int) -> None:
-    """A slave does not answer: leave it out."""
+    """A slave does not answer although the frame came back: leave it out."""
     if unit.is_lost:
         return
     unit.lose()
     unit.retry_ns = 0
     unit.missed_ns = unit.missed_ns or now_ns
-    if unit.work is not None:
-        unit.work.cancel()
+    work, unit.work = unit.work, None
+    if work is not None:
+        work.cancel()
     bus.close_mailbox(unit)
     bus.set_presence(unit, Presence.UNSURE)
     if unit.station == bus.reference:
@@ -104,8 +102,9 @@ def _judge(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
         unit.state = AlState(status.state) if status.state in set(AlState) else None
     if now_ns < unit.retry_ns:
         return
-    is_right = status.state == unit.target and not status.error
-    if is_right and not unit.is_lost:
+    is_set_up = unit.is_set_up or unit.target not in _WITH_PROCESS_DATA
+    if status.state == unit.target and not status.error and is_set_up and not unit.is_lost:
+        _take_back(bus, unit, now_ns)
         return
     if unit.missed_ns is None:
         unit.missed_ns = now_ns
@@ -114,26 +113,34 @@ def _judge(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
     _begin(bus, unit, status, now_ns)
 
 
+def _take_back(bus: Bus, unit: Unit, now_ns: int) -> None:
+    """A slave is where it belongs: report it if it was missed."""
+    missed_ns, unit.missed_ns = unit.missed_ns, None
+    if missed_ns is not None:
+        bus.emit(SlaveBack(unit.station, now_ns - missed_ns, now_ns))
+
+
 def _begin(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
     stays = (
         not unit.is_lost
-        and status.state in _WITH_MAILBOX
-        and unit.target in _WITH_MAILBOX
+        and status.state in _WITH_PROCESS_DATA
+        and unit.target in _WITH_PROCESS_DATA
         and unit.is_set_up
     )
-    unit.is_lost = False
     bus.is_troubled = True
 
     def done(task: Task[int]) -> None:
-        if task.error is None:
-            missed_ns, unit.missed_ns = unit.missed_ns, None
-            end_ns = task.result()
-            bus.emit(SlaveBack(unit.station, end_ns - (missed_ns or end_ns), end_ns))
-        elif not unit.is_lost:
+        error = task.error
+        if unit.work is not task or isinstance(error, FrameLostError):
+            return  # the slave is lost meanwhile, or nobody knows: the next look begins again
+        if error is None:
+            _take_back(bus, unit, task.result())
+        elif not (unit.is_lost and isinstance(error, WorkingCounterError)):
             unit.retry_ns = now_ns + RETRY_NS
-            if isinstance(task.error, IdentityError):
+            if isinstance(error, IdentityError):
                 unit.lose()
-            bus.emit(SlaveFailed(unit.station, str(task.error), now_ns))
+                bus.close_mailbox(unit)
+            bus.emit(SlaveFailed(unit.station, str(error), now_ns))
 
     work = _revive(bus, unit, stays=stays)
     unit.work = bus.runner.start(work, now_ns, f"bringing back slave {unit.station}")
@@ -152,6 +159,7 @@ def _revive(bus: Bus, unit: Unit, *, stays: bool) -> Procedure[int]:
                 f" {identity.serial}, expected {found}, serial {found.serial}"
             )
         yield from bring(bus, unit, AlState.INIT)
+        unit.is_lost = False
         if bus.settings.clocks:
             yield from set_clocks(bus, only=frozenset((unit.station,)))
     yield from bring(bus, unit, unit.target)

@@ -21,6 +21,8 @@ _HEADER = struct.Struct("<BBHHHH")
 _SIZE = _HEADER.size
 _MORE, _CIRCULATING, _LENGTH = 0x8000, 0x4000, 0x07FF
 _ADDRESS_END = Register.DL_CONTROL + 4
+_MASK_END = Register.ECAT_EVENT_MASK + 2
+"""Behind the registers of a controller's addresses, and of the events that it shows."""
 _READS = frozenset((Command.APRD, Command.FPRD, Command.BRD, Command.APRW, Command.FPRW,
                     Command.BRW))  # fmt: skip
 _WRITES = frozenset((Command.APWR, Command.FPWR, Command.BWR, Command.APRW, Command.FPRW,
@@ -57,6 +59,7 @@ class Chain:
         self._escs = tuple(escs)
         self._closed_at = closed_at
         self._stations: dict[int, list[Esc]] | None = None
+        self._masked: list[Esc] | None = None
         self._plans: dict[tuple[int, int], tuple[_Share, ...]] = {}
         self._planned: list[tuple[Window, ...]] = []
 
@@ -105,8 +108,10 @@ class Chain:
                 struct.pack_into("<H", frame, offset + 2, (adp + len(self._escs)) & 0xFFFF)
             if count:
                 frame[start:end] = data
-                if ado < _ADDRESS_END:
-                    self._stations = None
+                if ado < _MASK_END and (command in _WRITES or command in _MULTIPLE):
+                    self._masked = None
+                    if ado < _ADDRESS_END:
+                        self._stations = None
         self._add_irq(frame, offset + 8)
         if count:
             wkc = (frame[end] | frame[end + 1] << 8) + count
@@ -187,10 +192,11 @@ class Chain:
         return plan
 
     def _add_irq(self, frame: bytearray, at: int) -> None:
+        if self._masked is None:
+            self._masked = [esc for esc in self._escs if esc.event_mask]
         irq = 0
-        for esc in self._escs:
-            if esc.event_mask:
-                irq |= esc.irq
+        for esc in self._masked:
+            irq |= esc.irq
         if irq:
             frame[at] |= irq & 0xFF
             frame[at + 1] |= irq >> 8

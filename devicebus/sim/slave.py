@@ -88,7 +88,11 @@ class Slave:
             self._refuse(AlStatusCode.NO_OUTPUTS)
         if self._has_mailbox():
             self._move_messages(now_ns)
-        if self._is_sync_pulse(now_ns) and self.state in _WITH_PROCESS_DATA:
+        if (
+            self.esc.clock.sync0_is_active
+            and self._is_sync_pulse(now_ns)
+            and self.state in _WITH_PROCESS_DATA
+        ):
             self._offer_inputs(now_ns)
 
     def next_timeout(self) -> int | None:

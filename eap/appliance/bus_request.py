@@ -133,11 +133,22 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Why not."""
     slaves: tuple[SlaveReport, ...] = ()
     frames_sent: int = 0
+    frames_late: int = 0
+    """Frames that came back after their time-out: the bus or this machine was slow."""
     frames_lost: int = 0
+    """Frames that never came back."""
+    frames_retried: int = 0
+    timeout_ns: int = 0
+    """How long the next frame may be under way before it is sent again."""
+    round_trip_ns: int = 0
+    """Mean of the latest round trips, 0 before the first."""
     cycles: int = 0
     cycles_good: int = 0
     wkc_errors: int = 0
+    cycles_late: int = 0
     cycles_lost: int = 0
+    cycles_skipped: int = 0
+    """Cycles that were not sent, because the ones before had not come back."""
     expected_wkc: int = 0
     received_wkc: int = 0
     trip_ns: int = 0

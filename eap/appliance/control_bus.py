@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Ask
-from devicebus.master.access import TRIES, Access, Reply
+from devicebus.master.access import Access, Reply
 from devicebus.wire.datagram import Command
 from eap.appliance.control import ErrorCode, Parameters
 from eap.codec.mailbox import MailboxType
@@ -51,7 +51,7 @@ Protocol = Literal["aoe", "eoe", "coe", "foe", "soe", "voe"]
 State = Literal["INIT", "PREOP", "BOOT", "SAFEOP", "OP"]
 Duration = Annotated[int, Meta(ge=0, le=_MAX_MS)]
 DatagramRow = tuple[int, int, int, str, int]
-"""Command, ADP, ADO, octets, tries."""
+"""Command, ADP, ADO, octets, tries (0: as the master's settings say)."""
 ReplyRow = tuple[int, str, int]
 """Working counter, octets, tries."""
 
@@ -154,7 +154,7 @@ def to_access(row: DatagramRow) -> Access:
     """Return the datagram of a row; raise ControlError if there is none like it."""
     command, adp, ado, octets, tries = row
     try:
-        return Access(Command(command), adp, ado, to_octets(octets), tries or TRIES)
+        return Access(Command(command), adp, ado, to_octets(octets), tries)
     except ValueError:
         reason = f"params: {command} is no command of a datagram"
         raise ControlError(reason, code=ErrorCode.BAD_REQUEST) from None

@@ -290,7 +290,14 @@ def _bus_port(index: Index, station: Station, port: Port, folder: Path) -> PortS
         kind=port.kind,
         interface=str(InterfaceUri("sim", path) if uri.scheme == "sim" else uri),
         net_id=str(NetId.parse(port.net_id)),
-        bus=BusPortSpec(path, slaves, port.target, port.clocks),
+        bus=BusPortSpec(
+            path,
+            slaves,
+            port.target,
+            port.clocks,
+            port.frame_timeout_us,
+            port.frame_retries,
+        ),
         gateway=gateway_spec(index, station, port),
     )
 

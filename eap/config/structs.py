@@ -18,6 +18,8 @@ U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
 Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
 Milliseconds = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
 DeviceCycle = Annotated[int, Meta(ge=100, le=60_000_000)]
+FrameTimeout = Annotated[int, Meta(ge=2_000, le=10_000_000)]
+FrameRetries = Annotated[int, Meta(ge=0, le=20)]
 Period = Annotated[int, Meta(ge=1, le=0xFFFF_FFFF)]
 MAX_BITS = 8 * 0xFFFF
 """Of the largest variable."""
@@ -88,6 +90,8 @@ class Port(Section, frozen=True):
     bus: str = ""
     target: BusTarget = BusTarget.OP
     clocks: bool = False
+    frame_timeout_us: FrameTimeout = 1_000_000
+    frame_retries: FrameRetries = 4
     gateway: Gateway = Gateway()
 
     EAP_KEYS: ClassVar[tuple[str, ...]] = (
@@ -101,7 +105,14 @@ class Port(Section, frozen=True):
         "ams",
         "mac",
     )
-    BUS_KEYS: ClassVar[tuple[str, ...]] = ("bus", "target", "clocks", "gateway")
+    BUS_KEYS: ClassVar[tuple[str, ...]] = (
+        "bus",
+        "target",
+        "clocks",
+        "frame_timeout_us",
+        "frame_retries",
+        "gateway",
+    )
 
 
 class Variable(Section, frozen=True):

@@ -309,6 +309,10 @@ class BusPortSpec(Record, frozen=True):
     target: BusTarget = BusTarget.OP
     clocks: bool = False
     """Whether distributed clocks are set and kept together."""
+    frame_timeout_us: int = 1_000_000
+    """How long a frame may be under way at most before it is sent again."""
+    frame_retries: int = 4
+    """How often a frame that is overdue is sent again."""
 
 
 class LinkSpec(Record, frozen=True):

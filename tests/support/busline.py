@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -219,3 +220,31 @@ class Paced(Line):
     def events(self):
         """Take all events."""
         return list(iter(self.core.next_event, None))
+
+
+class Slow(Paced):
+    """A line on which each frame takes *trip_ns()*, and none overtakes another."""
+
+    def __init__(self, core: Core, segment: Segment, trip_ns: Callable[[], int]) -> None:
+        super().__init__(core, segment)
+        self.trip_ns = trip_ns
+        self._under_way: deque[tuple[int, bytes]] = deque()
+
+    def step(self, until_ns: int) -> None:
+        """Send frames, and let the time pass to what happens next."""
+        if self.now_ns >= self.next_cycle_ns:
+            self.core.start_cycle(self.now_ns)
+            self.next_cycle_ns = self.now_ns + self.period_ns
+        for frame in self.core.frames_to_send(self.now_ns):
+            last_ns = self._under_way[-1][0] if self._under_way else 0
+            self._under_way.append((max(last_ns, self.now_ns + self.trip_ns()), frame))
+            self.frames += 1
+        times = [self.core.next_timeout(), self.next_cycle_ns, until_ns]
+        times += [at_ns for at_ns, _ in list(self._under_way)[:1]]
+        self.now_ns = max(self.now_ns + 1, min(at for at in times if at is not None))
+        self.segment.handle_timeout(self.now_ns)
+        while self._under_way and self._under_way[0][0] <= self.now_ns:
+            frame = bytearray(self._under_way.popleft()[1])
+            if self.segment.process_frame(frame, self.now_ns) is Side.PRIMARY:
+                self.core.receive_frame(bytes(frame), self.now_ns)
+        self.core.handle_timeout(self.now_ns)

@@ -8,6 +8,7 @@ import msgspec
 
 from devicebus.master.clocks import read_difference
 from devicebus.master.diagnosis import clear_counters, diagnose
+from devicebus.master.link import LINGER_NS
 from devicebus.master.task import Task
 from devicebus.sim.devices.build import build_slave
 from devicebus.sim.spec import BusSpec, FaultKind
@@ -71,6 +72,8 @@ class Trial:
             self._go_on(1 * MS)
         if self._task is not None:
             bench.run_until(end_ns + _BACK_WITHIN_NS, lambda: bool(self._answer))
+        # A frame that does not come back counts as lost after a while.
+        bench.run_until(bench.now_ns + 2 * LINGER_NS, lambda: not bench.master.is_waiting)
         changes = counters(before, bench.master.stats())
         again = "never left"
         if self._unwell_ns is not None:

@@ -54,6 +54,7 @@ def counters(before: MasterStats, now: MasterStats) -> str:
     parts += [
         (now.link.lost - before.link.lost, "frames lost"),
         (now.link.late - before.link.late, "frames late"),
+        (now.link.retried - before.link.retried, "frames sent again"),
     ]
     for name, what in (("repeats", "repeat requests"), ("timeouts", "time-outs of mailboxes")):
         both = [sum(getattr(each, name) for each in s.mailboxes.values()) for s in (before, now)]

@@ -32,8 +32,6 @@ from eap.net.busport import BusPort, open_bus_port
 
 T = TypeVar("T")
 
-FRAME_TIMEOUT_NS = 20_000_000
-"""Longer than a master's with a cycle: nobody waits for these frames but a person."""
 CYCLE_NS = 2_000_000
 SPIN_NS = 200_000
 """How long the answer to a frame is looked for before sleeping."""
@@ -55,7 +53,7 @@ class BusSession:
     def __init__(self, port: BusPort, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._port = port
         self._clock = clock
-        self._bus = Bus(MasterSettings(frame_timeout_ns=FRAME_TIMEOUT_NS))
+        self._bus = Bus(MasterSettings())
         self._cycle_ns = 0
         self._slaves: Sequence[Slave] = ()
 

@@ -8,7 +8,7 @@ import msgspec
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
-from devicebus.master.access import Access, Reply
+from devicebus.master.access import AS_SET, Access, Reply
 from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure
 from devicebus.wire.datagram import Command
@@ -78,4 +78,4 @@ def _to_access(wanted: Datagram) -> Access:
             f"datagram to 0x{adp:X}:0x{ado:X} with {len(data)} octets, expected addresses of 16"
             f" bits and 1 to {MAX_DATA} octets"
         )
-    return Access(Command(command), adp, ado, data, min(max(tries, 1), MAX_TRIES))
+    return Access(Command(command), adp, ado, data, min(max(tries, AS_SET), MAX_TRIES))

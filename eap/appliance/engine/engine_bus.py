@@ -25,8 +25,9 @@ RETRY_NS = 2_000_000_000
 """Between two attempts to bring a bus up."""
 SILENT_RETRY_NS = 100_000_000
 """The same while nothing comes back at all: nobody is disturbed then."""
-BATCH = 8
+BATCH = 16
 """Frames taken in one go; the rest waits until the cycles have had their turn."""
+NO_FRAME = "no frame comes back: check the cable to the first slave and its power"
 _LONG_CYCLE_NS = 20_000_000
 _MOST_STALE = 4096
 
@@ -74,8 +75,12 @@ class EngineBus:
     @property
     def fault(self) -> str:
         """Why the bus is not wholly as it should be, empty if it is."""
-        faults = (self._wire_fault, self._start_fault, *self._ties.missing)
+        faults = (self._wire_fault, self._silence, self._start_fault, *self._ties.missing)
         return "\n".join(filter(None, faults))
+
+    @property
+    def _silence(self) -> str:
+        return NO_FRAME if self.master.is_lost and not self._wire_fault else ""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when a frame waits."""
@@ -190,16 +195,21 @@ class EngineBus:
         self.faults.take_events(self.master)
 
     def _handle_timeout(self, now_ns: int) -> None:
+        self._take_frames(now_ns)
         self.master.handle_timeout(now_ns)
         self._send(now_ns)
 
     def _receive(self, now_ns: int) -> None:
+        self._take_frames(now_ns)
+        self._send(now_ns)
+
+    def _take_frames(self, now_ns: int) -> None:
+        """Take a batch of what is there: a frame that waits to be taken is not overdue."""
         for _ in range(BATCH):
             frame = self._take_frame()
             if frame is None:
                 break
             self.master.receive_frame(frame, now_ns)
-        self._send(now_ns)
 
     def _take_frame(self) -> bytes | None:
         try:

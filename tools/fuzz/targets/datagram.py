@@ -45,7 +45,7 @@ def _pass_slaves(data: bytes) -> None:
 def _answer(data: bytes) -> None:
     """Whatever comes back, each request is answered once: by a frame, or by its loss."""
     answers: list[object] = []
-    link = Link()
+    link = Link(ceiling_ns=4_000_000, retries=2)
     accesses = [fprd(1001, 0x130, 6), logical(Command.LRW, 0x10000, bytes(4))]
     link.submit(accesses, lambda outcome, _: answers.append(outcome))
     (sent,) = link.frames_to_send(0)

@@ -12,7 +12,7 @@ def test_positions_count_down_on_their_way():
 
 def test_stations_and_broadcasts():
     assert access.fprd(1001, 0x130, 2, tries=1) == Access(Command.FPRD, 1001, 0x130, b"\0\0", 1)
-    assert access.fpwr(1001, 0x120, b"\1\0") == Access(Command.FPWR, 1001, 0x120, b"\1\0", 3)
+    assert access.fpwr(1001, 0x120, b"\1\0") == Access(Command.FPWR, 1001, 0x120, b"\1\0", 0)
     assert access.brd(0, 1) == Access(Command.BRD, 0, 0, b"\0")
     assert access.bwr(0x120, b"\1") == Access(Command.BWR, 0, 0x120, b"\1")
 

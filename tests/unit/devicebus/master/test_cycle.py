@@ -3,10 +3,11 @@ from __future__ import annotations
 import pytest
 
 from devicebus.master.access import frmw
-from devicebus.master.cycle import Cycle, Presence
+from devicebus.master.cycle import MAX_UNDER_WAY, Cycle, Presence
 from devicebus.master.image import BusImage
 from devicebus.master.layout import BASE, lay_out
-from devicebus.master.link import Link
+from devicebus.master.link import LINGER_NS, Link
+from devicebus.master.roundtrip import PATIENCE_NS
 from devicebus.wire.datagram import Command
 from tests.support.busline import MS, accesses_of, answer
 from tests.unit.devicebus.master.test_layout import shape
@@ -35,7 +36,7 @@ def test_one_datagram_takes_outputs_and_brings_inputs():
     f = Fixture()
     f.image.outputs[:] = b"abc"
     (access,) = f.round(7, b"...WXYZ")
-    assert access == (Command.LRW, BASE & 0xFFFF, BASE >> 16, b"abc\0\0\0\0", 3)
+    assert access == (Command.LRW, BASE & 0xFFFF, BASE >> 16, b"abc\0\0\0\0", 0)
     assert f.image.inputs == b"WXYZ"
     stats = f.cycle.stats()
     assert (stats.cycles, stats.good, stats.expected_wkc, stats.received_wkc) == (1, 1, 7, 7)
@@ -91,13 +92,55 @@ def test_what_is_expected_holds_from_the_next_cycle_on():
     assert f.cycle.stats().good == 1
 
 
-def test_a_lost_cycle_is_counted_and_not_sent_again():
+def counts(f):
+    stats = f.cycle.stats()
+    return stats.good, stats.late, stats.lost, stats.skipped
+
+
+def test_cycle_lost_is_counted_and_neither_sent_again_nor_held_against_slaves():
     f = Fixture()
     f.cycle.start(0)
     f.link.frames_to_send(0)
-    f.link.handle_timeout(2 * MS)
-    assert f.link.frames_to_send(2 * MS) == []
-    assert (f.cycle.stats().lost, f.troubles) == (1, [2 * MS])
+    f.link.handle_timeout(PATIENCE_NS)
+    assert f.link.frames_to_send(PATIENCE_NS) == []
+    assert counts(f) == (0, 0, 0, 0)
+    f.link.handle_timeout(PATIENCE_NS + LINGER_NS)
+    assert counts(f) == (0, 0, 1, 0)
+    assert f.troubles == []
+
+
+def test_cycle_late_is_counted_and_its_inputs_are_taken():
+    f = Fixture()
+    f.cycle.start(0)
+    (frame,) = f.link.frames_to_send(0)
+    f.link.handle_timeout(PATIENCE_NS)
+    f.link.receive_frame(answer(frame, wkc=7, data=b"...WXYZ"), PATIENCE_NS + 1)
+    assert f.image.inputs == b"WXYZ"
+    assert counts(f) == (1, 1, 0, 0)
+
+
+def test_cycle_overtaken_by_a_newer_one_changes_nothing():
+    f = Fixture()
+    f.cycle.start(0)
+    (older,) = f.link.frames_to_send(0)
+    f.round(7, b"...new!", now_ns=MS)
+    f.link.receive_frame(answer(older, wkc=7, data=b"...old!"), 2 * MS)
+    assert f.image.inputs == b"new!"
+
+
+def test_cycle_with_too_many_under_way_is_skipped():
+    f = Fixture()
+    frames = []
+    for number in range(MAX_UNDER_WAY + 3):
+        f.cycle.start(number)
+        frames += f.link.frames_to_send(number)
+    assert (len(frames), counts(f)) == (MAX_UNDER_WAY, (0, 0, 0, 3))
+    f.link.receive_frame(answer(frames[0], wkc=7, data=b"...WXYZ"), MS)
+    f.cycle.start(2 * MS)
+    assert len(f.link.frames_to_send(2 * MS)) == 1
+    f.link.handle_timeout(PATIENCE_NS + 2 * MS)
+    f.cycle.start(PATIENCE_NS + 2 * MS)
+    assert len(f.link.frames_to_send(PATIENCE_NS + 2 * MS)) == 1
 
 
 def test_more_datagrams_go_with_a_cycle():

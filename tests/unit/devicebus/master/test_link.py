@@ -8,7 +8,16 @@ from hypothesis import strategies as st
 
 from devicebus.errors import FrameLostError
 from devicebus.master.access import Reply, fprd, fpwr, logical
-from devicebus.master.link import MAX_BODY, MAX_DATA, MAX_DATAGRAMS, MAX_RIDE, Link
+from devicebus.master.link import (
+    INDEXES,
+    LINGER_NS,
+    MAX_BODY,
+    MAX_DATA,
+    MAX_DATAGRAMS,
+    MAX_RIDE,
+    Link,
+)
+from devicebus.master.roundtrip import PATIENCE_NS
 from devicebus.wire.datagram import Command
 from tests.support.busline import MS, accesses_of, answer
 
@@ -30,6 +39,16 @@ class Client:
 @pytest.fixture
 def link():
     return Link()
+
+
+@pytest.fixture
+def quick():
+    """A link of which a round trip is known, so that frames are overdue after 2 ms."""
+    link = Link()
+    Client(link).ask(READ)
+    for frame in link.frames_to_send(0):
+        link.receive_frame(answer(frame), 50_000)
+    return link
 
 
 def test_accesses_of_several_share_a_frame_and_each_gets_its_own_answer(link):
@@ -75,45 +94,116 @@ def test_what_fits_no_frame_is_refused(link, accesses):
         Client(link).ask(*accesses)
 
 
-def test_a_lost_frame_is_sent_again_and_given_up_after_three_times(link):
-    client = Client(link)
+def test_link_sends_an_overdue_frame_again_less_often_each_time_and_gives_up(quick):
+    client = Client(quick)
     client.ask(READ)
-    for attempt in range(3):
-        assert len(link.frames_to_send(attempt * 2 * MS)) == 1
-        assert link.next_timeout() == (attempt + 1) * 2 * MS
-        link.handle_timeout((attempt + 1) * 2 * MS - 1)
-        assert link.frames_to_send(0) == []
-        link.handle_timeout((attempt + 1) * 2 * MS)
-    ((error, now),) = client.outcomes
+    now = 0
+    for wait_ms in (2, 4, 8, 16, 100):
+        assert len(quick.frames_to_send(now)) == 1
+        assert quick.next_timeout() == now + wait_ms * MS
+        quick.handle_timeout(now + wait_ms * MS - 1)
+        assert quick.frames_to_send(now) == []
+        now += wait_ms * MS
+        quick.handle_timeout(now)
+    ((error, failed_at),) = client.outcomes
     assert isinstance(error, FrameLostError)
     assert "FPRD 0x03E9:0x0130" in str(error)
-    assert "sent 3 times" in str(error)
-    assert (now, link.next_timeout(), link.frames_to_send(now)) == (6 * MS, None, [])
-    assert (link.stats().sent, link.stats().lost) == (3, 3)
+    assert "sent 5 times" in str(error)
+    assert (failed_at, quick.next_timeout(), quick.frames_to_send(now)) == (now, None, [])
+    stats = quick.stats()
+    assert (stats.sent, stats.retried, stats.lost) == (6, 4, 0)
+    quick.handle_timeout(now + LINGER_NS)
+    assert quick.stats().lost == 5
+    assert not quick.is_waiting
 
 
-def test_an_answer_says_how_often_it_was_asked_for(link):
+def test_link_sends_as_often_as_it_is_told():
+    link = Link(retries=1, ceiling_ns=5 * MS)
     client = Client(link)
     client.ask(READ)
-    link.frames_to_send(0)
-    link.handle_timeout(2 * MS)
-    (frame,) = link.frames_to_send(2 * MS)
-    link.receive_frame(answer(frame, data=b"abcdef"), 2 * MS)
+    client.ask(READ._replace(tries=1))
+    for number in range(2):
+        assert len(link.frames_to_send(5 * MS * number)) == 1
+        link.handle_timeout(5 * MS * (number + 1))
+    assert [type(outcome) for outcome, _ in client.outcomes] == [FrameLostError] * 2
+    assert [at for _, at in client.outcomes] == [5 * MS, 10 * MS]
+
+
+def test_an_answer_says_how_often_it_was_asked_for(quick):
+    client = Client(quick)
+    client.ask(READ)
+    quick.frames_to_send(0)
+    quick.handle_timeout(2 * MS)
+    (frame,) = quick.frames_to_send(2 * MS)
+    quick.receive_frame(answer(frame, data=b"abcdef"), 2 * MS)
     assert client.outcomes == [([Reply(b"abcdef", 1, 2)], 2 * MS)]
 
 
-def test_a_late_frame_answers_nothing(link):
-    client = Client(link)
+def test_link_takes_the_answer_of_a_late_frame_and_drops_the_second_one(quick):
+    client = Client(quick)
     client.ask(READ)
-    (late,) = link.frames_to_send(0)
-    link.handle_timeout(2 * MS)
-    (again,) = link.frames_to_send(2 * MS)
-    link.receive_frame(answer(late, data=b"late!!"), 2 * MS)
-    assert (client.outcomes, link.stats().late) == ([], 1)
-    link.receive_frame(answer(again, data=b"abcdef"), 2 * MS)
-    link.receive_frame(answer(again, data=b"abcdef"), 2 * MS)
-    assert client.outcomes[0][0][0].data == b"abcdef"
-    assert (len(client.outcomes), link.stats().late) == (1, 2)
+    (late,) = quick.frames_to_send(0)
+    quick.handle_timeout(2 * MS)
+    (again,) = quick.frames_to_send(2 * MS)
+    quick.receive_frame(answer(late, data=b"abcdef"), 3 * MS)
+    assert client.outcomes == [([Reply(b"abcdef", 1, 2)], 3 * MS)]
+    quick.receive_frame(answer(again, data=b"second"), 3 * MS)
+    quick.receive_frame(answer(again, data=b"third!"), 3 * MS)
+    assert len(client.outcomes) == 1
+    stats = quick.stats()
+    assert (stats.late, stats.lost, stats.retried, stats.unexpected) == (1, 0, 1, 1)
+    assert not quick.is_waiting
+
+
+def test_link_does_not_send_again_what_a_late_frame_has_answered(quick):
+    client = Client(quick)
+    client.ask(READ)
+    (late,) = quick.frames_to_send(0)
+    quick.handle_timeout(2 * MS)
+    quick.receive_frame(answer(late), 2 * MS)
+    assert quick.frames_to_send(3 * MS) == []
+    assert len(client.outcomes) == 1
+
+
+def test_link_keeps_the_index_of_a_frame_that_may_still_come(quick):
+    client = Client(quick)
+    client.ask(READ._replace(tries=1))
+    (late,) = quick.frames_to_send(0)
+    quick.handle_timeout(2 * MS)
+    for _ in range(300):
+        client.ask(READ)
+        (frame,) = quick.frames_to_send(3 * MS)
+        assert frame[3] != late[3]
+        quick.receive_frame(answer(frame), 3 * MS)
+    assert len(client.outcomes) == 301
+    quick.receive_frame(answer(late), 4 * MS)
+    assert (quick.stats().late, quick.stats().unexpected) == (1, 0)
+
+
+def test_link_counts_the_oldest_as_lost_when_all_indexes_are_taken():
+    link = Link(ceiling_ns=2 * MS)
+    client = Client(link)
+    for number in range(INDEXES + 8):
+        client.ask(READ._replace(tries=1))
+        link.frames_to_send(number)
+        link.handle_timeout(3 * MS)
+    assert (len(client.outcomes), link.stats().lost) == (INDEXES + 8, 8)
+
+
+def test_link_learns_the_round_trip_from_late_frames(quick):
+    client = Client(quick)
+    for number in range(40):
+        client.ask(READ)
+        now = number * 1000 * MS
+        frames = quick.frames_to_send(now)
+        quick.handle_timeout(now + 30 * MS)
+        frames += quick.frames_to_send(now + 30 * MS)
+        for frame in frames:
+            quick.receive_frame(answer(frame), now + 30 * MS)
+    assert len(client.outcomes) == 40
+    stats = quick.stats()
+    assert stats.timeout_ns > 30 * MS
+    assert 0 < stats.late < 20
 
 
 @pytest.mark.parametrize(
@@ -205,7 +295,7 @@ def test_cyclic_frames_go_first_and_take_a_little_along():
     cyclic = logical(Command.LRW, 0x10000, bytes(20))._replace(tries=1)
     client.ask(cyclic, cyclic=True)
     first, second = link.frames_to_send(0)
-    assert accesses_of(first) == [cyclic._replace(tries=3), READ, READ]
+    assert accesses_of(first) == [cyclic._replace(tries=0), READ, READ]
     assert accesses_of(second) == [long, READ]
 
 
@@ -222,17 +312,20 @@ def test_nobody_rides_along_without_budget_or_room():
     assert len(accesses_of(third)) == 1
 
 
-def test_who_rode_along_with_a_lost_frame_is_sent_again():
+def test_who_rode_along_with_an_overdue_frame_is_sent_again():
     link = Link(acyclic_octets=3000)
     client = Client(link)
     client.ask(READ)
     link.start_cycle()
-    client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
+    exchange = client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
     link.frames_to_send(0)
-    link.handle_timeout(2 * MS)
-    assert [type(outcome) for outcome, _ in client.outcomes] == [FrameLostError]
-    (again,) = link.frames_to_send(2 * MS)
+    assert not exchange.is_overdue
+    link.handle_timeout(PATIENCE_NS)
+    assert exchange.is_overdue
+    (again,) = link.frames_to_send(PATIENCE_NS)
     assert accesses_of(again) == [READ]
+    link.handle_timeout(PATIENCE_NS + LINGER_NS)
+    assert [type(outcome) for outcome, _ in client.outcomes] == [FrameLostError]
 
 
 def test_a_cycle_sends_no_more_acyclic_octets_than_its_budget_and_one_datagram():

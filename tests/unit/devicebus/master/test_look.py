@@ -67,5 +67,5 @@ def test_a_look_that_is_lost_is_made_again(line):
     line.tellers[0].news = [b"here"]
     first = line.frames
     line.lose_back = lambda number: number < first + 6
-    line.elapse(40 * MS)
+    line.elapse(400 * MS)
     assert heard(line) == [(1001, b"here")]

@@ -69,7 +69,7 @@ class Wire:
 def test_a_message_fills_its_mailbox():
     wire = Wire()
     assert drive(MailboxPort(7, AREA).post(b"abc"), wire) == Posted(True, False)
-    assert wire.accesses == [(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 8)]
+    assert wire.accesses == [(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 0)]
 
 
 def test_a_full_mailbox_takes_nothing():
@@ -87,32 +87,42 @@ def test_messages_are_fetched_whole_and_never_read_twice():
     assert not drive(port.is_full(), Wire())
 
 
-def lose_first_read(port, wire):
+def lose_read(port):
     fetching = port.fetch()
     next(fetching)
-    step = fetching.throw(FrameLostError("gone"))
-
-    def rest():
-        answer = yield step
-        while True:
-            try:
-                answer = yield fetching.send(answer)
-            except StopIteration as end:
-                return end.value
-
-    return drive(rest(), wire)
+    with pytest.raises(StopIteration) as end:
+        fetching.throw(FrameLostError("gone"))
+    assert end.value.value is None
 
 
 def test_a_lost_reply_is_asked_for_again():
     port, wire = MailboxPort(7, AREA), Wire(reply=b"x")
-    assert lose_first_read(port, wire) is None
-    assert wire.accesses[0] == (Command.FPWR, 7, 0x080E, b"\x03", 8)
-    assert lose_first_read(port, wire) is None
-    assert wire.accesses[2][3] == b"\x01"
+    lose_read(port)
+    assert drive(port.is_full(), wire)
+    assert wire.accesses[0] == (Command.FPWR, 7, 0x080E, b"\x03", 0)
+    assert drive(port.fetch(), wire) == b"x"
+    assert len(wire.accesses) == 4
+    lose_read(port)
+    assert drive(port.is_full(), wire)
+    assert wire.accesses[4][3] == b"\x01"
     assert port.repeats == 2
+
+
+def test_mailbox_port_without_any_frame_back_asks_again_with_the_same_bit():
+    port, wire = MailboxPort(7, AREA), Wire(reply=b"x")
+    lose_read(port)
+    asking = port.is_full()
+    next(asking)
+    with pytest.raises(FrameLostError):
+        asking.throw(FrameLostError("gone"))
+    assert drive(port.is_full(), wire)
+    assert wire.accesses[0][3] == b"\x03"
+    assert port.repeats == 1
 
 
 def test_a_slave_that_does_not_repeat_is_not_waited_for_longer_than_a_tenth_of_a_second():
     wire = Wire(acknowledges=False)
-    assert lose_first_read(MailboxPort(7, AREA), wire) is None
-    assert 100 < len(wire.accesses) < 500 + 2
+    port = MailboxPort(7, AREA)
+    lose_read(port)
+    assert not drive(port.is_full(), wire)
+    assert 100 < len(wire.accesses) < 500 + 3

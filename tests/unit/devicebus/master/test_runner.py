@@ -4,8 +4,10 @@ import pytest
 
 from devicebus.errors import FrameLostError, WorkingCounterError
 from devicebus.master.access import fprd
+from devicebus.master.link import RETRIES
 from devicebus.master.procedure import Sleep, read
-from tests.support.busline import MS, Bench, answer
+from devicebus.master.roundtrip import PATIENCE_NS
+from tests.support.busline import Bench, answer
 
 
 @pytest.fixture
@@ -35,9 +37,9 @@ def test_errors_of_a_procedure_are_those_of_its_task(bench):
 
 def test_lost_frames_are_thrown_into_it(bench):
     task = bench.runner.start(read(1, 0, 1), 0)
-    for count in range(1, 4):
-        bench.frames_to_send(0)
-        bench.handle_timeout(2 * MS * count)
+    for count in range(1 + RETRIES):
+        bench.frames_to_send(count * PATIENCE_NS)
+        bench.handle_timeout((count + 1) * PATIENCE_NS)
     with pytest.raises(FrameLostError):
         task.result()
     assert bench.next_timeout() is None

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import random
+
 import msgspec
 import pytest
 
@@ -17,7 +19,7 @@ from devicebus.master.master import Master
 from devicebus.sim.spec import ClockSpec, MailboxSpec
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState
-from tests.support.busline import MS, Paced, segment, slave
+from tests.support.busline import MS, Paced, Slow, segment, slave
 
 
 def line_of(*slaves, **settings):
@@ -236,3 +238,45 @@ def test_a_bus_that_does_not_rest_is_told():
     line.segment.slaves[0].refuses[AlState.INIT] = 0x11
     with pytest.raises(StateTimeoutError, match="not in INIT within 5 s"):
         line.wait(line.core.shut_down(line.now_ns))
+
+
+def test_200_slaves_come_to_op_while_the_round_trip_jumps():
+    dice = random.Random(200)
+    trip_ns = [MS // 10]
+
+    def jump():
+        if dice.random() < 0.02:
+            trip_ns[0] = dice.choice((MS // 10, MS, 10 * MS, 30 * MS))
+        return trip_ns[0]
+
+    line = Slow(Master(), segment(*(slave(f"s{number}") for number in range(200))), jump)
+    line.period_ns = 2 * MS
+    line.wait(line.core.bring_up(line.now_ns), 30_000 * MS)
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
+    assert line.events() == []
+    stats = line.core.stats()
+    assert stats.link.late > 0
+    assert stats.link.lost == 0
+    assert stats.cycle.wkc_errors == 0
+    line.elapse(200 * MS)
+    assert line.events() == []
+    assert {unit.state for unit in line.core.units.values()} == {AlState.OP}
+
+
+def test_bring_up_with_one_frame_lost_fails_no_slave():
+    for lost in range(0, 400, 17):
+        line = Paced(Master(), segment(*(slave(f"s{number}") for number in range(5))))
+        line.lose_back = lambda number, lost=lost: number == lost
+        line.wait(line.core.bring_up(line.now_ns))
+        line.elapse(200 * MS)
+        assert line.events() == []
+        assert {unit.state for unit in line.core.units.values()} == {AlState.OP}
+
+
+def test_bring_up_on_a_bus_that_falls_silent_blames_no_slave():
+    line = Paced(Master(), segment(*(slave(f"s{number}") for number in range(5))))
+    line.lose_out = lambda number: number > 60
+    with pytest.raises(FrameLostError) as caught:
+        line.wait(line.core.bring_up(line.now_ns))
+    assert "no frame came back" in str(caught.value)
+    assert "slaves have failed" not in str(caught.value)

@@ -11,7 +11,6 @@ from devicebus.master.event import (
     SlaveBack,
     SlaveFailed,
     SlaveLeft,
-    SlaveLost,
 )
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import AlState
@@ -132,18 +131,68 @@ def test_another_slave_in_its_place_is_refused(line):
     assert by_name(line)["b"].state is AlState.OP
 
 
-def test_the_whole_bus_goes_and_comes_back(line):
+def test_watch_with_a_cut_first_cable_reports_the_bus_and_no_slave(line):
     line.segment.cut(0)
     line.elapse(300 * MS)
-    events = line.events()
-    assert [each for each in events if isinstance(each, BusLost)]
-    assert len([each for each in events if isinstance(each, SlaveLost)]) == 4
+    assert line.core.is_lost
+    (lost,) = line.events()
+    assert isinstance(lost, BusLost)
     line.segment.mend(0)
-    line.elapse(300 * MS)
+    line.elapse(500 * MS)
     events = line.events()
     assert isinstance(events[0], BusBack)
+    assert not line.core.is_lost
+    # Without outputs their watchdogs have brought them to SAFEOP.
+    assert {(each.status, each.code) for each in events if isinstance(each, SlaveLeft)} == {
+        (0x14, 0x1B)
+    }
     assert len([each for each in events if isinstance(each, SlaveBack)]) == 4
     assert {each.state for each in line.segment.slaves} == {AlState.OP}
+
+
+def test_watch_with_a_short_silence_changes_nothing(line):
+    mailboxes = [unit.mailbox for unit in line.core.units.values()]
+    for _ in range(10):
+        line.lose_back = lambda _: True
+        line.elapse(60 * MS)
+        line.lose_back = lambda _: False
+        line.elapse(240 * MS)
+    assert line.events() == []
+    assert [unit.mailbox for unit in line.core.units.values()] == mailboxes
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
+
+
+def test_slave_is_shown_lost_until_it_is_set_up_anew(line):
+    unit = line.core.units[1003]
+    line.segment.switch(2, on=False)
+    line.elapse(50 * MS)
+    line.segment.switch(2, on=True)
+    shown = []
+    while unit.missed_ns is not None:
+        line.step(line.now_ns + MS)
+        state = 0 if unit.is_lost else int(unit.state)
+        assert state == 0 or (unit.mailbox is not None) is (state > AlState.INIT)
+        if not shown or shown[-1] != state:
+            shown.append(state)
+    assert shown == [0, 1, 2, 4, 8]
+
+
+def test_slave_whose_return_was_interrupted_by_a_silent_bus_gets_its_mailbox_back(line):
+    unit = line.core.units[1003]
+    slave_b = by_name(line)["b"]
+    for frames in range(1, 40, 3):  # the bus falls silent at another step each time
+        line.segment.switch(2, on=False)
+        line.elapse(40 * MS)
+        line.segment.switch(2, on=True)
+        while not unit.is_busy:
+            line.step(line.now_ns + MS)
+        first = line.frames + frames
+        line.lose_out = lambda number, first=first: number >= first
+        line.elapse(400 * MS)
+        line.lose_out = lambda number: False
+        line.elapse(1300 * MS)
+        assert (unit.is_lost, unit.state, slave_b.state) == (False, AlState.OP, AlState.OP)
+        assert unit.mailbox is not None
 
 
 def test_a_reference_clock_that_is_gone_is_followed_no_longer():

@@ -6,7 +6,7 @@ import pytest
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Ask
-from devicebus.master.access import TRIES, Access, Reply, fprd
+from devicebus.master.access import Access, Reply, fprd
 from devicebus.wire.datagram import Command
 from eap.appliance.control import parameters
 from eap.appliance.control_bus import (
@@ -51,7 +51,7 @@ def test_datagrams_and_replies():
     access = fprd(1001, 0x130, 6)
     assert to_access(datagram_row(access)) == access
     row = (Command.FPWR, 1, 2, "ff", 0)
-    assert to_access(row) == Access(Command.FPWR, 1, 2, b"\xff", TRIES)
+    assert to_access(row) == Access(Command.FPWR, 1, 2, b"\xff")
     replies = [Reply(b"\1\2", 1, 2), Reply(b"", 0)]
     assert to_replies([reply_row(each) for each in replies]) == replies
 

@@ -14,7 +14,7 @@ def test_before_it_is_up_the_expected_slaves_are_told(tmp_path):
     rig = BusRig(tmp_path)
     rig.wire.is_deaf = True
     rig.start()
-    rig.run(200 * MS)
+    rig.run(2000 * MS)
     report = report_bus(rig.bus)
     assert not report.is_up
     assert "no frame came back" in report.fault

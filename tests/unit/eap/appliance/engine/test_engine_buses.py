@@ -123,11 +123,11 @@ def test_slaves_that_do_not_rest_are_not_waited_for_long(start):
     assert REST_NS <= monotonic_ns() - begun_ns < 4 * REST_NS
 
 
-def test_nobody_who_answers_is_not_waited_for(start):
+def test_buses_that_are_silent_are_not_waited_for_longer(start):
     running = start(answers=False)
     begun_ns = monotonic_ns()
     running.buses.rest()
-    assert monotonic_ns() - begun_ns < REST_NS
+    assert monotonic_ns() - begun_ns < 4 * REST_NS
 
 
 def test_without_a_pair_there_is_no_desk(tmp_path):

@@ -9,7 +9,7 @@ from eap.codec.ads import AdsError, AdsState, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode
 from tests.support.busads import DRIVE, play, until
 
-TALKER, MUTE = 1001, 1002
+TALKER, MUTE, OTHER = 1001, 1002, 1002
 
 
 def test_states_as_a_value():
@@ -49,17 +49,17 @@ def test_slave_without_a_mailbox_in_its_state():
 
 def test_slave_that_is_gone():
     async def scene(client, engine):
-        with engine.buses[0].line.lost("drive"):
+        with engine.buses[0].line.lost("other"):
 
             async def is_gone():
-                return (await client.good(DRIVE, ReadState())) == bytes(4)
+                return (await client.good(OTHER, ReadState())) == bytes(4)
 
             await until(is_gone)
-            outcome = await client.do(DRIVE, Read(IndexGroup.SDO, 0x1018_0001, 4))
+            outcome = await client.do(OTHER, Read(IndexGroup.SDO, 0x1018_0001, 4))
             assert outcome.result == AdsError.TIMEOUT
-            assert client.why == "slave 1001 does not answer"
+            assert client.why == "slave 1002 does not answer"
 
-    play(scene)
+    play(scene, "files")
 
 
 def test_there_are_no_notifications():
