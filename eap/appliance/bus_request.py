@@ -133,6 +133,7 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Why not."""
     slaves: tuple[SlaveReport, ...] = ()
     frames_sent: int = 0
+    frames_received: int = 0
     frames_late: int = 0
     """Frames that came back after their time-out: the bus or this machine was slow."""
     frames_lost: int = 0

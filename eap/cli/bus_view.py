@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 from rich.text import Text
 
 from eap.cli.table import Column, TextTable
-from eap.cli.words import count
+from eap.cli.words import count, duration
 from eap.ids import ObjectId
 
 Row: TypeAlias = dict[str, Any]
@@ -89,7 +89,11 @@ def diagnosis_tables(found: Row) -> Iterator[TextTable | Text]:
         if row["reason"]:
             yield Text(f"{row['name']} ({row['address']}): {_reason(row)}")
     frames = found["frames"]
-    yield Text(f"{count(frames['sent'], 'frame')} sent, {frames['lost']} lost")
+    yield Text(
+        f"{count(frames['sent'], 'frame')} sent, {frames['late']} late, {frames['lost']} lost,"
+        f" {frames['retried']} sent again; round trip {duration(frames['round_trip_us'])}, time-out"
+        f" {duration(frames['timeout_us'])}"
+    )
     start = found["starts_at"]
     if start is not None:
         far = f" to slave {start['neighbour']}" if start["neighbour"] is not None else ""

@@ -239,7 +239,11 @@ def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
         cycles = words.count(bus["wkc_errors"], "cycle")
         yield _info(where, f"{cycles} with a wrong working counter")
     if bus["lost"]:
-        yield _info(where, f"{words.count(bus['lost'], 'exchange')} lost")
+        yield _info(where, f"{words.count(bus['lost'], 'exchange')} lost: no frame came back")
+    if late := bus.get("late"):
+        yield _info(where, f"{words.count(late, 'exchange')} late: the bus or this host was busy")
+    if skipped := bus.get("skipped"):
+        yield _info(where, f"{words.count(skipped, 'exchange')} left out: others were under way")
 
 
 def _of_sent(where: str, row: Row) -> Iterator[Finding]:

@@ -115,11 +115,15 @@ class FakeBus:
 
     def report(self) -> BusReport:
         """Say how it is."""
+        link = self.master.stats().link
         return BusReport(
             is_up=self.is_up,
             fault="" if self.is_up else "no frame comes back",
             slaves=tuple(_slave(unit) for unit in self.master.units.values()),
-            frames_sent=self.master.stats().link.sent,
+            frames_sent=link.sent,
+            frames_received=link.received,
+            timeout_ns=link.timeout_ns,
+            round_trip_ns=link.round_trip_ns,
         )
 
 

@@ -50,7 +50,7 @@ def diagnosis(bus: SlaveBus, slave: str | None) -> dict[str, Any]:
     fault = found.first_fault
     frames = bus.frame_counts()
     return {
-        "frames": {"sent": frames.sent, "received": frames.received, "lost": frames.lost},
+        "frames": frames._asdict(),
         "starts_at": None
         if fault is None
         else {

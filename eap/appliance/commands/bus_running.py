@@ -138,8 +138,15 @@ class RunningBus:
     def frame_counts(self) -> FrameCounts:
         """Return the frames of the master since the engine started."""
         report = self._describe()
-        sent, lost = report.frames_sent, report.frames_lost
-        return FrameCounts(sent, sent - lost, lost)
+        return FrameCounts(
+            sent=report.frames_sent,
+            received=report.frames_received,
+            late=report.frames_late,
+            lost=report.frames_lost,
+            retried=report.frames_retried,
+            timeout_us=report.timeout_ns // 1000,
+            round_trip_us=report.round_trip_ns // 1000,
+        )
 
     def _describe(self) -> BusReport:
         found = self._request(control_bus.PATIENCE_S, "bus_describe", wait=True)

@@ -123,7 +123,15 @@ class BusSession:
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the frames of this session."""
         stats = self._bus.link.stats()
-        return FrameCounts(stats.sent, stats.received, stats.lost)
+        return FrameCounts(
+            sent=stats.sent,
+            received=stats.received,
+            late=stats.late,
+            lost=stats.lost,
+            retried=stats.retried,
+            timeout_us=stats.timeout_ns // 1000,
+            round_trip_us=stats.round_trip_ns // 1000,
+        )
 
     def _bring_all(self, units: Sequence[Unit], target: AlState) -> None:
         self._run_all(units, [bring(self._bus, unit, target) for unit in units])

@@ -46,11 +46,20 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FrameCounts(NamedTuple):
-    """Frames of a master."""
+    """Frames of a master, and what it knows of their round trip."""
 
     sent: int
     received: int
+    late: int
+    """Came back after their time-out."""
     lost: int
+    """Never came back."""
+    retried: int
+    """Sent again."""
+    timeout_us: int
+    """How long the next one may be under way."""
+    round_trip_us: int
+    """Mean of the latest, 0 before the first."""
 
 
 class SlaveBus(Protocol):

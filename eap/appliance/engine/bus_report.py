@@ -26,6 +26,7 @@ def report_bus(bus: EngineBus) -> BusReport:
         fault=bus.fault,
         slaves=tuple(slaves),
         frames_sent=stats.link.sent,
+        frames_received=stats.link.received,
         frames_late=stats.link.late,
         frames_lost=stats.link.lost,
         frames_retried=stats.link.retried,

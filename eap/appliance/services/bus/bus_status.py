@@ -35,10 +35,21 @@ def bus_document(report: BusReport | None) -> dict[str, Any]:
             ],
             "cycles": report.cycles,
             "wkc_errors": report.wkc_errors,
+            "late": report.cycles_late,
             "lost": report.cycles_lost,
+            "skipped": report.cycles_skipped,
             "expected_wkc": report.expected_wkc,
             "received_wkc": report.received_wkc,
             "trip_us": report.trip_ns // 1000,
             "max_trip_us": report.max_trip_ns // 1000,
+            "frames": {
+                "sent": report.frames_sent,
+                "received": report.frames_received,
+                "late": report.frames_late,
+                "lost": report.frames_lost,
+                "retried": report.frames_retried,
+                "timeout_us": report.timeout_ns // 1000,
+                "round_trip_us": report.round_trip_ns // 1000,
+            },
         }
     }

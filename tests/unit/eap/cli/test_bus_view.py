@@ -68,13 +68,15 @@ def test_diagnosis():
             "answers": False, "ports": []}  # fmt: skip
     found = {
         "slaves": [row, gone],
-        "frames": {"sent": 1, "lost": 0},
+        "frames": {"sent": 1, "late": 3, "lost": 0, "retried": 2,
+                   "timeout_us": 2000, "round_trip_us": 480},
         "starts_at": {"slave": 1002, "name": "b", "port": 0, "neighbour": 1001},
     }
     text = shown(*diagnosis_tables(found))
     assert "errors start at port 0 of b (1002): check its cable to slave 1001 first" in text
     assert "b (1002): watchdog (0x001B)" in text
-    assert "1 frame sent, 0 lost" in text
+    words = " ".join(text.split())
+    assert "1 frame sent, 3 late, 0 lost, 2 sent again; round trip 480 µs, time-out 2.0 ms" in words
     assert "no answer" in text
 
 

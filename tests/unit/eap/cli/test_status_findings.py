@@ -238,8 +238,14 @@ def test_buses_and_their_slaves() -> None:
         "error mixer/bus1: no frame comes back; so far; 'eapctl bus diag mixer/bus1' says more",
         "warning mixer/bus2: not up yet",
         "info mixer/bus0: 4 cycles with a wrong working counter",
-        "info mixer/bus0: 3 exchanges lost",
+        "info mixer/bus0: 3 exchanges lost: no frame came back",
     ]
+
+
+def test_findings_tell_late_exchanges_from_lost_ones() -> None:
+    (*_, late, skipped) = texts(ports=[bus_port(lost=0, slaves=[], late=2, skipped=1)])
+    assert late == "info mixer/bus0: 2 exchanges late: the bus or this host was busy"
+    assert skipped == "info mixer/bus0: 1 exchange left out: others were under way"
 
 
 def test_many_slaves_with_the_same_fault_are_one_finding() -> None:

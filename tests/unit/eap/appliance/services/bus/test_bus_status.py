@@ -32,10 +32,23 @@ def test_link(report, link):
 
 
 def test_document():
-    report = msgspec.structs.replace(UP, wkc_errors=1, cycles_lost=2, trip_ns=1999)
+    report = msgspec.structs.replace(
+        UP, wkc_errors=1, cycles_lost=2, cycles_late=3, cycles_skipped=4, trip_ns=1999,
+        frames_sent=90, frames_received=80, frames_late=5, frames_lost=6, frames_retried=7,
+        timeout_ns=2_000_999, round_trip_ns=300_999,
+    )  # fmt: skip
     bus = bus_document(report)["bus"]
     assert (bus["is_up"], bus["fault"], bus["cycles"], bus["wkc_errors"]) == (True, "", 7, 1)
-    assert (bus["lost"], bus["trip_us"]) == (2, 1)
+    assert (bus["lost"], bus["late"], bus["skipped"], bus["trip_us"]) == (2, 3, 4, 1)
+    assert bus["frames"] == {
+        "sent": 90,
+        "received": 80,
+        "late": 5,
+        "lost": 6,
+        "retried": 7,
+        "timeout_us": 2000,
+        "round_trip_us": 300,
+    }
     assert [each["state"] for each in bus["slaves"]] == ["OP", None]
     assert bus["slaves"][1]["fault"] == "it does not answer"
     assert bus_document(None) == {}
