@@ -68,8 +68,14 @@ def test_diagnosis():
             "answers": False, "ports": []}  # fmt: skip
     found = {
         "slaves": [row, gone],
-        "frames": {"sent": 1, "late": 3, "lost": 0, "retried": 2,
-                   "timeout_us": 2000, "round_trip_us": 480},
+        "frames": {
+            "sent": 1,
+            "late": 3,
+            "lost": 0,
+            "retried": 2,
+            "timeout_us": 2000,
+            "round_trip_us": 480,
+        },
         "starts_at": {"slave": 1002, "name": "b", "port": 0, "neighbour": 1001},
     }
     text = shown(*diagnosis_tables(found))
