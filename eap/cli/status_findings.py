@@ -219,6 +219,14 @@ def _of_cycles(station: Row) -> Iterator[Finding]:
         yield _info(name, f"dropped: {discarded}")
 
 
+_BUS_COUNTERS = (
+    ("wkc_errors", "cycle", "with a wrong working counter"),
+    ("lost", "exchange", "lost: no frame came back"),
+    ("late", "exchange", "late: the bus or this host was busy"),
+    ("skipped", "exchange", "left out: others were under way"),
+)
+
+
 def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
     advice = f"'eapctl bus diag {where}' says more"
     if bus["fault"]:
@@ -235,15 +243,9 @@ def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
             yield from (_error(f"{where} {name}", fault, advice) for name in names)
         else:
             yield _error(f"{where}: {len(names)} slaves from {names[0]} on", fault, advice)
-    if bus["wkc_errors"]:
-        cycles = words.count(bus["wkc_errors"], "cycle")
-        yield _info(where, f"{cycles} with a wrong working counter")
-    if bus["lost"]:
-        yield _info(where, f"{words.count(bus['lost'], 'exchange')} lost: no frame came back")
-    if late := bus.get("late"):
-        yield _info(where, f"{words.count(late, 'exchange')} late: the bus or this host was busy")
-    if skipped := bus.get("skipped"):
-        yield _info(where, f"{words.count(skipped, 'exchange')} left out: others were under way")
+    for key, noun, text in _BUS_COUNTERS:
+        if number := bus.get(key):
+            yield _info(where, f"{words.count(number, noun)} {text}")
 
 
 def _of_sent(where: str, row: Row) -> Iterator[Finding]:
