@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+from contextlib import suppress
 from types import TracebackType
 from typing import Self, TypeVar, cast
 
@@ -23,7 +24,7 @@ from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.dialogue import Dialogue, patience
-from eap.gateway.slaves import MasterSlave, read_slaves, sizes_of
+from eap.gateway.slaves import NOT_TOLD, MasterSlave, not_told, read_slaves, sizes_of
 
 T = TypeVar("T")
 
@@ -50,6 +51,7 @@ class AsyncGatewayClient:
         self, host: str, port: int = PORT, *, timeout_s: float = TIMEOUT_S, tries: int = TRIES
     ) -> None:
         self.mailboxes: dict[int, MailboxSizes] = {}
+        self._master_tells = True
         self._place = host, port
         self._timeout_s = timeout_s
         self._tries = tries
@@ -83,7 +85,8 @@ class AsyncGatewayClient:
         self, address: int, index: int, subindex: int, data: bytes, *, complete: bool = False
     ) -> None:
         """Write an entry, or with *complete* a whole object."""
-        sizes = await self.sizes_of(address) if len(data) > EXPEDITED_SIZE else MailboxSizes()
+        is_short = len(data) <= EXPEDITED_SIZE
+        sizes = MailboxSizes() if is_short else await self._sizes_or_default(address)
         talk = coe_client.download(index, subindex, data, sizes, complete=complete)
         await self.converse(address, talk)
 
@@ -144,7 +147,7 @@ class AsyncGatewayClient:
         drive: int = 0,
     ) -> None:
         """Write an element of an IDN; a list or text with its head."""
-        sizes = await self.sizes_of(address)
+        sizes = await self._sizes_or_default(address)
         talk = soe_client.write(idn, data, sizes, elements=element, drive=drive)
         await self.converse(address, talk)
 
@@ -158,8 +161,21 @@ class AsyncGatewayClient:
 
     async def sizes_of(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave; raises as :meth:`GatewayClient.sizes_of`."""
-        known = self.mailboxes.get(address)
-        return known or sizes_of(await self.slaves(), address)
+        if known := self.mailboxes.get(address):
+            return known
+        try:
+            return sizes_of(await self.slaves(), address)
+        except NOT_TOLD as exc:
+            exc.add_note(not_told(address))
+            raise
+
+    async def _sizes_or_default(self, address: int) -> MailboxSizes:
+        """Return the mailboxes of a slave, for messages that may as well be shorter."""
+        if self._master_tells:
+            with suppress(*NOT_TOLD):
+                return await self.sizes_of(address)
+            self._master_tells = False  # each question would wait for as long
+        return self.mailboxes.get(address, MailboxSizes())
 
     async def converse(self, address: int, conversation: Conversation[T]) -> T:
         """Lead any conversation."""

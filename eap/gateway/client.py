@@ -4,7 +4,9 @@
         vendor = gateway.sdo_read(1001, 0x1018, 1)
         gateway.foe_write(1001, "firmware.bin", Path("new.bin").read_bytes())
 
-Address 0 is the master itself, 1001 usually the first slave.  What is refused raises SdoAbortError,
+Address 0 is the master itself, 1001 usually the first slave.  Where a message may not fit, the
+mailbox of a slave is looked up in the master's dictionary; for objects and IDNs 128 octets will do
+if there is none.  What is refused raises SdoAbortError,
 SoeError, FoeError or MailboxRefusedError; who does not answer, MailboxTimeoutError.
 """
 
@@ -38,7 +40,7 @@ from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.async_client import PORT, TIMEOUT_S, TRIES, AsyncGatewayClient
 from eap.gateway.dialogue import Dialogue, patience
-from eap.gateway.slaves import MasterSlave, read_slaves, sizes_of
+from eap.gateway.slaves import NOT_TOLD, MasterSlave, not_told, read_slaves, sizes_of
 
 T = TypeVar("T")
 
@@ -78,6 +80,7 @@ class GatewayClient(Closing):
         tries: int = TRIES,
     ) -> None:
         self.mailboxes: dict[int, MailboxSizes] = {}
+        self._master_tells = True
         self._tries = 1 if tcp else tries
         self._timeout_s = timeout_s * tries if tcp else timeout_s
         self._is_stream = tcp
@@ -114,7 +117,7 @@ class GatewayClient(Closing):
         self, address: int, index: int, subindex: int, data: bytes, *, complete: bool = False
     ) -> None:
         """Write an entry, or with *complete* a whole object."""
-        sizes = self.sizes_of(address) if len(data) > EXPEDITED_SIZE else _DEFAULT_SIZES
+        sizes = self._sizes_or_default(address) if len(data) > EXPEDITED_SIZE else _DEFAULT_SIZES
         talk = coe_client.download(index, subindex, data, sizes, complete=complete)
         self.converse(address, talk)
 
@@ -150,7 +153,7 @@ class GatewayClient(Closing):
         drive: int = 0,
     ) -> None:
         """Write an element of an IDN; a list or text with its head."""
-        sizes = self.sizes_of(address)
+        sizes = self._sizes_or_default(address)
         talk = soe_client.write(idn, data, sizes, elements=element, drive=drive)
         self.converse(address, talk)
 
@@ -192,9 +195,23 @@ class GatewayClient(Closing):
 
         Raises:
             BusError: the master knows no such slave, or the slave has no mailbox.
+            MailboxTimeoutError, MailboxRefusedError, SdoAbortError: the master does not tell.
         """
-        known = self.mailboxes.get(address)
-        return known or sizes_of(self.slaves(), address)
+        if known := self.mailboxes.get(address):
+            return known
+        try:
+            return sizes_of(self.slaves(), address)
+        except NOT_TOLD as exc:
+            exc.add_note(not_told(address))
+            raise
+
+    def _sizes_or_default(self, address: int) -> MailboxSizes:
+        """Return the mailboxes of a slave, for messages that may as well be shorter."""
+        if self._master_tells:
+            with suppress(*NOT_TOLD):
+                return self.sizes_of(address)
+            self._master_tells = False  # each question would wait for as long
+        return self.mailboxes.get(address, _DEFAULT_SIZES)
 
     def converse(
         self,

@@ -6,12 +6,23 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
-from devicebus.errors import BusError
+from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox import coe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.gateway.address import VIRTUAL_BIT
 from eap.od.abort import SdoAbortError
+
+NOT_TOLD = (SdoAbortError, MailboxRefusedError, MailboxTimeoutError)
+"""Errors of a master that has no dictionary, or is silent at address 0."""
+
+
+def not_told(address: int) -> str:
+    """Return what to do where the master does not tell how long a mailbox is."""
+    return (
+        f"the mailbox of slave {address} has to be known, and the master does not tell it: put its"
+        f" sizes into mailboxes[{address}]"
+    )
 
 
 class MasterSlave(NamedTuple):

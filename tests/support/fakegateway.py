@@ -70,7 +70,9 @@ class FakeGateway:
 
     Attributes:
         drop: Requests by UDP that are not heard, from now on.
-        has_master: Whether address 0 has a dictionary.
+        has_master: Whether address 0 has a dictionary; otherwise it refuses what is asked.
+        is_master_silent: Whether address 0 never answers, as with KickCAT.
+        addresses: Of the messages that came.
         heard: The messages that came, without headers.
     """
 
@@ -78,6 +80,8 @@ class FakeGateway:
         self.drop = 0
         self.heard: list[bytes] = []
         self.has_master = True
+        self.is_master_silent = False
+        self.addresses: list[int] = []
         slave = ObjectDictionary(
             [
                 variable(0x1008, "N", "STRING(500)", RW, "x" * 300),
@@ -123,6 +127,9 @@ class FakeGateway:
     def _answers(self, frame: bytes) -> list[bytes]:
         header, body = decode_message(frame, EtherCatHeader.SIZE)
         self.heard.append(bytes(body))
+        self.addresses.append(header.address)
+        if header.address == 0 and self.is_master_silent:
+            return []
         box = self._boxes.get(header.address)
         if box is None or (header.address == 0 and not self.has_master):
             detail = MailboxErrorReply(detail=MailboxError.UNSUPPORTED_PROTOCOL).encode()

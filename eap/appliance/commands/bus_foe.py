@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
-from devicebus.errors import BusError, MailboxSizeError
+from devicebus.errors import MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
 from devicebus.mailbox.conversation import Progress
 from eap.appliance.commands.bus_slave import Begin, Slave, SlaveBus
@@ -168,11 +168,7 @@ def _converse(
 
 def _find(bus: SlaveBus, slave: str) -> Slave:
     unit = bus.find(slave)
-    if not unit.is_mailbox_known and unit.station:
-        raise BusError(
-            f"slave {slave}: the master does not tell how long its mailbox is, and in packets of"
-            " another length a file would be cut off; say it (--mailbox OCTETS)"
-        )
+    bus.require_mailbox(unit)
     return unit
 
 

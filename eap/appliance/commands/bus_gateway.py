@@ -1,16 +1,15 @@
 """A bus behind a mailbox gateway, ours or anybody's, as a command uses it (ETG.8200).
 
-What a gateway passes is mailbox messages: slaves are known by the master's dictionary, and nobody
-reads registers.
+A gateway passes mailbox messages, and no registers.  Slaves are known by the master's dictionary.
+Not every gateway has one (KickCAT's is silent at address 0), so that it is read only for names, for
+the sizes of mailboxes that files need, and for hints about what was refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NoReturn, TypeVar
-
-import msgspec
 
 from devicebus.errors import BusError, MailboxRefusedError
 from devicebus.mailbox.protocol import MailboxSizes
@@ -18,11 +17,10 @@ from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import AlStatus
 from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
-from eap.errors import ConfigError, EapError
+from eap.errors import ConfigError
 from eap.gateway.address import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.client import GatewayClient
-from eap.gateway.slaves import MasterSlave
-from eap.od.abort import SdoAbortError
+from eap.gateway.slaves import NOT_TOLD, MasterSlave
 
 T = TypeVar("T")
 
@@ -45,30 +43,54 @@ class GatewayBus:
         self._slaves: list[MasterSlave] | None = None
 
     def scan(self) -> Sequence[Slave]:
-        """Return the slaves that the master tells of."""
-        self._slaves = self._client.slaves()
+        """Return the slaves that the master tells of.
+
+        Raises:
+            BusError: it does not answer, or has no dictionary.
+        """
+        try:
+            self._slaves = self._client.slaves()
+        except NOT_TOLD as exc:
+            raise BusError(
+                f"the gateway cannot be asked for its slaves and their names: {exc}; name a slave"
+                " by its station address, such as 1001"
+            ) from exc
         return [_slave(each) for each in self._slaves]
 
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name, the master for 0.
 
-        Other addresses are for the gateway to know: it may have virtual ones.
+        The master is asked for names only: addresses are for the gateway to know, which may have
+        virtual ones and no dictionary.
         """
         if name in {"0", "master"}:
-            return msgspec.structs.replace(self._unknown(MASTER_ADDRESS), name="master")
+            return _slave(_unknown(MASTER_ADDRESS, "master"))
         number = _number(name)
         if number == ALL_SLAVES:
             raise ConfigError(f"{name} is all slaves, each of which answers for itself: name one")
+        if number < 0:
+            return choose(self.scan(), name)
+        return _slave(_unknown(number, name))
+
+    def require_mailbox(self, slave: Slave) -> None:
+        """Learn how long the mailbox of *slave* is.
+
+        Raises:
+            BusError: the master does not tell.
+        """
+        if slave.station == MASTER_ADDRESS or self._mailbox is not None:
+            return
+        reason = "the master does not tell how long its mailbox is"
         try:
-            slaves = self.scan()
-        except (SdoAbortError, MailboxRefusedError):  # of a master without a dictionary
-            if number < 0:
-                raise
-            return self._unknown(number)
-        for slave in slaves:
-            if slave.station == number & ~VIRTUAL_BIT and number > 0:
-                return msgspec.structs.replace(slave, station=number)
-        return choose(slaves, name) if number < 0 else self._unknown(number)
+            if self._slaves is None:
+                self.scan()
+        except BusError as exc:
+            reason += f" ({exc.__cause__})"
+        if self._told_of(slave) is None:
+            raise BusError(
+                f"slave {slave.name}: {reason}, and in packets of another length a file would be"
+                " cut off; say it (--mailbox OCTETS)"
+            )
 
     def converse(
         self,
@@ -82,12 +104,9 @@ class GatewayBus:
         conversation = begin(self._sizes(slave))
         try:
             return self._client.converse(slave.station, conversation, meanwhile)
-        except EapError as exc:
-            if slave.station and self._slaves is not None and self._told_of(slave) is None:
-                known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
-                exc.add_note(
-                    f"the master knows no slave {slave.station}; it knows {known or 'none'}"
-                )
+        except MailboxRefusedError as exc:
+            if hint := self._hint(slave):
+                exc.add_note(hint)
             raise
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
@@ -113,17 +132,34 @@ class GatewayBus:
         if told is None:
             return MailboxSizes()
         if not told.to_slave:
-            raise no_mailbox(slave, state_name(slave.status.state))
+            raise no_mailbox(_slave(told), state_name(_slave(told).status.state))
         return MailboxSizes(told.to_slave, told.to_master)
+
+    def _hint(self, slave: Slave) -> str:
+        """Return what the master knows that explains why a slave's mailbox is not reached."""
+        if slave.station == MASTER_ADDRESS:
+            return ""
+        with suppress(BusError):
+            if self._slaves is None:
+                self.scan()
+        if self._slaves is None:
+            return ""
+        told = self._told_of(slave)
+        if told is None:
+            known = ", ".join(f"{each.station} ({each.name})" for each in self._slaves)
+            return f"the master knows no slave {slave.station}; it knows {known or 'none'}"
+        if not told.to_slave:
+            return str(no_mailbox(_slave(told), state_name(_slave(told).status.state)))
+        return f"the master says that its mailbox takes {told.to_slave} octets (--mailbox OCTETS)"
 
     def _told_of(self, slave: Slave) -> MasterSlave | None:
         """Return what the master tells of a slave, None if it has not told anything."""
         station = slave.station & ~VIRTUAL_BIT
         return next((each for each in self._slaves or () if each.station == station), None)
 
-    def _unknown(self, station: int) -> Slave:
-        found = _slave(MasterSlave(station, "", 0, 0, 0, 0, 0, 0, 0))
-        return msgspec.structs.replace(found, is_mailbox_known=self._mailbox is not None)
+
+def _unknown(station: int, name: str) -> MasterSlave:
+    return MasterSlave(station, name, 0, 0, 0, 0, 0, 0, 0)
 
 
 def _number(text: str) -> int:

@@ -82,6 +82,9 @@ class RunningBus:
         """Return the slave with a station address or a name; raise BusError if that is not one."""
         return choose(self.scan(), name)
 
+    def require_mailbox(self, slave: Slave) -> None:
+        """Do nothing: this master knows the mailboxes of its slaves."""
+
     def converse(
         self,
         slave: Slave,

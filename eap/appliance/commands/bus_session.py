@@ -75,6 +75,9 @@ class BusSession:
         """
         return choose(self._slaves or self.scan(), name)
 
+    def require_mailbox(self, slave: Slave) -> None:
+        """Do nothing: this master knows the mailboxes of its slaves."""
+
     def converse(
         self,
         slave: Slave,

@@ -39,8 +39,6 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """Position of the slave that it is wired to; None for the master."""
     ports: tuple[int, ...]
     """Open ports."""
-    is_mailbox_known: bool = True
-    """Whether somebody tells how long its mailbox is; no file passes without."""
     fault: str = ""
     """Why not all is known of it, or why it is not where it belongs."""
 
@@ -70,6 +68,9 @@ class SlaveBus(Protocol):
 
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name; raise BusError if that is not one."""
+
+    def require_mailbox(self, slave: Slave) -> None:
+        """Learn how long the mailbox of *slave* is, as files need; raise BusError otherwise."""
 
     def converse(
         self,

@@ -11,7 +11,7 @@ from devicebus.mailbox.conversation import Progress
 from eap.codec.soe import Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.client import AsyncGatewayClient
-from tests.support.fakegateway import FILE, FakeGateway
+from tests.support.fakegateway import FILE, SIZES, FakeGateway
 
 MODE = Idn.parse("S-0-0032")
 
@@ -43,6 +43,23 @@ def test_all_services(gateway) -> None:
             assert await client.voe(1001, 0x1164, 1, b"\1") == b"\1"
             assert await client.idn_read(1001, MODE) == bytes((7, 0, 0, 0))
             assert [slave.name for slave in await client.slaves()] == ["drive"]
+
+    asyncio.run(run())
+
+
+def test_client_of_a_gateway_that_is_silent_at_address_0_writes_objects_and_idns() -> None:
+    async def run() -> None:
+        with FakeGateway() as gateway:
+            gateway.is_master_silent = True
+            place = "127.0.0.1", gateway.port
+            async with AsyncGatewayClient(*place, timeout_s=0.02) as client:
+                await client.sdo_write(1001, 0x1008, 0, b"y" * 400)
+                await client.idn_write(1001, MODE, bytes((7, 0, 0, 0)))
+                assert await client.sdo_read(1001, 0x1008) == b"y" * 400
+                with pytest.raises(MailboxTimeoutError):
+                    await client.foe_read(1001, "f")
+                client.mailboxes[1001] = SIZES
+                assert await client.foe_read(1001, "f") == FILE
 
     asyncio.run(run())
 

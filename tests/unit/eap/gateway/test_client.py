@@ -15,7 +15,7 @@ from eap.codec.soe import Idn
 from eap.errors import EnvironmentalError
 from eap.gateway.client import GatewayClient, cut_frame
 from eap.od.abort import SdoAbortError
-from tests.support.fakegateway import FILE, FakeGateway
+from tests.support.fakegateway import FILE, SIZES, FakeGateway
 
 pytestmark = pytest.mark.net
 
@@ -81,6 +81,26 @@ def test_slaves(client) -> None:
         client.sdo_read(7, 0x1018)
     client.mailboxes[7] = MailboxSizes(64, 80)
     assert client.sizes_of(7).to_slave == 64
+
+
+def test_client_of_a_gateway_that_is_silent_at_address_0_writes_objects_and_idns() -> None:
+    with (
+        FakeGateway() as gateway,
+        GatewayClient("127.0.0.1", gateway.port, timeout_s=0.02) as client,
+    ):
+        gateway.is_master_silent = True
+        client.sdo_write(1001, 0x1008, 0, b"y" * 400)
+        asked = gateway.addresses.count(0)
+        client.sdo_write(1001, 0x1008, 0, b"z" * 400)
+        client.idn_write(1001, MODE, bytes((7, 0, 0, 0)))
+        assert client.sdo_read(1001, 0x1008) == b"z" * 400
+        assert gateway.addresses.count(0) == asked, "once is enough"
+        with pytest.raises(MailboxTimeoutError) as caught:
+            client.foe_read(1001, "f")
+        assert "put its sizes into mailboxes[1001]" in caught.value.__notes__[0]
+        client.mailboxes[1001] = SIZES
+        client.foe_write(1001, "f", FILE)
+        assert client.foe_read(1001, "f") == FILE
 
 
 def test_a_datagram_that_got_lost_is_sent_again(gateway) -> None:

@@ -10,14 +10,21 @@ from devicebus.errors import BusError, MailboxSizeError
 from devicebus.mailbox import coe_client, foe_client
 from devicebus.master.diagnosis import diagnose
 from devicebus.wire.alstatus import AlState
-from eap.appliance.commands.bus_foe import put_file
+from eap.appliance.commands import bus_gateway
+from eap.appliance.commands.bus_foe import exchange, put_file
 from eap.appliance.commands.bus_gateway import open_gateway
+from eap.appliance.commands.bus_idn import read_idn
 from eap.appliance.commands.bus_info import scan_rows
 from eap.appliance.commands.bus_sdo import dump_entries, read_entry, write_entry
+from eap.codec import datatypes
+from eap.codec.soe import Idn
 from eap.errors import ConfigError
+from eap.gateway.client import GatewayClient
 from tests.support.fakegateway import FILE, SIZES, FakeGateway
 
 pytestmark = pytest.mark.net
+
+MODE = Idn.parse("S-0-0032")
 
 
 @pytest.fixture
@@ -64,7 +71,8 @@ def test_files_go_in_packets_that_fill_the_mailbox(bus, tmp_path) -> None:
     source = tmp_path / "a"
     source.write_bytes(FILE)
     drive = bus.find(str(0x8000 | 1001))
-    assert (drive.station, drive.name) == (0x8000 | 1001, "drive")
+    assert drive.station == 0x8000 | 1001
+    bus.require_mailbox(drive)
     seen = []
     with pytest.raises(BusError, match="UNSUPPORTED_PROTOCOL"):  # this gateway knows no bit 15
         bus.converse(drive, lambda sizes: seen.append(sizes) or coe_client.upload(0x2000, 0), "x")
@@ -94,6 +102,45 @@ def test_a_gateway_whose_master_has_no_dictionary(gateway, bus) -> None:
     assert len(bus.converse(slave, lambda _: coe_client.upload(0x2000, 0), "x")) == 4
     with pytest.raises(BusError):
         bus.find("drive")
+
+
+@pytest.fixture
+def silent_at_master(gateway, monkeypatch):
+    monkeypatch.setattr(bus_gateway, "GatewayClient", partial(GatewayClient, timeout_s=0.02))
+    gateway.is_master_silent = True
+    with open_gateway("127.0.0.1", gateway.port, tcp=False) as opened:
+        yield opened
+
+
+def test_slave_by_station_address_never_asks_the_master(gateway, silent_at_master) -> None:
+    bus = silent_at_master
+    write_entry(bus, "1001", 0x2000, 0, "77", kind=None, complete=False)
+    text = datatypes.parse("STRING(500)")
+    write_entry(bus, "1001", 0x1008, 0, "y" * 400, kind=text, complete=False)
+    assert read_entry(bus, "1001", 0x1008, 0, kind=text, complete=False)["value"] == "y" * 400
+    assert {row["index"] for row in dump_entries(bus, "0x3E9")} == {0x1008, 0x2000}
+    assert read_idn(bus, "1001", MODE, drive=0)["value"] == 7
+    assert exchange(bus, "1001", 0x1164, 1, b"\1\2")["data"] == "0102"
+    assert set(gateway.addresses) == {1001}
+
+
+def test_slave_by_name_where_the_master_is_silent_says_to_give_the_address(silent_at_master):
+    with pytest.raises(BusError, match=r"cannot be asked for .* names: no answer .* such as 1001"):
+        silent_at_master.find("drive")
+
+
+def test_file_of_a_slave_where_the_master_is_silent_needs_the_mailbox(
+    gateway, silent_at_master, tmp_path
+) -> None:
+    source = tmp_path / "a"
+    source.write_bytes(FILE)
+    with pytest.raises(BusError, match=r"no answer from address 0.*--mailbox OCTETS"):
+        put_file(silent_at_master, "1001", source, "f", password=0, report=lambda *_: None)
+    gateway.addresses.clear()
+    with open_gateway("127.0.0.1", gateway.port, tcp=False, mailbox=SIZES.to_slave) as bus:
+        done = put_file(bus, "1001", source, "f", password=0, report=lambda *_: None)
+    assert done["octets"] == len(FILE)
+    assert set(gateway.addresses) == {1001}
 
 
 def test_what_is_no_mailbox_message_is_not_passed(bus) -> None:
