@@ -2,7 +2,8 @@
 
 ETG.8200 leaves open what a gateway answers that gets no answer itself.  A tool understands the
 errors of its own protocol best, so an SDO is aborted, an IDN refused, a file transfer ended with a
-text; a mailbox error is for what has no error of its own, and for a protocol that nobody speaks.
+text, also by a master or slave that does not speak that protocol.  A mailbox error is for protocols
+without an error of their own (VoE, EoE), and for what is no request.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class Reason(Enum):
         "it does not speak this protocol",
         MailboxError.UNSUPPORTED_PROTOCOL,
         AbortCode.UNSUPPORTED_ACCESS,
-        SoeErrorCode.GENERAL,
+        SoeErrorCode.NO_IDN,
         FoeErrorCode.NOT_DEFINED,
         AdsError.SERVICE,
     )
@@ -166,7 +167,7 @@ def refuse(kind: MailboxType, request: bytes, reason: Reason, text: str = "") ->
         text: More than *reason* says, where the protocol has room for words.
     """
     refuser = _REFUSERS.get(kind)
-    if refuser is None or (reason is Reason.NO_PROTOCOL and kind is not MailboxType.COE):
+    if refuser is None:
         return mailbox_error(reason.value.mailbox)
     body = refuser(request, reason, text or reason.text)
     return mailbox_error(reason.value.mailbox) if body is None else Answer(kind, body)

@@ -94,10 +94,15 @@ def test_what_has_no_error_of_its_own_gets_that_of_the_mailbox(reason, octets) -
     assert refuse(FOE, b"", reason) == expected
 
 
-def test_a_protocol_that_nobody_speaks_is_for_the_mailbox_to_refuse() -> None:
-    for kind in (SOE, FOE, AOE):
-        answer = refuse(kind, bytes.fromhex("01 40 2000"), Reason.NO_PROTOCOL)
-        assert answer == (MailboxType.ERR, bytes.fromhex("0100 0200"))
+def test_protocol_that_is_not_spoken_is_refused_in_that_protocol() -> None:
+    soe = refuse(SOE, bytes.fromhex("a1 40 2000"), Reason.NO_PROTOCOL)
+    header = SoeHeader.decode(soe.body)
+    assert (soe.type, header.opcode, header.error, header.drive, header.idn) == (SOE, 2, 1, 5, 32)
+    assert error_code_of(soe.body) == SoeErrorCode.NO_IDN
+    foe = refuse(FOE, bytes.fromhex("01 00 00000000 66"), Reason.NO_PROTOCOL)
+    header, body = decode_message(foe.body)
+    assert (foe.type, header.opcode) == (FOE, FoeOpcode.ERROR)
+    assert text_of(body) == "it does not speak this protocol"
 
 
 def test_time_outs_missing_slaves_and_protocols_and_lengths_differ_in_every_protocol() -> None:

@@ -180,7 +180,7 @@ def test_any_upload_command_and_surplus_octets_are_taken() -> None:
         (COE, 1009, VENDOR, (COE, "0020 80 1810 01 00000206")),
         (SOE, 1009, "01 40 2000", (SOE, "12 40 2000 0a80")),
         (VOE, 1009, "64110000 0100", (MailboxType.ERR, "0100 0500")),
-        (SOE, 1001, "01 40 2000", (MailboxType.ERR, "0100 0200")),
+        (SOE, 1001, "01 40 2000", (SOE, "12 40 2000 0110")),
         (COE, 1001, "0020 40 1810 01" + "00" * 1500, (COE, "0020 80 1810 01 05000106")),
         (COE, 1001, "0020 40 9999 00 00000000", (COE, "0020 80 9999 00 00000206")),
     ],
@@ -238,6 +238,10 @@ def test_the_masters_dictionary() -> None:
         assert bytes.fromhex(name).endswith(b"m" * 300)
         assert (await desk.one(COE, 0, "0080 01 00 0000 0100"))[:8] == "00 80 02"
         ((header, body),) = await desk.ask(SOE, 0, "01 40 2000")
+        assert (header.type, body) == (SOE, bytes.fromhex("12 40 2000 0110"))
+        ((header, body),) = await desk.ask(FOE, 0, "01 00 00000000 66")
+        assert (header.type, body[:6]) == (FOE, bytes.fromhex("05 00 00800000"))
+        ((header, body),) = await desk.ask(VOE, 0, "64110000 0100")
         assert (header.type, body) == (MailboxType.ERR, bytes.fromhex("0100 0200"))
 
     play(scene)

@@ -44,6 +44,12 @@ def test_segments_of_two_clients_do_not_meet() -> None:
 
 def test_refusals() -> None:
     (reply,) = asyncio.run(session().ask(MailboxType.FOE, b"\1\0\0\0\0\0f"))
+    assert (reply.type, reply.reason) == (MailboxType.FOE, Reason.NO_PROTOCOL)
+    assert reply.body[:6] == bytes.fromhex("0500 00800000")
+    (reply,) = asyncio.run(session().ask(MailboxType.SOE, bytes.fromhex("01 40 2000")))
+    assert (reply.type, reply.reason) == (MailboxType.SOE, Reason.NO_PROTOCOL)
+    assert reply.body == bytes.fromhex("12 40 2000 0110")
+    (reply,) = asyncio.run(session().ask(MailboxType.VOE, bytes(6)))
     assert (reply.type, reply.reason) == (MailboxType.ERR, Reason.NO_PROTOCOL)
     (reply,) = asyncio.run(session().ask(COE, b"\0"))
     assert (reply.type, reply.body) == (MailboxType.ERR, bytes.fromhex("0100 0600"))
