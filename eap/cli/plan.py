@@ -21,7 +21,7 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], as_json: bo
 
     Nothing is changed.  Exits with 1 when a station cannot become what the file says while it runs.
     """
-    from eap.appliance.commands.plant_change import plan_all, steps_to
+    from eap.appliance.commands.plant_change import plan_all, start_command, steps_to
     from eap.cli.plan_view import plan_lines
 
     with running_plant(plant, stations) as (link, wanted):
@@ -45,6 +45,7 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], as_json: bo
         for line in plan_lines(plans, order):
             write_text(line)
         if absent:
-            write_text(f"not running here: {', '.join(absent)}")
+            write_text(f"not running here: {', '.join(absent)}; start them with:")
+            write_text(f"  {start_command(plant, absent)}")
     if not is_possible:
         ctx.exit(ExitCode.FAILED)

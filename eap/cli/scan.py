@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from eap.cli.output import write_json, write_text
+from eap.cli.output import write_json, write_tables
 from eap.cli.params import examples, json_option, plant_option
 
 
@@ -23,7 +23,7 @@ def scan(via: str | None, plant: str | None, as_json: bool) -> None:
     on stderr.
     """
     from eap.appliance.commands import ams
-    from eap.cli.scan_view import fault_lines, scan_lines
+    from eap.cli.scan_view import fault_lines, scan_table  # rich; --help must not wait for it
 
     answers = ams.scan(plant, via)
     if as_json:
@@ -31,6 +31,6 @@ def scan(via: str | None, plant: str | None, as_json: bool) -> None:
         write_json({"stations": stations, "via": [answer["via"] for answer in answers]})
     for answer in answers:
         if not as_json:
-            write_text("\n".join(scan_lines(answer)))
+            write_tables([scan_table(answer)])
         for line in fault_lines(answer):
             click.echo(line, err=True)

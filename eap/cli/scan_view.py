@@ -1,6 +1,7 @@
 """Stations, ports and slaves as lines for people, with what to paste.
 
-Lines are as long as they have to be: a table that wraps them could not be pasted.
+On a terminal without room for the lines that connect pyads these are left out: a line that wraps
+could not be pasted.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple, TypeAlias
 
+from eap.cli.table import Column, TextTable
 from eap.codec.ams import DEVICE_PORT, SYSTEM_PORT
 
 Row: TypeAlias = dict[str, Any]
@@ -15,18 +17,21 @@ Row: TypeAlias = dict[str, Any]
 
 class _Line(NamedTuple):
     name: str
-    what: str
+    kind: str
     state: str
+    address: str
     client: str
 
 
-def scan_lines(answer: Row) -> Iterator[str]:
-    """Yield the lines of one plant: names as commands take them, and what connects pyads."""
-    lines = [line for station in answer["stations"] for line in _lines(station, answer["via"])]
-    widths = [max((len(line[column]) for line in lines), default=0) for column in range(3)]
-    for line in lines:
-        columns = (text.ljust(width) for text, width in zip(line, widths, strict=False))
-        yield "  ".join((*columns, line.client)).rstrip()
+def scan_table(answer: Row) -> TextTable:
+    """Return the table of one plant: names as commands take them, AMS addresses, lines of pyads."""
+    table = TextTable(
+        "Name", Column("What", rank=1), "State", "AMS address", Column("To paste", rank=2)
+    )
+    for station in answer["stations"]:
+        for line in _lines(station, answer["via"]):
+            table.add_row(*line)
+    return table
 
 
 def fault_lines(answer: Row) -> Iterator[str]:
@@ -40,29 +45,29 @@ def fault_lines(answer: Row) -> Iterator[str]:
 
 
 def client_line(net_id: str, port: int, address: str) -> str:
-    """Return what connects pyads to somebody; the AMS address alone without AMS/TCP."""
+    """Return the Python line that connects pyads to a device; empty without AMS/TCP."""
     if not address:
-        return f"{net_id}:{port}"
+        return ""
     return f'pyads.Connection("{net_id}", {port}, "{address}")'
 
 
 def _lines(station: Row, via: Row) -> Iterator[_Line]:
-    def client(net_id: str, port: int) -> str:
-        return client_line(net_id, port, via["address"])
+    def client(net_id: str, port: int) -> tuple[str, str]:
+        return f"{net_id}:{port}", client_line(net_id, port, via["address"])
 
     name = station["name"]
-    yield _Line(name, "router", _state(station), client(station["net_id"], SYSTEM_PORT))
+    yield _Line(name, "router", _state(station), *client(station["net_id"], SYSTEM_PORT))
     for port in station["ports"]:
         place = f"{name}/{port['name']}"
         what = f"  {port['kind']} {port['interface']}".rstrip()
-        yield _Line(place, what, _state(port), client(port["net_id"], DEVICE_PORT))
+        yield _Line(place, what, _state(port), *client(port["net_id"], DEVICE_PORT))
         for slave in port["slaves"]:
             number = slave["address"]
             yield _Line(
                 f"{place}/{number}",
                 f"    {slave['name']}",
                 slave["state"] or "?",
-                client(port["net_id"], number),
+                *client(port["net_id"], number),
             )
 
 

@@ -58,9 +58,7 @@ _BY_WIDTH = {
 _ALIASES = {
     "BOOLEAN": "BOOL",
     "BIT": "BIT1",
-    "FLOAT": "REAL",
     "REAL32": "REAL",
-    "DOUBLE": "LREAL",
     "REAL64": "LREAL",
     "VISIBLE_STRING": "STRING",
     "OCTET_STRING": "BLOCK",
@@ -75,6 +73,9 @@ _ALIASES = {
     },
 }
 
+_OF_OTHER_LANGUAGES = {"FLOAT": "REAL", "DOUBLE": "LREAL"}
+"""Names that no standard of the field has; the right name is suggested."""
+
 _SIZED: dict[str, Callable[[int], DataType]] = {
     "STRING": lambda size: String(f"STRING({size})", 0x09, size * 8, size),
     "BLOCK": lambda size: Block(f"BLOCK({size})", 0x0A, size * 8, size),
@@ -87,8 +88,8 @@ _IEC_ARRAY = re.compile(r"ARRAY\s*\[\s*(\d+)\s*\.\.\s*(\d+)\s*\]\s*OF\s+(\S.*)",
 def parse(text: str) -> DataType:
     """Return the type that *text* names: ``UINT``, ``REAL[4]``, ``STRING(16)``, ``BLOCK(600)``.
 
-    Upper and lower case are the same, and so are the IEC, the CANopen and the short names
-    (``UINT``, ``UNSIGNED16``, ``U16``).  ``ARRAY [0..3] OF REAL`` is read as ``REAL[4]``.
+    Upper and lower case are the same, as in IEC 61131-3, and so are the IEC, CANopen and short
+    names (``UINT``, ``UNSIGNED16``, ``U16``).  ``ARRAY [0..3] OF REAL`` is read as ``REAL[4]``.
 
     Raises:
         ValueError: there is no such type; the message says which one comes near.
@@ -111,7 +112,12 @@ def _scalar(text: str, name: str, length: str | None) -> DataType:
         return _NUMBERS[name]
     if name not in _SIZED:
         known = [*_NUMBERS, *_SIZED, *_ALIASES]
-        hint = near(name, known) or " (such as UINT, REAL[4] or STRING(16))"
+        meant = _OF_OTHER_LANGUAGES.get(name)
+        hint = (
+            f", did you mean {meant}?"
+            if meant
+            else near(name, known) or " (such as UINT, REAL[4] or STRING(16))"
+        )
         raise ValueError(f"{text!r} is not a data type{hint}")
     if length is None:
         raise ValueError(f"{text!r} lacks its length in octets, such as {name}(16)")

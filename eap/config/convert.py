@@ -140,8 +140,8 @@ class _Converter:
 
     def _enter(self, node: Node, path: str) -> None:
         if isinstance(node.value, dict):
-            for name, (line, _) in node.value.items():
-                self._report.lines[f"{path}.{name}" if path else name] = line
+            for name, (line, entry) in node.value.items():
+                self._report.enter(f"{path}.{name}" if path else name, line, entry)
 
     def _struct(self, node: Node, kind: inspect.StructType, path: str, key: str) -> Any:
         short = getattr(kind.cls, "SHORT", "")
@@ -194,7 +194,7 @@ class _Converter:
             meant = nearest(name, missing)
             if meant is not None:
                 given[meant] = node
-                self._report.lines[f"{path}.{meant}" if path else meant] = line
+                self._report.enter(f"{path}.{meant}" if path else meant, line, node)
         return given
 
     def _items(self, node: Node, kind: inspect.Type, path: str, key: str) -> tuple[Any, ...]:
@@ -205,7 +205,7 @@ class _Converter:
         found = []
         for position, item in enumerate(node.value):
             where = f"{path}[{position}]"
-            self._report.lines[where] = item.line
+            self._report.enter(where, item.line, item)
             try:
                 found.append(self.value(item, kind, where, f"item {position + 1} of {key}"))
             except _BrokenError:

@@ -61,14 +61,20 @@ class _UnreadableError(Exception):
 
 def read(path: Path, report: Report) -> Node | None:
     """Return the tree of the file at *path*; None, with findings, if it has none."""
+    text = ""
     try:
-        return _Builder(report).build(_text(path))
+        text = _text(path)
+        return _Builder(report).build(text)
     except _UnreadableError as exc:
         report.add("", str(exc), exc.expected, line=exc.line)
     except yaml.MarkedYAMLError as exc:
         mark = exc.problem_mark or exc.context_mark
+        line = mark.line + 1 if mark else 0
         what = " ".join(part for part in (exc.context, exc.problem) if part)
-        report.add("", f"not YAML: {what}", "valid YAML", line=mark.line + 1 if mark else 0)
+        if tab := _tab_in(text, line):
+            report.add("", f"line {line} {tab}", "spaces: YAML takes no tabs there", line=line)
+        else:
+            report.add("", f"not YAML: {what}", "valid YAML", line=line)
     except yaml.YAMLError as exc:
         report.add("", f"not YAML: {str(exc).splitlines()[0]}", "valid YAML", line=0)
     return None
@@ -96,6 +102,15 @@ def _text(path: Path) -> str:
         raise _UnreadableError(
             line, f"octet {octets[exc.start]:#04x} is no UTF-8", "UTF-8"
         ) from None
+
+
+def _tab_in(text: str, line: int) -> str:
+    """Return where *line* has a tab that YAML does not take; empty without one."""
+    lines = text.split("\n")
+    written = lines[line - 1] if 0 < line <= len(lines) else ""
+    if _TAB_INDENT.match(written):
+        return "begins with a tab"
+    return "has a tab behind '-', '?' or ':'" if _TAB_BEHIND_SIGN.search(written) else ""
 
 
 class _Open:
@@ -193,6 +208,8 @@ class _Builder:
                 merged.setdefault(key, entry)
 
 
+_TAB_INDENT = re.compile(r" *\t")
+_TAB_BEHIND_SIGN = re.compile(r"(^|\s)[-?:] *\t|: *\t")
 _NULL = {"", "~", "null", "Null", "NULL"}
 _BOOL = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _INT = re.compile(r"[-+]?\d{1,100}|0x[0-9a-fA-F]{1,100}|0o[0-7]{1,100}", re.ASCII)

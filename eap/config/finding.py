@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import msgspec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from eap.config.document import Node
+
+_VARYING = re.compile(r"'[^']*'|\S*\d\S*|, did you mean [^?]*\?")
+"""Parts of a message that differ from one use of an anchor to the next."""
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -30,23 +36,37 @@ class Report:
     """Collects findings and knows the line of every path of the file.
 
     *broken* holds the names of items that could not be read: whoever refers to one of them is not
-    blamed for it.
+    blamed for it.  *stations* are the names of the stations, as far as they are known.
+
+    A part of the file that is used in several places, by an anchor, is wrong once: the finding of
+    its first place says how many more there are.
     """
 
     def __init__(self, file: str) -> None:
         self.file = file
         self.lines: dict[str, int] = {}
         self.broken: set[str] = set()
+        self.stations: set[str] = set()
+        self._nodes: dict[str, Node] = {}
         self._findings: dict[tuple[int, str, str], Finding] = {}
+        self._first_use: dict[tuple[int, str, str], Finding] = {}
+        self._further_uses: dict[Finding, set[str]] = {}
         self._adopted: list[Finding] = []
+
+    def enter(self, path: str, line: int, node: Node) -> None:
+        """Remember that *path* leads to *node*, in *line*."""
+        self.lines[path] = line
+        self._nodes[path] = node
 
     def add(self, path: str, message: str, expected: str, *, line: int | None = None) -> None:
         """Report *message* at *path*; without *line* the one of the path or of what holds it."""
         where = self.line_of(path) if line is None else line
-        # An anchor used at many places is wrong once.
-        self._findings.setdefault(
-            (where, message, expected), Finding(self.file, where, path, message, expected)
-        )
+        finding = Finding(self.file, where, path, message, expected)
+        first = self._first_use.setdefault(self._cause(path, message), finding)
+        if first.path != path:
+            self._further_uses.setdefault(first, set()).add(path)
+        else:
+            self._findings.setdefault((where, message, expected), finding)
 
     def adopt(self, findings: Iterable[Finding]) -> None:
         """Take over what is wrong with another file."""
@@ -54,18 +74,43 @@ class Report:
 
     def has(self, path: str) -> bool:
         """Tell whether something is wrong at *path* itself."""
-        return any(finding.path == path for finding in self._findings.values())
+        return any(finding.path == path for finding in self._findings.values()) or any(
+            path in paths for paths in self._further_uses.values()
+        )
 
     def line_of(self, path: str) -> int:
         """Return the line of *path*, or of the nearest thing around it that the file has."""
         while path and path not in self.lines:
-            path = path[: max(path.rfind("."), path.rfind("["), 0)]
+            path = _parent(path)
         return self.lines.get(path, 0)
+
+    def _cause(self, path: str, message: str) -> tuple[int, str, str]:
+        """Return what the findings of one part of the file have in common in all its places."""
+        known = path
+        while known and known not in self._nodes:
+            known = _parent(known)
+        if not known:
+            return 0, path, message
+        words = (word for word in message.split() if word.strip(":,") not in self.stations)
+        shape = _VARYING.sub("", " ".join(words))
+        return id(self._nodes[known]), path.removeprefix(known), shape
 
     def findings(self) -> tuple[Finding, ...]:
         """Return all findings in the order of the file, then those of other files."""
-        own = sorted(self._findings.values(), key=lambda finding: finding.line)
+        own = sorted(map(self._with_uses, self._findings.values()), key=lambda each: each.line)
         return (*own, *self._adopted)
+
+    def _with_uses(self, finding: Finding) -> Finding:
+        further = len(self._further_uses.get(finding, ()))
+        if not further:
+            return finding
+        places = "place" if further == 1 else "places"
+        message = f"{finding.message} (and in {further} more {places}, by an anchor)"
+        return msgspec.structs.replace(finding, message=message)
+
+
+def _parent(path: str) -> str:
+    return path[: max(path.rfind("."), path.rfind("["), 0)]
 
 
 def one_of(known: Iterable[str]) -> str:

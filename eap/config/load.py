@@ -65,6 +65,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     plant_file = None if root is None else convert(root, report)
     if plant_file is None:
         return LoadResult(None, report.findings())
+    report.stations |= {station.name for station in plant_file.stations}
     index = Index(plant_file, describe_buses(plant_file, path.parent, describe_bus, report))
     check_ports(index, report)
     check_gateways(index, report)

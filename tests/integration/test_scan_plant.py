@@ -101,7 +101,7 @@ def test_one_connection_lists_every_port_and_slave(row: Row) -> None:
 
 def check_lines_to_paste(row: Row) -> None:
     pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
-    lines = row.eapctl("scan").stdout.splitlines()
+    _, _, *lines = row.eapctl("scan").stdout.splitlines()
     assert len(lines) == COUNT * (3 + len(SLAVES))
     (line,) = (each for each in lines if each.startswith(f"{name(COUNT)}/bus0/1002 "))
     (client,) = re.findall(r"pyads\.Connection\(.*\)", line)

@@ -8,6 +8,7 @@ Rule 3: what a station refuses ends it, unless told to go on with the other stat
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
@@ -49,7 +50,8 @@ def choose(plant: Plant, link: PlantLink, wanted: Sequence[str]) -> dict[str, St
     """Return the specifications of *wanted* stations, of all that run here if it is empty.
 
     Raises:
-        ConfigError: the plant has no such station, or it does not run here.
+        ConfigError: the plant has no such station, or it does not run here; the message has the
+            command that starts it.
     """
     known = {station.name: station for station in plant.stations}
     for name in wanted:
@@ -57,8 +59,19 @@ def choose(plant: Plant, link: PlantLink, wanted: Sequence[str]) -> dict[str, St
             raise ConfigError(f"plant {plant.name} has no station {name!r}{near(name, known)}")
         if name not in link.stations:
             running = ", ".join(link.stations)
-            raise ConfigError(f"station {name} does not run here; of its plant run {running}")
+            raise ConfigError(
+                f"station {name} does not run here; of its plant run {running};"
+                f" start it with '{start_command(link.file, [name])}'"
+            )
     return {name: known[name] for name in wanted or link.stations}
+
+
+def start_command(file: Path, stations: Iterable[str]) -> str:
+    """Return the command that runs *stations* of a plant file."""
+    words = ["eapctl", "run", str(file)]
+    for name in stations:
+        words += ["--station", name]
+    return shlex.join(words)
 
 
 def plan_all(link: PlantLink, wanted: Mapping[str, StationSpec]) -> list[StationPlan]:

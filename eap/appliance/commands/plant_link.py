@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,6 +71,7 @@ class PlantLink:
         routing: What it says of their routers.
 
     Attributes:
+        file: The plant file, as it was named.
         routing: Asks about routers.
     """
 
@@ -82,6 +84,7 @@ class PlantLink:
     ) -> None:
         self.routing = RoutingLink(self._ask, routing)
         self._clients = clients
+        self.file = file
         self._file = str(file.resolve())
         self.absent = absent
 
@@ -139,8 +142,9 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
     try:
         found = {name: each for each in clients for name in each.info.stations if name in names}
         if not found:
+            command = shlex.join(["eapctl", "run", str(file)])
             raise ControlError(
-                f"no station of plant {plant.name} runs here: start them with 'eapctl run {file}'",
+                f"no station of plant {plant.name} runs here: start them with '{command}'",
                 code=ErrorCode.UNAVAILABLE,
             )
         order = [station.name for station in plant.stations]

@@ -46,10 +46,11 @@ class RoutesApp(App[None]):
         Binding("d,delete", "remove", "Remove", key_display="d"),
         Binding("t,enter", "test", "Test", key_display="t"),
         Binding("slash", "filter", "Filter", key_display="/"),
-        Binding("s", "station", "Station"),
-        Binding("r", "view('routes')", "Routes"),
-        Binding("c", "view('connections')", "Conns"),
-        Binding("w", "view('warnings')", "Warn"),
+        Binding("s", "station", "Station", show=False),  # the line of the views names these four
+        Binding("r", "view('routes')", "Routes", show=False),
+        Binding("c", "view('connections')", "Connections", show=False),
+        Binding("w", "view('warnings')", "Warnings", show=False),
+        Binding("question_mark,f1", "help", "Help", key_display="?"),
         Binding("q,ctrl+c", "quit", "Quit", key_display="q"),
     ]
 
@@ -141,10 +142,11 @@ class RoutesApp(App[None]):
         }
         parts = [
             f"[@click=app.view('{view}')]{'[reverse]' if view is self._view else ''}"
-            f" {view.capitalize()} {counts[view]} {'[/]' if view is self._view else ''}[/]"
+            f" {view[0]} {view.capitalize()} {counts[view]} "
+            f"{'[/]' if view is self._view else ''}[/]"
             for view in View
         ]
-        parts.append(f"[@click=app.station()] Station: {self._station} [/]")
+        parts.append(f"[@click=app.station()] s {self._station} [/]")
         if self._match:
             parts.append(f"[@click=app.filter()] Filter: {self._match.replace('[', '')} [/]")
         self.query_one("#views", Static).update("".join(parts))
@@ -155,6 +157,10 @@ class RoutesApp(App[None]):
             Text(part, style=STYLES[style]) for part, style in detail(self.query_one(Grid).chosen)
         )
         self.query_one("#said", Static).update(text)
+
+    def action_help(self) -> None:
+        """Show what each key does."""
+        self._tell("Keys", _HELP)
 
     def action_view(self, view: str) -> None:
         """Show routes, connections or warnings."""
@@ -278,6 +284,18 @@ class RoutesApp(App[None]):
     def _tell(self, title: str, text: str) -> None:
         self.push_screen(Message(title, text))
 
+
+_HELP = """\
+↑ ↓      choose a row
+t Enter  test the chosen route: ask its station for its state
+a        add a route
+e d      edit or remove a route that was added
+/        show only rows that have a text in them; Esc ends that
+s        show one station after the other, then all
+r c w    show routes, connections, warnings
+? F1     this help
+q        quit
+Left out columns: a wider terminal shows them."""
 
 _KEPT_ELSEWHERE = {
     "static": "Route {name} is in the plant file: change it there.",

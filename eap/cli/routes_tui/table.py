@@ -5,7 +5,7 @@ Pure: records in, texts out.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -14,6 +14,8 @@ from eap.cli import routes_text
 from eap.cli.routes_tui.link import Router
 
 _GAP = 1
+_READABLE = 12
+"""A text is not cut to less than that while another column can be left out."""
 
 
 class View(StrEnum):
@@ -32,14 +34,14 @@ class Column(NamedTuple):
         least: Characters without which it is useless.
         most: Characters that it never needs more of; 0 takes what is left.
         is_number: Whether it stands on the right.
-        is_extra: Whether it is left out on a narrow screen.
+        rank: 0 is always shown; where there is no room, the highest rank is left out first.
     """
 
     heading: str
     least: int
     most: int
     is_number: bool = False
-    is_extra: bool = False
+    rank: int = 0
 
 
 class Line(NamedTuple):
@@ -59,27 +61,27 @@ COLUMNS = {
     View.ROUTES: (
         _STATION,
         Column("Route", 8, 20),
-        Column("NetID", 11, 23),
-        Column("Door", 7, 16),
+        Column("NetID", 11, 23, rank=1),
+        Column("Door", 7, 16, rank=3),
         Column("State", 5, 7),
-        Column("Trip", 7, 8, is_number=True),
-        Column("Asked", 5, 5, is_number=True),
-        Column("Octets", 6, 6, is_number=True),
+        Column("Trip", 7, 8, is_number=True, rank=2),
+        Column("Asked", 5, 5, is_number=True, rank=4),
+        Column("Octets", 6, 6, is_number=True, rank=5),
         Column("Errors", 6, 6, is_number=True),
-        Column("Address", 12, 21, is_extra=True),
-        Column("Origin", 7, 7, is_extra=True),
-        Column("Last error", 20, 0, is_extra=True),
+        Column("Address", 12, 21, rank=6),
+        Column("Origin", 7, 7, rank=7),
+        Column("Last error", 20, 0, rank=8),
     ),
     View.CONNECTIONS: (
         _STATION,
         Column("Connection", 16, 26),
-        Column("Door", 7, 16),
-        Column("NetIDs", 12, 23),
-        Column("For", 6, 8, is_number=True),
+        Column("Door", 7, 16, rank=3),
+        Column("NetIDs", 12, 23, rank=1),
+        Column("For", 6, 8, is_number=True, rank=2),
         Column("Asked", 5, 5, is_number=True),
-        Column("Octets", 6, 6, is_number=True),
+        Column("Octets", 6, 6, is_number=True, rank=4),
         Column("Errors", 6, 6, is_number=True),
-        Column("Last error", 20, 0, is_extra=True),
+        Column("Last error", 20, 0, rank=5),
     ),
     View.WARNINGS: (_STATION, Column("Warning", 30, 0)),
 }
@@ -109,31 +111,45 @@ def fit(
 ) -> list[tuple[int, Column, int]]:
     """Return number, column and width of what *width* characters have room for.
 
-    Columns are as wide as they need to be; where that is too wide, texts give way, the longest
-    first.
+    Columns are as wide as they need to be.  Where that is too wide, long texts give way, the
+    longest first; but before they become unreadable, the columns of the highest rank are left out.
     """
-    chosen = []
-    left = width
-    for number, column in enumerate(COLUMNS[view]):
-        if column is _STATION and not has_station:
-            continue
-        if column.is_extra and left < column.least + _GAP:
+    chosen = {
+        number: column
+        for number, column in enumerate(COLUMNS[view])
+        if has_station or column is not _STATION
+    }
+    while (sizes := _sizes(chosen, found)) and _total(
+        min(size, _READABLE) for size in sizes.values()
+    ) > width:
+        worst = max(chosen, key=lambda number: chosen[number].rank)
+        if not chosen[worst].rank:
             break
-        needed = max((len(line.cells[number]) for line in found), default=0)
-        needed = max(needed, len(column.heading), column.least if column.is_number else 0)
-        size = min(needed, column.most) if column.most else max(left - _GAP, column.least)
-        if column.is_extra:
-            size = min(size, left - _GAP)
-        chosen.append((number, column, size))
-        left -= size + _GAP
-    sizes = [size for _, _, size in chosen]
-    while sum(sizes) + _GAP * len(sizes) > width:
-        spare = [size - each[1].least for size, each in zip(sizes, chosen, strict=True)]
-        widest = max(range(len(spare)), key=lambda each: (spare[each], sizes[each]))
+        del chosen[worst]
+    while (excess := _total(sizes.values()) - width) > 0:
+        spare = {number: size - chosen[number].least for number, size in sizes.items()}
+        widest = max(spare, key=lambda number: (spare[number], sizes[number]))
         if spare[widest] <= 0:
             break
         sizes[widest] -= 1
-    return [(*each[:2], size) for each, size in zip(chosen, sizes, strict=True)]
+    last = next(reversed(chosen))
+    if not chosen[last].most and excess < 0:
+        sizes[last] -= excess
+    return [(number, column, sizes[number]) for number, column in chosen.items()]
+
+
+def _sizes(chosen: Mapping[int, Column], found: Sequence[Line]) -> dict[int, int]:
+    """Return the width that each column needs, between its bounds."""
+    sizes = {}
+    for number, column in chosen.items():
+        needed = max((len(line.cells[number]) for line in found), default=0)
+        needed = max(needed, len(column.heading), column.least if column.is_number else 0)
+        sizes[number] = min(needed, column.most) if column.most else column.least
+    return sizes
+
+
+def _total(sizes: Iterable[int]) -> int:
+    return sum(size + _GAP for size in sizes)
 
 
 def cut(text: str, size: int, *, is_number: bool) -> str:

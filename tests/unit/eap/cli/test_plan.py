@@ -78,7 +78,11 @@ def test_stations_elsewhere(file, runtime):
         PlantStub("ring", specs[1:], stack)
         assert plan(file).output.splitlines() == [
             "nothing differs: all 2 stations are as the file says",
-            "not running here: station-01",
+            "not running here: station-01; start them with:",
+            f"  eapctl run {file} --station station-01",
         ]
+        refused = plan(file, "--station", "station-01")
+        assert refused.exit_code == 2
+        assert refused.stderr.endswith(f"start it with 'eapctl run {file} --station station-01'\n")
         assert json.loads(plan(file, "--json").output)["absent"] == ["station-01"]
         assert json.loads(plan(file, "--json", "--station", "station-02").output)["absent"] == []

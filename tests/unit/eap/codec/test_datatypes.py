@@ -56,8 +56,8 @@ def test_base_type(text: str) -> None:
         *((name, "INT24") for name in ("I24", "INTEGER24")),
         *((name, "UINT24") for name in ("U24", "UNSIGNED24")),
         *((name, "ULINT") for name in ("U64", "UINT64", "UNSIGNED64")),
-        *((name, "REAL") for name in ("REAL32", "float")),
-        *((name, "LREAL") for name in ("REAL64", "double")),
+        *((name, "REAL") for name in ("REAL32", "Real")),
+        *((name, "LREAL") for name in ("REAL64", "lreal")),
         ("visible_string(3)", "STRING(3)"),
         ("OCTET_STRING( 3 )", "BLOCK(3)"),
         (" u16 [ 8 ] ", "UINT[8]"),
@@ -117,3 +117,11 @@ def test_types_are_shared_and_cannot_be_changed() -> None:
     assert parse("UINT") is parse("UINT")
     with pytest.raises(AttributeError):
         parse("UINT").size = 3
+
+
+@pytest.mark.parametrize(("name", "meant"), [("FLOAT", "REAL"), ("Double", "LREAL")])
+def test_type_names_of_other_languages_are_refused_with_the_right_one(
+    name: str, meant: str
+) -> None:
+    with pytest.raises(ValueError, match=f"'{name}' is not a data type, did you mean {meant}\\?"):
+        parse(name)

@@ -139,3 +139,24 @@ def test_no_content_is_a_traceback(tmp_path_factory, content):
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     report = Report("p.yaml")
     assert read(path, report) is not None or report.findings()
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "what"),
+    [
+        ("plant: x\nvariables:\n    a: REAL\n\t  b: REAL\n", 4, "line 4 begins with a tab"),
+        ("plant: x\nstations:\n\t- name: a\n", 3, "line 3 begins with a tab"),
+        ("\tplant: x\n", 1, "line 1 begins with a tab"),
+        ("a:\n  -\t{b: c}\n", 2, "line 2 has a tab behind '-', '?' or ':'"),
+    ],
+)
+def test_document_with_a_tab_as_indentation_is_refused_in_words(
+    tree, text: str, line: int, what: str
+) -> None:
+    expected = "spaces: YAML takes no tabs there"
+    assert tree(text) == (None, [f"p.yaml:{line}: {what}; expected {expected}"])
+
+
+def test_document_with_tabs_that_yaml_takes_is_read(tree) -> None:
+    node, findings = tree("a:\tb\nc: [1,\n\t2]\n")
+    assert (plain(node), findings) == ({"a": "b", "c": [1, 2]}, [])

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from eap.config.document import Node
 from eap.config.finding import Finding, Report, one_of
 
 
@@ -48,3 +49,42 @@ def test_a_report_knows_where_something_is_wrong():
     report.add("a.b", "first", "x", line=2)
     assert report.has("a.b")
     assert not report.has("a")
+
+
+def shared_report():
+    """Return the report of two stations that share a mapping with the keys a and b."""
+    report = Report("p.yaml")
+    report.stations |= {"oven", "press"}
+    a, b = Node(2, 1), Node(2, 2)
+    for number in range(2):
+        report.enter(f"stations[{number}].a", 2, a)
+        report.enter(f"stations[{number}].b", 2, b)
+    return report
+
+
+def test_finding_of_an_anchor_is_reported_once_with_the_number_of_its_places():
+    report = shared_report()
+    report.add("stations[0].a", "station oven has no port 'x', did you mean y?", "one of y")
+    report.add("stations[1].a", "station press has no port 'x'", "one of z")
+    (finding,) = report.findings()
+    assert str(finding) == (
+        "p.yaml:2: station oven has no port 'x', did you mean y?"
+        " (and in 1 more place, by an anchor); expected one of y"
+    )
+    assert report.has("stations[0].a")
+    assert report.has("stations[1].a")
+
+
+def test_different_findings_of_an_anchor_are_all_reported():
+    report = shared_report()
+    report.add("stations[0].a", "unknown key 'a'", "b")
+    report.add("stations[0].b", "unknown key 'b'", "a")
+    report.add("stations[1].a", "a is too small", "5")
+    assert len(report.findings()) == 3
+
+
+def test_findings_of_one_place_are_never_merged():
+    report = shared_report()
+    report.add("stations[0].a", "nothing is called 'x'", "y")
+    report.add("stations[0].a", "nothing is called 'z'", "y")
+    assert len(report.findings()) == 2

@@ -133,3 +133,22 @@ def test_no_content_is_a_traceback(tmp_path_factory, changes):
     path.write_text(" ".join(words))
     result = load_shipped(path)
     assert (result.plant is None) == bool(result.findings)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "count"),
+    [
+        ("timeout_ms: 50, substitute", "timeout_sm: 50, substitute", 1),
+        ("timeout_ms: 50, substitute", "timeout_ms: 3, substitute", 1),
+        ("pieces: {kind: counter}", "pieces: {kind: conuter}", 1),
+        ("pieces: {kind: counter}", "peices: {kind: counter}", 1),
+    ],
+)
+def test_fault_in_an_anchor_is_one_finding(tmp_path: Path, old: str, new: str, count: int) -> None:
+    text = (PLANTS / "solar-line.yaml").read_text()
+    assert text.count(old) == 1
+    path = tmp_path / "line.yaml"
+    path.write_text(text.replace(old, new))
+    findings = load_shipped(path).findings
+    assert len(findings) == count, [str(each) for each in findings]
+    assert "more places, by an anchor)" in findings[0].message

@@ -45,7 +45,7 @@ def test_everything_fits_80_by_24(stub):
         shown = screen.text().splitlines()
         assert len(shown) == 24
         assert shown[0] == " line, 2 stations: 2 routes, 1 down, 1 connection, 1 warning"
-        assert shown[1] == " Routes 2  Connections 1  Warnings 1  Station: all stations"
+        assert shown[1] == " r Routes 2  c Connections 1  w Warnings 1  s all stations"
         assert shown[2].split() == [
             "Station", "Route", "NetID", "Door", "State", "Trip", "Asked", "Octets", "Errors"
         ]  # fmt: skip
@@ -56,11 +56,36 @@ def test_everything_fits_80_by_24(stub):
         assert shown[16] == " island-02  127.0.1.2.*.*  127.0.1.2:34980 by udp:eap0"
         assert shown[17] == " derived; up: round trip 840 µs"
         assert "READ 127.0.1.2.2.1:65535 < 127.0.0.1.1.1:32905: 1.2 ms" in shown[19]
-        assert shown[23] == (
-            "a Add e Edit d Remove t Test / Filter s Station r Routes c Conns w Warn q Quit"
-        )
+        assert shown[23] == "a Add e Edit d Remove t Test / Filter ? Help q Quit"
 
     run(script)
+
+
+def test_everything_fits_60_by_15(stub):
+    async def script(screen):
+        shown = screen.text().splitlines()
+        assert len(shown) == 15
+        assert shown[1] == " r Routes 2  c Connections 1  w Warnings 1  s all stations"
+        assert shown[2].split() == ["Station", "Route", "NetID", "State", "Trip", "Errors"]
+        assert shown[3].split() == [
+            "island-01", "island-02", "127.0.1.2.*.*", "up", "840", "µs", "0"
+        ]  # fmt: skip
+        assert shown[14] == "a Add e Edit d Remove t Test / Filter ? Help q Quit"
+        assert not any("…" in line for line in shown[1:8])
+
+    run(script, (60, 15))
+
+
+@pytest.mark.parametrize("key", ["question_mark", "f1"])
+@pytest.mark.parametrize("size", [(80, 24), (60, 15)])
+def test_keys_are_explained(stub, key, size):
+    async def script(screen):
+        shown = await screen.press(key)
+        for words in ("? F1     this help", "r c w    show routes, connections, warnings"):
+            assert words in shown
+        assert "this help" not in await screen.press("escape")
+
+    run(script, size)
 
 
 def test_cursor_tells_of_its_row(stub):

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from eap.cli.routes_tui.link import Router
-from eap.cli.routes_tui.table import COLUMNS, View, cut, detail, fit, lines
+from eap.cli.routes_tui.table import View, cut, detail, fit, lines
 from tests.support.fakeroutes import ISLAND, FakeRoutes
 
 ROUTER = Router("line", FakeRoutes().stations["island-01"])
@@ -41,8 +41,12 @@ def test_long_texts_give_way_to_their_least(view: View, width: int) -> None:
     routes = msgspec.structs.replace(ROUTER.routes, station="station-of-cell-17", routes=[names])
     found = lines(view, [ROUTER._replace(routes=routes)], "")
     fitted = fit(view, found, width, has_station=True)
-    least = sum(column.least + 1 for column in COLUMNS[view] if not column.is_extra)
-    assert sum(size + 1 for _, _, size in fitted) <= max(width, least)
+    assert sum(size + 1 for _, _, size in fitted) <= width
+
+
+def test_columns_are_left_out_on_narrow_screens_before_names_are_cut() -> None:
+    found = widths(View.ROUTES, 60)
+    assert found == {"Station": 9, "Route": 9, "NetID": 13, "State": 5, "Trip": 7, "Errors": 6}
 
 
 @pytest.mark.parametrize(
