@@ -1,17 +1,20 @@
 """What holds for every test: the hypothesis profile, who is skipped and why, and who runs alone.
 
-Tests marked ``net`` open sockets and start processes, on fixed addresses and with an eye on the
-clock.  They come after all others; under xdist, where each file has one worker (``--dist
-loadfile``), the other workers wait while a file of them runs.
+Tests marked ``net`` open sockets and start processes, on fixed addresses; they come after all
+others.  Under xdist, where each file has one worker (``--dist loadfile``), every worker has a
+network namespace of its own where it may make one.  Tests marked ``quiet`` judge time: the other
+workers wait while one of them runs, as they do for each ``net`` test without namespaces.
 """
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import gc
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -45,7 +48,10 @@ os.environ.pop("COLUMNS", None)
 _CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_SYS_ADMIN": 21}
 """What a network namespace with a veth pair and a raw socket takes: name to bit."""
 
-_TURN = os.open(__file__, os.O_RDONLY)  # only ever locked: shared by the rest, exclusive for net
+_CLONE_NEWNET = 0x40000000
+
+_TURN = os.open(__file__, os.O_RDONLY)  # only ever locked, as is the next one
+_QUEUE = os.open(Path(__file__).parent / "support" / "eventually.py", os.O_RDONLY)
 
 
 def _lacks_root() -> str | None:
@@ -66,6 +72,24 @@ def _lacks_program(name: str, *, package: str) -> str | None:
     return None
 
 
+def _enter_own_network() -> bool:
+    """Give this worker a network namespace of its own, where its fixed addresses are free.
+
+    Returns:
+        Whether it has one; without the privilege it shares the network of all others.
+    """
+    if _lacks_root() is not None:
+        return False
+    library = ctypes.CDLL(None, use_errno=True)
+    if library.unshare(_CLONE_NEWNET):
+        return False
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    return True
+
+
+_HAS_OWN_NETWORK = "PYTEST_XDIST_WORKER" in os.environ and _enter_own_network()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def state_dir_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep configurations away from the user's own; for appliances that several tests share."""
@@ -82,12 +106,16 @@ def state_dir(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     return path
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Run two workers a core: most of what tests of running plants do is to wait."""
+    return min(2 * (os.cpu_count() or 1), 8)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what this machine cannot do, and put the ``net`` tests last.
+    """Skip what this machine cannot do, and begin with the files that take longest.
 
-    Those of the tools are first: their files take longest, and a worker that has the last one would
-    keep the others waiting.
+    A worker that has the last long file would keep the others waiting.
     """
     missing = {
         "root": _lacks_root(),
@@ -110,21 +138,28 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(
-    item: pytest.Item, nextitem: pytest.Item | None
-) -> Generator[None, object, object]:
-    """Under xdist, let a file of ``net`` tests have the machine to itself, its fixtures included.
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Under xdist, let a test that judges time have the machine to itself.
 
     Outside pytest-timeout's wrapper, so that waiting for a turn costs no test its time.
     """
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return (yield)
-    fcntl.flock(_TURN, fcntl.LOCK_EX if _is_net(item) else fcntl.LOCK_SH)
+    # Who waits for the exclusive lock holds the queue, so that no further test begins meanwhile.
+    fcntl.flock(_QUEUE, fcntl.LOCK_EX)
+    fcntl.flock(_TURN, fcntl.LOCK_EX if _needs_machine(item) else fcntl.LOCK_SH)
+    fcntl.flock(_QUEUE, fcntl.LOCK_UN)
     try:
         return (yield)
     finally:
-        if not (_is_net(item) and nextitem is not None and nextitem.path == item.path):
-            fcntl.flock(_TURN, fcntl.LOCK_UN)
+        fcntl.flock(_TURN, fcntl.LOCK_UN)
+
+
+def _needs_machine(item: pytest.Item) -> bool:
+    """Tell whether nothing may run beside *item*: it judges time, or shares addresses."""
+    if item.get_closest_marker("quiet") is not None:
+        return True
+    return _is_net(item) and not _HAS_OWN_NETWORK
 
 
 def _is_net(item: pytest.Item) -> bool:

@@ -131,6 +131,7 @@ def ask_for_a_while(sock: socket.socket) -> list[float]:
     return took
 
 
+@pytest.mark.quiet
 def test_others_are_served_memory_is_bounded_and_the_engine_undisturbed(
     appliance: Appliance,
 ) -> None:

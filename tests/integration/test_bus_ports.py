@@ -104,6 +104,7 @@ def test_two_buses_of_one_station(running):
     wait_until(lambda: running.values("one")["bus0.buttons.lamp"] is False)
 
 
+@pytest.mark.quiet
 def test_engine_that_is_killed(running):
     set_output(running, "bus0.buttons.valve", True)
     wait_until(lambda: running.values("one")["bus0.buttons.echo"] is True)
@@ -144,6 +145,7 @@ def test_services_that_are_killed_disturb_no_bus(running):
     wait_until(lambda: is_op(running, "bus0", "bus1"))
 
 
+@pytest.mark.quiet
 def test_nothing_is_left_in_time(running):
     pids = [*segments(running).values(), running.pid("engine"), running.pid("services")]
     took_s = wait_until(lambda: running.stop()[0] == 0)

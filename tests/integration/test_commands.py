@@ -149,6 +149,7 @@ def test_status_for_people_fits(
     assert all(name in done.stdout for name in ISLANDS)
 
 
+@pytest.mark.quiet
 def test_two_appliances_are_one_answer_and_end_when_told() -> None:
     """Two halves of a plant share a runtime directory, as two commands of one user do."""
     with plants() as folder:

@@ -54,6 +54,7 @@ def quiet(appliance: Appliance, station: str) -> dict[str, Any]:
     return rx
 
 
+@pytest.mark.quiet
 @pytest.mark.timeout(DURATION_S + 60)
 def test_nothing_is_lost_at_one_millisecond(pair: tuple[Appliance, Appliance]) -> None:
     left, right = pair
@@ -108,6 +109,7 @@ def test_a_cable_is_cut_and_restored(
         assert [before[p]["pid"] for p in before] == [after[p]["pid"] for p in after]
 
 
+@pytest.mark.quiet
 def test_a_killed_engine_is_missed_for_its_true_length(
     pair: tuple[Appliance, Appliance], ends: tuple[Namespace, Namespace]
 ) -> None:

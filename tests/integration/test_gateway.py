@@ -143,6 +143,7 @@ def test_writing_to_all_needs_a_rule(gateway: Wire) -> None:
     assert [gateway.receive()[8:] for _ in range(5)] == [denied] * 5
 
 
+@pytest.mark.quiet
 def test_who_is_not_there_and_who_says_nothing(gateway: Wire) -> None:
     assert gateway.talk(COE, 1777, VENDOR) == abort(0x1018, 1, NO_OBJECT)
     assert gateway.talk(COE, COUPLER, VENDOR) == abort(0x1018, 1, LOCAL)

@@ -72,6 +72,7 @@ def stale(appliance: Appliance, station: str) -> int:
     return int(appliance.station(station)["discarded"].get("stale", 0))
 
 
+@pytest.mark.quiet
 def test_a_killed_engine_leaves_a_gap_of_its_true_length(
     both: tuple[Appliance, Appliance], witness: Listener
 ) -> None:
@@ -121,6 +122,7 @@ def test_killed_services_leave_no_gap(both: tuple[Appliance, Appliance], witness
     assert (processes["engine"]["restarts"], processes["services"]["restarts"]) == (0, 3)
 
 
+@pytest.mark.quiet
 def test_an_engine_that_does_not_get_up_ends_the_start_in_one_line(farm: Plants) -> None:
     appliance = farm.start(farm.write(PLANT))
     engine = 0

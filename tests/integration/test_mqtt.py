@@ -62,6 +62,7 @@ def test_slaves_are_reached_both_ways_and_only_read(halls):
         assert refused.value.err_code == DENIED
 
 
+@pytest.mark.quiet
 def test_broker_is_restarted_in_mid_run_and_service_resumes(halls, server):
     until_read(SOUTH, by=NORTH)
     server.stop()

@@ -139,7 +139,8 @@ def test_unicast_over_ethernet_goes_to_its_address_only(farm: Plants) -> None:
         far = farm.run(path, "--station", "far", prefix=there.prefix)
         near = farm.run(path, "--station", "source", "--station", "near", prefix=here.prefix)
         assert_hears(far, "far", "source")
-        assert near.station("near")["discarded"] == {}
+        # Stale is what came before the engine was ready, such as questions to all routers.
+        assert near.station("near")["discarded"].keys() <= {"stale"}
 
 
 @pytest.mark.root

@@ -155,6 +155,7 @@ def test_answers_come_back_on_the_connection_of_the_request(farm: Plants) -> Non
             assert set(row["reason"]) == {"poll"}
 
 
+@pytest.mark.quiet
 @pytest.mark.root
 @pytest.mark.parametrize("transport", ["ethernet", "udp"])
 def test_quality_is_the_captured_response_time(farm: Plants, transport: str) -> None:

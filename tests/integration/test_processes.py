@@ -151,6 +151,7 @@ def assert_sorted_by_the_kernel() -> None:
     assert discarded().get("wrong_type", 0) == 0
 
 
+@pytest.mark.quiet
 def test_life_of_an_appliance(plant):
     running = Appliance(plant)
     assert running.wait_ready() == {"ready": True, "stations": ["left", "right"]}
@@ -191,6 +192,7 @@ def test_values_move_and_can_be_set(appliance):
         assert 0 <= loads[0] <= 100
 
 
+@pytest.mark.quiet
 def test_a_killed_engine_is_back_within_a_second_and_counts_on(appliance):
     before = status()
     engine = before["processes"]["engine"]["pid"]

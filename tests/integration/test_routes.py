@@ -78,6 +78,7 @@ def test_two_hops(farm: Plants, scheme: str) -> None:
         assert other.ask(TARGET, aoe.READ_STATE, b"") == (0, struct.pack("<IHH", 0, 15, 2))
 
 
+@pytest.mark.quiet
 @pytest.mark.parametrize("scheme", ["udp", "tcp"])
 def test_dead_hop_is_answered_for_at_once_and_comes_back(farm: Plants, scheme: str) -> None:
     _, middle, west = start(farm, scheme, "east", "middle", "west")
@@ -98,6 +99,7 @@ def test_dead_hop_is_answered_for_at_once_and_comes_back(farm: Plants, scheme: s
     assert "0x1b" in text
 
 
+@pytest.mark.quiet
 def test_unknown_and_circles_are_answered_and_named(farm: Plants) -> None:
     """The route to north runs in a circle through all stations."""
     _, _, west = start(farm, "udp", "east", "middle", "west")
@@ -119,6 +121,7 @@ def test_unknown_and_circles_are_answered_and_named(farm: Plants) -> None:
     assert "routes to 127.9.70.4.2.1 run in a circle" in text
 
 
+@pytest.mark.quiet
 def test_hop_that_swallows_everything(farm: Plants) -> None:
     """The one that waits is answered before clients give up; those that are too many at once."""
     (west,) = start(farm, "udp", "west")

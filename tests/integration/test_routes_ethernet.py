@@ -171,6 +171,7 @@ def test_each_station_on_the_way_judges(line: Row) -> None:
     assert "no rule allows it" in text
 
 
+@pytest.mark.quiet
 def test_cable_that_is_pulled_is_answered_for_at_once(line: Row) -> None:
     for name in "cba":
         line.start(name)

@@ -23,6 +23,7 @@ def subscriptions(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield from station["pd"]["rx"]
 
 
+@pytest.mark.quiet
 def test_ten_seconds_of_the_solar_line(farm: Plants) -> None:
     appliance = farm.start(PLANT)
     stations = [f"island-{number:02}" for number in range(1, 15)] + ["control"]

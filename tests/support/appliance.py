@@ -21,7 +21,7 @@ from eap.appliance.commands.client import connect_those
 from eap.appliance.runtime import VARIABLE
 
 EAPCTL = [sys.executable, "-m", "eap"]
-READY_S = 30.0
+READY_S = 60.0
 
 
 class Appliance:

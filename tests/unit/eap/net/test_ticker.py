@@ -10,7 +10,7 @@ import pytest
 
 from eap.net.ticker import Ticker
 
-pytestmark = pytest.mark.net
+pytestmark = [pytest.mark.net, pytest.mark.quiet]
 
 LATER_NS = 10_000_000_000
 
