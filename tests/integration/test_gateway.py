@@ -155,10 +155,17 @@ def test_who_is_not_there_and_who_says_nothing(gateway: Wire) -> None:
 
 
 def test_protocols_that_are_not_offered_and_messages_that_are_too_long(gateway: Wire) -> None:
-    requests = {SOE: "01 40 2000", FOE: "01 00 00000000 66", VOE: "64110000 0100", EOE: "06000000"}
-    for kind, body in requests.items():
-        assert gateway.talk(kind, SENSOR, bytes.fromhex(body)) == (ERR, bytes.fromhex("0100 0200"))
-        assert gateway.talk(kind, 0, bytes.fromhex(body)) == (ERR, bytes.fromhex("0100 0200"))
+    no_protocol = ERR, bytes.fromhex("0100 0200")
+    words = b"it does not speak this protocol\0"
+    requests = {
+        SOE: ("01 40 2000", (SOE, bytes.fromhex("12 40 2000 0110"))),
+        FOE: ("01 00 00000000 66", (FOE, bytes.fromhex("05 00 00800000") + words)),
+        VOE: ("64110000 0100", no_protocol),
+        EOE: ("06000000", no_protocol),
+    }
+    for kind, (body, answer) in requests.items():
+        assert gateway.talk(kind, SENSOR, bytes.fromhex(body)) == answer
+        assert gateway.talk(kind, 0, bytes.fromhex(body)) == answer
     assert gateway.talk(6, DRIVE, bytes(8)) == (ERR, bytes.fromhex("0100 0200"))
     long = bytes.fromhex("0020 21 0180 00 00020000") + bytes(512)
     assert gateway.talk(COE, SENSOR, long) == abort(0x8001, 0, "05000106")

@@ -3,8 +3,10 @@
 A file is opened by its name, read or written in blocks by a handle, and closed; Read and Write do
 as well as the ReadWrite that TwinCAT's clients send.  Own format: what cannot be answered in time
 is answered BUSY, has done nothing, and is to be asked again; what FOE_PROGRESS answers; and that a
-ReadWrite of it with any data gives the file up, where closing it would make it complete.
-Handles belong to the NetID that opened them, through whichever connection it comes.
+ReadWrite of it with any data gives the file up, where closing it would make it complete.  Data of
+a close means nothing: some clients cannot write none.  Handles belong to the NetID that opened
+them, through whichever connection it comes; a file that it has left open gives way to its next one
+at that slave, which takes one at a time.
 """
 
 from __future__ import annotations
@@ -32,6 +34,12 @@ ANSWER_S = 3.0
 """How long one request may take."""
 IDLE_S = 30.0
 """A file for which nothing is asked for so long is closed: others may wait for the slave."""
+LEFT_S = 2.0
+"""A file for which nothing is asked for so long gives way to the next one of its owner.
+
+Shorter than ANSWER_S, so that the next one has its turn when it asks for the first time; longer
+than the pauses between the blocks of a transfer, since several programs may share one NetID.
+"""
 MAX_OF_CLIENT = 8
 """Files that a NetID may have open."""
 MAX_OPEN = 64
@@ -52,6 +60,8 @@ class _Open:
         self.transfer = transfer
         self.task: asyncio.Task[None] | None = None
         self.idle: asyncio.TimerHandle | None = None
+        self.idle_since_s: float | None = None
+        """None while something is being done with it."""
 
 
 class SlaveFiles(SlaveSpace):
@@ -94,7 +104,7 @@ class SlaveFiles(SlaveSpace):
             return await self._begin(asked, data, offset, is_write=is_write)
         if max(len(data), length) > MAX_BLOCK:
             raise AdsRefusedError(AdsError.SIZE, f"a block has at most {MAX_BLOCK} octets")
-        if data and group not in {IndexGroup.FOE_WRITE, IndexGroup.FOE_PROGRESS}:
+        if data and group == IndexGroup.FOE_READ:
             raise AdsRefusedError(AdsError.SIZE, "nothing is written here")
         item = self._find(asked, offset)
         self._end_idle(item)
@@ -106,6 +116,7 @@ class SlaveFiles(SlaveSpace):
 
     async def _begin(self, asked: Asked, name: bytes, password: int, *, is_write: bool) -> bytes:
         owner, station = asked.client.net_id, asked.slave.station
+        self._replace_left(owner, station)
         self._check_room(owner)
         what = _text(name)
         transfer = Transfer(what, password, asked.sizes, is_write=is_write)
@@ -160,6 +171,25 @@ class SlaveFiles(SlaveSpace):
                 raise
         self._drop(handle)
 
+    def _replace_left(self, owner: NetId, station: int) -> None:
+        """Give up files of *owner* at a slave that it has left open, now or when it is time."""
+        loop = asyncio.get_running_loop()
+        for handle, item in list(self._open.items()):
+            if (item.owner, item.station) != (owner, station) or item.idle_since_s is None:
+                continue
+            left_at_s = item.idle_since_s + LEFT_S
+            if left_at_s <= loop.time():
+                self._give_up_left(handle, item.idle_since_s)
+            elif item.transfer.has_turn:
+                loop.call_at(left_at_s, self._give_up_left, handle, item.idle_since_s)
+
+    def _give_up_left(self, handle: int, since_s: float) -> None:
+        """Give a file up if nothing has been asked for it since then."""
+        item = self._open.get(handle)
+        if item is not None and item.idle_since_s == since_s:
+            logger.info("%s given up: %s left it open and opens another one", item.what, item.owner)
+            self._drop(handle)
+
     def _check_room(self, owner: NetId) -> None:
         of_client = sum(item.owner == owner for item in self._open.values())
         if of_client >= MAX_OF_CLIENT or len(self._open) >= MAX_OPEN:
@@ -183,9 +213,12 @@ class SlaveFiles(SlaveSpace):
     def _begin_idle(self, handle: int) -> None:
         item = self._open[handle]
         self._end_idle(item)
-        item.idle = asyncio.get_running_loop().call_later(IDLE_S, self._expire, handle)
+        loop = asyncio.get_running_loop()
+        item.idle_since_s = loop.time()
+        item.idle = loop.call_later(IDLE_S, self._expire, handle)
 
     def _end_idle(self, item: _Open) -> None:
+        item.idle_since_s = None
         if item.idle is not None:
             item.idle.cancel()
 

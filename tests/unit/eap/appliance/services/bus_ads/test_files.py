@@ -161,6 +161,81 @@ def test_file_that_nobody_asks_for_is_closed(monkeypatch):
     play(scene, "files")
 
 
+@pytest.mark.parametrize("data", [b"\0", b"\1\2\3\4"])
+def test_close_with_data_closes_the_file(data):
+    async def scene(client, engine):
+        handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
+        await client.write(DISK, WRITE, handle, b"short")
+        await client.write(DISK, CLOSE, handle, data)
+        other = Client(client.service, client.bus, net_id=NetId.parse("8.8.8.8.1.1"))
+        handle = await other.open_file(DISK, OPEN_READ, b"a.bin")
+        assert await other.ask(DISK, READ, handle, length=100) == b"short"
+        await other.ask(DISK, CLOSE, handle, data)
+
+    play(scene, "files")
+
+
+def test_file_left_open_gives_way_to_the_next_one_of_its_owner(monkeypatch):
+    monkeypatch.setattr(files, "LEFT_S", 0.02)
+
+    async def scene(client, engine):
+        left = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
+        await client.ask(DISK, WRITE, left, b"lost", 0)
+        handle = await client.open_file(DISK, OPEN_READ, b"a.bin")
+        assert await client.read_file(DISK, handle, 100) == b"first file"
+        gone = await client.do(DISK, ReadWrite(CLOSE, left, 0, b""))
+        assert gone.result == AdsError.INDEX_OFFSET
+
+    play(scene, "files")
+
+
+def test_file_left_open_does_not_count_when_its_owner_opens_the_next_one(monkeypatch):
+    monkeypatch.setattr(files, "LEFT_S", 0)
+    monkeypatch.setattr(files, "MAX_OF_CLIENT", 1)
+
+    async def scene(client, engine):
+        await client.open_file(DISK, OPEN_READ, b"a.bin")
+        handle = await client.open_file(DISK, OPEN_READ, b"a.bin")
+        assert await client.read_file(DISK, handle, 100) == b"first file"
+
+    play(scene, "files")
+
+
+def test_file_left_open_does_not_give_way_to_other_clients(monkeypatch):
+    monkeypatch.setattr(files, "LEFT_S", 0)
+    monkeypatch.setattr(files, "ANSWER_S", 0.05)
+
+    async def scene(client, engine):
+        handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
+        other = Client(client.service, client.bus, net_id=NetId.parse("8.8.8.8.1.1"))
+        busy = await other.do(DISK, ReadWrite(OPEN_READ, 0, 4, b"a.bin"))
+        assert busy.result == AdsError.BUSY
+        await client.ask(DISK, CLOSE, handle)
+
+    play(scene, "files")
+
+
+def test_file_in_use_does_not_give_way_to_the_next_one_of_its_owner(monkeypatch):
+    monkeypatch.setattr(files, "LEFT_S", 0.05)
+    monkeypatch.setattr(files, "ANSWER_S", 0.1)
+
+    async def scene(client, engine):
+        handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
+        hold_mailboxes(engine)
+        block = bytes(transfer.AHEAD + 1)
+        await client.ask(DISK, WRITE, handle, block, 0)
+        closing = asyncio.ensure_future(client.do(DISK, ReadWrite(CLOSE, handle, 0, b"")))
+        await asyncio.sleep(0)
+        busy = await client.do(DISK, ReadWrite(OPEN_READ, 0, 4, b"a.bin"))
+        assert busy.result == AdsError.BUSY
+        await closing
+        engine.release()
+        monkeypatch.undo()
+        await client.ask(DISK, CLOSE, handle)
+
+    play(scene, "files")
+
+
 def test_file_that_is_given_up_keeps_its_content():
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
