@@ -200,6 +200,11 @@ class ApplianceFolder(Closing):
         """Where clients connect."""
         return self.path / "control"
 
+    @property
+    def bytecode(self) -> Path:
+        """Folder for bytecode of modules, where Python keeps none."""
+        return self.path / "bytecode"
+
     def discards(self, process: str) -> Path:
         """Return the file of what *process* turned away before any subscription saw it."""
         return self.path / f"{process}.discards"
@@ -248,7 +253,9 @@ class ApplianceFolder(Closing):
 
     def _empty(self) -> None:
         for entry in self.path.iterdir():
-            if entry.name != "lock":
+            if entry == self.bytecode:
+                shutil.rmtree(entry)
+            elif entry.name != "lock":
                 entry.unlink()
 
 

@@ -10,10 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
-from xml.sax.saxutils import escape
-
-from defusedxml import ElementTree
-from defusedxml.common import DefusedXmlException
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -41,6 +37,9 @@ def parse(xml: str | bytes) -> list[StaticRoute]:
     Raises:
         ValueError: it is no such file, or one that wants more of its reader than to be read.
     """
+    from defusedxml import ElementTree  # services, which hardly ever reads one, starts without
+    from defusedxml.common import DefusedXmlException
+
     try:
         root: Element = ElementTree.fromstring(xml)
     except DefusedXmlException:
@@ -57,6 +56,8 @@ def parse(xml: str | bytes) -> list[StaticRoute]:
 
 def dump(name: str, net_id: str, routes: Iterable[StaticRoute], *, tcp_port: int) -> str:
     """Return a file with *routes* for the router *name* that has *net_id* and listens there."""
+    from xml.sax.saxutils import escape
+
     lines = [
         '<?xml version="1.0" encoding="utf-8"?>',
         f"<{_ROOT}>",

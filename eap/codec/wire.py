@@ -9,9 +9,10 @@ per frame.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from enum import Enum
-from typing import Annotated, Any, ClassVar, Self, TypeAlias, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Self, TypeAlias, get_args, get_origin
 
 import msgspec
 
@@ -90,6 +91,20 @@ def _reader(wrap: type | None) -> Callable[[Any], Any] | None:
     return member_of
 
 
+def _kinds_of(cls: type[WireStruct]) -> Iterator[tuple[str, Scalar | Bits]]:
+    """Yield name and kind of each field.
+
+    ``typing.get_type_hints`` tells the same; for all records it took a tenth of a process's start.
+    """
+    for base in reversed(cls.__mro__):
+        scope = vars(sys.modules[base.__module__])
+        for name, hint in base.__dict__.get("__annotations__", {}).items():  # noqa: RUF063  inspect is not needed otherwise
+            if isinstance(hint, str):
+                hint = scope.get(hint) or eval(hint, scope)  # noqa: PLW2901, S307  our own source
+            if get_origin(hint) is not ClassVar:
+                yield name, get_args(hint)[1]
+
+
 def _compile(cls: type[WireStruct]) -> None:
     codes: list[str] = []  # one struct code a word
     reads: list[str] = []  # one expression over w0, w1, ... a field
@@ -105,10 +120,7 @@ def _compile(cls: type[WireStruct]) -> None:
         codes[-1] = _WORD_CODE[filled]
         filled = 0
 
-    for name, hint in get_type_hints(cls, include_extras=True).items():
-        if get_origin(hint) is ClassVar:
-            continue
-        kind = get_args(hint)[1]
+    for name, kind in _kinds_of(cls):
         if isinstance(kind, Scalar):
             if filled:
                 close_word()

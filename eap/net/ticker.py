@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import platform
 import select
 import struct
 import time
@@ -19,7 +18,7 @@ _LEAD_NS = 150_000
 _LARGEST_EVENT = 16
 # struct epoll_event: its 64 bits of data, of which Python uses the first half for the descriptor,
 # are packed behind the events on x86-64 only.
-_EVENT = struct.Struct("=Ii4x" if platform.machine() == "x86_64" else "=I4xi4x")
+_EVENT = struct.Struct("=Ii4x" if os.uname().machine == "x86_64" else "=I4xi4x")
 
 _library = ctypes.CDLL(None, use_errno=True)
 

@@ -15,7 +15,6 @@ from eap.aoe.ads_operation import Operation, Read, ReadWrite
 from eap.appliance.control import Request
 from eap.appliance.control_bus import BusOpenParameters, kind_of
 from eap.appliance.services.audit import operation_words
-from eap.appliance.services.gateway.guard import error_in
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxType
@@ -83,6 +82,8 @@ def refusal_in(result: Any, talk: BusOpenParameters | None = None) -> str:
     if not isinstance(result, Mapping):
         return ""
     if talk is not None:
+        from eap.appliance.services.gateway.guard import error_in  # plants without buses have none
+
         kind, answer = kind_of(talk.protocol), bytes.fromhex(result["data"])
         code = error_in(kind, answer)
         if code and kind is MailboxType.COE:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import platform
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -108,7 +108,7 @@ class Devices:
         self._players.append(player)
         identity = Identity(
             device_name=f"EAP station {name}",
-            hardware_version=platform.machine(),
+            hardware_version=os.uname().machine,
             software_version=self._release,
         )
         device = StationDevice(keeper, ImageValues(image), identity)

@@ -13,12 +13,11 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from eap.aoe.directory import Directory
 from eap.appliance.discards import DiscardCounters
@@ -34,17 +33,13 @@ from eap.appliance.services.audit_file import AuditFile
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.bus_methods import Buses
 from eap.appliance.services.bus.segment_link import SegmentLink
-from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.control_server import ControlServer
 from eap.appliance.services.device.device_methods import DeviceMethods
 from eap.appliance.services.device.engine_client import EngineClient
 from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.gateway.gateway_methods import GatewayMethods
-from eap.appliance.services.gateway.opening import open_desks, open_gateways
 from eap.appliance.services.log_limits import LimitedLogHandler
-from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
@@ -52,7 +47,6 @@ from eap.appliance.services.routes.ams_methods import AmsMethods
 from eap.appliance.services.routes.route_methods import RouteMethods
 from eap.appliance.services.routes.route_rows import RouterView
 from eap.appliance.services.routes.routing_methods import RoutingMethods
-from eap.appliance.services.routing.mqtt_door import open_mqtt_doors
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.services.status import ProcessMeter, appliance_status, take_snapshot
@@ -62,10 +56,15 @@ from eap.appliance.store import Store
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.ids import NetId
 from eap.net import realtime
+from eap.release import RELEASE
+
+if TYPE_CHECKING:
+    from eap.appliance.services.gateway.gateway import MailboxGateway
+    from eap.appliance.services.master.master_desk import MasterDesk
+    from eap.appliance.services.routing.mqtt_door import MqttDoor
 
 STATUS_PATIENCE_S = 0.3
 """How long ``status`` waits for what the engine says of its buses."""
-RELEASE = version("eap-appliance")
 _IMAGE_PAUSE_S = 0.01
 
 
@@ -103,8 +102,7 @@ class Services:
         devices = self._devices(images, link)
         self._startup.step("opening gateways and sockets")
         client = BusClient(link, [bus.owner for bus in self._handover.buses])
-        desks = open_desks(self._handover, client, RELEASE)
-        gateways = open_gateways(self._handover, client, desks, devices.routers)
+        desks, gateways = self._gateways(client, devices.routers)
         doors = open_doors(
             self._handover,
             devices.routers,
@@ -114,7 +112,7 @@ class Services:
             self._link,
             self._resources,
         )
-        brokers = open_mqtt_doors(self._handover.routing, devices.routers, self._counters)
+        brokers = self._brokers(devices.routers)
         audit = self._audit(devices.routers, gateways)
         buses = self._buses(client, devices, desks)
         methods = self._methods(images, buses, devices, gateways, audit)
@@ -163,6 +161,24 @@ class Services:
         link.on_restart.append(devices.engine_has_restarted)
         gc.freeze()  # what a collection would go through again and again, while clients wait
         return devices
+
+    def _gateways(
+        self, client: BusClient, routers: Mapping[str, StationRouter]
+    ) -> tuple[Mapping[PortName, MasterDesk], Mapping[PortName, MailboxGateway]]:
+        if not self._handover.buses:
+            return {}, {}
+        from eap.appliance.services.gateway.opening import open_desks, open_gateways
+
+        desks = open_desks(self._handover, client, RELEASE)
+        return desks, open_gateways(self._handover, client, desks, routers)
+
+    def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttDoor]:
+        routing = self._handover.routing
+        if not any(told.mqtt for told in routing.values()):
+            return ()
+        from eap.appliance.services.routing.mqtt_door import open_mqtt_doors  # few plants have any
+
+        return open_mqtt_doors(routing, routers, self._counters)
 
     def _methods(
         self,
@@ -245,6 +261,8 @@ class Services:
                 segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
                 self._resources.callback(segments[bus.owner].close)
         for bus in handover.buses:
+            from eap.appliance.services.bus_ads.service import BusService
+
             net_id = NetId.parse(handover.port(bus.owner).net_id)
             router = devices.routers[bus.owner.station]
             service = BusService(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address
 from time import monotonic_ns
+from typing import TYPE_CHECKING
 
 from eap.aoe.spec import DoorKind
 from eap.aoe.way import Door
@@ -16,7 +17,6 @@ from eap.appliance.services.ams.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.ams.ams_door import AmsClients, AmsDoor
 from eap.appliance.services.ams.ams_uplinks import AmsUplinks
 from eap.appliance.services.gateway.door import GatewayDoor
-from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.intake import FrameIntake, watch_channel
 from eap.appliance.services.routes.ams_questions import AmsQuestions
 from eap.appliance.services.routes.route_desk import RouteDesk
@@ -38,6 +38,9 @@ from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
 from eap.pd.link import Origin
 from eap.pd.spec import StationSpec
+
+if TYPE_CHECKING:
+    from eap.appliance.services.gateway.gateway import MailboxGateway
 
 AMS_DOOR = DoorKind.AMS_TCP
 """By which clients come in that connect to AMS/TCP."""

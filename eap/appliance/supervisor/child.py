@@ -45,10 +45,17 @@ class RestartPolicy:
 
 
 class Child:
-    """A process made from a module; it exists from ``start`` to ``reap``, any number of times."""
+    """A process made from a module; it exists from ``start`` to ``reap``, any number of times.
 
-    def __init__(self, name: str, module: str) -> None:
+    Args:
+        name: Of the process, in messages.
+        module: Has its ``main``.
+        bytecode: Folder for bytecode that is kept nowhere else; empty for none.
+    """
+
+    def __init__(self, name: str, module: str, bytecode: str = "") -> None:
         self.name = name
+        self._bytecode = bytecode
         self.restarts = 0
         self.is_ready = False
         self.report: dict[str, Any] = {}
@@ -77,11 +84,12 @@ class Child:
         self.error_fd, error_end = os.pipe2(os.O_CLOEXEC)
         os.set_blocking(self.error_fd, False)
         described = handover.to_descriptor()
+        command = [sys.executable, "-m", _LAUNCHER, self._module, str(described), str(report_end)]
         # A SIGINT before the child can take one would end it with a traceback: it waits.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process = subprocess.Popen(  # noqa: S603  our own module
-                [sys.executable, "-m", _LAUNCHER, self._module, str(described), str(report_end)],
+                [*command, self._bytecode],
                 stdin=subprocess.DEVNULL,
                 stdout=error_end,
                 stderr=error_end,

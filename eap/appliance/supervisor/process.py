@@ -172,8 +172,9 @@ class Supervisor:
         self._clock = clock
         self._info = info
         self._folder = folder
-        self._engine = Child("engine", "eap.appliance.engine.process")
-        self._services = Child("services", "eap.appliance.services.process")
+        bytecode = str(folder.bytecode)
+        self._engine = Child("engine", "eap.appliance.engine.process", bytecode)
+        self._services = Child("services", "eap.appliance.services.process", bytecode)
         self._segments: dict[str, Child] = {}
         self._restart_ns: dict[Child, int] = {}
         self._announced = False
@@ -193,7 +194,7 @@ class Supervisor:
             directory=plant.directory,
             audit_required=plant.audit_required,
         )
-        self._given = _given_to_segments(self._segments, common)
+        self._given = _given_to_segments(self._segments, common, bytecode)
         self._given[self._engine] = (
             replace(common, link_fd=sockets.engine_link, bus_fd=sockets.engine_bus),
             sockets.engine_descriptors(),
@@ -391,12 +392,12 @@ def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:
 
 
 def _given_to_segments(
-    children: dict[str, Child], common: Handover
+    children: dict[str, Child], common: Handover, bytecode: str
 ) -> dict[Child, tuple[Handover | SegmentHandover, list[int]]]:
     """Add a child for each simulated segment; return what they are given."""
     given: dict[Child, tuple[Handover | SegmentHandover, list[int]]] = {}
     for owner, handover in segments(common.stations, common.buses, common.supervisor):
         name = f"{owner.station}/{owner.port}"
-        child = children[name] = Child(f"segment {name}", "eap.appliance.segment.process")
+        child = children[name] = Child(f"segment {name}", "eap.appliance.segment.process", bytecode)
         given[child] = handover, [handover.frames_fd, handover.command_fd]
     return given

@@ -11,7 +11,6 @@ import asyncio
 import logging
 import socket
 from collections.abc import AsyncIterator, Callable, Sequence
-from importlib.metadata import version
 from ipaddress import IPv4Address
 from typing import NamedTuple
 
@@ -32,8 +31,9 @@ from eap.codec.amsdiscovery import (
 )
 from eap.errors import CodecError
 from eap.ids import NetId
+from eap.release import RELEASE
 
-_VERSION = encode_version(version("eap-appliance"))
+_VERSION = encode_version(RELEASE)
 _LONGEST = 2048
 _DATAGRAMS_PER_TURN = 64
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from eap.aoe.way import Way
 from eap.appliance.discards import Refusal
-from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.appliance.services.routing.mailbox_frames import refusal_of
 from eap.codec.mailbox import MailboxError, encode_plain_frame
 from eap.errors import MalformedError, TruncatedError
 from eap.gateway.refusal import mailbox_error
+
+if TYPE_CHECKING:
+    from eap.appliance.services.gateway.gateway import MailboxGateway
 
 _ADDRESS = slice(4, 6)
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from eap.appliance.control import ErrorCode, parameters
 from eap.appliance.control_gateway import GatewayParameters
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
-from eap.appliance.services.gateway.gateway import MailboxGateway
 from eap.errors import ControlError
 from eap.near import near
+
+if TYPE_CHECKING:
+    from eap.appliance.services.gateway.gateway import MailboxGateway
 
 _OWN = {SocketKind.GATEWAY_UDP: "udp", SocketKind.GATEWAY_TCP: "tcp"}
 _SHARED = {SocketKind.UDP: "udp", SocketKind.TCP: "tcp", SocketKind.PACKET: "ethernet"}

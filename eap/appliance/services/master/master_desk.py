@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import platform
+import os
 
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
@@ -43,7 +43,7 @@ class MasterDesk:
         self._view = MasterView(client, port)
         identity = Identity(
             device_name=f"EtherCAT master {port.station}/{port.port}",
-            hardware_version=platform.machine(),
+            hardware_version=os.uname().machine,
             software_version=release,
         )
         self.dictionary = MasterDictionary(self._view, identity, full=full, padded=padded)

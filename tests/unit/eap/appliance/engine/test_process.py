@@ -82,7 +82,7 @@ class Engine:
         given = msgspec.structs.replace(given, link_fd=theirs.fileno())
         fd = given.to_descriptor()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready_end)],
+            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready_end), ""],
             pass_fds=(fd, ready_end, theirs.fileno()),
             stderr=subprocess.PIPE,
             text=True,

@@ -165,7 +165,7 @@ class Child:
         )
         fd = given.to_descriptor()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready)],
+            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready), ""],
             pass_fds=(fd, frames.fileno(), commands.fileno(), ready),
             stderr=subprocess.PIPE,
             text=True,

@@ -53,7 +53,7 @@ class Services:
             bus_fd=self.sockets.services_bus,
         ).to_descriptor()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready_end)],
+            [sys.executable, "-m", "eap.appliance.startup", MODULE, str(fd), str(ready_end), ""],
             pass_fds=(fd, ready_end, *self.sockets.services_descriptors()),
             stderr=subprocess.PIPE,
             text=True,

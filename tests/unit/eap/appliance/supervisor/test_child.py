@@ -53,10 +53,10 @@ def test_ends_have_words(code, words):
     assert words in describe_end(code)
 
 
-def make(tmp_path: Path, monkeypatch, code: str) -> Child:
+def make(tmp_path: Path, monkeypatch, code: str, bytecode: str = "") -> Child:
     (tmp_path / "eap_child_for_test.py").write_text(code)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path.cwd()}")
-    return Child("test", "eap_child_for_test")
+    return Child("test", "eap_child_for_test", bytecode)
 
 
 def wait(fd: int) -> None:
@@ -104,3 +104,16 @@ def test_child_that_is_interrupted_while_it_starts_ends_without_a_traceback(tmp_
     child.ask_to_end(signal.SIGINT)
     wait(child.pid_fd)
     assert child.reap() == (-signal.SIGTERM, "it said nothing")
+
+
+@pytest.mark.net
+def test_bytecode_that_python_may_not_write_is_kept_for_the_next_start(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    child = make(tmp_path, monkeypatch, READS_ITS_HANDOVER, bytecode=str(tmp_path / "bytecode"))
+    for _ in range(2):
+        child.start(HANDOVER, [], monotonic_ns())
+        wait(child.pid_fd)
+        assert child.reap()[0] == 3
+    (kept,) = (tmp_path / "bytecode").rglob("eap_child_for_test.*.pyc")
+    assert kept.read_bytes()
+    assert not (tmp_path / "__pycache__").exists()
