@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from hypothesis import strategies as st
 
 from eap.appliance.plantfile import load_plant as load_shipped
 from eap.codec import datatypes, pdo
+from eap.codec.amsdiscovery import AMS_UDP_PORT
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.codec.ethercat import EAP_PORT
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec
 
@@ -152,3 +156,21 @@ def test_fault_in_an_anchor_is_one_finding(tmp_path: Path, old: str, new: str, c
     findings = load_shipped(path).findings
     assert len(findings) == count, [str(each) for each in findings]
     assert "more places, by an anchor)" in findings[0].message
+
+
+SECURITY = PLANTS.parent / "docs" / "security.md"
+
+
+def test_plant_of_the_security_page_has_no_findings(tmp_path):
+    (text,) = re.findall(r"^```yaml\n(.*?)^```$", SECURITY.read_text(), re.MULTILINE | re.DOTALL)
+    path = tmp_path / "plant.yaml"
+    path.write_text(text)
+    result = load_shipped(path)
+    assert result.findings == result.warnings == ()
+
+
+def test_security_page_lists_the_ports():
+    lines = SECURITY.read_text().splitlines()
+    listed = " ".join(line for line in lines if line.startswith("|"))
+    for number in (EAP_PORT, EAP_PORT + 1, AMS_TCP_PORT, AMS_UDP_PORT):
+        assert str(number) in listed
