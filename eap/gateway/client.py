@@ -15,8 +15,8 @@ from __future__ import annotations
 import io
 import select
 import socket
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from time import monotonic
 from typing import TypeVar
 
@@ -106,6 +106,16 @@ class GatewayClient(Closing):
     def close(self) -> None:
         """Let go of the socket."""
         self._socket.close()
+
+    @contextmanager
+    def waiting_once(self, timeout_s: float) -> Iterator[None]:
+        """Send each request once and wait so long for its answer, for the length of a block."""
+        before = self._tries, self._timeout_s
+        self._tries, self._timeout_s = 1, timeout_s
+        try:
+            yield
+        finally:
+            self._tries, self._timeout_s = before
 
     def sdo_read(
         self, address: int, index: int, subindex: int = 0, *, complete: bool = False

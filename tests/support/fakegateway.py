@@ -26,6 +26,7 @@ from eap.codec.mailbox import (
 from eap.codec.soe import SoeAttribute
 from eap.device.eap_content import Identity
 from eap.device.master_dictionary import MasterDictionary
+from eap.gateway.refusal import Reason, refuse
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.od.profiles.master1100 import Live
@@ -37,6 +38,9 @@ FILE = bytes(range(256)) * 4
 class _OneSlave:
     """Values of a master with one slave, 1001."""
 
+    def __init__(self, sizes: MailboxSizes) -> None:
+        self._sizes = sizes
+
     def configured(self) -> list[int]:
         return [1001]
 
@@ -44,8 +48,9 @@ class _OneSlave:
 
     def of_configured(self, station: int, key: Live) -> int | str:
         texts = {Live.NAME: "drive", Live.TYPE: "D1"}
-        return {Live.ADDRESS: 1001, Live.VENDOR: 5, Live.MAILBOX_OUT: 140, Live.MAILBOX_IN: 132,
-                Live.PROTOCOLS: 0x0C, **texts}.get(key, 0)  # fmt: skip
+        sizes = {Live.MAILBOX_OUT: self._sizes.to_slave, Live.MAILBOX_IN: self._sizes.to_master}
+        numbers = {Live.ADDRESS: 1001, Live.VENDOR: 5, Live.PROTOCOLS: 0x0C}
+        return {**numbers, **sizes, **texts}.get(key, 0)
 
     of_detected = of_configured
 
@@ -67,21 +72,25 @@ class FakeGateway:
 
     Args:
         full: Whether the master's dictionary has all entries.
+        sizes: Of the slave's mailboxes.
 
     Attributes:
         drop: Requests by UDP that are not heard, from now on.
         has_master: Whether address 0 has a dictionary; otherwise it refuses what is asked.
         is_master_silent: Whether address 0 never answers, as with KickCAT.
         addresses: Of the messages that came.
+        aborts_for: An address for which SDO requests are aborted, though nobody has it.
         heard: The messages that came, without headers.
     """
 
-    def __init__(self, *, full: bool = False) -> None:
+    def __init__(self, *, full: bool = False, sizes: MailboxSizes = SIZES) -> None:
         self.drop = 0
         self.heard: list[bytes] = []
         self.has_master = True
         self.is_master_silent = False
         self.addresses: list[int] = []
+        self._sizes = sizes
+        self.aborts_for: int | None = None
         slave = ObjectDictionary(
             [
                 variable(0x1008, "N", "STRING(500)", RW, "x" * 300),
@@ -89,18 +98,18 @@ class FakeGateway:
             ]
         )
         servers = {
-            MailboxType.COE: CoeServer(slave, _op, SIZES),
-            MailboxType.FOE: FoeServer(MemoryStore([MemoryFile("f", FILE, max_size=9999)]), SIZES),
+            MailboxType.COE: CoeServer(slave, _op, sizes),
+            MailboxType.FOE: FoeServer(MemoryStore([MemoryFile("f", FILE, max_size=9999)]), sizes),
             MailboxType.SOE: SoeServer(
-                {0: [SoeParameter("S-0-0032", "Mode", SoeAttribute(), 7)]}, _op, SIZES
+                {0: [SoeParameter("S-0-0032", "Mode", SoeAttribute(), 7)]}, _op, sizes
             ),
             MailboxType.VOE: VoeServer(),
         }
         large = MailboxSizes(1400, 1400)
-        objects = MasterDictionary(_OneSlave(), Identity(device_name="M"), full=full)
+        objects = MasterDictionary(_OneSlave(sizes), Identity(device_name="M"), full=full)
         master = CoeServer(objects, _op, large)
         self._boxes = {
-            1001: MailboxServer(servers, SIZES),
+            1001: MailboxServer(servers, sizes),
             0: MailboxServer({MailboxType.COE: master}, large),
         }
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -130,6 +139,12 @@ class FakeGateway:
         self.addresses.append(header.address)
         if header.address == 0 and self.is_master_silent:
             return []
+        if header.address == self.aborts_for:
+            refusal = refuse(header.type, bytes(body), Reason.NO_SLAVE)
+            return [_frame(MailboxHeader(0, header.address, type=refusal.type), refusal.body)]
+        if header.address and len(body) + MailboxHeader.SIZE > self._sizes.to_slave:
+            refusal = refuse(header.type, bytes(body), Reason.TOO_LONG)
+            return [_frame(MailboxHeader(0, header.address, type=refusal.type), refusal.body)]
         box = self._boxes.get(header.address)
         if box is None or (header.address == 0 and not self.has_master):
             detail = MailboxErrorReply(detail=MailboxError.UNSUPPORTED_PROTOCOL).encode()

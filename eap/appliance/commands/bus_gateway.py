@@ -11,20 +11,25 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import NoReturn, TypeVar
 
-from devicebus.errors import BusError, MailboxRefusedError
+from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError, SoeError
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import AlStatus
 from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
-from eap.errors import ConfigError
+from eap.codec.mailbox import MailboxError
+from eap.codec.soeerror import SoeErrorCode
+from eap.errors import ConfigError, EapError
 from eap.gateway.address import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT
 from eap.gateway.client import GatewayClient
 from eap.gateway.slaves import NOT_TOLD, MasterSlave
+from eap.od.abort import AbortCode, SdoAbortError
 
 T = TypeVar("T")
 
 _MASTER_SIZE = 1480
+_HINT_S = 0.3
+"""How long the master may take for each answer that only explains an error."""
 
 
 class GatewayBus:
@@ -41,6 +46,8 @@ class GatewayBus:
         self._client = client
         self._mailbox = None if mailbox is None else MailboxSizes(mailbox, mailbox)
         self._slaves: list[MasterSlave] | None = None
+        self._reached: set[int] = {MASTER_ADDRESS}
+        """Who has answered; a refusal needs no hint then."""
 
     def scan(self) -> Sequence[Slave]:
         """Return the slaves that the master tells of.
@@ -100,14 +107,21 @@ class GatewayBus:
         meanwhile: Callable[[], None] | None = None,
     ) -> T:
         """Talk to a slave's mailbox, or to the master; return the result or raise."""
-        del name
         conversation = begin(self._sizes(slave))
         try:
-            return self._client.converse(slave.station, conversation, meanwhile)
-        except MailboxRefusedError as exc:
-            if hint := self._hint(slave):
+            result = self._client.converse(slave.station, conversation, meanwhile)
+        except MailboxTimeoutError:
+            raise
+        except EapError as exc:
+            # Its mailbox is smaller than was assumed, and nothing was done: say it in more pieces.
+            if _is_too_long(exc) and self._can_learn_size(slave):
+                return self.converse(slave, begin, name, meanwhile)
+            # A gateway may refuse for a slave that is not there as slaves do for their objects.
+            if slave.station not in self._reached and (hint := self._hint(slave)):
                 exc.add_note(hint)
             raise
+        self._reached.add(slave.station)
+        return result
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
         """Refuse: states are asked for by the master's dictionary, 0xAnnn:02."""
@@ -135,12 +149,19 @@ class GatewayBus:
             raise no_mailbox(_slave(told), state_name(_slave(told).status.state))
         return MailboxSizes(told.to_slave, told.to_master)
 
+    def _can_learn_size(self, slave: Slave) -> bool:
+        """Ask the master how long the mailbox of *slave* is, if that was only assumed."""
+        if self._mailbox is not None or self._slaves is not None:
+            return False
+        with suppress(BusError), self._client.waiting_once(_HINT_S):
+            self.scan()
+        return self._told_of(slave) is not None
+
     def _hint(self, slave: Slave) -> str:
         """Return what the master knows that explains why a slave's mailbox is not reached."""
-        if slave.station == MASTER_ADDRESS:
-            return ""
-        with suppress(BusError):
-            if self._slaves is None:
+        self._reached.add(slave.station)  # once is enough
+        if self._slaves is None:
+            with suppress(BusError), self._client.waiting_once(_HINT_S):
                 self.scan()
         if self._slaves is None:
             return ""
@@ -150,7 +171,7 @@ class GatewayBus:
             return f"the master knows no slave {slave.station}; it knows {known or 'none'}"
         if not told.to_slave:
             return str(no_mailbox(_slave(told), state_name(_slave(told).status.state)))
-        return f"the master says that its mailbox takes {told.to_slave} octets (--mailbox OCTETS)"
+        return ""
 
     def _told_of(self, slave: Slave) -> MasterSlave | None:
         """Return what the master tells of a slave, None if it has not told anything."""
@@ -160,6 +181,14 @@ class GatewayBus:
 
 def _unknown(station: int, name: str) -> MasterSlave:
     return MasterSlave(station, name, 0, 0, 0, 0, 0, 0, 0)
+
+
+def _is_too_long(error: EapError) -> bool:
+    return (
+        (isinstance(error, SdoAbortError) and error.code == AbortCode.LONGER_THAN_MAILBOX)
+        or (isinstance(error, MailboxRefusedError) and error.detail == MailboxError.INVALID_SIZE)
+        or (isinstance(error, SoeError) and error.code == SoeErrorCode.VALUE_TOO_LONG)
+    )
 
 
 def _number(text: str) -> int:

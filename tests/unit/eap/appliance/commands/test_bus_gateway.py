@@ -8,6 +8,7 @@ import pytest
 
 from devicebus.errors import BusError, MailboxSizeError
 from devicebus.mailbox import coe_client, foe_client
+from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.diagnosis import diagnose
 from devicebus.wire.alstatus import AlState
 from eap.appliance.commands import bus_gateway
@@ -20,6 +21,7 @@ from eap.codec import datatypes
 from eap.codec.soe import Idn
 from eap.errors import ConfigError
 from eap.gateway.client import GatewayClient
+from eap.od.abort import SdoAbortError
 from tests.support.fakegateway import FILE, SIZES, FakeGateway
 
 pytestmark = pytest.mark.net
@@ -122,6 +124,31 @@ def test_slave_by_station_address_never_asks_the_master(gateway, silent_at_maste
     assert read_idn(bus, "1001", MODE, drive=0)["value"] == 7
     assert exchange(bus, "1001", 0x1164, 1, b"\1\2")["data"] == "0102"
     assert set(gateway.addresses) == {1001}
+
+
+def test_object_for_a_mailbox_that_is_smaller_than_usual_is_written_in_more_pieces() -> None:
+    text = datatypes.parse("STRING(500)")
+    with (
+        FakeGateway(sizes=MailboxSizes(64, 64)) as gateway,
+        open_gateway("127.0.0.1", gateway.port, tcp=False) as bus,
+    ):
+        write_entry(bus, "1001", 0x1008, 0, "y" * 400, kind=text, complete=False)
+        assert read_entry(bus, "1001", 0x1008, 0, kind=text, complete=False)["value"] == "y" * 400
+
+
+def test_refusal_of_a_slave_that_has_answered_asks_the_master_for_no_hint(gateway, bus) -> None:
+    read_entry(bus, "1001", 0x2000, 0, kind=None, complete=False)
+    with pytest.raises(SdoAbortError) as caught:
+        read_entry(bus, "1001", 0x2001, 0, kind=None, complete=False)
+    assert not hasattr(caught.value, "__notes__")
+    assert set(gateway.addresses) == {1001}
+
+
+def test_refusal_of_a_slave_that_the_master_does_not_know_has_a_hint(gateway, bus) -> None:
+    gateway.aborts_for = 1009  # as a gateway may, for want of a better error
+    with pytest.raises(SdoAbortError) as caught:
+        read_entry(bus, "1009", 0x1018, 1, kind=None, complete=False)
+    assert caught.value.__notes__ == ["the master knows no slave 1009; it knows 1001 (drive)"]
 
 
 def test_slave_by_name_where_the_master_is_silent_says_to_give_the_address(silent_at_master):
