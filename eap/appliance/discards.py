@@ -25,8 +25,10 @@ class Refusal(StrEnum):
     """Shorter than its headers say."""
     TCP_OFF = auto()
     """A type-4 connection to a station none of whose ports says ``tcp: true``."""
-    TCP_SILENT = auto()
-    """A connection that sent no frame header in time."""
+    TCP_SLOW = auto()
+    """A connection left a frame unfinished, or took no answers, and was closed."""
+    TCP_EVICTED = auto()
+    """A connection with process data made room for another one."""
     TCP_FULL = auto()
     """More connections than there is room for."""
     TCP_TYPE = auto()

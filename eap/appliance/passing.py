@@ -19,11 +19,11 @@ _DESCRIPTOR_SPACE = socket.CMSG_SPACE(array.array("i").itemsize)
 
 
 class PassedConnection(Record, frozen=True):
-    """A type-4 connection: whom its frames are for and who is at its other end."""
+    """A type-4 connection: the ports that its frames are for, and its peer."""
 
     owners: tuple[PortName, ...]
-    peer: str
-    """``address:port``"""
+    host: str
+    """Address of the peer, as the policy counts it (eap.net.connections)."""
 
 
 def pass_connection(
@@ -45,7 +45,7 @@ def take_connection(link: socket.socket) -> tuple[socket.socket, PassedConnectio
     flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
     try:
         message, ancillary, _, _ = link.recvmsg(_MAX_MESSAGE, _DESCRIPTOR_SPACE, flags)
-    except BlockingIOError:
+    except OSError:
         return None
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:

@@ -45,6 +45,13 @@ STATES = {
     "SAFEOP": "it receives no process data",
 }
 """Effect of the states that a station can be left in by request."""
+LISTENER_COUNTS = {
+    "refused": "refused",
+    "evicted": "closed to make room",
+    "overdue": "closed as too slow",
+}
+_MOST_DESCRIPTORS = 0.9
+"""Share of the limit from which on it is a warning."""
 _TOO_LARGE, _NO_SUBSCRIBER = 2, 4
 """Bits of FrameState."""
 _OTHER_VERSION, _OTHER_LENGTH = 1, 2
@@ -142,6 +149,10 @@ def _of_appliance(appliance: Row) -> Iterator[Finding]:
             yield _warning(f"{plant} {name}", f"starting: {step}")
     if audit := appliance.get("audit"):
         yield from _of_audit(f"{plant} audit", audit)
+    for name, process in processes.items():
+        yield from _of_descriptors(f"{plant} {name}", process.get("descriptors"))
+    for listener in appliance.get("listeners", ()):
+        yield from _of_listener(plant, listener)
     engine = processes["engine"]
     refused = [
         f"{name.replace('_', ' ')} ({outcome.removeprefix('other: ')})"
@@ -163,6 +174,27 @@ def _of_audit(where: str, audit: Row) -> Iterator[Finding]:
         yield _error(where, f"cannot be written: {error}; {effect}", advice, audit["since"])
     elif audit["lines"]:
         yield _warning(where, f"{lost} lost, written again", since=audit["since"])
+
+
+def _of_descriptors(where: str, descriptors: Row | None) -> Iterator[Finding]:
+    if descriptors is not None and descriptors["used"] > _MOST_DESCRIPTORS * descriptors["limit"]:
+        what = f"{descriptors['used']} of {descriptors['limit']} file descriptors are in use"
+        yield _warning(where, what, "raise the hard limit (ulimit -Hn, or LimitNOFILE= of systemd)")
+
+
+def _of_listener(plant: str, listener: Row) -> Iterator[Finding]:
+    counts = {name: listener[key] for key, name in LISTENER_COUNTS.items() if listener[key]}
+    if not counts:
+        return
+    ago_us = listener["crowded_ago_us"]
+    where, what = f"{plant} {listener['name']}", _counts(counts)
+    if ago_us is not None and ago_us < _RECENT_US:
+        places = f"crowded: {listener['open']} of {listener['limit']} places taken"
+        _, _, number = listener["name"].rpartition(":")
+        advice = f"'ss -tn sport = :{number}' shows the hosts" if number.isdecimal() else ""
+        yield _warning(where, f"{places}; connections: {what}", advice)
+    else:
+        yield _info(where, f"connections: {what}")
 
 
 def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from eap.cli import words
-from eap.cli.status_findings import REASONS, STATES, Finding, Severity, is_special
+from eap.cli.status_findings import LISTENER_COUNTS, REASONS, STATES, Finding, Severity, is_special
 from eap.cli.status_screen import finding_grid, verdict
 from eap.cli.table import Column, TextTable
 
@@ -36,6 +36,9 @@ def status_tables(document: Row, now_s: float) -> Iterator[RenderableType]:
     for appliance in document["appliances"]:
         yield Text()
         yield _processes(appliance)
+        if listeners := appliance.get("listeners"):
+            yield Text()
+            yield _listeners(listeners)
     yield Text()
     yield _stations(stations)
     if any("bus" in port for station in stations for port in station["ports"]):
@@ -57,6 +60,7 @@ def _processes(appliance: Row) -> RenderableType:
         Column("PID", rank=1, is_number=True),
         Column("CPU", is_number=True),
         Column("Memory", is_number=True),
+        Column("Files", rank=1, is_number=True),
         Column("Restarts", is_number=True),
     )
     processes = dict(appliance["processes"])
@@ -75,8 +79,28 @@ def _processes(appliance: Row) -> RenderableType:
             str(process["pid"]),
             "" if cpu is None else f"{cpu:.1f} %",
             "" if rss is None else f"{rss / 1e6:.0f} MB",
+            _descriptors(process.get("descriptors")),
             str(process.get("restarts", "")),
         )
+    return table
+
+
+def _descriptors(descriptors: Row | None) -> str:
+    return "" if descriptors is None else f"{descriptors['used']} of {descriptors['limit']}"
+
+
+def _listeners(listeners: Sequence[Row]) -> RenderableType:
+    table = TextTable(
+        "Listener",
+        Column("Open", is_number=True),
+        Column("Refused", is_number=True),
+        Column("Evicted", is_number=True),
+        Column("Too slow", is_number=True),
+    )
+    for row in listeners:
+        opened = f"{row['open']} of {row['limit']}"
+        counts = (str(row[key]) for key in LISTENER_COUNTS)
+        table.add_row(row["name"], opened, *counts)
     return table
 
 

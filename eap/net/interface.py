@@ -6,6 +6,7 @@ import ctypes
 import fcntl
 import socket
 import struct
+from functools import cache
 
 from eap.errors import EnvironmentalError
 
@@ -17,6 +18,12 @@ _IFF_RUNNING = 0x40
 _IFREQ_SIZE = 40
 _INTERFACES = 1024
 _NAME_LIMIT = 15
+
+
+@cache
+def _kernel() -> socket.socket:
+    """Return the socket for all questions; kept, so that none needs a free descriptor."""
+    return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
 
 def interface_of(address: str) -> str:
@@ -46,11 +53,10 @@ def broadcast_of(address: str) -> str:
     # Name and address together find one of several addresses of an interface.
     name = _label_of(address).encode()
     request = struct.pack("@16sHH4s16x", name, socket.AF_INET, 0, socket.inet_aton(address))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        try:
-            answer = fcntl.ioctl(sock.fileno(), _SIOCGIFBRDADDR, request)
-        except OSError:
-            return ""
+    try:
+        answer = fcntl.ioctl(_kernel().fileno(), _SIOCGIFBRDADDR, request)
+    except OSError:
+        return ""
     found = socket.inet_ntoa(answer[20:24])
     return "" if found in {"0.0.0.0", address} else found  # noqa: S104  a comparison
 
@@ -59,8 +65,7 @@ def own_addresses() -> list[tuple[str, str]]:
     """Return all IPv4 addresses of this machine now, each behind its label (``eth0:1``)."""
     memory = ctypes.create_string_buffer(_INTERFACES * _IFREQ_SIZE)
     request = struct.pack("@iP", len(memory), ctypes.addressof(memory))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        size = struct.unpack("@iP", fcntl.ioctl(sock.fileno(), _SIOCGIFCONF, request))[0]
+    size = struct.unpack("@iP", fcntl.ioctl(_kernel().fileno(), _SIOCGIFCONF, request))[0]
     data = memory.raw
     found = []
     for offset in range(0, size, _IFREQ_SIZE):
@@ -94,7 +99,11 @@ def check_interface(name: str) -> None:
 
 
 def link_is_up(name: str) -> bool:
-    """Whether interface *name* exists, is switched on and has a live cable."""
+    """Whether interface *name* exists, is switched on and has a live cable.
+
+    Raises:
+        OSError: the first question of this process, and there is no descriptor for it.
+    """
     flags = _flags(name)
     return flags is not None and flags & (_IFF_UP | _IFF_RUNNING) == _IFF_UP | _IFF_RUNNING
 
@@ -103,9 +112,9 @@ def _flags(name: str) -> int | None:
     if len(name.encode()) > _NAME_LIMIT:
         return None
     request = struct.pack("@16s24x", name.encode())
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        try:
-            answer = fcntl.ioctl(sock.fileno(), _SIOCGIFFLAGS, request)
-        except OSError:
-            return None
+    sock = _kernel()
+    try:
+        answer = fcntl.ioctl(sock.fileno(), _SIOCGIFFLAGS, request)
+    except OSError:
+        return None
     return int(struct.unpack_from("@H", answer, 16)[0])

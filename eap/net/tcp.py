@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from eap.codec.ethercat import EAP_PORT, EtherCatHeader, FrameType
 from eap.errors import EnvironmentalError
 from eap.ids import Destination
+from eap.net.connections import OWN_HOST, Activity
 from eap.net.mmsg import count_error
 from eap.net.tcpwriter import TcpWriter
 from eap.net.udpsocket import bind_failure
@@ -26,7 +27,8 @@ _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 2_000_000_000
 _CONNECT_NS = 1_000_000_000
 _RECEIVE_BUFFER = 32 << 10
-_BACKLOG = 64
+_BACKLOG = 512
+"""Connections that the kernel keeps until they are accepted: a crowd must not hide a client."""
 _CONNECTING = (errno.EINPROGRESS, errno.EALREADY)
 _CONNECTED = (0, errno.EISCONN)
 
@@ -50,6 +52,26 @@ def open_tcp_listener(address: str, port: int = EAP_PORT) -> socket.socket:
         sock.close()
         raise EnvironmentalError(bind_failure("TCP", address, port, error)) from None
     return sock
+
+
+def set_keepalive(sock: socket.socket, unanswered_s: float = 60.0) -> None:
+    """Have the kernel find out that a peer has vanished without a word.
+
+    Args:
+        sock: Of the connection; it does not block any more.
+        unanswered_s: Time after which it is given up if the peer does not confirm what was sent;
+            where nothing is sent it takes a minute.
+    """
+    sock.setblocking(False)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        (socket.TCP_KEEPIDLE, 30),
+        (socket.TCP_KEEPINTVL, 10),
+        (socket.TCP_KEEPCNT, 3),
+        (socket.TCP_NODELAY, 1),
+        (socket.TCP_USER_TIMEOUT, int(1000 * unanswered_s)),
+    ):
+        sock.setsockopt(socket.IPPROTO_TCP, option, value)
 
 
 class TcpSender:
@@ -196,10 +218,14 @@ class TcpReceiver:
         takers: Who takes its frames.
         name: The destination of answers to them, if it has been connected to; else it gets one.
         writer: Who sends on it; else it is made.
+        host: Of the peer, as the policy counts it (connections.py).
 
     Attributes:
         name: The destination of answers.
+        host: As above.
         closed: Why the connection ended, empty while it lasts.
+        used_at_ns: When the last frame was complete.
+        late_since_ns: Since when a frame is unfinished.
     """
 
     def __init__(
@@ -208,6 +234,8 @@ class TcpReceiver:
         takers: Sequence[Taker],
         name: str = "",
         writer: TcpWriter | None = None,
+        *,
+        host: str = OWN_HOST,
     ) -> None:
         self._writer = writer or TcpWriter(sock)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -216,7 +244,10 @@ class TcpReceiver:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
         self.takers = list(takers)
         self.name = name or f"{CONNECTION}{next(_numbers)}"
+        self.host = host
         self.closed = ""
+        self.used_at_ns = 0
+        self.late_since_ns: int | None = None
         self._sock = sock
         self._source = _peer_of(sock)
         self._buffer = bytearray(_RECEIVE_BUFFER)
@@ -235,7 +266,17 @@ class TcpReceiver:
         count = self._take_frames(now_ns, FRAMES_PER_DRAIN)
         if count < FRAMES_PER_DRAIN and not self.closed and self._read():
             count += self._take_frames(now_ns, FRAMES_PER_DRAIN - count)
+        if count:
+            self.used_at_ns = now_ns
+            self.late_since_ns = None
+        elif self._end > self._start and self.late_since_ns is None:
+            self.late_since_ns = now_ns
         return count
+
+    @property
+    def activity(self) -> Activity:
+        """Current use: frames are expected whenever the publisher has some."""
+        return Activity.IDLE if self.used_at_ns else Activity.UNUSED
 
     def source_of(self, data: memoryview) -> bytes:
         """Return the IPv4 address of the peer."""

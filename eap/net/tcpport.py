@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from eap.ids import Destination, DestinationKind
+from eap.net.connections import CloseReason, ConnectionTable, Limits
 from eap.net.tcp import CONNECTION, TcpReceiver, TcpSender
 from eap.pd.link import Channel, OutFrame, Taker
 
-MOST_CONNECTIONS = 32
+LIMITS = Limits(total=32, reserved=8, per_host=16)
 """Incoming connections of a port: each costs a system call a cycle, whether it says anything."""
+LOOK_NS = 1_000_000_000
+"""Between two looks for connections that leave a frame unfinished."""
 
 
 class TcpPort:
@@ -37,6 +40,9 @@ class TcpPort:
         self._datagrams = datagrams
         self._senders: dict[str, TcpSender] = {}
         self._receivers: list[TcpReceiver] = []
+        self._table = ConnectionTable()
+        self._listener = self._table.add_listener("process data", LIMITS)
+        self._look_ns = 0
 
     def link_header(self, destination: str) -> bytes:
         """Nothing; but from now on there is a connection to a TCP *destination*."""
@@ -56,13 +62,24 @@ class TcpPort:
             self._senders.pop(gone).close()
 
     @property
-    def is_full(self) -> bool:
-        """Whether there is no room for one more incoming connection."""
-        return len(self._receivers) >= MOST_CONNECTIONS
+    def connections(self) -> int:
+        """Number of incoming connections."""
+        return len(self._receivers)
 
-    def accept(self, receiver: TcpReceiver) -> None:
-        """Take frames from *receiver* until its connection ends."""
+    def accept(self, receiver: TcpReceiver, now_ns: int, *, spare_descriptors: int) -> bool:
+        """Take frames from *receiver* until its connection ends; return False if it gets no place.
+
+        The policy is that of all listeners (connections.py).
+        """
+        refusal, victim = self._table.admit(
+            self._listener, receiver, now_ns, spare_descriptors=spare_descriptors
+        )
+        if victim is not None:
+            victim.close(CloseReason.EVICTED)
+        if refusal:
+            return False
         self._receivers.append(receiver)
+        return True
 
     def drain(self, now_ns: int) -> int:
         """Hand over what has arrived, and keep the outgoing connections going."""
@@ -73,8 +90,13 @@ class TcpPort:
             total += receiver.drain(now_ns)
             if receiver.closed:
                 self.closed[receiver.closed] = self.closed.get(receiver.closed, 0) + 1
+                self._table.remove(self._listener, receiver)
         if self._receivers:
             self._receivers = [receiver for receiver in self._receivers if not receiver.closed]
+            if now_ns >= self._look_ns:
+                self._look_ns = now_ns + LOOK_NS
+                for late in self._table.take_overdue(now_ns):
+                    late.close(CloseReason.OVERDUE)
         return total
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:

@@ -16,6 +16,7 @@ from devicebus.wire.alstatus import AlState
 from eap.appliance.control import encode_request
 from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
+from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.bus_methods import Buses
 from eap.appliance.services.bus.segment_link import SegmentLink
@@ -171,7 +172,7 @@ class Appliance:
 
         methods = Methods({"plant": self.info.plant}, self.images, status=status, stop=lambda: None)
         try:
-            await ControlServer(methods, buses).serve(self._listener)
+            await ControlServer(methods, buses).serve(self._listener, Listeners())
         finally:
             for each in (link, engine, *links.values(), *segments.values()):
                 each.close()

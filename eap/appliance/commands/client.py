@@ -167,7 +167,8 @@ def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return one answer for several appliances.
 
     *processes* are those of the first; *appliances* lists all, each with its plant, its stations'
-    names, its processes, its findings and its audit.  Each station has the name of its plant.
+    names, its processes, its findings, its audit and its listeners.  Each station has the name of
+    its plant.
     """
     appliances = [
         {
@@ -176,6 +177,7 @@ def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "processes": answer["processes"],
             "findings": answer.get("findings", []),
             "audit": answer.get("audit"),
+            "listeners": answer.get("listeners", []),
         }
         for answer in answers
     ]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from time import monotonic_ns
 from typing import Protocol
 
 from eap.appliance.discards import DiscardCounters, Refusal, Tally
@@ -19,6 +20,8 @@ from eap.appliance.passing import PassedConnection
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.startup import Step, no_step
 from eap.ids import InterfaceUri
+from eap.net.connections import CloseReason
+from eap.net.descriptors import descriptor_reserve, spare_descriptors
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines
@@ -32,6 +35,11 @@ from eap.pd.link import Channel, Taker
 from eap.pd.spec import PortKind, PortSpec, Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
+
+_REFUSALS: Mapping[str, Refusal] = {
+    CloseReason.OVERDUE: Refusal.TCP_SLOW,
+    CloseReason.EVICTED: Refusal.TCP_EVICTED,
+}
 
 
 class SocketChannel(Channel, Protocol):
@@ -98,17 +106,17 @@ class EnginePlant:
         """Take frames from a connection that services accepted, for all ports behind it."""
         first = passed.owners[0]
         port = self._stations[first.station].tcp_ports[first.port]
-        if port.is_full:
-            connection.close()
-            for station in {owner.station for owner in passed.owners}:
-                self._counters.count(station, Refusal.TCP_FULL)
-            return
+        takers = [self._taker(owner) for owner in passed.owners]
+        spare = spare_descriptors(connection.fileno(), descriptor_reserve())
         try:
-            receiver = TcpReceiver(connection, [self._taker(owner) for owner in passed.owners])
+            receiver = TcpReceiver(connection, takers, host=passed.host)
         except OSError:
             connection.close()  # the peer has left again
             return
-        port.accept(receiver)
+        if not port.accept(receiver, monotonic_ns(), spare_descriptors=spare):
+            receiver.close()
+            for station in {owner.station for owner in passed.owners}:
+                self._counters.count(station, Refusal.TCP_FULL)
 
     def image(self, station: str) -> Image:
         """Return the process image of a station as it is now."""
@@ -212,4 +220,6 @@ class EnginePlant:
 
 def _tcp_reason(closed: str) -> Refusal | None:
     """Return what to count for a connection that ended; one that was just closed is no refusal."""
-    return Refusal.TCP_TYPE if closed.startswith("frame of type") else None
+    if closed.startswith("frame of type"):
+        return Refusal.TCP_TYPE
+    return _REFUSALS.get(closed)

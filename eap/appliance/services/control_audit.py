@@ -7,13 +7,13 @@ which program a process number was, but whose it was.
 from __future__ import annotations
 
 import socket
-import struct
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 from eap.aoe.ads_operation import Operation, Read, ReadWrite
 from eap.appliance.control import Request
 from eap.appliance.control_bus import BusOpenParameters, kind_of
+from eap.appliance.services.accepting import process_of
 from eap.appliance.services.audit import operation_words
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeHeader
@@ -41,13 +41,11 @@ _READING = frozenset((1, 4, 7))
 _EEPROM_OWNER, _EEPROM_CONTROL, _EEPROM_READ = 0x0500, 0x0502, "0001"
 """Registers, and how the command begins that reads (ETG.1000.4)."""
 _MAX_WORDS = 200
-_PEER = struct.Struct("3i")
 
 
 def peer_of(connection: socket.socket) -> str:
     """Return whose process is at the other end of a Unix socket, and which."""
-    octets = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
-    pid, uid, _ = _PEER.unpack(octets)
+    pid, uid = process_of(connection)
     return f"uid {uid}, pid {pid}"
 
 

@@ -11,10 +11,10 @@ import asyncio
 import logging
 import select
 import socket
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterable, Sized
+from contextlib import asynccontextmanager, suppress
 from functools import partial
-from typing import Any
+from typing import Any, SupportsIndex
 
 from devicebus.errors import BusError
 from eap.appliance.bus_failure import to_failure
@@ -36,7 +36,7 @@ from eap.appliance.control import (
     request_id,
 )
 from eap.appliance.control_bus import BUS_METHODS
-from eap.appliance.services.accepting import accept_connections
+from eap.appliance.services.accepting import Listeners, ListeningSocket, TaskConnection
 from eap.appliance.services.bus.bus_methods import BusConnection, Buses
 from eap.appliance.services.control_audit import (
     BeginChange,
@@ -47,7 +47,10 @@ from eap.appliance.services.control_audit import (
 )
 from eap.appliance.services.methods import Methods, Watch
 from eap.errors import ControlError, EapError, ImageError
+from eap.net.connections import Activity, Limits
 from eap.od.abort import SdoAbortError
+
+LIMITS = Limits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
 
 logger = logging.getLogger(__name__)
 
@@ -69,48 +72,84 @@ class ControlServer:
         self._tell = tell
         self._begin = begin
         self._slow_reader_s = slow_reader_s
-        self._clients = 0
+        self._listening: ListeningSocket[ControlConnection] | None = None
 
-    async def serve(self, listener: socket.socket) -> None:
-        """Accept clients until cancelled; *listener* stays open."""
-        await accept_connections(
-            listener, "control socket", lambda client, _: self.serve_client(client)
-        )
+    async def serve(self, listener: socket.socket, listeners: Listeners) -> None:
+        """Accept clients until cancelled; *listener* stays open.
 
-    async def serve_client(self, connection: socket.socket) -> None:
-        """Answer one client until it leaves."""
+        Shares are counted by process: there is one host, and one user mostly.
+        """
+        if self._listening is None:
+            self._listening = ListeningSocket(listener, "control", self, listeners, LIMITS)
+        await self._listening.serve()
+
+    def connection_from(self, sock: socket.socket, host: str) -> ControlConnection:
+        """Return the connection on a socket that was accepted (ConnectionServer)."""
+        del sock
+        return ControlConnection(host)
+
+    def refuse_connection(self, sock: socket.socket, why: str) -> None:
+        """Tell a client that there is no room for it (ConnectionServer)."""
+        with suppress(OSError):
+            sock.send(encode_error(None, ControlError(why, code=ErrorCode.BUSY)))
+
+    async def serve_connection(self, connection: ControlConnection, sock: socket.socket) -> None:
+        """Answer one client until it leaves (ConnectionServer)."""
+        connection.begin()
         loop = asyncio.get_running_loop()
-        reader = _Reader(connection, loop)
+        reader = _Reader(connection, sock, loop)
         transport, protocol = await loop.connect_accepted_socket(
-            lambda: asyncio.StreamReaderProtocol(reader, loop=loop), connection
+            lambda: asyncio.StreamReaderProtocol(reader, loop=loop), sock
         )
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
-        self._clients += 1
         bus = BusConnection(self._buses)
         try:
-            peer = peer_of(connection)
+            peer = peer_of(sock)
             tell = self._tell and partial(self._tell, peer)
             begin = self._begin and partial(self._begin, peer)
             client = _Client(self._methods, bus, writer, self._slow_reader_s, tell, begin)
-            if self._clients > MAX_CLIENTS:
-                reason = f"{MAX_CLIENTS} clients are connected, which is all there is room for"
-                await client.send(encode_error(None, ControlError(reason, code=ErrorCode.BUSY)))
-            else:
-                await client.run(reader)
+            connection.subscriptions = client.subscriptions
+            await client.run(reader)
         except* (OSError, TimeoutError) as group:
             logger.debug("control client left: %s", group.exceptions[0])
         finally:
             bus.close()
-            self._clients -= 1
             transport.abort()
+
+
+class ControlConnection(TaskConnection):
+    """A client of the control socket.
+
+    Attributes:
+        is_answered: Whether a request of it is being answered.
+        subscriptions: Those that it has.
+    """
+
+    def __init__(self, host: str) -> None:
+        super().__init__(host)
+        self.is_answered = False
+        self.subscriptions: Sized = ()
+
+    @property
+    def activity(self) -> Activity:
+        """Current use."""
+        if self.subscriptions:
+            return Activity.SUBSCRIBED
+        return Activity.BUSY if self.is_answered else super().activity
 
 
 class _Reader(asyncio.StreamReader):
     """Reads lines, and notices at once when the client has gone while it waits for an answer."""
 
-    def __init__(self, connection: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self,
+        connection: ControlConnection,
+        sock: socket.socket,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
         super().__init__(limit=MAX_LINE, loop=loop)
         self._connection = connection
+        self._socket = sock
         self._clock = loop.time
         self._has_gone = False
         self._wait: asyncio.Timeout | None = None
@@ -119,17 +158,28 @@ class _Reader(asyncio.StreamReader):
     async def while_there(self) -> AsyncIterator[None]:
         """Raise TimeoutError in a block that waits when the client has gone."""
         self._wait = asyncio.timeout_at(self._clock() if self._has_gone else None)
+        self._connection.is_answered = True
+        self._connection.late_since_ns = None
         try:
             async with self._wait:
                 yield
         finally:
+            self._connection.is_answered = False
             self._wait = None
+
+    def feed_data(self, data: Iterable[SupportsIndex]) -> None:
+        """Take data, some of a line or more."""
+        super().feed_data(data)
+        if bytes(data).endswith(b"\n"):
+            self._connection.note_frame()
+        elif not self._connection.is_answered:
+            self._connection.note_partial()
 
     def feed_eof(self) -> None:
         """Take the end of what the client sends; it may still wait for answers."""
         super().feed_eof()
         poll = select.poll()
-        poll.register(self._connection, 0)
+        poll.register(self._socket, 0)
         if poll.poll(0):  # hung up: not only its sending side is closed
             self._note_end()
 
@@ -160,7 +210,7 @@ class _Client:
         self._bus = bus
         self._writer = writer
         self._slow_reader_s = slow_reader_s
-        self._subscriptions: dict[int, asyncio.Task[None]] = {}
+        self.subscriptions: dict[int, asyncio.Task[None]] = {}
         self._last_subscription = 0
 
     async def send(self, line: bytes) -> None:
@@ -173,7 +223,7 @@ class _Client:
         async with asyncio.TaskGroup() as group:
             while line := await self._next_line(reader):
                 await self._answer(line, reader, group)
-            for task in self._subscriptions.values():
+            for task in self.subscriptions.values():
                 task.cancel()
 
     async def _next_line(self, reader: asyncio.StreamReader) -> bytes:
@@ -251,18 +301,18 @@ class _Client:
     async def _subscribe(
         self, number: int | None, params: dict[str, Any], group: asyncio.TaskGroup
     ) -> None:
-        if len(self._subscriptions) >= MAX_SUBSCRIPTIONS:
+        if len(self.subscriptions) >= MAX_SUBSCRIPTIONS:
             reason = f"this connection has {MAX_SUBSCRIPTIONS} subscriptions, which is the limit"
             raise ControlError(reason, code=ErrorCode.BUSY)
         watch = self._methods.watch(params)
         self._last_subscription += 1
         subscription = self._last_subscription
         await self.send(encode_result(number, {"subscription": subscription}))
-        self._subscriptions[subscription] = group.create_task(self._events(subscription, watch))
+        self.subscriptions[subscription] = group.create_task(self._events(subscription, watch))
 
     def _unsubscribe(self, params: dict[str, Any]) -> dict[str, Any]:
         subscription = parameters(params, UnsubscribeParameters).subscription
-        task = self._subscriptions.pop(subscription, None)
+        task = self.subscriptions.pop(subscription, None)
         if task is None:
             reason = f"no subscription {subscription} on this connection"
             raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)

@@ -13,7 +13,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from eap.appliance.handover import (
     SocketKind,
 )
 from eap.appliance.runtime import ApplianceFolder
+from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.audit import Audit
 from eap.appliance.services.audit_file import AuditFile
 from eap.appliance.services.bus.bus_client import BusClient
@@ -66,6 +67,10 @@ if TYPE_CHECKING:
 STATUS_PATIENCE_S = 0.3
 """How long ``status`` waits for what the engine says of its buses."""
 _IMAGE_PAUSE_S = 0.01
+_AGAIN_S = 1.0
+"""After an error of a socket."""
+
+logger = logging.getLogger(__name__)
 
 
 class Services:
@@ -90,6 +95,7 @@ class Services:
         )
         self._link = resources.enter_context(socket.socket(fileno=handover.link_fd))
         self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
+        self._listeners = Listeners()
         self._stopping = asyncio.Event()
 
     async def run(self) -> None:
@@ -110,6 +116,7 @@ class Services:
             gateways,
             self._counters,
             self._link,
+            self._listeners,
             self._resources,
         )
         brokers = self._brokers(devices.routers)
@@ -118,8 +125,11 @@ class Services:
         methods = self._methods(images, buses, devices, gateways, audit)
         server = ControlServer(methods, buses, audit.write_request, begin=audit.begin_request)
         async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(server.serve(self._listener))]
-            tasks += [group.create_task(door.serve()) for door in (*doors, *brokers)]
+            control = partial(server.serve, self._listener, self._listeners)
+            tasks = [group.create_task(_keep_serving(control))]
+            tasks.append(group.create_task(_keep_serving(self._listeners.serve)))
+            tasks += [group.create_task(_keep_serving(each.serve)) for each in doors]
+            tasks += [group.create_task(_keep_serving(each.serve)) for each in brokers]
             tasks.append(group.create_task(devices.serve()))
             tasks.append(group.create_task(audit.serve()))
             tasks.append(group.create_task(self._log.serve()))
@@ -202,6 +212,7 @@ class Services:
                 (engine.stats(), self._counters.stats()),
                 meter,
                 reports,
+                self._listeners.stats(),
             ) | {"audit": audit.report()}
 
         return Methods(
@@ -285,6 +296,18 @@ def main(handover_fd: int, startup: Startup) -> int:
         sys.stderr.write(f"services: {exc}\n")
         return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
     return 0
+
+
+async def _keep_serving(serve: Callable[[], Awaitable[None]]) -> None:
+    """Call *serve* again after an error of a socket: that ends neither it nor this process."""
+    while True:
+        try:
+            await serve()
+        except* OSError as group:
+            logger.exception("an error of a socket: %s", group.exceptions[0])
+        else:
+            return
+        await asyncio.sleep(_AGAIN_S)
 
 
 async def _serve(

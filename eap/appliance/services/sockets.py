@@ -13,6 +13,7 @@ from eap.aoe.spec import DoorKind
 from eap.aoe.way import Door
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.appliance.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
+from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.ams.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.ams.ams_door import AmsClients, AmsDoor
 from eap.appliance.services.ams.ams_uplinks import AmsUplinks
@@ -53,6 +54,7 @@ def open_doors(
     gateways: Mapping[PortName, MailboxGateway],
     counters: DiscardCounters,
     link: socket.socket,
+    listeners: Listeners,
     resources: ExitStack,
 ) -> list[TcpDoor | AmsDoor | AmsUplinks | LinkWatch]:
     """Take frames from all sockets of *handover*, as long as the running loop lives.
@@ -64,12 +66,14 @@ def open_doors(
         gateways: To the buses, in their order.
         counters: Of what is not taken.
         link: To the engine, for connections that belong there.
+        listeners: Of this process.
         resources: Closes what is opened here.
 
     Returns:
         The listeners for TCP, the connections to others and the watch over links, to be served.
     """
-    return _Sockets(handover, routers, routes, gateways, counters, resources).open(link)
+    doors = _Sockets(handover, routers, routes, gateways, counters, listeners, resources)
+    return doors.open(link)
 
 
 class _Sockets:
@@ -80,9 +84,11 @@ class _Sockets:
         routes: Mapping[str, StationRoutes],
         gateways: Mapping[PortName, MailboxGateway],
         counters: DiscardCounters,
+        listeners: Listeners,
         resources: ExitStack,
     ) -> None:
         self._handover = handover
+        self._listeners = listeners
         self._routers = routers
         self._routes = routes
         self._gateways = gateways
@@ -167,7 +173,7 @@ class _Sockets:
         refuse = self._refuser(_stations_of(shared))
         gateway = self._own_gateway("tcp", shared)
         streams = MailboxStreams(Entrance([]), gateway, refuse, is_aoe_here=False)
-        return TcpDoor(self._socket(shared), (), link, refuse, streams)
+        return TcpDoor(self._socket(shared), (), link, refuse, streams, self._listeners)
 
     def _watch_unicast(self, shared: SharedSocket) -> None:
         channel = self._channel(shared)
@@ -263,7 +269,7 @@ class _Sockets:
                 self._routers[station].add_door(door, self._ams_clients)
         entrance = Entrance([(self._routers[station], AMS_DOOR) for station in stations])
         refuse = self._refuser(stations)
-        return AmsDoor(self._socket(shared), entrance, self._ams_clients, refuse)
+        return AmsDoor(self._socket(shared), entrance, self._ams_clients, refuse, self._listeners)
 
     def _uplinks(self, station: StationSpec) -> AmsUplinks:
         sources = [
@@ -291,6 +297,7 @@ class _Sockets:
             link,
             refuse,
             streams,
+            self._listeners,
         )
 
     def _watch_link(self, address: str, owner: PortName, door: Door) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import resource
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
@@ -15,6 +16,7 @@ from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.appliance.services.bus.bus_status import bus_document, bus_link
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
+from eap.net.connections import ListenerStats
 from eap.net.interface import interface_of, link_is_up
 from eap.pd.image import Image
 from eap.pd.report import station_status
@@ -32,6 +34,9 @@ _TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
+NOTHING_MEASURED: dict[str, Any] = {"cpu": None, "rss": None, "descriptors": None}
+
+
 class ProcessMeter:
     """CPU share and memory of processes, by pid, between one question and the next."""
 
@@ -39,24 +44,35 @@ class ProcessMeter:
         self._samples: dict[int, tuple[int, int, float]] = {}
 
     def measure(self, pid: int, now_ns: int) -> dict[str, Any]:
-        """Return *cpu* in percent of one core and *rss* in octets, both None for one that is gone.
+        """Return CPU share, memory and file descriptors of a process.
 
-        The share is that since the last question, or since the process started; *now_ns* is on
-        the clock of process start times (CLOCK_BOOTTIME).
+        *cpu* is in percent of one core since the last question, or since the process started,
+        *rss* in bytes, both None for a process that is gone; *descriptors* has those *used* and
+        their *limit*, None where they may not be seen.  *now_ns* is on the clock of process start
+        times (CLOCK_BOOTTIME).
         """
         try:
             fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
             resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
         except (OSError, IndexError):
             self._samples.pop(pid, None)
-            return {"cpu": None, "rss": None}
+            return NOTHING_MEASURED
         used_ns = (int(fields[11]) + int(fields[12])) * _TICK_NS
         started_ns = int(fields[19]) * _TICK_NS
         at_ns, before_ns, share = self._samples.get(pid, (started_ns, 0, 0.0))
         if now_ns - at_ns >= MIN_SAMPLE_NS:
             share = round(100 * (used_ns - before_ns) / (now_ns - at_ns), 1)
             self._samples[pid] = (now_ns, used_ns, share)
-        return {"cpu": share, "rss": resident}
+        return {"cpu": share, "rss": resident, "descriptors": _descriptors(pid)}
+
+
+def _descriptors(pid: int) -> dict[str, int] | None:
+    try:
+        used = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+        limit, _ = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    except OSError:
+        return None
+    return {"used": used, "limit": limit}
 
 
 async def take_snapshot(image: Image) -> Image:
@@ -77,6 +93,7 @@ def appliance_status(
     discarded: Sequence[Mapping[str, Mapping[str, int]]],
     meter: ProcessMeter,
     buses: Mapping[PortName, BusReport],
+    listeners: Iterable[ListenerStats] = (),
 ) -> dict[str, Any]:
     """Return the whole answer.
 
@@ -86,6 +103,7 @@ def appliance_status(
         discarded: What each process turned away, by station.
         meter: Of the processes.
         buses: What the engine says of its buses, of none if it does not answer.
+        listeners: Figures of the listeners of services.
     """
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
     engine = _process(info.engine, meter, now_ns)
@@ -105,8 +123,16 @@ def appliance_status(
         "version": VERSION,
         "plant": info.plant,
         "processes": processes,
+        "listeners": [_listener(each) for each in listeners],
         "stations": [_station(image, discarded, buses) for image in images],
     }
+
+
+def _listener(stats: ListenerStats) -> dict[str, Any]:
+    document = stats._asdict()
+    crowded_at_ns = document.pop("crowded_at_ns")
+    ago_us = None if crowded_at_ns is None else (monotonic_ns() - crowded_at_ns) // 1000
+    return document | {"crowded_ago_us": ago_us}
 
 
 def _station(
@@ -148,6 +174,6 @@ def link_state(interface: str) -> str:
 
 
 def _process(process: ProcessInfo, meter: ProcessMeter, now_ns: int) -> dict[str, Any]:
-    measured = meter.measure(process.pid, now_ns) if process.pid else {"cpu": None, "rss": None}
+    measured = meter.measure(process.pid, now_ns) if process.pid else NOTHING_MEASURED
     document = {"pid": process.pid or None, **measured, "restarts": process.restarts}
     return document | {"step": process.step} if process.step else document

@@ -33,8 +33,9 @@ from eap.appliance.supervisor.progress import StartEvent
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.appliance.supervisor.what_runs import what_runs_now
 from eap.config.load import Plant
-from eap.errors import ConfigError
+from eap.errors import ConfigError, EnvironmentalError
 from eap.near import near
+from eap.net.descriptors import raise_descriptor_limit
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
@@ -97,6 +98,7 @@ def _claim(folder: str) -> ApplianceFolder:
     logging.basicConfig(
         format="supervisor: %(message)s", level=logging.INFO, handlers=[OutputHandler()]
     )
+    raise_descriptor_limit()
     return ApplianceFolder.claim(folder)
 
 
@@ -228,7 +230,18 @@ class Supervisor:
         handover, descriptors = self._given[child]
         if isinstance(handover, Handover):
             handover = what_runs_now(handover)
-        child.start(handover, descriptors, self._clock())
+        try:
+            child.start(handover, descriptors, self._clock())
+        except OSError as exc:
+            child.close()
+            if not child.watch.has_run:
+                raise EnvironmentalError(f"{child.name} cannot be started: {exc}") from None
+            delay_ns = child.policy.delay_ns(0)
+            self._restart_ns[child] = self._clock() + delay_ns
+            logger.warning(
+                "%s cannot be started: %s; trying again in %d ms",
+                *(child.name, exc, delay_ns // 1_000_000),
+            )
         self._write_info()
 
     def _timeout_ms(self) -> int:

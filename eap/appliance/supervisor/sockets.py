@@ -28,7 +28,7 @@ from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 BROADCAST = "255.255.255.255"
 EVERY_ADDRESS = "0.0.0.0"  # noqa: S104  what a plant file may say
-CONTROL_BACKLOG = 64
+CONTROL_BACKLOG = 512
 _ORDER = tuple(SocketKind)
 
 

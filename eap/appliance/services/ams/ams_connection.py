@@ -17,8 +17,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-import socket
 from collections.abc import Callable, Iterable
+from time import monotonic_ns
 from typing import Protocol
 
 import msgspec
@@ -37,13 +37,12 @@ from eap.codec.amstcp import (
 )
 from eap.errors import MalformedError
 from eap.ids import NetId
+from eap.net.connections import Activity, CloseReason
 
 LONGEST_PACKET = 256 << 10
 """Octets of an AMS packet; nothing here has a value a quarter as long."""
 LONGEST_ANSWER = 4 << 20
 """Octets of a packet by a connection that this side opened: the symbols of a large controller."""
-PATIENCE_S = 10.0
-"""How long a packet may take from its first octet to its last, and answers to be taken."""
 MAX_UNSENT = 8 << 20
 """Octets that wait for a peer to take them; a client is kept below by what it may ask for at a
 time, unless it does not keep up with its notifications."""
@@ -56,9 +55,6 @@ _FIRST_PORT, _LAST_PORT = 32768, 40959
 """AMS ports for clients that ask for one, as a TwinCAT router numbers them."""
 _FIRST_SUFFIX, _LAST_SUFFIX = 0x8001, 0xFEFE
 """Last two bytes of the NetIDs for these clients: not .1.1, .2.1 and so on, which stations have."""
-_PROBE_AFTER_S = 30
-_PROBES = 3
-_PROBE_S = 10
 _NO_RETURN = StateFlags.NO_RETURN.value  # a plain number: operators of flags are slow
 
 logger = logging.getLogger(__name__)
@@ -112,47 +108,61 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     Args:
         name: Of this one and no other.
-        host: The peer's address.
+        address: Of the peer.
         taker: Acts on what it brings.
         is_ours: Whether this side opened it.
         give_address: Returns NetID and port for a client on a host that asks for an AMS address;
             without it no peer may ask for one.
+        host: By which the policy counts it (:mod:`eap.net.connections`).
 
     Attributes:
         name: As above.
         host: As above.
+        used_at_ns: When the last packet came.
+        late_since_ns: Since when a packet is unfinished, or answers are not taken.
+        closed: Done, with the reason, when the connection has ended.
     """
 
     def __init__(
         self,
         name: str,
-        host: str,
+        address: str,
         taker: PacketTaker,
         *,
         is_ours: bool = False,
         give_address: Callable[[str], tuple[NetId, int]] | None = None,
+        host: str = "",
     ) -> None:
         self.name = name
         self.host = host
+        self.used_at_ns = monotonic_ns()
+        self.late_since_ns: int | None = None
+        self.closed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._address = address
+        self._is_used = False
         self._taker = taker
         self._is_ours = is_ours
         self._window = AmsWindow()
         self._cutter = PacketCutter(LONGEST_ANSWER if is_ours else LONGEST_PACKET)
         self._transport: asyncio.Transport
+        self._is_open = False
         self._is_held = False
         self._is_scheduled = False
         self._is_blocked = False
         self._has_ended = False
-        self._late_since: float | None = None
         self._why = "closed by the peer"
         self._give_address = give_address
         self._net_id: NetId | None = None
+        self._is_closed = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Begin (asyncio)."""
         assert isinstance(transport, asyncio.Transport)  # noqa: S101  for the type
         self._transport = transport
+        self._is_open = True
         self._taker.connection_opened(self)
+        if self._is_closed:
+            transport.abort()
 
     def get_buffer(self, sizehint: int) -> memoryview:
         """Return where octets go; they are taken before anybody else has a turn (asyncio)."""
@@ -178,14 +188,14 @@ class AmsConnection(asyncio.BufferedProtocol):
     def pause_writing(self) -> None:
         """Read no more: the peer does not take what waits for it (asyncio)."""
         self._is_blocked = True
-        self._late_since = None
+        self.late_since_ns = monotonic_ns()
         if not self._is_ours:
             self._hold()
 
     def resume_writing(self) -> None:
         """Read again (asyncio)."""
         self._is_blocked = False
-        self._late_since = None
+        self.late_since_ns = None
         self._schedule()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -193,6 +203,8 @@ class AmsConnection(asyncio.BufferedProtocol):
         if isinstance(exc, OSError) and exc.strerror:
             self._why = exc.strerror
         self._taker.connection_closed(self, self._why)
+        if not self.closed.done():
+            self.closed.set_result(self._why)
 
     def send(self, packets: Iterable[bytes]) -> str | None:
         """Send packets; return why not if that is not possible any more."""
@@ -201,7 +213,7 @@ class AmsConnection(asyncio.BufferedProtocol):
             return "the connection was closed"
         if self._is_blocked and transport.get_write_buffer_size() > MAX_UNSENT:
             if not self._is_ours:
-                self._give_up()
+                self.close(CloseReason.OVERDUE)
             return "the peer takes nothing"
         for packet in packets:
             transport.write(encode_with_prefix(packet))
@@ -209,25 +221,23 @@ class AmsConnection(asyncio.BufferedProtocol):
                 self._schedule()
         return None
 
+    @property
+    def activity(self) -> Activity:
+        """How much would be lost with it."""
+        if self._window.subscriptions:
+            return Activity.SUBSCRIBED
+        if self._window.requests:
+            return Activity.BUSY
+        return Activity.IDLE if self._is_used else Activity.UNUSED
+
     def close(self, why: str) -> None:
-        """Close it at once; the taker is told *why*."""
-        self._why = why
-        self._transport.abort()
-
-    def find_slow(self, now: float, patience_s: float) -> None:
-        """Close it if the peer lets something wait for too long; to be called now and then."""
-        is_waiting_for_rest = self._cutter.has_begun and not self._is_held
-        if not (self._is_blocked or is_waiting_for_rest or self._transport.is_closing()):
-            self._late_since = None
-        elif self._late_since is None:
-            self._late_since = now
-        elif now - self._late_since >= patience_s:
-            self._give_up()
-
-    def _give_up(self) -> None:
-        if not self._has_ended:
+        """Close it at once, even before it is open; the taker is told *why*."""
+        if why is CloseReason.OVERDUE and not self._has_ended:
             self._taker.refuse(Refusal.AMS_SLOW)
-        self.close("too slow: it left a packet unfinished, or took no answers")
+        self._why = why
+        self._is_closed = True
+        if self._is_open:
+            self._transport.abort()
 
     def _schedule(self) -> None:
         if not self._is_scheduled:
@@ -238,6 +248,8 @@ class AmsConnection(asyncio.BufferedProtocol):
         if not self._is_held:
             self._is_held = True
             self._transport.pause_reading()
+        if not self._is_blocked:
+            self.late_since_ns = None  # what is unfinished waits here, not at the peer
 
     def _go_on(self) -> None:
         """Take some of the packets that are here, and read on when there are no more."""
@@ -256,7 +268,6 @@ class AmsConnection(asyncio.BufferedProtocol):
             if piece is None:
                 self._read_on()
                 return
-            self._late_since = None
             self._take(piece)
         self._hold()
         self._schedule()
@@ -264,9 +275,12 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _read_on(self) -> None:
         if self._has_ended:
             self._close_when_done()
-        elif self._is_held:
+            return
+        if self._is_held:
             self._is_held = False
             self._transport.resume_reading()
+        if self._cutter.has_begun and self.late_since_ns is None:
+            self.late_since_ns = monotonic_ns()
 
     def _break_off(self, why: str) -> None:
         """Read no more: these are no AMS packets."""
@@ -281,8 +295,14 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _close_when_done(self) -> None:
         if self._is_ours or not (self._window.requests or self._is_scheduled):
             self._transport.close()
+            if self.late_since_ns is None:
+                self.late_since_ns = monotonic_ns()  # answers may still wait to be taken
 
     def _take(self, piece: Piece) -> None:
+        self.used_at_ns = monotonic_ns()
+        self._is_used = True
+        if not self._is_blocked:
+            self.late_since_ns = None
         if isinstance(piece, TooLong):
             self._refuse_length(piece.header)
         elif isinstance(piece, Asked):
@@ -299,7 +319,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         if self._give_address is None:
             self._break_off("a router that asks for an address")
             return
-        net_id, own_port = self._give_address(self.host)
+        net_id, own_port = self._give_address(self._address)
         self._net_id = net_id = self._net_id or net_id
         if asked.command is RouterCommand.NET_ID:
             self._transport.write(encode_net_id(net_id))
@@ -321,23 +341,3 @@ class AmsConnection(asyncio.BufferedProtocol):
         elif not header.state_flags & _NO_RETURN and header.command != AmsCommand.NOTIFICATION:
             refusal = response_to(header, AmsAnswer(error_code=AdsError.AMS_LENGTH))
             self._transport.write(encode_with_prefix(refusal))
-
-
-def set_options(sock: socket.socket, unanswered_s: float = 60.0) -> None:
-    """Have the kernel find out that a peer has vanished without a word.
-
-    Args:
-        sock: Of the connection.
-        unanswered_s: After how long it is given up what the peer does not confirm; where nothing
-            is sent it takes a minute.
-    """
-    sock.setblocking(False)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (
-        (socket.TCP_KEEPIDLE, _PROBE_AFTER_S),
-        (socket.TCP_KEEPINTVL, _PROBE_S),
-        (socket.TCP_KEEPCNT, _PROBES),
-        (socket.TCP_NODELAY, 1),
-        (socket.TCP_USER_TIMEOUT, int(1000 * unanswered_s)),
-    ):
-        sock.setsockopt(socket.IPPROTO_TCP, option, value)

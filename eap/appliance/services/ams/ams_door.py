@@ -1,25 +1,22 @@
-"""The AMS/TCP listener of an address: the stations there, and who has connected to them."""
+"""The AMS/TCP listener of an address: the stations behind it, and the clients that connected."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from secrets import randbelow
-from typing import Any
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.accepting import accept_connections, connection_name
-from eap.appliance.services.ams.ams_connection import (
-    PATIENCE_S,
-    AmsConnection,
-    ClientAddresses,
-    set_options,
-)
-from eap.appliance.services.ams.ams_shares import Shares
+from eap.appliance.services.accepting import Listeners, ListeningSocket, connection_name
+from eap.appliance.services.ams.ams_connection import AmsConnection, ClientAddresses
 from eap.appliance.services.routing.entrance import Entrance
 from eap.ids import NetId
+from eap.net.connections import CloseReason, Limits
+from eap.net.tcp import set_keepalive
+
+LIMITS = Limits()
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +59,7 @@ class AmsDoor:
         entrance: To the stations that are reached by it.
         clients: Where those who have connected are found when an answer is there.
         refuse: Counts what is not answered as it was wanted.
-        patience_s: How long a packet, or answers that wait to be taken, may last.
+        listeners: Of this process.
     """
 
     def __init__(
@@ -71,38 +68,51 @@ class AmsDoor:
         entrance: Entrance,
         clients: AmsClients,
         refuse: Callable[[Refusal], None],
-        *,
-        patience_s: float = PATIENCE_S,
+        listeners: Listeners,
     ) -> None:
         self.refuse = refuse
-        self._listener = listener
         self._entrance = entrance
         self._clients = clients
-        self._patience_s = patience_s
-        self._shares = Shares()
-        self._connections: set[AmsConnection] = set()
+        name = "ams-tcp {}:{}".format(*listener.getsockname())
+        self._listening = ListeningSocket(listener, name, self, listeners, LIMITS)
 
     async def serve(self) -> None:
         """Accept until cancelled; then close all connections."""
+        await self._listening.serve()
+
+    def connection_from(self, sock: socket.socket, host: str) -> AmsConnection:
+        """Return the connection on a socket that was accepted (ConnectionServer)."""
+        set_keepalive(sock)
+        return AmsConnection(
+            connection_name(sock),
+            sock.getpeername()[0],
+            self,
+            host=host,
+            give_address=self._give_address,
+        )
+
+    async def serve_connection(self, connection: AmsConnection, sock: socket.socket) -> None:
+        """Serve a connection until its end (ConnectionServer)."""
+        loop = asyncio.get_running_loop()
+        await loop.connect_accepted_socket(lambda: connection, sock)
         try:
-            async with asyncio.TaskGroup() as group:
-                group.create_task(self._watch_slow())
-                await accept_connections(self._listener, "AMS/TCP", self._take)
+            await connection.closed
         finally:
-            for connection in list(self._connections):
-                connection.close("the appliance ends")
+            connection.close(CloseReason.ENDED)
+
+    def refuse_connection(self, sock: socket.socket, why: str) -> None:
+        """Count a connection that gets no place (ConnectionServer)."""
+        del sock, why
+        self.refuse(Refusal.AMS_FULL)
 
     def connection_opened(self, connection: AmsConnection) -> None:
         """Keep it (PacketTaker)."""
-        self._connections.add(connection)
         self._clients.add(connection)
 
     def connection_closed(self, connection: AmsConnection, why: str) -> None:
         """Let others have its place (PacketTaker)."""
         logger.debug("AMS/TCP connection %s: %s", connection.name, why)
-        self._connections.remove(connection)
         self._clients.remove(connection)
-        self._shares.give_back(connection.host)
         self._entrance.connection_closed(connection.name)
 
     def take_packet(self, packet: bytes, connection: AmsConnection) -> None:
@@ -114,37 +124,5 @@ class AmsDoor:
         del packet, connection
         self.refuse(Refusal.AMS_UNASKED)
 
-    def _take(
-        self, sock: socket.socket, address: tuple[str, int]
-    ) -> Coroutine[Any, Any, None] | None:
-        host, _ = address
-        why_not = self._shares.take(host, sock.getsockname()[0])
-        if why_not is not None:
-            logger.debug("AMS/TCP connection from %s closed: %s", host, why_not)
-            self.refuse(Refusal.AMS_FULL)
-            sock.close()
-            return None
-        return self._open(sock, host)
-
-    async def _open(self, sock: socket.socket, host: str) -> None:
-        loop = asyncio.get_running_loop()
-        name = connection_name(sock)
-        try:
-            set_options(sock)
-            await loop.connect_accepted_socket(
-                lambda: AmsConnection(name, host, self, give_address=self._give_address), sock
-            )
-        except OSError as exc:  # it has gone again already
-            logger.debug("AMS/TCP connection %s: %s", name, exc.strerror)
-            self._shares.give_back(host)
-            sock.close()
-
     def _give_address(self, host: str) -> tuple[NetId, int]:
         return self._clients.addresses.next(host, self._entrance.has)
-
-    async def _watch_slow(self) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            await asyncio.sleep(self._patience_s / 4)
-            for connection in list(self._connections):
-                connection.find_slow(loop.time(), self._patience_s)

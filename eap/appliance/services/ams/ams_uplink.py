@@ -11,12 +11,15 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable, Collection, Iterable
+from time import monotonic_ns
 from typing import NamedTuple, Protocol
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.ams.ams_connection import PATIENCE_S, AmsConnection, set_options
+from eap.appliance.services.ams.ams_connection import AmsConnection
 from eap.appliance.services.resolving import resolve
 from eap.net.backoff import Backoff
+from eap.net.connections import OVERDUE_NS, CloseReason
+from eap.net.tcp import set_keepalive
 
 CONNECT_S = 3.0
 """How long a peer may take to accept a connection."""
@@ -90,7 +93,7 @@ class AmsUplink:
         claims: dict[tuple[str, int], AmsUplink],
         refuse: Callable[[Refusal], None],
         may_be_client: Callable[[], bool] = bool,
-        patience_s: float = PATIENCE_S,
+        patience_ns: int = OVERDUE_NS,
     ) -> None:
         self.peer = peer
         self._may_be_client = may_be_client
@@ -100,7 +103,7 @@ class AmsUplink:
         self._router = router
         self._sources = sources
         self._claims = claims
-        self._patience_s = patience_s
+        self._patience_ns = patience_ns
         self._connection: AmsConnection | None = None
         self._closed: asyncio.Future[str]
         self._early: list[bytes] | None = []
@@ -209,8 +212,10 @@ class AmsUplink:
             lambda: AmsConnection(str(self.peer), host, self, is_ours=True), sock=sock
         )
         try:
-            while not (await asyncio.wait([self._closed], timeout=self._patience_s / 4))[0]:
-                connection.find_slow(loop.time(), self._patience_s)
+            while not (await asyncio.wait([self._closed], timeout=self._patience_ns / 4e9))[0]:
+                late_ns = connection.late_since_ns
+                if late_ns is not None and monotonic_ns() - late_ns >= self._patience_ns:
+                    connection.close(CloseReason.OVERDUE)
                 if self._said:
                     self._said = ""
                     logger.info("%s: connected to %s", self._router.name, self.peer)
@@ -226,7 +231,7 @@ async def _open(host: str, port: int, source: str | None) -> socket.socket:
     """Return a socket that is connected; raise OSError if that fails."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        set_options(sock, _UNCONFIRMED_S)
+        set_keepalive(sock, _UNCONFIRMED_S)
         if source is not None:
             sock.bind((source, 0))
         await asyncio.get_running_loop().sock_connect(sock, (host, port))

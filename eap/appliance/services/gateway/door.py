@@ -71,6 +71,12 @@ class GatewayDoor:
         if self._gateway is not None:
             self._gateway.connection_closed(Way(self._name, connection))
 
+    def waiting(self, connection: str) -> int:
+        """Return how many requests of a connection wait for their answers."""
+        if self._gateway is None:
+            return 0
+        return self._gateway.ledger.waiting(Way(self._name, connection))
+
     async def wait_below(self, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait."""
         if self._gateway is not None:

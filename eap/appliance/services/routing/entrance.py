@@ -77,6 +77,10 @@ class Entrance:
         """Say whether a station waits for an answer from there."""
         return any(station.is_awaited(Way(door, address)) for station, door in self._behind)
 
+    def waiting(self, connection: str) -> int:
+        """Return how many requests of a connection wait for their answers."""
+        return sum(station.waiting(Way(door, connection)) for station, door in self._behind)
+
     async def wait_below(self, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait at each station."""
         for station, door in self._behind:

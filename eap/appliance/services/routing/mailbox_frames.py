@@ -42,6 +42,9 @@ class FrameTaker(Protocol):
     def connection_closed(self, connection: str) -> None:
         """Forget who is gone."""
 
+    def waiting(self, connection: str) -> int:
+        """Return how many requests of a connection wait for their answers."""
+
     async def wait_below(self, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait."""
 

@@ -7,23 +7,46 @@ import socket
 from collections.abc import Callable
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.accepting import connection_name
+from eap.appliance.services.accepting import TaskConnection, connection_name
+from eap.appliance.services.ams.ams_window import grants_notification
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_frames import FrameTaker, MailboxCounters, aoe_packet
 from eap.appliance.services.routing.uplink import Uplinks
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxHeader
+from eap.net.connections import OWN_HOST, Activity, CloseReason
 
+SLOW_READER_S = 10.0
+"""A peer that takes nothing for this long while answers wait for it is disconnected."""
 LARGEST_FRAME = EtherCatHeader.SIZE + 0x7FF
 """What the 11 bits of Length allow."""
-SLOW_READER_S = 10.0
-"""A client that takes nothing for this long while answers wait for it is disconnected."""
 MAX_UNANSWERED = 64
 """Requests of one connection that wait; what it sends ahead stays in the connection."""
 MAX_AT_GATEWAY = 16
 """Likewise, requests for slaves and the master."""
 _MAX_UNSENT = 1 << 20
 """Octets that wait for a client that does not take them."""
+
+
+class StreamConnection(TaskConnection):
+    """A connection of a TCP listener, from its acceptance to its end.
+
+    Attributes:
+        is_subscribed: Whether a notification was granted on it.
+        waiting: Returns how many requests that came by it wait for their answers.
+    """
+
+    def __init__(self, host: str) -> None:
+        super().__init__(host)
+        self.is_subscribed = False
+        self.waiting: Callable[[], int] = int
+
+    @property
+    def activity(self) -> Activity:
+        """Current use."""
+        if self.is_subscribed:
+            return Activity.SUBSCRIBED
+        return Activity.BUSY if self.waiting() else super().activity
 
 
 class MailboxStreams:
@@ -52,44 +75,50 @@ class MailboxStreams:
         self._is_aoe_here = is_aoe_here
         self._uplinks = Uplinks(entrance, self._serve_uplink, source)
         self._counters = MailboxCounters()
-        self._writers: dict[str, asyncio.StreamWriter] = {}
+        self._streams: dict[str, tuple[asyncio.StreamWriter, StreamConnection]] = {}
 
-    async def serve(self, connection: socket.socket) -> None:
-        """Take what comes by *connection* until its end, and close it.
+    async def serve(self, connection: StreamConnection, sock: socket.socket) -> None:
+        """Take what comes by *sock* until its end, and close it.
 
         Its first frame may have been looked at, not taken.
         """
-        reader, writer = await asyncio.open_connection(sock=connection)
-        name = connection_name(connection)
-        self._writers[name] = writer
+        reader, writer = await asyncio.open_connection(sock=sock)
+        name = connection_name(sock)
+        self._streams[name] = writer, connection
+        connection.waiting = lambda: self._entrance.waiting(name) + self._gateway.waiting(name)
         try:
-            await self._take(reader, writer, name)
+            await self._take(reader, writer, name, connection)
             async with asyncio.timeout(SLOW_READER_S):
                 # Who has only closed its sending side still listens.
                 await self._entrance.wait_below(name, 1)
                 await self._gateway.wait_below(name, 1)
                 writer.close()
                 await writer.wait_closed()
-        except (OSError, TimeoutError):
+        except TimeoutError:
+            connection.closed_for = CloseReason.OVERDUE
+        except OSError:
             pass
         finally:
             writer.transport.abort()
-            del self._writers[name]
+            del self._streams[name]
             self._entrance.connection_closed(name)
             self._gateway.connection_closed(name)
 
     def send(self, connection: str, packets: tuple[bytes, ...]) -> str | None:
         """Send packets on a connection; return why not if that cannot be done."""
         frames = b"".join(self._counters.frame(connection, packet) for packet in packets)
-        if connection not in self._writers:
+        if connection not in self._streams:
             return self._uplinks.send(connection, frames)
+        if grants_notification(packets[0]):
+            self._streams[connection][1].is_subscribed = True
         return self.send_frame(connection, frames)
 
     def send_frame(self, connection: str, frame: bytes) -> str | None:
         """Send what is packed already on a connection that came; returns as :meth:`send` does."""
-        writer = self._writers.get(connection)
-        if writer is None or writer.is_closing():
+        found = self._streams.get(connection)
+        if found is None or found[0].is_closing():
             return "the connection is closed"
+        writer, _ = found
         if writer.transport.get_write_buffer_size() > _MAX_UNSENT:
             writer.transport.abort()
             return "the other side takes nothing"
@@ -104,17 +133,23 @@ class MailboxStreams:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str
     ) -> None:
         try:
-            await self._take(reader, writer, name)
+            await self._take(reader, writer, name, StreamConnection(OWN_HOST))
         finally:
             self._entrance.connection_closed(name)
 
     async def _take(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        name: str,
+        connection: StreamConnection,
     ) -> None:
         """Take frames until the end, or until what comes is none."""
         while True:
             try:
-                head = await reader.readexactly(EtherCatHeader.SIZE)
+                head = await reader.readexactly(1)
+                connection.note_partial()
+                head += await reader.readexactly(EtherCatHeader.SIZE - 1)
                 header = EtherCatHeader.decode(head)
                 if header.type != FrameType.MAILBOX or header.length < MailboxHeader.SIZE:
                     self._refuse(Refusal.TCP_TYPE)
@@ -122,6 +157,7 @@ class MailboxStreams:
                 frame = head + await reader.readexactly(header.length)
             except asyncio.IncompleteReadError:
                 return
+            connection.note_frame()
             packet = aoe_packet(frame) if self._is_aoe_here else None
             if packet is not None:
                 self._entrance.receive(packet, name)

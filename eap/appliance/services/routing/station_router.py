@@ -255,6 +255,10 @@ class StationRouter:
         """
         return await self._client.ask(target, target_port, command, body, timeout_s=timeout_s)
 
+    def waiting(self, way: Way) -> int:
+        """Return how many requests that came by *way* wait for their answers."""
+        return self._router.waiting(way)
+
     async def wait_below(self, door: str, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait for their answers.
 

@@ -11,7 +11,7 @@ from eap.appliance.passing import PassedConnection, pass_connection, take_connec
 
 pytestmark = pytest.mark.net
 
-DESCRIPTION = PassedConnection((PortName("a", "eap0"),), "127.0.0.1:5")
+DESCRIPTION = PassedConnection((PortName("a", "eap0"),), "10.0.0.2")
 
 
 @pytest.fixture

@@ -275,3 +275,34 @@ def test_what_happened_since_the_start_are_remarks() -> None:
             " dropped: 5 version, 6 length"
         ),
     ]
+
+
+LISTENER = {
+    "name": "ams-tcp 10.0.0.1:48898", "open": 128, "limit": 128, "refused": 5, "evicted": 12,
+    "overdue": 3, "crowded_ago_us": 1_000_000,
+}  # fmt: skip
+
+
+def test_listener_that_is_crowded_now_is_a_warning_and_a_remark_later() -> None:
+    status = document()
+    status["appliances"][0]["listeners"] = [LISTENER]
+    counts = "5 refused, 12 closed to make room, 3 closed as too slow"
+    where = "line ams-tcp 10.0.0.1:48898"
+    advice = "'ss -tn sport = :48898' shows the hosts"
+    text = f"{where}: crowded: 128 of 128 places taken; connections: {counts}; {advice}"
+    assert found(status) == [("warning", text)]
+    status["appliances"][0]["listeners"] = [LISTENER | {"crowded_ago_us": 61_000_000}]
+    assert found(status) == [("info", f"{where}: connections: {counts}")]
+    none = dict.fromkeys(("refused", "evicted", "overdue"), 0)
+    status["appliances"][0]["listeners"] = [LISTENER | none]
+    assert found(status) == []
+
+
+def test_process_near_its_limit_of_descriptors_is_a_warning() -> None:
+    status = document()
+    status["processes"]["services"]["descriptors"] = {"used": 55, "limit": 60}
+    advice = "raise the hard limit (ulimit -Hn, or LimitNOFILE= of systemd)"
+    text = f"line services: 55 of 60 file descriptors are in use; {advice}"
+    assert found(status) == [("warning", text)]
+    status["processes"]["services"]["descriptors"] = {"used": 54, "limit": 60}
+    assert found(status) == []

@@ -57,6 +57,20 @@ def test_process_that_was_restarted_and_one_that_is_being() -> None:
     assert row_of(text, "services  ") == "services restarting"
 
 
+def test_listeners_and_descriptors_are_shown() -> None:
+    status = document()
+    status["processes"]["engine"]["descriptors"] = {"used": 21, "limit": 1024}
+    status["appliances"][0]["listeners"] = [
+        {
+            "name": "ams-tcp 10.0.0.1:48898", "open": 7, "limit": 128, "refused": 1, "evicted": 2,
+            "overdue": 3, "crowded_ago_us": None,
+        }
+    ]  # fmt: skip
+    text = show(status)
+    assert row_of(text, "engine") == "engine 101 4.2 % 35 MB 21 of 1024 0"
+    assert row_of(text, "ams-tcp") == "ams-tcp 10.0.0.1:48898 7 of 128 1 2 3"
+
+
 def test_process_that_starts_is_shown_as_such() -> None:
     status = document()
     status["processes"]["engine"]["step"] = "building station mixer"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from eap.net import interface
 from eap.net.interface import link_is_up
 
 CLONE_NEWNET = 0x40000000
@@ -26,6 +27,12 @@ def wait_for_links(*names):
         assert time.monotonic() < limit
 
 
+def forget_kernel_socket():
+    """Have questions about interfaces asked in the namespace of now; a process has only one."""
+    interface._kernel().close()
+    interface._kernel.cache_clear()
+
+
 @pytest.fixture
 def cable():
     """Two joined Ethernet interfaces, ``left`` and ``right``, in a network of their own."""
@@ -33,6 +40,7 @@ def cable():
     with Path("/proc/thread-self/ns/net").open("rb") as home:
         if library.unshare(CLONE_NEWNET):
             pytest.skip(f"no network namespace: {os.strerror(ctypes.get_errno())}")
+        forget_kernel_socket()
         try:
             ip("link set lo up")
             ip("link add left type veth peer name right")
@@ -42,3 +50,4 @@ def cable():
             yield "left", "right"
         finally:
             library.setns(home.fileno(), CLONE_NEWNET)
+            forget_kernel_socket()

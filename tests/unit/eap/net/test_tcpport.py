@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import socket
 import time
 
 import pytest
 
 from eap.ids import InterfaceUri
+from eap.net import tcpport
+from eap.net.connections import CloseReason, Limits
 from eap.net.loopback import LoopbackLines
 from eap.net.tcp import TcpReceiver, open_tcp_listener
 from eap.net.tcpport import TcpPort
 from eap.pd.link import OutFrame
+from tests.support.appliance import wait_until
 
 pytestmark = pytest.mark.net
 
 HERE, THERE = "127.0.3.22", "127.0.3.23"
 TCP = f"tcp://{THERE}"
+SECOND = 1_000_000_000
 
 
 class Listener:
@@ -43,7 +48,8 @@ def plant():
         assert near.link_header(TCP) == near.link_header(TCP) == b""
         near.drain(0)
         taken = Listener()
-        far.accept(TcpReceiver(listener.accept()[0], [taken.take]))
+        receiver = TcpReceiver(listener.accept()[0], [taken.take])
+        assert far.accept(receiver, 0, spare_descriptors=9)
         near.drain(0)
         yield near, far, heard, taken
     near.close()
@@ -100,7 +106,7 @@ def test_an_answer_takes_the_connection_that_asked_and_comes_back_to_the_asker()
         near.link_header(TCP)
         near.drain(0)
         accepted = [TcpReceiver(listener.accept()[0], [requests.take])]
-        far.accept(accepted[0])
+        far.accept(accepted[0], 0, spare_descriptors=9)
         drain_until(near, lambda: near.send([frame(1, TCP)], 0) == [])
         drain_until(far, lambda: requests.got)
         back = accepted[0].name
@@ -125,3 +131,35 @@ def test_answers_that_nobody_reads_are_returned_and_counted(plant):
     failed = [each for _ in range(4000) for each in far.send([large], 0)]
     assert failed[-1] is large
     assert far.errors == {"slow_peer": len(failed)}
+
+
+def test_port_evicts_unused_connections_and_closes_unfinished_ones(monkeypatch):
+    monkeypatch.setattr(tcpport, "LIMITS", Limits(total=2, reserved=0))
+    port, peers = TcpPort(HERE), []
+
+    def connect(host, now_ns):
+        peers.append(socket.create_connection(listener.getsockname(), 5))
+        receiver = TcpReceiver(listener.accept()[0], [], host=host)
+        is_taken = port.accept(receiver, now_ns, spare_descriptors=9)
+        if not is_taken:
+            receiver.close()
+        return is_taken
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        assert connect("10.0.0.2", SECOND)
+        assert connect("10.0.0.2", SECOND)
+        peers[0].sendall(b"\x01\x40\x07")
+        wait_until(lambda: port.drain(SECOND))
+        assert connect("10.0.0.3", 2 * SECOND)
+        assert peers[1].recv(1) == b""
+        peers[2].sendall(b"\x05\x40x")
+        wait_until(lambda: port.drain(3 * SECOND) or port._receivers[1].late_since_ns)
+        assert not connect("10.0.0.2", 4 * SECOND)
+        port.drain(13 * SECOND)
+        port.drain(14 * SECOND)
+    assert port.closed == {CloseReason.EVICTED: 1, CloseReason.OVERDUE: 1}
+    assert peers[2].recv(1) == b""
+    assert port.connections == 1
+    for peer in peers:
+        peer.close()
+    port.close()

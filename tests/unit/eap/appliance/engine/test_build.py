@@ -16,6 +16,7 @@ from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EtherCatHeader
 from eap.net import tcpport
+from eap.net.connections import Limits
 from eap.net.image_file import open_image
 from eap.pd.report import station_status
 from eap.pd.spec import Wake
@@ -118,7 +119,7 @@ def test_frames_of_a_passed_connection_reach_the_port_behind_it(start, shared):
         with socket.create_connection(listener.getsockname()) as peer:
             connection, _ = listener.accept()
             owners = (PortName("right", "eap0"),)
-            running.plant.add_connection(connection, PassedConnection(owners, "peer"))
+            running.plant.add_connection(connection, PassedConnection(owners, "10.0.0.2"))
             peer.sendall(EtherCatHeader(1, 0, 4).encode() + b"\0")
             peer.sendall(EtherCatHeader(0, 0, 5).encode())
             running.run_cycles(3)
@@ -130,14 +131,20 @@ def test_frames_of_a_passed_connection_reach_the_port_behind_it(start, shared):
 
 
 @pytest.mark.net
-def test_a_port_has_room_for_so_many_connections(start, shared, monkeypatch):
-    monkeypatch.setattr(tcpport, "MOST_CONNECTIONS", 2)
+def test_host_over_its_share_loses_its_silent_connection_to_a_port(start, shared, monkeypatch):
+    monkeypatch.setattr(tcpport, "LIMITS", Limits(total=2, reserved=0, per_host=1))
     stations = [left(), right(eap_port(2, tcp=True))]
     running = start(stations, shared(*stations))
-    passed = PassedConnection((PortName("right", "eap0"),), "peer")
-    with socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as peers:
-        for _ in range(3):
-            peer = peers.enter_context(socket.create_connection(listener.getsockname(), 5))
+    owners = (PortName("right", "eap0"),)
+    with socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as stack:
+        peers = [
+            stack.enter_context(socket.create_connection(listener.getsockname(), 5))
+            for _ in range(2)
+        ]
+        for _ in peers:
+            passed = PassedConnection(owners, "10.0.0.1")
             running.plant.add_connection(listener.accept()[0], passed)
-        assert peer.recv(1) == b""  # the third was closed
-    assert running.discards() == {"left": {}, "right": {"tcp_full": 1}}
+        assert peers[0].recv(1) == b""
+        running.run_cycles(3)
+        running.plant.publish_discards()
+    assert running.discards() == {"left": {}, "right": {"tcp_evicted": 1}}

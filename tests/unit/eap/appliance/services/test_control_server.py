@@ -11,14 +11,17 @@ import pytest
 
 from eap.appliance.control import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.appliance.services import control_server
+from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.bus_methods import Buses
-from eap.appliance.services.control_server import ControlServer
+from eap.appliance.services.control_server import ControlConnection, ControlServer
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.methods import Methods, Watch
 from eap.errors import ControlError, TornReadError
+from eap.net.connections import Activity, CloseReason, Limits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
+from tests.support.eventually import eventually
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -37,6 +40,10 @@ def methods(images):
 NO_BUSES = Buses((), None, {})
 
 
+def serve_client(server: ControlServer, sock: socket.socket):
+    return server.serve_connection(ControlConnection(""), sock)
+
+
 class Talk:
     """One client of a server, both in one loop."""
 
@@ -45,7 +52,7 @@ class Talk:
 
     async def __aenter__(self):
         ours, theirs = socket.socketpair()
-        self.task = asyncio.ensure_future(self._server.serve_client(theirs))
+        self.task = asyncio.ensure_future(serve_client(self._server, theirs))
         self.reader, self.writer = await asyncio.open_unix_connection(sock=ours, limit=2 * MAX_LINE)
         return self
 
@@ -208,23 +215,73 @@ def test_a_subscription_outlives_what_cannot_be_read(methods, monkeypatch, exc, 
     asyncio.run(talk())
 
 
-def test_there_are_limits_on_subscriptions_and_clients(methods, monkeypatch):
-    monkeypatch.setattr(control_server, "MAX_CLIENTS", 1)
-
+def test_there_are_limits_on_subscriptions(methods):
     async def talk():
-        server = ControlServer(methods, NO_BUSES)
-        async with Talk(server) as client:
+        async with Talk(ControlServer(methods, NO_BUSES)) as client:
             for _ in range(MAX_SUBSCRIPTIONS):
                 answer = await client.ask("subscribe", station="left", on="change", names=["name"])
                 assert "result" in answer
                 await client.hear()
             answer = await client.ask("subscribe", station="left")
             assert answer["error"]["code"] == "busy"
-            async with Talk(server) as second:
-                assert (await second.hear())["error"]["code"] == "busy"
-                assert await second.reader.read() == b""
-        async with Talk(server) as third:
-            assert "result" in await third.ask("hello")
+
+    asyncio.run(talk())
+
+
+def test_listener_is_full_of_subscribers_and_has_room_when_one_leaves(
+    methods, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(control_server, "LIMITS", Limits(total=2, reserved=0, per_host=3))
+    listeners = Listeners()
+
+    async def ask(reader, writer, method):
+        line = {"v": 1, "id": 1, "method": method, "params": {"station": "left", "on": "change"}}
+        if method == "hello":
+            del line["params"]
+        writer.write(json.dumps(line).encode() + b"\n")
+        return json.loads(await reader.readline())
+
+    async def talk():
+        with socket.socket(socket.AF_UNIX) as listener:
+            path = str(tmp_path / "control")
+            listener.bind(path)
+            listener.listen()
+            server = ControlServer(methods, NO_BUSES)
+            serving = asyncio.ensure_future(server.serve(listener, listeners))
+            clients = []
+            for _ in range(2):
+                clients.append(await asyncio.open_unix_connection(path))
+                assert "result" in await ask(*clients[-1], "subscribe")
+            clients.append(await asyncio.open_unix_connection(path))
+            refusal = json.loads(await clients[-1][0].readline())["error"]
+            assert (refusal["code"], refusal["message"]) == ("busy", "all 2 places are taken")
+            clients[0][1].close()
+            await eventually(lambda: listeners.stats()[0].open == 1)
+            clients.append(await asyncio.open_unix_connection(path))
+            assert "result" in await ask(*clients[-1], "hello")
+            for _, writer in clients:
+                writer.close()
+            serving.cancel()
+            await asyncio.wait([serving])
+
+    asyncio.run(talk())
+
+
+def test_line_that_stays_unfinished_makes_its_client_late(methods):
+    async def talk():
+        ours, theirs = socket.socketpair()
+        connection = ControlConnection("")
+        server = ControlServer(methods, NO_BUSES)
+        serving = asyncio.ensure_future(server.serve_connection(connection, theirs))
+        with ours:
+            ours.sendall(b'{"v":1,')
+            await eventually(lambda: connection.late_since_ns is not None)
+            assert connection.activity is Activity.UNUSED
+            ours.sendall(b'"id":1,"method":"hello"}\n')
+            await eventually(lambda: connection.late_since_ns is None)
+            assert connection.activity in {Activity.IDLE, Activity.BUSY}
+            connection.close(CloseReason.OVERDUE)
+            await asyncio.wait([serving])
 
     asyncio.run(talk())
 
@@ -235,7 +292,7 @@ def test_who_does_not_read_is_disconnected(methods):
         ours, theirs = socket.socketpair()
         with ours:
             ours.sendall(b'{"v":1,"method":"variables","params":{"station":"left"}}\n' * 2000)
-            await asyncio.wait_for(server.serve_client(theirs), 10)
+            await asyncio.wait_for(serve_client(server, theirs), 10)
 
     asyncio.run(talk())
 
@@ -245,7 +302,9 @@ def test_a_listener_serves_many(methods, tmp_path):
         with socket.socket(socket.AF_UNIX) as listener:
             listener.bind(str(tmp_path / "control"))
             listener.listen()
-            serving = asyncio.ensure_future(ControlServer(methods, NO_BUSES).serve(listener))
+            serving = asyncio.ensure_future(
+                ControlServer(methods, NO_BUSES).serve(listener, Listeners())
+            )
             for _ in range(2):
                 reader, writer = await asyncio.open_unix_connection(str(tmp_path / "control"))
                 writer.write(b'{"v":1,"id":1,"method":"hello"}\n')
@@ -287,7 +346,7 @@ def test_who_leaves_is_not_waited_for(files, rest):
         server = ControlServer(methods, NO_BUSES)
         ours, theirs = socket.socketpair()
         with ours:
-            serving = asyncio.ensure_future(server.serve_client(theirs))
+            serving = asyncio.ensure_future(serve_client(server, theirs))
             ours.sendall(STATUS + rest)
             await slow.begun.wait()
         await asyncio.wait_for(serving, 0.1)
@@ -304,7 +363,7 @@ def test_who_only_stops_sending_gets_answers(files):
         with ours:
             ours.sendall(STATUS)
             ours.shutdown(socket.SHUT_WR)
-            await asyncio.wait_for(ControlServer(methods, NO_BUSES).serve_client(theirs), 5)
+            await asyncio.wait_for(serve_client(ControlServer(methods, NO_BUSES), theirs), 5)
             assert ours.recv(100) == b'{"v":1,"id":1,"result":{}}\n'
         assert slow.outcomes == ["answered"]
 
@@ -318,7 +377,7 @@ def test_what_was_sent_before_leaving_is_done(files):
         ours, theirs = socket.socketpair()
         with ours:
             ours.sendall(b'{"v":1,"id":1,"method":"stop"}\n')
-        await asyncio.wait_for(ControlServer(methods, NO_BUSES).serve_client(theirs), 5)
+        await asyncio.wait_for(serve_client(ControlServer(methods, NO_BUSES), theirs), 5)
         assert stopped == [True]
 
     asyncio.run(talk())

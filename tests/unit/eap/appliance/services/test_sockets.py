@@ -14,6 +14,7 @@ from eap.aoe.spec import RoutingSpec
 from eap.appliance.discards import DiscardCounters
 from eap.appliance.handover import Handover
 from eap.appliance.route_store import RouteStore
+from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.sockets import open_doors
 from eap.appliance.supervisor.sockets import SharedSockets
@@ -50,7 +51,9 @@ def script_on(tmp_path):
                     name: StationRoutes(router, RoutingSpec(), RouteStore("plant", name))
                     for name, router in routers.items()
                 }
-                doors = open_doors(handover, routers, routes, {}, counters, ours, resources)
+                doors = open_doors(
+                    handover, routers, routes, {}, counters, ours, Listeners(), resources
+                )
                 serving = [
                     asyncio.ensure_future(each.serve()) for each in (*routers.values(), *doors)
                 ]

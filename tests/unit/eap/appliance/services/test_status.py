@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import resource
+from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns
 
 import msgspec
@@ -13,6 +15,7 @@ from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.appliance.services import status
 from eap.appliance.services.status import ProcessMeter, appliance_status, link_state
+from eap.net.connections import ListenerStats
 from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec
@@ -37,7 +40,15 @@ def test_a_process_is_measured_since_its_start_then_since_the_last_time():
 
 
 def test_a_process_that_is_gone_has_no_share():
-    assert ProcessMeter().measure(2**22 + 1, now_ns()) == {"cpu": None, "rss": None}
+    assert ProcessMeter().measure(2**22 + 1, now_ns()) == status.NOTHING_MEASURED
+
+
+def test_process_meter_counts_descriptors():
+    with Path("/dev/null").open() as one, Path("/dev/null").open() as other:
+        measured = ProcessMeter().measure(os.getpid(), now_ns())["descriptors"]
+        assert measured["used"] > max(one.fileno(), other.fileno()) // 2
+    assert measured["limit"] == resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    assert ProcessMeter().measure(os.getpid(), now_ns())["descriptors"]["used"] < measured["used"]
 
 
 @pytest.mark.parametrize(
@@ -69,14 +80,21 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     monkeypatch.setattr(status, "monotonic_ns", lambda: 9_000_000_000)
     images[1].words[StationWord.CYCLE_AT_NS] = 4_000_000_000
     discarded = ({"left": {"other_vlan": 1}}, {"left": {"mailbox": 3}})
-    document = appliance_status(info, images, discarded, ProcessMeter(), {})
+    listeners = [ListenerStats("control", 1, 64, 2, 3, 4, 8_000_000_000)]
+    document = appliance_status(info, images, discarded, ProcessMeter(), {}, listeners)
     assert (document["version"], document["plant"]) == (1, "demo")
     processes = document["processes"]
     assert set(processes) == {"supervisor", "engine", "services"}
     assert processes["supervisor"]["pid"] == os.getpid()
     assert processes["engine"]["restarts"] == 2
     assert processes["engine"]["realtime"] == {"scheduler": "fifo 50"}
-    assert processes["services"] == {"pid": None, "cpu": None, "rss": None, "restarts": 1}
+    assert processes["services"] == {"pid": None, **status.NOTHING_MEASURED, "restarts": 1}
+    assert document["listeners"] == [
+        {
+            "name": "control", "open": 1, "limit": 64, "refused": 2, "evicted": 3, "overdue": 4,
+            "crowded_ago_us": 1_000_000,
+        }
+    ]  # fmt: skip
     left, right = document["stations"]
     assert (left["name"], left["state"], left["ports"][0]["link"]) == ("left", "INIT", "up")
     assert (left["cycle_age_us"], right["cycle_age_us"]) == (None, 5_000_000)

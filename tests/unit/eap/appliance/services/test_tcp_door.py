@@ -13,10 +13,12 @@ from eap.appliance.discards import Refusal
 from eap.appliance.handover import PortName
 from eap.appliance.passing import take_connection
 from eap.appliance.services import tcp_door
+from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.gateway.door import GatewayDoor
-from eap.appliance.services.routing.mailbox_stream import MailboxStreams
+from eap.appliance.services.routing.mailbox_stream import MailboxStreams, StreamConnection
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import EtherCatHeader
+from eap.net.connections import OWN_HOST, Activity, Limits
 from tests.support import aoe
 from tests.support.routing import entrance, station
 
@@ -33,7 +35,8 @@ def frame(kind: int) -> bytes:
 class Scene:
     """A door, the engine's end of its link, and what it refused."""
 
-    def __init__(self, listener, engine, refused) -> None:
+    def __init__(self, listener, engine, refused, listeners) -> None:
+        self.listeners = listeners
         self.address = listener.getsockname()
         self.engine = engine
         self.refused = refused
@@ -54,7 +57,7 @@ class Scene:
 
 
 def play(
-    script: Callable[[Scene], Awaitable[None]], takers=OWNERS, first_frame_s: float = 5
+    script: Callable[[Scene], Awaitable[None]], takers=OWNERS, patience_s: float = 5
 ) -> list[Refusal]:
     refused: list[Refusal] = []
 
@@ -64,11 +67,10 @@ def play(
             there = station(TARGET)
             streams = MailboxStreams(entrance(there), GatewayDoor([]), refused.append)
             there.add_door(Door("door", is_stream=True), streams)
-            door = TcpDoor(
-                listener, takers, services, refused.append, streams, first_frame_s=first_frame_s
-            )
-            serving = [asyncio.ensure_future(each.serve()) for each in (door, there)]
-            await script(Scene(listener, engine, refused))
+            listeners = Listeners(int(patience_s * 1e9))
+            door = TcpDoor(listener, takers, services, refused.append, streams, listeners)
+            serving = [asyncio.ensure_future(each.serve()) for each in (door, there, listeners)]
+            await script(Scene(listener, engine, refused, listeners))
             for task in serving:
                 task.cancel()
             await asyncio.wait(serving)
@@ -91,8 +93,9 @@ def test_type_4_goes_to_the_engine_with_its_first_frame():
         connection, passed = taken
         with connection:
             assert passed.owners == OWNERS
-            assert passed.peer == "{}:{}".format(*writer.get_extra_info("sockname"))
+            assert passed.host == OWN_HOST
             assert connection.recv(100) == data
+        assert scene.listeners.stats()[0].open == 0
         writer.close()
 
     assert play(script) == []
@@ -126,8 +129,7 @@ def test_type_5_is_answered_here():
 
 
 def test_a_fault_ends_one_connection_only(monkeypatch, caplog):
-    async def fail(streams, connection):
-        connection.close()
+    async def fail(streams, connection, sock):
         raise RuntimeError("a fault")
 
     async def script(scene):
@@ -139,25 +141,55 @@ def test_a_fault_ends_one_connection_only(monkeypatch, caplog):
     assert ["a fault" in record.exc_text for record in caplog.records] == [True, True]
 
 
-def test_there_is_a_limit_to_those_who_talk(monkeypatch):
-    monkeypatch.setattr(tcp_door, "MAX_STREAMS", 1)
+def test_connection_with_a_frame_goes_before_silent_ones(monkeypatch):
+    monkeypatch.setattr(tcp_door, "LIMITS", Limits(total=2, reserved=0))
     question = aoe.frame(aoe.packet(TARGET, 4, b""))
 
     async def script(scene):
         reader, writer = await scene.connect()
         writer.write(question)
         await asyncio.wait_for(reader.readexactly(8), 5)
-        assert await scene.send(question) == b""
-        writer.close()
+        silent, other = await scene.connect()
+        late_reader, late = await scene.connect()
+        late.write(question)
+        await asyncio.wait_for(late_reader.readexactly(8), 5)
+        assert await silent.read() == b""
+        assert await scene.send(question) == b""  # both are in use
+        for each in (writer, other, late):
+            each.close()
 
     assert play(script) == [Refusal.TCP_FULL]
 
 
-def test_who_says_nothing_is_closed():
-    async def script(scene):
-        assert await scene.send(b"") == b""
+def test_subscribed_connection_is_known_as_such():
+    connection = StreamConnection(OWN_HOST)
+    seen = [connection.activity]
+    connection.note_frame()
+    seen.append(connection.activity)
+    connection.waiting = lambda: 1
+    seen.append(connection.activity)
+    connection.is_subscribed = True
+    seen.append(connection.activity)
+    assert seen == list(Activity)
 
-    assert play(script, first_frame_s=0.05) == [Refusal.TCP_SILENT]
+
+@pytest.mark.parametrize("octets", [b"\x04", aoe.frame(aoe.packet(TARGET, 4, b""))[:9]])
+def test_frame_that_stays_unfinished_ends_the_connection(octets):
+    async def script(scene):
+        assert await scene.send(octets) == b""
+
+    assert play(script, patience_s=0.05) == [Refusal.TCP_SLOW]
+
+
+def test_silent_connection_is_kept():
+    async def script(scene):
+        reader, writer = await scene.connect()
+        await scene.send(b"\x04")  # which takes the time of an unfinished frame
+        writer.write(aoe.frame(aoe.packet(TARGET, 4, b"")))
+        assert await asyncio.wait_for(reader.readexactly(8), 5)
+        writer.close()
+
+    assert play(script, patience_s=0.05) == [Refusal.TCP_SLOW]
 
 
 def test_who_leaves_before_a_frame_is_not_counted():
@@ -177,28 +209,3 @@ def test_a_gone_engine_link_closes_the_connection():
         assert await scene.send(frame(4)) == b""
 
     assert play(script) == [Refusal.ENGINE_BUSY]
-
-
-def test_there_is_a_limit_to_those_who_wait(monkeypatch):
-    monkeypatch.setattr(tcp_door, "MAX_WAITING", 1)
-
-    async def script(scene):
-        _, silent = await scene.connect()
-        assert await scene.send(b"") == b""
-        silent.close()
-
-    assert play(script) == [Refusal.TCP_FULL]
-
-
-def test_the_limit_holds_when_all_come_at_once(monkeypatch):
-    monkeypatch.setattr(tcp_door, "MAX_WAITING", 2)
-
-    async def script(scene):
-        crowd = [socket.create_connection(scene.address) for _ in range(6)]  # before any is taken
-        for connection in crowd[2:]:  # closed by the door, the first two wait
-            connection.setblocking(False)
-            assert await asyncio.get_running_loop().sock_recv(connection, 1) == b""
-        for connection in crowd:
-            connection.close()
-
-    assert play(script) == [Refusal.TCP_FULL] * 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import time
@@ -13,10 +14,11 @@ from msgspec.structs import replace
 
 from eap.appliance.handover import EngineOptions
 from eap.appliance.runtime import ApplianceFolder, find_appliances
+from eap.appliance.supervisor.child import Child
 from eap.appliance.supervisor.process import Supervisor, make_info, run
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.config.load import Plant
-from eap.errors import ConfigError
+from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec
 
 DEMO = Path(__file__).parents[5] / "config" / "demo.yaml"
@@ -128,3 +130,28 @@ def test_supervisor_gives_children_that_got_stuck_more_time_and_never_gives_up(
     stuck = [line for line in caplog.messages if " is stuck: " in line]
     wanted = "no progress for 20 s; it is killed and started again, with 40 s for each step"
     assert stuck[0].endswith(wanted)
+
+
+def test_supervisor_tries_again_when_a_process_that_ran_cannot_be_started(
+    stations, caplog, monkeypatch
+):
+    def fail(self, *_):
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    with (
+        ApplianceFolder.claim("demo") as folder,
+        SharedSockets(stations, folder.control_socket) as sockets,
+    ):
+        options = EngineOptions(realtime=False)
+        info = make_info("demo", "demo.yaml", stations)
+        supervisor = Supervisor(info, Plant("x", stations), folder, sockets, options=options)
+        monkeypatch.setattr(Child, "start", fail)
+        engine = supervisor._engine
+        with pytest.raises(EnvironmentalError, match="engine cannot be started"):
+            supervisor._start(engine)
+        engine.watch.begin(0)
+        engine.watch.succeed()
+        for _ in range(2):
+            supervisor._start(engine)
+        assert engine in supervisor._restart_ns
+    assert "trying again in 100 ms" in caplog.messages[-1]

@@ -8,6 +8,7 @@ import socket
 import struct
 from collections.abc import Awaitable, Callable
 from functools import partial
+from time import monotonic_ns
 from typing import Any, TypeAlias
 
 import pytest
@@ -18,10 +19,11 @@ from eap.appliance.services.ams import ams_connection, ams_window
 from eap.appliance.services.ams.ams_connection import (
     AmsConnection,
     ClientAddresses,
-    set_options,
 )
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
+from eap.net.connections import CloseReason
+from eap.net.tcp import set_keepalive
 from tests.support import aoe
 from tests.support.eventually import eventually
 
@@ -103,7 +105,7 @@ def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more
         with socket.create_server(("127.0.0.1", 0)) as listener:
             ours = socket.create_connection(listener.getsockname())
             theirs, (host, port) = listener.accept()
-        set_options(theirs)
+        set_keepalive(theirs)
         connection = AmsConnection(
             f"{host}:{port}#1",
             host,
@@ -132,7 +134,9 @@ def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more
 async def look_for_slow(connection: AmsConnection, taker: Taker, patience_s: float) -> None:
     while not taker.closed.is_set():
         await asyncio.sleep(patience_s / 4)
-        connection.find_slow(asyncio.get_running_loop().time(), patience_s)
+        late_ns = connection.late_since_ns
+        if late_ns is not None and monotonic_ns() - late_ns >= patience_s * 1e9:
+            connection.close(CloseReason.OVERDUE)
 
 
 async def hear(reader: asyncio.StreamReader) -> tuple[int, int, bytes]:
@@ -401,7 +405,7 @@ def test_who_leaves_without_taking_its_answers_is_let_go() -> None:
 
 def test_dead_peers_are_looked_for() -> None:
     with socket.socket() as sock:
-        set_options(sock)
+        set_keepalive(sock)
         assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
         idle, each, count = (
             sock.getsockopt(socket.IPPROTO_TCP, option)

@@ -10,9 +10,11 @@ from collections.abc import Sequence
 import pytest
 
 from eap.appliance.discards import Refusal
-from eap.appliance.services.ams import ams_door, ams_shares
+from eap.appliance.services.accepting import Listeners
+from eap.appliance.services.ams import ams_door
 from eap.appliance.services.ams.ams_door import AmsClients, AmsDoor
 from eap.appliance.services.routing.entrance import Entrance
+from eap.net.connections import Limits
 from tests.support import aoe
 from tests.support.amsstation import EchoStation
 from tests.support.eventually import eventually
@@ -44,18 +46,21 @@ def play(
         with socket.create_server(("127.0.0.1", 0)) as listener:
             clients = AmsClients()
             entrance = Entrance([(station, "ams-tcp") for station in there])
-            door = AmsDoor(listener, entrance, clients, refused.append, patience_s=patience_s)
+            listeners = Listeners(int(patience_s * 1e9))
+            door = AmsDoor(listener, entrance, clients, refused.append, listeners)
+            door.address, door.listeners = listener.getsockname(), listeners
             for station in there:
                 station.send = clients.send
-            serving = asyncio.ensure_future(door.serve())
+            serving = [asyncio.ensure_future(each.serve()) for each in (door, listeners)]
 
             async def connect():
                 return await asyncio.open_connection(*listener.getsockname())
 
             await asyncio.wait_for(script(connect, door), 10)
-            serving.cancel()
-            await asyncio.wait([serving])
-            assert serving.cancelled()
+            for task in serving:
+                task.cancel()
+            await asyncio.wait(serving)
+            assert all(task.cancelled() for task in serving)
             await eventually(lambda: not clients)
 
     asyncio.run(run())
@@ -115,7 +120,7 @@ def test_names_of_connections_do_not_come_again():
                 sock.setblocking(False)
                 sock.bind(("127.0.0.1", port))
                 loop = asyncio.get_running_loop()
-                await loop.sock_connect(sock, door._listener.getsockname())
+                await loop.sock_connect(sock, door.address)
                 await loop.sock_sendall(sock, question(b"x"))
                 assert await loop.sock_recv(sock, 100)
 
@@ -163,22 +168,30 @@ def test_client_that_dies_leaves_the_others_alone():
     assert play(script)[0] == []
 
 
-def test_there_is_a_limit_and_room_again_when_somebody_leaves(monkeypatch):
-    monkeypatch.setattr(ams_shares, "MAX_CONNECTIONS", 2)
+def test_silent_connections_make_room_for_others(monkeypatch):
+    monkeypatch.setattr(ams_door, "LIMITS", Limits(total=3, reserved=0))
 
     async def script(connect, door):
-        first, second = await connect(), await connect()
-        third, writer = await connect()
-        assert await third.read() == b""
-        writer.close()
-        first[1].close()
-        await first[1].wait_closed()
-        await asyncio.sleep(0.05)
-        reader, writer = await connect()
-        for each, (to, back) in enumerate(((writer, reader), second[::-1])):
-            to.write(question(bytes([each])))
-            assert await hear(back) == bytes([each])
-            to.close()
+        async def ask(reader, writer):
+            writer.write(question(b"x"))
+            return await hear(reader)
+
+        clients = [await connect() for _ in range(3)]
+        *used, silent = clients
+        assert [await ask(*each) for each in used] == [b"x", b"x"]
+        clients.append(newcomer := await connect())
+        assert await silent[0].read() == b""
+        assert [await ask(*each) for each in (*used, newcomer)] == [b"x"] * 3
+        clients.append(refused := await connect())
+        assert await refused[0].read() == b""
+        used[0][1].close()
+        await eventually(lambda: door.listeners.stats()[0].open == 2)
+        clients.append(late := await connect())
+        assert await ask(*late) == b"x"
+        (stats,) = door.listeners.stats()
+        assert (stats.open, stats.limit, stats.refused, stats.evicted) == (3, 3, 1, 1)
+        for _, writer in clients:
+            writer.close()
 
     assert play(script)[0] == [Refusal.AMS_FULL]
 
@@ -215,7 +228,7 @@ def test_connection_that_is_reset_before_it_is_accepted_is_no_matter():
         for _ in range(5):
             with socket.socket() as sock:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                sock.connect(door._listener.getsockname())
+                sock.connect(door.address)
         reader, writer = await connect()
         writer.write(question(b"x"))
         assert await hear(reader) == b"x"
@@ -230,11 +243,11 @@ def test_connection_that_cannot_be_served_gives_its_place_back(monkeypatch):
 
     async def script(connect, door):
         with monkeypatch.context() as patch:
-            patch.setattr(ams_door, "set_options", refuse)
+            patch.setattr(ams_door, "set_keepalive", refuse)
             reader, writer = await connect()
             assert await reader.read() == b""
             writer.close()
-        assert door._shares._total == 0
+        assert door.listeners.stats()[0].open == 0
         reader, writer = await connect()
         writer.write(question(b"x"))
         assert await hear(reader) == b"x"
@@ -247,7 +260,7 @@ def test_connections_are_closed_when_the_door_is():
     async def script(connect, door):
         client.setblocking(False)
         loop = asyncio.get_running_loop()
-        await loop.sock_connect(client, door._listener.getsockname())
+        await loop.sock_connect(client, door.address)
         await loop.sock_sendall(client, question(b"x"))
         assert await loop.sock_recv(client, 100)
 

@@ -194,7 +194,7 @@ def test_peer_that_refuses_is_tried_again_until_it_is_there():
 def test_log_says_once_why_there_is_no_connection_and_when_there_is(caplog):
     async def run():
         port = free_port()
-        async with serving(port, patience_s=0.2) as (_, router, _):
+        async with serving(port, patience_ns=200_000_000) as (_, router, _):
             await eventually(lambda: len(router.seen) == 3)
             async with listening(port) as (plc, _):
                 _, writer = await plc.take()
@@ -277,7 +277,7 @@ def test_long_answers_are_taken_and_longer_ones_are_errors_at_once():
 
 def test_peer_that_takes_nothing_is_read_from_and_left_after_a_while():
     async def run():
-        async with listening() as (plc, port), serving(port, patience_s=0.4) as (
+        async with listening() as (plc, port), serving(port, patience_ns=400_000_000) as (
             uplink, router, refused,
         ):  # fmt: skip
             _, writer = await plc.take()

@@ -7,7 +7,12 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.appliance.services.ams.ams_window import MAX_OCTETS, MAX_REQUESTS, AmsWindow
+from eap.appliance.services.ams.ams_window import (
+    MAX_OCTETS,
+    MAX_REQUESTS,
+    AmsWindow,
+    grants_notification,
+)
 from tests.support import aoe
 
 TARGET = "1.1.1.1.2.1"
@@ -67,3 +72,29 @@ def test_nothing_is_left_when_all_have_been_answered(sizes: list[int]) -> None:
     for _ in sizes:
         window.take_out(answer())
     assert (window.requests, window._octets) == (0, 0)
+
+
+def granted(command: int, result: int = 0) -> bytes:
+    return answer(struct.pack("<II", result, 7), command)
+
+
+def test_window_counts_subscriptions_until_they_are_ended() -> None:
+    window = AmsWindow()
+    seen = []
+    for packet in (granted(6), granted(6), granted(6, 0x701), granted(7), granted(7), granted(7)):
+        window.take_in(request(command=packet[16]))
+        window.take_out(packet)
+        seen.append(window.subscriptions)
+    assert seen == [1, 2, 2, 1, 0, 0]
+
+
+def test_window_keeps_subscriptions_of_a_sum_command() -> None:
+    window = AmsWindow()
+    window.take_in(request(struct.pack("<IIII", 0xF085, 1, 8, 40), 9))
+    window.take_out(answer(command=9))
+    assert window.subscriptions == 1
+
+
+def test_grants_notification_needs_an_answer_without_error() -> None:
+    packets = (granted(6), granted(6, 0x701), granted(7), request(bytes(8), 6))
+    assert [grants_notification(packet) for packet in packets] == [True, False, False, False]

@@ -13,8 +13,9 @@ from eap.aoe.way import Door, Way
 from eap.appliance.discards import Refusal
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing import mailbox_stream
-from eap.appliance.services.routing.mailbox_stream import MailboxStreams
+from eap.appliance.services.routing.mailbox_stream import MailboxStreams, StreamConnection
 from eap.ids import NetId
+from eap.net.connections import OWN_HOST
 from tests.support import aoe
 from tests.support.routing import entrance, station, while_serving
 
@@ -36,7 +37,7 @@ def talk(script, there=None) -> list[Refusal]:
 
     async def run():
         ours, theirs = socket.socketpair()
-        stream = asyncio.ensure_future(streams.serve(theirs))
+        stream = asyncio.ensure_future(streams.serve(StreamConnection(OWN_HOST), theirs))
         reader, writer = await asyncio.open_connection(sock=ours)
         try:
             await script(reader, writer)
@@ -139,7 +140,7 @@ def test_hop_is_connected_to_and_asks_back_on_the_same_connection():
             here.add_route(Route(NetId.parse(TARGET), "there", Way("door", hop), is_probed=False))
             asking = asyncio.ensure_future(here.ask(NetId.parse(TARGET), 0xFFFF, 4, timeout_s=5))
             connection, _ = await asyncio.get_running_loop().sock_accept(listener)
-            stream = asyncio.ensure_future(far.serve(connection))
+            stream = asyncio.ensure_future(far.serve(StreamConnection(OWN_HOST), connection))
             answer = await asking
             (name,) = there.record.connections.snapshot()
             there.add_route(Route(NetId.parse("2.2.2.2.2.1"), "here", name, is_probed=False))
