@@ -37,10 +37,10 @@ demo: .venv/.stamp-run  ## run the demo plant and show its values moving; Ctrl-C
 valve: .venv/.stamp-run  ## a limit switch on one station's bus opens a valve on another's, through EAP
 	@$(BIN)/python tools/valve_demo.py
 
-# As root each worker has a network of its own; tests marked quiet run alone: see tests/conftest.py.
+# Each worker has a network of its own, as an ordinary user in a user namespace where these are allowed; tests marked quiet run alone: see tests/conftest.py.
 test: setup  ## run all tests; as root, first install the programs they use
 	@sh tools/install_peers.sh test || echo 'make test: going on; what needs them is skipped and listed'
-	@$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
+	@sh tools/isolated.sh $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: setup  ## format, lint, types, import contracts, tree
 	$(BIN)/ruff format --check .

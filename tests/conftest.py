@@ -66,6 +66,14 @@ def _lacks_root() -> str | None:
     return _lacks_program("ip", package="iproute2")
 
 
+def _lacks_host_root() -> str | None:
+    """Say why this process is not root of the machine itself, or None if it is."""
+    mapped = Path("/proc/self/uid_map").read_text().split()
+    if os.geteuid() == 0 and mapped == ["0", "0", "4294967295"]:
+        return None
+    return "needs root outside a user namespace; run the tests as root"
+
+
 def _lacks_program(name: str, *, package: str) -> str | None:
     if shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin") is None:
         return f"needs {name}; to install: apt-get install {package}"
@@ -119,6 +127,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     missing = {
         "root": _lacks_root(),
+        "host_root": _lacks_host_root(),
         "tshark": _lacks_program("tshark", package="tshark"),
         "mosquitto": _lacks_program("mosquitto", package="mosquitto")
         or _lacks_program("openssl", package="openssl"),

@@ -15,7 +15,7 @@ import pytest
 
 from tests.support.appliance import EAPCTL
 
-pytestmark = [pytest.mark.net, pytest.mark.root]
+pytestmark = [pytest.mark.net, pytest.mark.host_root]
 
 UID = 64_951
 PRIVATE = Path(f"/tmp/eap-{UID}")

@@ -91,14 +91,13 @@ def test_an_interface_that_is_missing_or_down(farm: Plants) -> None:
         assert "ip link set eth7 up" in down
 
 
+@pytest.mark.host_root
 def test_raw_sockets_without_the_capability(farm: Plants) -> None:
-    """An ordinary user; one made of root keeps only what it takes to read this tree."""
+    """An ordinary user made of root, who keeps only what it takes to read this tree."""
     farm.folder.chmod(0o755)
-    ordinary: list[str] = []
-    if os.geteuid() == 0:
-        keep = "+dac_override"
-        ordinary = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
-        ordinary += [f"--inh-caps={keep}", f"--ambient-caps={keep}"]
+    keep = "+dac_override"
+    ordinary = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
+    ordinary += [f"--inh-caps={keep}", f"--ambient-caps={keep}"]
     line = refusal(farm, "ethernet://lo", prefix=ordinary)
     assert "CAP_NET_RAW" in line
     assert "setpriv" in line

@@ -95,7 +95,7 @@ def test_claim_refuses_a_private_folder_that_others_may_enter(no_session):
         ApplianceFolder.claim("demo")
 
 
-@pytest.mark.root
+@pytest.mark.host_root
 def test_claim_refuses_a_private_folder_of_another_user(no_session):
     no_session.mkdir(mode=0o700)
     os.chown(no_session, 65534, 65534)

@@ -162,6 +162,7 @@ def test_missing_interface_is_named(cable):
         open_arp("nowhere")
 
 
+@pytest.mark.host_root
 def test_no_ethernet_is_refused(cable):
     del cable
     ip("tuntap add dev tun0 mode tun")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import subprocess
@@ -28,7 +27,6 @@ try:
 except EnvironmentalError as error:
     print(error)
 """
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
 
 
 def test_missing_interface_is_named_with_those_that_exist():
@@ -62,6 +60,7 @@ def test_bus_gets_frames_of_type_1_and_no_others(cable):
             deaf.recv(100)
 
 
+@pytest.mark.host_root
 @pytest.mark.root
 @pytest.mark.parametrize("opener", [open_packet_pair, open_type1])
 def test_interface_of_another_kind_is_refused(cable, opener):
@@ -71,8 +70,7 @@ def test_interface_of_another_kind_is_refused(cable, opener):
         opener("tunnel")
 
 
-@pytest.mark.root
-@as_root
+@pytest.mark.host_root
 def test_ordinary_user_is_told_a_command_that_works():
     done = subprocess.run(
         [sys.executable, "-c", AS_NOBODY], capture_output=True, text=True, check=True

@@ -38,7 +38,6 @@ child = subprocess.Popen([sys.executable, "-c", {CHILD!r}, str(os.getpid())])
 print(child.pid, flush=True)
 child.wait()
 """
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
 
 
 def prepare(priority=50, cpus="()", before="", prefix=()):
@@ -49,8 +48,7 @@ def prepare(priority=50, cpus="()", before="", prefix=()):
     return json.loads(done.stdout)
 
 
-@pytest.mark.root
-@as_root
+@pytest.mark.host_root
 def test_root_gets_everything():
     report = prepare(cpus="(0,)")
     assert report["scheduler"] == "fifo 50"
@@ -62,8 +60,7 @@ def test_root_gets_everything():
     assert (report["gc"], report["frozen"]) == (False, True)
 
 
-@pytest.mark.root
-@as_root
+@pytest.mark.host_root
 def test_ordinary_user_gets_reasons():
     before = (
         "import resource\n"
