@@ -26,7 +26,7 @@ _COMPLETE = 0x100
 _REASONS: dict[int, Reason] = {
     AdsError.TARGET_PORT: Reason.NO_SLAVE,
     AdsError.TARGET_MACHINE: Reason.NO_SLAVE,
-    AdsError.HOST_UNREACHABLE: Reason.BUS_DOWN,
+    AdsError.HOST_UNREACHABLE: Reason.UNREACHABLE,
     AdsError.TIMEOUT: Reason.TIMEOUT,
     AdsError.NOT_READY: Reason.NO_MAILBOX,
     AdsError.BUSY: Reason.BUSY,

@@ -84,6 +84,14 @@ class Reason(Enum):
         FoeErrorCode.NOT_DEFINED,
         AdsError.HOST_UNREACHABLE,
     )
+    UNREACHABLE = _Codes(
+        "its bus, or a station on the way to it, is down",
+        MailboxError.SERVICE_IN_WORK,
+        AbortCode.HARDWARE,
+        SoeErrorCode.GENERAL,
+        FoeErrorCode.NOT_DEFINED,
+        AdsError.HOST_UNREACHABLE,
+    )
     TOO_LONG = _Codes(
         "the message is longer than its mailbox",
         MailboxError.INVALID_SIZE,

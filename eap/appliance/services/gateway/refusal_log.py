@@ -11,7 +11,14 @@ from eap.codec.mailbox import MailboxType
 from eap.gateway.refusal import Reason
 
 _LOGGED = frozenset(
-    (Reason.DENIED, Reason.CROWDED, Reason.TOO_FAST, Reason.TIMEOUT, Reason.BUS_DOWN)
+    (
+        Reason.DENIED,
+        Reason.CROWDED,
+        Reason.TOO_FAST,
+        Reason.TIMEOUT,
+        Reason.BUS_DOWN,
+        Reason.UNREACHABLE,
+    )
 )
 """Reasons that an operator may want to act on; the others are between client and slave."""
 

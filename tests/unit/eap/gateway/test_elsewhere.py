@@ -17,7 +17,7 @@ COE, FOE, SOE, VOE = MailboxType.COE, MailboxType.FOE, MailboxType.SOE, MailboxT
 
 
 def test_who_did_not_answer_is_told_apart_from_who_refused():
-    assert elsewhere.reason_for(AdsError.HOST_UNREACHABLE) is Reason.BUS_DOWN
+    assert elsewhere.reason_for(AdsError.HOST_UNREACHABLE) is Reason.UNREACHABLE
     assert elsewhere.reason_for(AdsError.NOT_FOUND) is None
     assert elsewhere.abort_for(AdsError.NOT_FOUND) is AbortCode.NO_OBJECT
     assert elsewhere.abort_for(0x7FF) is AbortCode.GENERAL

@@ -61,7 +61,7 @@ def test_each_task_is_one_operation(task: Task, operation: Operation) -> None:
     ("task", "result", "told", "code", "reason"),
     [
         (UPLOAD, AdsError.NOT_FOUND, Failure.MISSING, 0x06020000, Reason.SERVICE),
-        (UPLOAD, AdsError.HOST_UNREACHABLE, Failure.GENERAL, None, Reason.BUS_DOWN),
+        (UPLOAD, AdsError.HOST_UNREACHABLE, Failure.GENERAL, None, Reason.UNREACHABLE),
         (UPLOAD, AdsError.TARGET_PORT, Failure.MISSING, None, Reason.NO_SLAVE),
         (ReadIdn(1, 0, Element.VALUE), AdsError.ACCESS, Failure.READ_ONLY, None, Reason.SERVICE),
         (TalkVoe(MESSAGE), 0x7FF, Failure.GENERAL, None, Reason.SERVICE),

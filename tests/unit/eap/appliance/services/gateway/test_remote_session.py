@@ -95,7 +95,7 @@ def test_idns_in_fragments():
     ("kind", "body", "result", "reason"),
     [
         (EOE, "00 00 0000 61", 0, Reason.NO_PROTOCOL),
-        (COE, UPLOAD, AdsError.HOST_UNREACHABLE, Reason.BUS_DOWN),
+        (COE, UPLOAD, AdsError.HOST_UNREACHABLE, Reason.UNREACHABLE),
         (COE, UPLOAD, AdsError.TARGET_PORT, Reason.NO_SLAVE),
         (COE, "00", 0, Reason.TOO_SHORT),
         (COE, "0090 40 0080 01 00000000", 0, Reason.SERVICE),
