@@ -55,6 +55,10 @@ class Outcome(StrEnum):
     """An answer or a notification that nobody waits for, or not any more."""
     DROPPED = "dropped"
     """Nothing was answered: broken, doubled, or of the kind that has no answer."""
+    INTERRUPTED = "interrupted"
+    """Nothing comes for subscriptions any more; they are to be restored."""
+    RESTORED = "restored"
+    """Subscriptions that were interrupted are established again."""
 
 
 class Trace(NamedTuple):

@@ -42,6 +42,7 @@ class AdsDevice:
         states: What ReadState tells.
         spaces: That read and write; the first that has an index group answers for it.
         control: Acts on WriteControl.
+        first_handle: Of its notifications.
 
     Attributes:
         notifications: Whom it tells of what; the caller says when a cycle is over.
@@ -54,8 +55,9 @@ class AdsDevice:
         spaces: Sequence[AdsSpace],
         *,
         control: Control = refuse_control,
+        first_handle: int = 1,
     ) -> None:
-        self.notifications = NotificationTable()
+        self.notifications = NotificationTable(first_handle)
         self._info = info
         self._states = states
         self._spaces = (*spaces, DeviceDataSpace(states))

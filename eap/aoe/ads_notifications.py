@@ -140,16 +140,20 @@ class _Pending:
 class NotificationTable:
     """The notifications of one device.
 
+    Args:
+        first_handle: Another one at each start keeps a router that missed the start from taking a
+            handle for one that it knows.
+
     Attributes:
         on_add: Called whenever there is one more.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first_handle: int = 1) -> None:
         self.on_add: Callable[[], None] | None = None
         self._notifications: dict[int, _Notification] = {}
         self._clients: dict[Client, _Pending] = {}
         self._due: list[tuple[int, int]] = []
-        self._next_handle = 1
+        self._next_handle = first_handle
         self._samples = 0
         self._packets = 0
         self._ended = 0

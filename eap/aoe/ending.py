@@ -7,17 +7,20 @@ was started again since; its server would send to nobody for ever.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from struct import Struct
 
 from eap.aoe.action import Action
 from eap.aoe.inflight import InFlight, Pending
 from eap.aoe.invoke import InvokeIds
 from eap.aoe.judge import Limits
 from eap.aoe.outlet import Outlet
-from eap.aoe.subscriptions import Subscription
+from eap.aoe.subscriptions import Grant
 from eap.aoe.way import Way
-from eap.codec.adsnotification import decode_notification
+from eap.codec.ads import IndexGroup
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.ids import NetId
+
+_WRITE = Struct("<III")  # group, offset, length
 
 
 class Ending:
@@ -36,30 +39,33 @@ class Ending:
         self._ids = ids
         self._limits = limits
 
-    def end(self, subscriptions: Iterable[Subscription], now_ns: int) -> list[Action]:
+    def end(self, grants: Iterable[Grant], now_ns: int) -> list[Action]:
         """Have notifications ended, for nobody and as long as there is room to wait for it."""
         actions: list[Action] = []
-        for subscription in subscriptions:
+        for grant in grants:
+            if grant.route.hop.door not in self._outlet.doors:
+                continue
             if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
                 break
-            actions.append(self._ask(subscription, now_ns))
+            handle = grant.handle.to_bytes(4, "little")
+            actions.append(self._ask(grant, AmsCommand.DELETE_NOTIFICATION, handle, now_ns))
+            actions += self.release(grant, now_ns)
         return actions
 
-    def end_unwanted(self, header: AmsHeader, body: bytes, way: Way) -> list[Action]:
-        """Return what ends a notification that nobody here has, at the server that sent it.
+    def release(self, grant: Grant, now_ns: int) -> list[Action]:
+        """Give back the handle of a symbol that this router looked up."""
+        if grant.symbol_handle is None:
+            return []
+        handle = grant.symbol_handle.to_bytes(4, "little")
+        body = _WRITE.pack(IndexGroup.RELEASE_HANDLE, 0, len(handle)) + handle
+        return [self._ask(grant, AmsCommand.WRITE, body, now_ns)]
+
+    def end_unwanted(self, header: AmsHeader, handle: int, way: Way) -> list[Action]:
+        """Return what ends a notification that no client here has, at the server that sent it.
 
         Not while the answer may still come that tells its handle: datagrams overtake each other.
-        It is the first that a packet tells of: one may have many handles, and ask for many packets.
-        Others come again.
-
-        Raises:
-            CodecError: the notification is shorter or longer than it says.
         """
         if any(pending.handles for pending in self._in_flight.on(way.door, None)):
-            return []
-        handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
-        handle = next(handles, None)
-        if handle is None:
             return []
         head = AmsHeader(
             header.source,
@@ -71,20 +77,19 @@ class Ending:
         )
         return [self._outlet.reply(way, encode_packet(head, handle.to_bytes(4, "little")))]
 
-    def _ask(self, subscription: Subscription, now_ns: int) -> Action:
-        target, target_port, source, source_port = ADDRESSES.unpack(subscription.onward)
+    def _ask(self, grant: Grant, command: AmsCommand, body: bytes, now_ns: int) -> Action:
         invoke_id = self._ids.take(self._in_flight)
-        header = AmsHeader(
-            NetId(target),
-            target_port,
-            NetId(source),
-            source_port,
-            AmsCommand.DELETE_NOTIFICATION,
-            invoke_id=invoke_id,
-        )
-        route, deadline_ns = subscription.route, now_ns + self._limits.timeout_ns
+        header = header_to(grant.onward, command, invoke_id)
+        route, deadline_ns = grant.route, now_ns + self._limits.timeout_ns
         self._in_flight.add(
-            Pending(invoke_id, header, None, route, subscription.onward, now_ns, deadline_ns)
+            Pending(invoke_id, header, None, route, grant.onward, now_ns, deadline_ns)
         )
-        packet = encode_packet(header, subscription.handle.to_bytes(4, "little"))
-        return self._outlet.forward(route.hop, packet, invoke_id)
+        return self._outlet.forward(route.hop, encode_packet(header, body), invoke_id)
+
+
+def header_to(addresses: bytes, command: int, invoke_id: int) -> AmsHeader:
+    """Return the header of a request with the *addresses* of its server and its client."""
+    target, target_port, source, source_port = ADDRESSES.unpack(addresses)
+    return AmsHeader(
+        NetId(target), target_port, NetId(source), source_port, command, invoke_id=invoke_id
+    )

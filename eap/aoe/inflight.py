@@ -23,11 +23,13 @@ class Pending:
         at_ns: When it came.
         deadline_ns: When its time is up.
         handles: How many notifications it asks for.
+        asked_for: What it asks for, if a subscription is restored by it here later: its body.
+        step: That of a restoration which the request is; None for a client's.
         judged: What access rules say of it, where its answer matters to them.
     """
 
-    __slots__ = ("at_ns", "came_by", "deadline_ns", "handles", "header", "invoke_id", "judged",
-                 "onward", "route")  # fmt: skip
+    __slots__ = ("asked_for", "at_ns", "came_by", "deadline_ns", "handles", "header", "invoke_id",
+                 "judged", "onward", "route", "step")  # fmt: skip
 
     def __init__(
         self, invoke_id: int, header: AmsHeader, came_by: Way | None, route: Route | None,
@@ -41,6 +43,8 @@ class Pending:
         self.at_ns = at_ns
         self.deadline_ns = deadline_ns
         self.handles = 0
+        self.asked_for = b""
+        self.step: object | None = None
         self.judged: Judged | None = None
 
 
@@ -93,7 +97,7 @@ class InFlight:
             self._by_way.setdefault(way, {})[key] = pending
             self._by_door[way.door] = self._by_door.get(way.door, 0) + 1
             self._asked[way, pending.onward, pending.header.invoke_id] = key
-        else:
+        elif pending.step is None:
             self._abandoned[key] = None
         # The times allowed are few, so that each has its requests in the order of their deadlines.
         allowed = pending.deadline_ns - pending.at_ns

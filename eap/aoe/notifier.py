@@ -1,28 +1,66 @@
-"""Notifications that pass a router: who asked for them, and who gets them."""
+"""Subscriptions that pass a router: requests and answers are followed, samples go to their clients.
+
+The first router on the way keeps what it needs to restore a subscription (restorer.py): it is the
+one whose client has a connection to it and whose request bears no mark of a router before it.
+"""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 from eap.aoe.action import Reply
 from eap.aoe.inflight import Pending
+from eap.aoe.invoke import is_marked
 from eap.aoe.outlet import Outlet
-from eap.aoe.subscriptions import MAX_PER_WAY, Subscription, Subscriptions, divide
+from eap.aoe.subscriptions import MAX_PER_CLIENT, Grant, Subscription, Subscriptions, divide
 from eap.aoe.way import Way
-from eap.codec.ads import AdsReadWrite, IndexGroup
-from eap.codec.adsnotification import decode_notification
-from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
-from eap.ids import NetId
+from eap.codec.ads import AdsError, AdsReadWrite, IndexGroup
+from eap.codec.adsnotification import AddNotification, decode_notification
+from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
 
 _GRANTED = struct.Struct("<II")  # result, handle
 _HANDLE = 4
-_OF_NOTIFICATIONS = frozenset(
-    (AmsCommand.ADD_NOTIFICATION, AmsCommand.DELETE_NOTIFICATION, AmsCommand.READ_WRITE)
-)
-"""Commands that may be about some."""
+_ADD = AmsCommand.ADD_NOTIFICATION.value  # plain numbers: members of enums are slow
+_DELETE = AmsCommand.DELETE_NOTIFICATION.value
+_READ_WRITE = AmsCommand.READ_WRITE.value
+_SYMBOL_HANDLE = IndexGroup.SYMBOL_HANDLE.value
+_SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value
+_SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value
 _SUM_HEAD = 8
-"""Octets of result and length before the answers to the items of a sum command."""
+"""Bytes of result and length before the answers to the items of a sum command."""
+_MAX_SYMBOLS = 1024
+"""Symbol handles that are remembered of one connection; the oldest makes room."""
+_LONGEST_NAME = 256
+BY_HANDLE = frozenset((IndexGroup.VALUE_BY_HANDLE, IndexGroup.SYMBOL_NOTIFICATION))
+"""Groups whose offset is the handle of a symbol."""
+_LENGTH = slice(20, 24)
+
+
+class Granted(NamedTuple):
+    """What follows from the answer to a request for notifications."""
+
+    body: bytes
+    """As the client gets it: with the handles that it knows."""
+    surplus: list[Grant]
+    """Notifications that no client waits for any more."""
+    new: list[Subscription]
+    displaced: list[Subscription]
+    """Subscriptions whose handle the server gave again, so that it does not know them any more."""
+
+
+class Samples(NamedTuple):
+    """What follows from a notification."""
+
+    replies: list[Reply]
+    ended: list[Subscription]
+    """Subscriptions that their server has ended."""
+    unknown: list[int]
+    """Handles that no client here has."""
+    hop: Way | None
+    """That samples of known subscriptions came from; None if there are none."""
 
 
 class Notifier:
@@ -35,89 +73,195 @@ class Notifier:
     def __init__(self, outlet: Outlet) -> None:
         self.subscriptions = Subscriptions()
         self._outlet = outlet
+        self._symbols: dict[Way, OrderedDict[tuple[bytes, int], bytes]] = {}
+
+    def find_own(self, header: AmsHeader, data: bytes, way: Way) -> list[Subscription] | None:
+        """Return the subscriptions of this client that a request deletes.
+
+        None says that it deletes nothing that is known here.
+        """
+        if header.command not in {_DELETE, _READ_WRITE}:
+            return None
+        handles = deleted_handles(header, data)
+        if not handles:
+            return None
+        asked = data[: ADDRESSES.size]
+        find = self.subscriptions.find_of_client
+        found = [find(way, asked, handle) for handle in handles]
+        return [each for each in found if each is not None] or None
+
+    def has_room(self, header: AmsHeader, data: bytes, way: Way) -> bool:
+        """Say whether a client may have the notifications that it asks for."""
+        if header.command not in {_ADD, _READ_WRITE}:
+            return True
+        count = _count_of(header, data[AmsHeader.SIZE :])
+        return not count or self.subscriptions.has_room(way, data[: ADDRESSES.size], count)
 
     def follow_request(self, pending: Pending, body: bytes, way: Way) -> None:
-        """Note how many notifications a client asks for, or which it wants no more."""
-        command, group, count = pending.header.command, 0, 0
-        if command not in _OF_NOTIFICATIONS:
+        """Note which notifications a client asks for, and which symbol it looks up."""
+        header = pending.header
+        if header.command not in {_ADD, _READ_WRITE}:
             return
-        if command == AmsCommand.READ_WRITE and len(body) >= AdsReadWrite.SIZE:
-            head = AdsReadWrite.decode(body)
-            group, count = head.group, min(head.offset, MAX_PER_WAY)
-        if command == AmsCommand.ADD_NOTIFICATION:
-            pending.handles = 1
-        elif group == IndexGroup.SUM_ADD_NOTIFICATION:
-            pending.handles = count
-        elif command == AmsCommand.DELETE_NOTIFICATION:
-            self._delete(pending.onward, body[:_HANDLE], way)
-        elif group == IndexGroup.SUM_DELETE_NOTIFICATION:
-            start = AdsReadWrite.SIZE
-            self._delete(pending.onward, body[start : start + count * _HANDLE], way)
+        pending.handles = _count_of(header, body)
+        if pending.handles or _group_of(header, body) == _SYMBOL_HANDLE:
+            door = self._outlet.doors[way.door]
+            # Where clients have no connection it is never known that they are gone.
+            is_first = (door.is_stream or door.is_shared) and not is_marked(header.invoke_id)
+            pending.asked_for = body if is_first else b""
 
-    def follow_answer(self, pending: Pending, header: AmsHeader, body: bytes) -> list[Subscription]:
-        """Note the notifications that were granted; return those that their server should end."""
-        if not pending.handles or header.error_code or pending.route is None:
-            return []
-        asked = pending.header
-        server = bytes(asked.target) + asked.target_port.to_bytes(2, "little")
+    def follow_answer(
+        self, pending: Pending, header: AmsHeader, body: bytes, now_ns: int
+    ) -> Granted | None:
+        """Note the notifications that were granted, if any were asked for."""
+        way, route = pending.came_by, pending.route
+        if header.error_code or route is None:
+            return None
+        if not pending.handles:
+            if pending.asked_for and way is not None:
+                self._note_symbol(pending, body, way)
+            return None
         start = 0 if header.command == AmsCommand.ADD_NOTIFICATION else _SUM_HEAD
-        granted = body[start : start + pending.handles * _GRANTED.size]
-        surplus = []
-        for result, handle in _GRANTED.iter_unpack(granted[: _whole(granted)]):
+        granted = Granted(body, [], [], [])
+        asked = _addresses(pending.header)
+        requests = _requests_of(pending)
+        for number in range(pending.handles):
+            at = start + number * _GRANTED.size
+            if at + _GRANTED.size > len(body):
+                break
+            result, handle = _GRANTED.unpack_from(body, at)
             if result:
                 continue
-            given = Subscription(pending.onward, handle, pending.route, server)
-            way = pending.came_by
-            oldest = given if way is None else self.subscriptions.add(way, given)
-            if oldest is not None:
-                surplus.append(oldest)
-        return surplus
+            grant = Grant(pending.onward, handle, route)
+            if way is None:
+                granted.surplus.append(grant)
+                continue
+            request = requests[number] if requests else None
+            symbol = self._symbol_of(way, asked, request)
+            subscription = Subscription(way, asked, grant, now_ns, request, symbol)
+            displaced = self.subscriptions.add(subscription)
+            granted.new.append(subscription)
+            if displaced is not None:
+                granted.displaced.append(displaced)
+            if subscription.handle != handle:
+                new = subscription.handle.to_bytes(_HANDLE, "little")
+                body = body[: at + _HANDLE] + new + body[at + _GRANTED.size :]
+        return granted._replace(body=body)
+
+    def forget(self, subscriptions: Iterable[Subscription]) -> list[Grant]:
+        """Forget what clients have deleted; return what servers gave for it."""
+        grants = [self.subscriptions.remove(each) for each in subscriptions if not each.is_closed]
+        return [grant for grant in grants if grant is not None]
 
     def knows(self, header: AmsHeader, body: bytes) -> bool:
-        """Say whether somebody here asked for a sample of a notification.
+        """Say whether a client here subscribed to a sample of a notification.
 
         Raises:
             CodecError: it is shorter or longer than it says.
         """
-        onward = ADDRESSES.pack(
-            header.source, header.source_port, header.target, header.target_port
-        )
+        onward = _back(header)
         handles = (sample.handle for stamp in decode_notification(body) for sample in stamp.samples)
         return any(self.subscriptions.find(onward, handle) is not None for handle in handles)
 
-    def hand_on(self, header: AmsHeader, body: bytes, is_hop: Callable[[Way], bool]) -> list[Reply]:
-        """Return what the clients get of a notification; nothing if nobody here asked for it.
+    def hand_on(
+        self, header: AmsHeader, data: bytes, now_ns: int, is_hop: Callable[[Way], bool]
+    ) -> Samples:
+        """Return what the clients get of a notification.
 
         Raises:
             CodecError: it is shorter or longer than it says.
         """
-        onward = ADDRESSES.pack(
-            header.source, header.source_port, header.target, header.target_port
-        )
-        parts = divide(body, onward, self.subscriptions, is_hop)
+        body = data[AmsHeader.SIZE :]
+        division = divide(body, _back(header), self.subscriptions, now_ns, is_hop)
         replies = []
-        for (way, server), part in parts.items():
-            source, port = NetId(server[:6]), int.from_bytes(server[6:], "little")
-            head = AmsHeader(
-                header.target,
-                header.target_port,
-                source,
-                port,
-                header.command,
-                header.state_flags,
-                error_code=header.error_code,
-                invoke_id=header.invoke_id,
-            )
-            replies.append(self._outlet.reply(way, encode_packet(head, part)))
-        return replies
+        for way, asked, part in division.parts:
+            addresses = asked[8:] + asked[:8]
+            length = len(part).to_bytes(4, "little")
+            head = data[ADDRESSES.size : _LENGTH.start] + length
+            packet = addresses + head + data[_LENGTH.stop : AmsHeader.SIZE] + part
+            replies.append(self._outlet.reply(way, packet))
+        return Samples(replies, division.ended, division.unknown, division.hop)
 
-    def _delete(self, onward: bytes, handles: bytes, way: Way) -> None:
-        for at in range(0, len(handles) - _HANDLE + 1, _HANDLE):
-            handle = int.from_bytes(handles[at : at + _HANDLE], "little")
-            found = self.subscriptions.find(onward, handle)
-            if found is not None and found[0] == way:
-                self.subscriptions.remove(onward, handle)
+    def close(self, way: Way) -> list[Grant]:
+        """Forget the clients of a connection; return what servers gave them."""
+        self._symbols.pop(way, None)
+        return self.subscriptions.close(way)
+
+    def _note_symbol(self, pending: Pending, body: bytes, way: Way) -> None:
+        head = AdsReadWrite.decode(pending.asked_for)
+        name = pending.asked_for[AdsReadWrite.SIZE :][: head.write_length]
+        if len(body) < _SUM_HEAD + _HANDLE or any(body[:4]) or len(name) > _LONGEST_NAME:
+            return
+        handle = int.from_bytes(body[_SUM_HEAD : _SUM_HEAD + _HANDLE], "little")
+        mine = self._symbols.setdefault(way, OrderedDict())
+        key = _addresses(pending.header), handle
+        mine[key] = name
+        mine.move_to_end(key)
+        if len(mine) > _MAX_SYMBOLS:
+            mine.popitem(last=False)
+
+    def _symbol_of(self, way: Way, asked: bytes, request: AddNotification | None) -> bytes:
+        if request is None or request.group not in BY_HANDLE:
+            return b""
+        mine = self._symbols.get(way)
+        return b"" if mine is None else mine.get((asked, request.offset), b"")
 
 
-def _whole(granted: bytes) -> int:
-    return len(granted) // _GRANTED.size * _GRANTED.size
+def deleted_handles(header: AmsHeader, data: bytes) -> Sequence[int]:
+    """Return the handles of the notifications that a request deletes; none if it is another one."""
+    body = data[AmsHeader.SIZE :]
+    if header.command == _DELETE:
+        octets = body[:_HANDLE]
+    elif _group_of(header, body) == _SUM_DELETE:
+        count = AdsReadWrite.decode(body).offset
+        octets = body[AdsReadWrite.SIZE :][: count * _HANDLE]
+    else:
+        return ()
+    return [
+        item for (item,) in struct.iter_unpack("<I", octets[: len(octets) // _HANDLE * _HANDLE])
+    ]
+
+
+def encode_deleted(header: AmsHeader, results: Sequence[AdsError]) -> bytes:
+    """Return the body of the answer to a request that deletes notifications."""
+    octets = b"".join(result.to_bytes(4, "little") for result in results)
+    if header.command == _DELETE:
+        return octets
+    return _GRANTED.pack(0, len(octets)) + octets
+
+
+def _group_of(header: AmsHeader, body: bytes) -> int:
+    """Return the index group of a ReadWrite, 0 for any other command."""
+    if header.command != _READ_WRITE or len(body) < AdsReadWrite.SIZE:
+        return 0
+    return int.from_bytes(body[:4], "little")
+
+
+def _count_of(header: AmsHeader, body: bytes) -> int:
+    """Return how many notifications a request asks for."""
+    if header.command == _ADD:
+        return 1
+    if _group_of(header, body) == _SUM_ADD:
+        return min(AdsReadWrite.decode(body).offset, MAX_PER_CLIENT)
+    return 0
+
+
+def _requests_of(pending: Pending) -> list[AddNotification]:
+    """Return the parameters of the notifications that were asked for, if they are kept here."""
+    octets = pending.asked_for
+    if not octets:
+        return []
+    if pending.header.command != _ADD:
+        octets = octets[AdsReadWrite.SIZE :]
+    size = AddNotification.SIZE
+    if len(octets) < size * pending.handles:
+        return []
+    return [AddNotification.decode(octets, size * number) for number in range(pending.handles)]
+
+
+def _addresses(header: AmsHeader) -> bytes:
+    return ADDRESSES.pack(header.target, header.target_port, header.source, header.source_port)
+
+
+def _back(header: AmsHeader) -> bytes:
+    """Return the addresses that the request for a notification had."""
+    return ADDRESSES.pack(header.source, header.source_port, header.target, header.target_port)

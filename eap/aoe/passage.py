@@ -15,14 +15,16 @@ from eap.aoe.inflight import InFlight, Pending
 from eap.aoe.invoke import InvokeIds, is_marked
 from eap.aoe.judge import Judge, Limits
 from eap.aoe.judged import Judged
-from eap.aoe.notifier import Notifier
+from eap.aoe.notifier import Notifier, Samples, deleted_handles, encode_deleted
 from eap.aoe.outlet import Outlet
 from eap.aoe.passed import Passed
 from eap.aoe.prober import Prober
 from eap.aoe.record import Record, describe
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
 from eap.aoe.report import Obstacle
+from eap.aoe.restorer import Restorer
 from eap.aoe.routes import Route, RouteTable
+from eap.aoe.subscriptions import MAX_PER_CLIENT, MAX_TOTAL, Subscription
 from eap.aoe.way import Way
 from eap.codec.ads import AdsError
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader
@@ -41,6 +43,7 @@ class Passage:
     Attributes:
         in_flight: What waits for an answer.
         notifier: Notifications that pass.
+        restorer: Subscriptions that are interrupted.
     """
 
     def __init__(
@@ -69,6 +72,12 @@ class Passage:
         self._judge = Judge(net_id, table, outlet.doors, self.in_flight, limits, prober)
         self._passed = Passed()
         self._ending = Ending(outlet, self.in_flight, self._ids, limits)
+        self.restorer = Restorer(
+            self.notifier.subscriptions, outlet, self.in_flight, self._ids, self._ending, refuser,
+            limits, self._find_way,
+        )  # fmt: skip
+        if prober is not None:
+            prober.watched = self.notifier.subscriptions.hops
 
     def take_notification(
         self, header: AmsHeader, data: bytes, way: Way, now_ns: int, *, is_own: bool
@@ -87,27 +96,41 @@ class Passage:
         Raises:
             CodecError: it is shorter or longer than it says.
         """
-        body = data[AmsHeader.SIZE :]
-        replies = self.notifier.hand_on(header, body, lambda hop: self._outlet.is_from(hop, way))
-        if replies:
-            return list(replies)
+        samples = self.notifier.hand_on(
+            header, data, now_ns, lambda hop: self._outlet.is_from(hop, way)
+        )
+        if samples.hop is not None:
+            if self._prober is not None:
+                self._prober.hear(samples.hop, now_ns)
+            actions = [*samples.replies, *self.restorer.ended(samples.ended, now_ns)]
+            return actions + self._end_unwanted(header, samples, way)
         found = None if is_own else self._judge.find_route(header, way)
         if isinstance(found, Route) or (found and found.error != AdsError.TARGET_MACHINE):
             return self.take_request(header, data, way, now_ns)
         text = "no client here subscribed to it, or not any more"
         self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
-        return self._ending.end_unwanted(header, body, way)
+        return self._end_unwanted(header, samples, way)
+
+    def _end_unwanted(self, header: AmsHeader, samples: Samples, way: Way) -> list[Action]:
+        """Have one notification ended that no client has; the others come again."""
+        if not samples.unknown:
+            return []
+        return self._ending.end_unwanted(header, samples.unknown[0], way)
 
     def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
         """Pass a request on that is for nobody here, or refuse it."""
+        own = self.notifier.find_own(header, data, way)
+        if own is not None and own[0].request is not None:
+            return self._delete(header, data, own, way, now_ns)
         found = self._let_on(header, data, way, now_ns)
         if isinstance(found, Refusal):
             return self._refuser.refuse(header, way, found, now_ns)
         route, data, judged = found
-        onward = ADDRESSES.pack(
-            route.to_real(header.target), header.target_port,
-            self._table.to_virtual(header.source, way), header.source_port,
-        )  # fmt: skip
+        if own is not None:
+            self.notifier.forget(own)
+        if not self.notifier.has_room(header, data, way):
+            return self._refuse_subscriptions(header, judged, way, now_ns)
+        onward = self._onward(header, way, route)
         if not wants_answer(header):
             if judged is not None:
                 self._gate.give_up(judged)
@@ -137,8 +160,15 @@ class Passage:
         self.in_flight.pop(header.invoke_id)
         if self._prober is not None and pending.route is not None:
             self._prober.hear(pending.route.hop, now_ns)
-        surplus = self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :])
-        actions = self._ending.end(surplus, now_ns)
+        if pending.step is not None:
+            body = data[AmsHeader.SIZE :]
+            return self.restorer.receive_answer(pending, header, body, now_ns)
+        actions: list[Action] = []
+        granted = self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :], now_ns)
+        if granted is not None:
+            actions += self._ending.end(granted.surplus, now_ns)
+            actions += self.restorer.displaced(granted.displaced, now_ns)
+            data = data[: AmsHeader.SIZE] + granted.body
         if pending.came_by is None:
             if header.command != AmsCommand.DELETE_NOTIFICATION:  # most of those are our own
                 self._refuser.drop(way, None, Outcome.LATE, _unasked(header), now_ns)
@@ -152,6 +182,8 @@ class Passage:
         number = asked.invoke_id.to_bytes(4, "little")
         packet = back + data[ADDRESSES.size : _INVOKE_ID] + number + data[AmsHeader.SIZE :]
         actions += self._send_back(pending, pending.came_by, packet, header.error_code, now_ns)
+        for subscription in () if granted is None else granted.new:
+            actions += self.restorer.granted(subscription, now_ns)
         return actions
 
     def answer_now(
@@ -192,7 +224,7 @@ class Passage:
             self._give_up(pending)
             if pending.route is None:
                 self.in_flight.pop(pending.invoke_id)
-        return self._ending.end(self.notifier.subscriptions.close(way), now_ns)
+        return self._ending.end(self.notifier.close(way), now_ns)
 
     def hop_down(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop, and refuse what will be for it."""
@@ -201,12 +233,18 @@ class Passage:
 
     def hop_lost(self, door: str, address: str | None, text: str, now_ns: int) -> list[Action]:
         """Answer what waits for a hop: it will not."""
-        self.notifier.subscriptions.forget_hop(door, address)
-        actions: list[Action] = []
+        actions = self.subscriptions_lost(door, address, text, now_ns)
         for pending in self.in_flight.on(door, address):
             self.in_flight.pop(pending.invoke_id)
             actions += self._fail(pending, text, now_ns)
         return actions
+
+    def subscriptions_lost(
+        self, door: str, address: str | None, text: str, now_ns: int
+    ) -> list[Action]:
+        """Restore the subscriptions by a hop, or tell the router before this one."""
+        lost = self.notifier.subscriptions.of_hop(door, address)
+        return self.restorer.interrupt(lost, text, now_ns)
 
     def hop_up(self, door: str, address: str | None) -> None:
         """Pass requests on to a hop again."""
@@ -230,16 +268,61 @@ class Passage:
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` has something to do."""
-        return self.in_flight.next_timeout()
+        times = (self.in_flight.next_timeout(), self.restorer.next_timeout())
+        return min((each for each in times if each is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> list[Action]:
         """Answer the requests whose time is up."""
         actions: list[Action] = []
         for pending in self.in_flight.due(now_ns):
             self.in_flight.pop(pending.invoke_id)
-            if pending.came_by is not None:
+            if pending.came_by is not None or pending.step is not None:
                 actions += self._time_out(pending, now_ns)
-        return actions
+        return actions + self.restorer.handle_timeout(now_ns)
+
+    def _find_way(
+        self, header: AmsHeader, packet: bytes, way: Way, now_ns: int
+    ) -> tuple[Route, bytes] | Refusal:
+        """Return by which route a request of a client goes on now, and with which addresses."""
+        found = self._let_on(header, packet, way, now_ns)
+        if isinstance(found, Refusal):
+            return found
+        route, _, judged = found
+        if judged is not None:
+            self._gate.give_up(judged)
+        return route, self._onward(header, way, route)
+
+    def _onward(self, header: AmsHeader, way: Way, route: Route) -> bytes:
+        return ADDRESSES.pack(
+            route.to_real(header.target), header.target_port,
+            self._table.to_virtual(header.source, way), header.source_port,
+        )  # fmt: skip
+
+    def _delete(
+        self, header: AmsHeader, data: bytes, own: list[Subscription], way: Way, now_ns: int
+    ) -> list[Action]:
+        """End subscriptions that this router restores, whatever is wrong with the way."""
+        known = {each.handle for each in own}
+        handles = deleted_handles(header, data)
+        grants = self.notifier.forget(own)
+        actions: list[Action] = []
+        if wants_answer(header):
+            results = [
+                AdsError.NONE if each in known else AdsError.NOTIFICATION_HANDLE for each in handles
+            ]
+            answer = AmsAnswer(encode_deleted(header, results))
+            actions += self.answer_now(header, way, answer, 0, now_ns)
+        return actions + self._ending.end(grants, now_ns)
+
+    def _refuse_subscriptions(
+        self, header: AmsHeader, judged: Judged | None, way: Way, now_ns: int
+    ) -> list[Action]:
+        if judged is not None:
+            self._gate.give_up(judged, AdsError.NO_MORE_HANDLES)
+        text = f"no more than {MAX_PER_CLIENT} notifications a client, {MAX_TOTAL} in all"
+        body = AdsError.NO_MORE_HANDLES.to_bytes(4, "little") + bytes(4)
+        why = Refusal(AdsError.NO_MORE_HANDLES, text, body=body)
+        return self._refuser.refuse(header, way, why, now_ns)
 
     def _let_on(
         self, header: AmsHeader, data: bytes, way: Way, now_ns: int
@@ -331,6 +414,8 @@ class Passage:
         return [self._outlet.reply(way, packet)]
 
     def _fail(self, pending: Pending, text: str, now_ns: int) -> list[Action]:
+        if pending.step is not None:
+            return self.restorer.request_failed(pending, AdsError.HOST_UNREACHABLE, now_ns)
         if pending.route is None or pending.came_by is None:
             return []
         route = pending.route
@@ -340,14 +425,17 @@ class Passage:
         return self._refuse(pending, why, now_ns)
 
     def _time_out(self, pending: Pending, now_ns: int) -> list[Action]:
-        allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
-        route = pending.route
-        who = "its service" if route is None else self._table.describe_beyond(route)
-        why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route)
-        actions = self._refuse(pending, why, now_ns)
+        if pending.step is not None:
+            actions = self.restorer.request_failed(pending, AdsError.TIMEOUT, now_ns)
+        else:
+            allowed_s = (pending.deadline_ns - pending.at_ns) / 1e9
+            route = pending.route
+            who = "its service" if route is None else self._table.describe_beyond(route)
+            why = Refusal(AdsError.TIMEOUT, f"no answer from {who} within {allowed_s:g} s", route)
+            actions = self._refuse(pending, why, now_ns)
         if pending.handles:
-            # If it is granted after all, somebody has to end it.
-            pending.came_by, pending.at_ns = None, now_ns
+            # If it is granted after all, it has to be ended.
+            pending.came_by, pending.step, pending.at_ns = None, None, now_ns
             pending.deadline_ns = now_ns + self._limits.timeout_ns
             self.in_flight.add(pending)
         return actions

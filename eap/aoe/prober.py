@@ -3,16 +3,21 @@
 A hop is asked for the ADS state of its router; whatever it answers, an error too, it is alive, and
 so it is while it answers requests that pass.  What misses two questions in a row is down until it
 answers again.
+
+Where subscriptions come from a hop, its system service is also asked for its restart index: another
+one than before says that the router was started again and has forgotten what it passed on, although
+the hop may never have been silent for long.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 from eap.aoe.routes import RouteTable
 from eap.aoe.way import Way
+from eap.codec.ads import AdsRange, AdsSystemState, IndexGroup
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader
 from eap.ids import NetId
 
@@ -24,6 +29,11 @@ _BUSY = 5
 """A hop that answers requests is asked only every so many turns: how long its router takes."""
 _SPACING_NS = 10_000_000
 """Between two probes at least, on the average: many hops are asked less often."""
+
+
+_STATE = AdsRange(IndexGroup.SYSTEM_STATE, 0, AdsSystemState.SIZE).encode()
+_HEAD = 8
+"""Bytes of result and length before what is read."""
 
 
 class Probe(NamedTuple):
@@ -38,8 +48,8 @@ class Probe(NamedTuple):
 class _Hop:
     """What is known of one hop."""
 
-    __slots__ = ("asked_at_ns", "heard_at_ns", "is_down", "misses", "number", "round_trip_ns",
-                 "target")  # fmt: skip
+    __slots__ = ("asked_at_ns", "has_restart_index", "heard_at_ns", "is_down", "misses", "number",
+                 "restart_index", "round_trip_ns", "target")  # fmt: skip
 
     def __init__(self, number: int, target: NetId) -> None:
         self.number = number
@@ -49,6 +59,8 @@ class _Hop:
         self.misses = 0
         self.is_down = False
         self.round_trip_ns: int | None = None
+        self.has_restart_index = True
+        self.restart_index: int | None = None
 
     def is_due(self, now_ns: int, interval_ns: int) -> bool:
         """Say whether to ask it, when its turn has come."""
@@ -60,6 +72,9 @@ class _Hop:
 
 class Prober:
     """Asks the hops of a table of routes.
+
+    Attributes:
+        watched: Hops by which subscriptions come.
 
     Args:
         net_id: Of the router that asks.
@@ -78,6 +93,7 @@ class Prober:
         self._turns: list[tuple[int, int]] = []
         self._number = 0
         self._version = -1
+        self.watched: Container[Way] = ()
 
     def pause(self, door: str, address: str | None) -> None:
         """Ask no more: the door itself knows that there is no way."""
@@ -108,24 +124,32 @@ class Prober:
         return header.target_port == PROBE_PORT and header.target == self._net_id
 
     def take_answer(
-        self, header: AmsHeader, way: Way, now_ns: int, is_from: Callable[[Way, Way], bool]
-    ) -> None:
+        self, header: AmsHeader, body: bytes, way: Way, now_ns: int,
+        is_from: Callable[[Way, Way], bool],
+    ) -> Way | None:  # fmt: skip
         """Note an answer: its hop is alive.
 
         Args:
             header: Of the answer.
+            body: What follows the header.
             way: That it came by.
             now_ns: The time on the monotonic clock.
             is_from: Says of a hop and a way whether it may come from there.
+
+        Returns:
+            The hop, if its router was started again since the answer before.
         """
         hop = self._by_number.get(header.invoke_id)
         if hop is None or not is_from(hop, way):
-            return
+            return None
         self.hear(hop, now_ns)
         known = self._hops[hop]
         known.is_down = False
+        if header.command == AmsCommand.READ:
+            return hop if _is_started_again(known, header, body) else None
         if known.asked_at_ns is not None:
             known.round_trip_ns = now_ns - known.asked_at_ns
+        return None
 
     def is_dead(self, hop: Way) -> bool:
         """Say whether a hop does not answer."""
@@ -160,8 +184,10 @@ class Prober:
             hop = self._hops[way]
             if way in self._paused or way.door in self._closed:
                 hop.asked_at_ns = None
-            elif hop.is_due(now_ns, interval_ns):
+            elif way in self.watched or hop.is_due(now_ns, interval_ns):
                 yield self._ask(way, hop, now_ns)
+                if way in self.watched and hop.has_restart_index and not hop.is_down:
+                    yield Probe(way, self._header(hop, AmsCommand.READ) + _STATE, False)
 
     def _ask(self, way: Way, hop: _Hop, now_ns: int) -> Probe:
         if hop.asked_at_ns is not None and hop.heard_at_ns < hop.asked_at_ns:
@@ -169,11 +195,13 @@ class Prober:
         hop.asked_at_ns = now_ns
         is_found_dead = hop.misses >= MISSES and not hop.is_down
         hop.is_down = hop.is_down or is_found_dead
-        header = AmsHeader(
-            hop.target, SYSTEM_PORT, self._net_id, PROBE_PORT, AmsCommand.READ_STATE,
-            invoke_id=hop.number,
-        )  # fmt: skip
-        return Probe(way, header.encode(), is_found_dead)
+        return Probe(way, self._header(hop, AmsCommand.READ_STATE), is_found_dead)
+
+    def _header(self, hop: _Hop, command: AmsCommand) -> bytes:
+        return AmsHeader(
+            hop.target, SYSTEM_PORT, self._net_id, PROBE_PORT, command,
+            length=len(_STATE) if command == AmsCommand.READ else 0, invoke_id=hop.number,
+        ).encode()  # fmt: skip
 
     def _follow_table(self, now_ns: int) -> None:
         self._version = self._table.version
@@ -190,3 +218,13 @@ class Prober:
         self._by_number = {hop.number: way for way, hop in self._hops.items()}
         self._turns = [each for each in self._turns if each[1] in self._by_number]
         heapify(self._turns)
+
+
+def _is_started_again(hop: _Hop, header: AmsHeader, body: bytes) -> bool:
+    """Note a restart index; say whether it is another one than before."""
+    if header.error_code or any(body[:4]) or len(body) < _HEAD + AdsSystemState.SIZE:
+        hop.has_restart_index = False
+        return False
+    before, now = hop.restart_index, AdsSystemState.decode(body, _HEAD).restart_index
+    hop.restart_index = now
+    return before not in {None, now}

@@ -21,6 +21,7 @@ from eap.aoe.reassembly import Reassembly
 from eap.aoe.record import Record, Stats
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
 from eap.aoe.report import ConnectionReport, Location, RouteReport, report_route
+from eap.aoe.restorer import Interruption
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
 from eap.codec.ads import AdsError
@@ -254,6 +255,10 @@ class Router:
         """Return who asks, or asked and is still connected."""
         return [ConnectionReport(*each) for each in self.record.connections.snapshot().items()]
 
+    def interruptions(self) -> list[Interruption]:
+        """Return the subscriptions to which nothing comes, by client and server."""
+        return self._passage.restorer.interruptions()
+
     def stats(self) -> Stats:
         """Return what is going on, and what was."""
         return Stats(
@@ -303,8 +308,11 @@ class Router:
         prober = self._prober
         if prober is None or not prober.is_answer(header):
             return self._passage.take_answer(header, data, way, now_ns)
-        prober.take_answer(header, way, now_ns, self._outlet.is_from)
-        return []
+        body = data[AmsHeader.SIZE :]
+        hop = prober.take_answer(header, body, way, now_ns, self._outlet.is_from)
+        if hop is None:
+            return []
+        return self._passage.hop_lost(*hop, "its router was started again", now_ns)
 
     def _deliver(
         self, header: AmsHeader, data: bytes, way: Way, ports: Container[int], now_ns: int

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Mapping, Sequence
 from functools import partial
+from secrets import randbelow
 from time import monotonic_ns
 
 from eap.aoe.ads_device import AdsDevice
@@ -18,6 +19,11 @@ from eap.appliance.services.ads.state_control import control_state
 from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsDeviceInfo, AdsStates
+
+
+def first_handle() -> int:
+    """Return a handle to begin with: another one at each start, see ``NotificationTable``."""
+    return randbelow(1 << 31) + 1
 
 
 class AdsService:
@@ -38,7 +44,10 @@ class AdsService:
         self, device: StationDevice, info: AdsDeviceInfo, spaces: Mapping[int, Sequence[AdsSpace]]
     ) -> None:
         self.device = device
-        self.devices = {port: AdsDevice(info, self.states, each) for port, each in spaces.items()}
+        self.devices = {
+            port: AdsDevice(info, self.states, each, first_handle=first_handle())
+            for port, each in spaces.items()
+        }
         self.ports = frozenset(self.devices)
 
     @property

@@ -7,6 +7,7 @@ all, and clients ask the one that they were given.
 from __future__ import annotations
 
 from collections.abc import Awaitable
+from secrets import randbelow
 
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import Operation, OperationOutcome, WriteControl
@@ -15,6 +16,9 @@ from eap.appliance.services.ads.ads_service import AdsService
 from eap.appliance.services.device.station_device import StationDevice
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsSystemState
 from eap.codec.ams import SYSTEM_PORT
+
+_RESTART_INDEX = randbelow(0xFFFF) + 1
+"""Another one at each start of this process, by which others know that subscriptions are gone."""
 
 
 class SystemAds(AdsService):
@@ -43,6 +47,7 @@ class SystemAds(AdsService):
         return AdsSystemState(
             states.ads_state,
             states.device_state,
+            restart_index=_RESTART_INDEX,
             version=info.major,
             revision=info.minor,
             build=info.build,

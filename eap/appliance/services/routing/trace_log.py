@@ -17,6 +17,8 @@ _LEVELS = {
     Outcome.LOOP: logging.WARNING,
     Outcome.LATE: logging.DEBUG,
     Outcome.DROPPED: logging.DEBUG,
+    Outcome.INTERRUPTED: logging.WARNING,
+    Outcome.RESTORED: logging.INFO,
 }
 
 logger = logging.getLogger(__name__)

@@ -52,8 +52,10 @@ def test_closed_connection_ends_its_notifications_at_the_server() -> None:
     assert station.events() == []
     assert station.router.stats().in_flight == 0
     station.router.hop_down(*LINK, "gone", 1)
+    assert station.router.stats().subscriptions == 1  # it will be restored
+    (end,) = station.router.connection_closed(*TWO, 1)
+    assert parse(*end.packets).body == b"\2\0\0\0"
     assert station.router.stats().subscriptions == 0
-    assert station.router.connection_closed(*TWO, 1) == []
 
 
 def test_notification_granted_to_a_closed_connection_is_ended() -> None:

@@ -2,7 +2,10 @@ from __future__ import annotations
 
 import struct
 
+from eap.aoe.action import Forward
+from eap.aoe.invoke import InvokeIds
 from eap.aoe.routes import Route
+from eap.aoe.subscriptions import MAX_PER_CLIENT
 from eap.aoe.way import Way
 from eap.ids import NetId
 from tests.support.ams import (
@@ -21,6 +24,7 @@ from tests.support.aoerouter import (
     ROUTER,
     SECOND_LINK,
     Station,
+    only_reply,
     route,
 )
 from tests.unit.eap.aoe.test_subscriptions import stream
@@ -94,14 +98,27 @@ def test_refused_notifications_are_not_remembered() -> None:
         assert station.router.stats().subscriptions == 0
 
 
-def test_deleted_notification_is_forgotten_by_its_client_only() -> None:
+def test_subscription_of_a_client_is_deleted_here_by_that_client_only() -> None:
     station = subscribed(ONE)
     delete = ADD._replace(command=DELETE_NOTIFICATION, body=b"\1\0\0\0")
     station.forwarded(delete, TWO)
-    station.forwarded(delete._replace(body=b"\2\0\0\0"), ONE)
-    station.forwarded(delete._replace(body=b""), ONE)
+    for unknown in (b"\2\0\0\0", b""):
+        station.forwarded(delete._replace(body=unknown), ONE)
     assert station.router.stats().subscriptions == 1
+    answer, end = station.give(delete, ONE)
+    assert only_reply([answer]) == (ONE, delete.answer(bytes(4)))
+    assert isinstance(end, Forward)
+    assert parse(*end.packets).body == b"\1\0\0\0"
+    assert station.router.stats().subscriptions == 0
     station.forwarded(delete, ONE)
+
+
+def test_subscription_of_another_router_is_deleted_at_the_server() -> None:
+    station = Station([route(FAR, LINK)])
+    marked = ADD._replace(invoke_id=InvokeIds(7).take(()))
+    station.replied(station.forwarded(marked, ONE).answer(granted(1)), LINK)
+    delete = marked._replace(command=DELETE_NOTIFICATION, body=b"\1\0\0\0")
+    assert station.forwarded(delete, ONE).body == b"\1\0\0\0"
     assert station.router.stats().subscriptions == 0
 
 
@@ -111,12 +128,44 @@ def test_sum_commands_are_followed() -> None:
     add = ADD._replace(command=READ_WRITE, body=sum_add)
     answer = granted(1) + granted(0, 0x702) + granted(3)
     body = struct.pack("<II", 0, len(answer)) + answer + b"tail"
-    station.replied(station.forwarded(add, ONE).answer(body), LINK)
+    assert station.replied(station.forwarded(add, ONE).answer(body), LINK) == (
+        ONE,
+        add.answer(body),
+    )
     notice = NOTICE._replace(body=stream((5, {1: b"a", 3: b"b"})))
     assert station.replied(notice, LINK) == (ONE, notice)
-    for handles in (b"\1\0\0\0\x09\0\0\0", b"\3\0\0\0\3\0"):
-        delete = struct.pack("<IIII", 0xF086, 2, 8, 8) + handles
-        station.forwarded(add._replace(body=delete), ONE)
+    delete = add._replace(body=struct.pack("<IIII5I", 0xF086, 4, 16, 16, 1, 9, 3, 3, 7))
+    back, *ends = station.give(delete, ONE)
+    results = struct.pack("<IIIIII", 0, 16, 0, 0x714, 0, 0)
+    assert only_reply([back]) == (ONE, delete.answer(results))
+    assert [parse(*each.packets).body[0] for each in ends] == [1, 3]
     assert station.router.stats().subscriptions == 0
     station.forwarded(add._replace(body=b"short"), ONE)
     station.forwarded(add._replace(body=struct.pack("<IIII", 0xF080, 3, 24, 0)), ONE)
+
+
+def test_client_that_has_too_many_subscriptions_is_refused() -> None:
+    station = Station([route(FAR, LINK)])
+    count = MAX_PER_CLIENT
+    add = ADD._replace(
+        command=READ_WRITE, body=struct.pack("<IIII", 0xF085, count, 8 * count, 40 * count)
+    )
+    answer = b"".join(granted(handle) for handle in range(count))
+    body = struct.pack("<II", 0, len(answer)) + answer
+    station.replied(station.forwarded(add, ONE).answer(body), LINK)
+    more = ADD._replace(invoke_id=2)
+    assert station.replied(more, ONE) == (ONE, more.answer(granted(0, 0x716)))
+    station.forwarded(more, TWO)
+
+
+def test_handle_that_a_client_has_already_is_given_as_another_one() -> None:
+    station = subscribed(ONE)
+    again = ADD._replace(invoke_id=2)
+    interrupted, _ = station.give(station.forwarded(again, ONE).answer(granted(1)), LINK), None
+    _, answer = only_reply(interrupted)
+    assert answer.body[:4] == bytes(4)
+    handle = int.from_bytes(answer.body[4:], "little")
+    assert handle != 1
+    notice = NOTICE._replace(body=stream((5, {1: b"data"})))
+    renamed = NOTICE._replace(body=stream((5, {handle: b"data"})))
+    assert station.replied(notice, LINK) == (ONE, renamed)

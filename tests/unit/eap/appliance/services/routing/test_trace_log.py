@@ -46,6 +46,8 @@ def test_each_outcome_has_its_level(caplog):
         "WARNING",
         "DEBUG",
         "DEBUG",
+        "WARNING",
+        "INFO",
     ]
     assert caplog.messages[0] == (
         "island: READ_STATE of 5.1.1.2.1.1:10000 for 10.0.0.9.1.1:32000 (10.0.0.9:40000 by ams-tcp)"
