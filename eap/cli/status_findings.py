@@ -262,12 +262,13 @@ _BUS_COUNTERS = (
 def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
     advice = f"'eapctl bus diag {where}' says more"
     if bus["fault"]:
-        yield _error(where, "; ".join(bus["fault"].splitlines()), advice)
+        lines = "; ".join(line.strip() for line in bus["fault"].splitlines())
+        yield _error(where, lines.replace(":; ", ": "), advice)
     elif not bus["is_up"]:
         yield _warning(where, "not up yet")
     by_fault = defaultdict(list)
     for slave in bus["slaves"]:
-        if slave["fault"]:
+        if slave["fault"] and bus["is_up"]:  # else it follows from that of the bus
             by_fault[slave["fault"]].append(slave)
     for fault, slaves in by_fault.items():
         names = [f"{slave['name']} ({slave['address']})" for slave in slaves]

@@ -14,6 +14,8 @@ from eap.cli import routes_text
 from eap.cli.routes_tui.link import Router
 
 _GAP = 1
+_EXTRA = 6
+"""Columns from this rank on are shown only where no text has to be cut for them."""
 _READABLE = 12
 """A text is not cut to less than that while another column can be left out."""
 
@@ -111,19 +113,20 @@ def fit(
 ) -> list[tuple[int, Column, int]]:
     """Return number, column and width of what *width* characters have room for.
 
-    Columns are as wide as they need to be.  Where that is too wide, long texts give way, the
-    longest first; but before they become unreadable, the columns of the highest rank are left out.
+    Columns are as wide as they need to be.  Where that is too wide, extra columns are left out, and
+    then long texts give way, the longest first; but before they become unreadable, more columns are
+    left out, those of the highest rank first.
     """
     chosen = {
         number: column
         for number, column in enumerate(COLUMNS[view])
         if has_station or column is not _STATION
     }
-    while (sizes := _sizes(chosen, found)) and _total(
-        min(size, _READABLE) for size in sizes.values()
-    ) > width:
+    while (sizes := _sizes(chosen, found)) and _total(sizes.values()) > width:
         worst = max(chosen, key=lambda number: chosen[number].rank)
-        if not chosen[worst].rank:
+        rank = chosen[worst].rank
+        is_readable = _total(min(size, _READABLE) for size in sizes.values()) <= width
+        if not rank or (rank < _EXTRA and is_readable):
             break
         del chosen[worst]
     while (excess := _total(sizes.values()) - width) > 0:

@@ -248,6 +248,17 @@ def test_findings_tell_late_exchanges_from_lost_ones() -> None:
     assert skipped == "info mixer/bus0: 1 exchange left out: others were under way"
 
 
+def test_bus_that_is_down_is_one_finding() -> None:
+    slaves = [{"address": 1001, "name": "a", "state": None, "fault": "has not been found yet"}]
+    fault = "the bus is not as configured:\n  a is missing"
+    assert texts(ports=[bus_port(slaves=slaves, is_up=False, fault=fault, lost=0)]) == [
+        (
+            "error mixer/bus0: the bus is not as configured: a is missing;"
+            " 'eapctl bus diag mixer/bus0' says more"
+        )
+    ]
+
+
 def test_many_slaves_with_the_same_fault_are_one_finding() -> None:
     slaves = [
         {"address": 1000 + n, "name": f"s{n}", "state": None, "target": "OP", "fault": "is lost"}

@@ -6,7 +6,7 @@ from tests.support.cyclic import OWN, station, written
 
 
 def test_variables_lie_in_pdo_order_under_the_one_name_of_their_type():
-    layout = lay_out(3, [("on", "BOOL"), ("off", "bit"), ("level", "float")])
+    layout = lay_out(3, [("on", "BOOL"), ("off", "bit"), ("level", "real")])
     assert (layout.version, layout.size) == (3, 5)
     assert layout.variables == (("on", "BOOL", 0), ("off", "BIT1", 1), ("level", "REAL", 8))
 
