@@ -76,6 +76,7 @@ class DiscardCounters(Closing):
         size = 8 * len(_REFUSALS) * max(1, len(stations))
         try:
             with path.open("ab") as file:
+                os.posix_fallocate(file.fileno(), 0, size)  # no SIGBUS on a full disk
                 os.ftruncate(file.fileno(), size)
             with path.open("r+b") as file:
                 self._map = mmap.mmap(file.fileno(), size)

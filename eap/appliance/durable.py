@@ -6,14 +6,18 @@ file that was damaged, or edited by hand, from one that was written whole.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 
-from eap.errors import ConfigError
+from eap.errors import ConfigError, EnvironmentalError
 
 logger = logging.getLogger(__name__)
 
@@ -71,6 +75,36 @@ def replace_file(path: Path, data: bytes) -> None:
         os.fsync(folder)  # the name, too, is to survive a loss of power
     finally:
         os.close(folder)
+
+
+@contextmanager
+def whole_file(target: Path) -> Iterator[BinaryIO]:
+    """Open a file that takes the place of *target* once the block is through, and it is on disk.
+
+    A pipe or a device is written as it is.
+
+    Raises:
+        EnvironmentalError: it cannot be written; what there was is still there.
+    """
+    whole = target.resolve()
+    partial = whole.with_name(f".{whole.name}.{os.getpid()}")
+    try:
+        if whole.exists() and not whole.is_file():
+            with whole.open("wb") as file:
+                yield file
+            return
+        if whole.exists() and not os.access(whole, os.W_OK):
+            raise PermissionError(errno.EACCES, "it is read only")
+        try:
+            with partial.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(whole)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as exc:
+        raise EnvironmentalError(f"{target} cannot be written: {exc.strerror}") from None
 
 
 def put_aside(path: Path, aside: Path) -> None:

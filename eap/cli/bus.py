@@ -126,11 +126,13 @@ def sii() -> None:
 def sii_dump(slave: str, file: Path | None, bus: Place, as_json: bool) -> None:
     """Read the EEPROM; with FILE, store its octets there."""
     from eap.appliance.commands.bus_info import read_eeprom
+    from eap.appliance.durable import whole_file
 
     with open_session(bus) as session:
         content, image = read_eeprom(session, slave)
     if file is not None:
-        file.write_bytes(image)
+        with whole_file(file) as target:
+            target.write(image)
     if as_json:
         write_json(content | {"data": image.hex()})
         return

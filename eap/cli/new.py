@@ -87,8 +87,9 @@ def new(
 
 
 def _write(file: Path, text: str, *, force: bool) -> None:
-    try:
-        with file.open("w" if force else "x", encoding="utf-8") as target:
-            target.write(text)
-    except FileExistsError:
-        raise click.ClickException(f"{file} exists: write over it with --force") from None
+    from eap.appliance.durable import whole_file
+
+    if file.exists() and not force:
+        raise click.ClickException(f"{file} exists: write over it with --force")
+    with whole_file(file) as target:
+        target.write(text.encode())

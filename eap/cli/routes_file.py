@@ -65,13 +65,15 @@ def export(station: str, file: Path | None, plant: str | None) -> None:
     """
     from eap.appliance.commands.client import connect_station
     from eap.appliance.control_routes import Export, read_document
+    from eap.appliance.durable import whole_file
 
     with connect_station(station, plant) as client:
         found = read_document(client.request("routes_export", station=station), Export)
     if file is None or str(file) == "-":
         write_text(found.xml, end="")
     else:
-        file.write_text(found.xml, encoding="utf-8")
+        with whole_file(file) as target:
+            target.write(found.xml.encode())
         write_text(f"{file}: the AMS/TCP routes of {station}")
     if found.left_out:
         names = ", ".join(found.left_out)

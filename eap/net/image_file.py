@@ -220,7 +220,8 @@ def prepare_image(path: Path, layout: ImageLayout, generation: int) -> ImageFile
     except OSError as exc:
         raise EnvironmentalError(f"{path}: the process image cannot be made: {exc}") from None
     try:
-        os.ftruncate(descriptor, layout.size)
+        # With ftruncate alone a full disk would be a SIGBUS at the first write to a page.
+        os.posix_fallocate(descriptor, 0, layout.size)
         with mmap.mmap(descriptor, 0) as memory, memoryview(memory) as view:
             _format(view, layout, generation)
     except OSError as exc:

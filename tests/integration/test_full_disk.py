@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import struct
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from shutil import copy
@@ -16,7 +18,7 @@ import pytest
 from eap.errors import ControlError
 from tests.support import aoe
 from tests.support.amsclient import AmsClient
-from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.appliance import EAPCTL, Appliance, Plants, wait_until
 from tests.support.gatewaywire import COE, wire
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
@@ -136,3 +138,42 @@ def test_changes_on_a_full_disk_are_refused_where_the_audit_is_required(
         assert gateway.talk(COE, DRIVE, download)[1][2] == 0x60
         assert read(client) == 1234
         lines(disk)
+
+
+MAKES_AN_IMAGE = """\
+import pathlib, sys
+from eap.net.image_file import create_image
+from eap.pd.layout import plan_layout
+from eap.pd.spec import StationSpec
+create_image(pathlib.Path(sys.argv[1]), plan_layout(StationSpec("a", "1.1.1.1.1.1", 1000, ())))
+"""
+
+
+def test_process_image_on_a_full_disk_is_refused_and_kills_nobody(disk: Path) -> None:
+    fill(disk)
+    command = [sys.executable, "-c", MAKES_AN_IMAGE, str(disk / "a.image")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1  # and not SIGBUS
+    assert done.stderr.splitlines()[-1].endswith("No space left on device")
+    assert [each.name for each in disk.iterdir()] == ["filler"]
+
+
+def test_appliance_runs_although_its_ready_line_cannot_be_written(farm: Plants) -> None:
+    plant = farm.write(PLANT.replace("ACCESS", "").replace("kind: bus", "kind: eap"), "full.yaml")
+    plant.write_text("\n".join(plant.read_text().splitlines()[:-1]) + "\n")
+    environment = os.environ | {"EAP_RUNTIME_DIR": str(farm.folder / "run")}
+    with (
+        Path("/dev/full").open("w") as full,
+        subprocess.Popen(
+            [*EAPCTL, "run", str(plant)],
+            env=environment, stdout=full, stderr=subprocess.PIPE, text=True,
+        ) as appliance,
+    ):  # fmt: skip
+        assert appliance.stderr is not None
+        line = appliance.stderr.readline()
+        appliance.terminate()
+        appliance.communicate(timeout=20)
+    assert line == (
+        "supervisor: the ready line cannot be written to stdout: No space left on device\n"
+    )
+    assert appliance.returncode == 0

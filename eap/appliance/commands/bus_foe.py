@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import sys
@@ -16,6 +15,7 @@ from devicebus.errors import MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
 from devicebus.mailbox.conversation import Progress
 from eap.appliance.commands.bus_slave import Begin, Slave, SlaveBus
+from eap.appliance.durable import whole_file
 from eap.errors import ConfigError, EapError, EnvironmentalError
 
 Report: TypeAlias = Callable[[int, int | None], None]
@@ -109,25 +109,8 @@ def _writing(target: Path | None) -> Iterator[BinaryIO]:
         except OSError as exc:
             raise EnvironmentalError(f"stdout cannot be written: {exc.strerror}") from None
         return
-    whole = target.resolve()
-    partial = whole.with_name(f".{whole.name}.{os.getpid()}")
-    try:
-        if whole.exists() and not whole.is_file():
-            with whole.open("wb") as file:
-                yield file
-            return
-        if whole.exists() and not os.access(whole, os.W_OK):
-            raise PermissionError(errno.EACCES, "it is read only")
-        try:
-            with partial.open("wb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(whole)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as exc:
-        raise EnvironmentalError(f"{target} cannot be written: {exc.strerror}") from None
+    with whole_file(target) as file:
+        yield file
 
 
 @contextmanager

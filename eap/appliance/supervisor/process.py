@@ -10,7 +10,6 @@ import logging
 import os
 import select
 import signal
-import sys
 from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -293,8 +292,10 @@ class Supervisor:
         if not self._announced and all(child.is_ready for child in self._children):
             self._announced = True
             line = msgspec.json.encode({"ready": True, "stations": self._info.stations})
-            sys.stdout.write(line.decode() + "\n")
-            sys.stdout.flush()
+            try:
+                os.write(1, line + b"\n")
+            except OSError as exc:  # the plant runs all the same
+                logger.warning("the ready line cannot be written to stdout: %s", exc.strerror)
 
     def _has_died(self, child: Child) -> None:
         lived_ns = self._clock() - child.started_ns

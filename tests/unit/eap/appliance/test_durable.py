@@ -6,8 +6,9 @@ import re
 import pytest
 
 from eap.appliance import durable
-from eap.appliance.durable import digest, put_aside, replace_file, seal, unseal
-from eap.errors import ConfigError
+from eap.appliance.durable import digest, put_aside, replace_file, seal, unseal, whole_file
+from eap.errors import ConfigError, EnvironmentalError
+from tests.support.limits import largest_file
 
 
 def test_content_comes_out_as_it_went_in():
@@ -58,3 +59,25 @@ def test_what_is_damaged_is_put_aside_or_told(tmp_path, caplog):
     assert (tmp_path / "x.damaged").exists()
     put_aside(path, tmp_path / "x.damaged")
     assert "x.json cannot be renamed: No such file" in caplog.text
+
+
+def test_whole_file_appears_once_it_is_complete(tmp_path):
+    target = tmp_path / "a.bin"
+    with whole_file(target) as file:
+        file.write(b"one")
+        assert not target.exists()
+    assert target.read_bytes() == b"one"
+
+
+@pytest.mark.parametrize("before", [None, b"before"])
+def test_whole_file_on_a_full_disk_leaves_what_there_was(tmp_path, before):
+    target = tmp_path / "a.bin"
+    if before:
+        target.write_bytes(before)
+    with (
+        largest_file(100),
+        pytest.raises(EnvironmentalError, match=r"a\.bin cannot be written: File too large"),
+        whole_file(target) as file,
+    ):
+        file.write(bytes(200))
+    assert [each.read_bytes() for each in tmp_path.iterdir()] == ([before] if before else [])

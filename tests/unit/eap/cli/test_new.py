@@ -80,5 +80,5 @@ def test_what_cannot_be_is_said(run, tmp_path, words, reason):
 
 def test_folder_that_is_not_there(run):
     result = run("nowhere/hall.yaml")
-    assert result.exit_code == 1
-    assert "No such file or directory" in result.stderr
+    assert result.exit_code == 2
+    assert "nowhere/hall.yaml cannot be written: No such file or directory" in result.stderr

@@ -113,10 +113,10 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_a_failure_half_way_leaves_nothing_behind(path, monkeypatch):
-    def full(descriptor: int, size: int) -> None:
+    def full(descriptor: int, offset: int, size: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(os, "ftruncate", full)
+    monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(EnvironmentalError, match="No space left"):
         create_image(path, LAYOUT)
     assert list(path.parent.iterdir()) == []

@@ -4,32 +4,19 @@ from __future__ import annotations
 
 import fcntl
 import os
-import resource
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from eap.appliance.services import audit_file as module
 from eap.appliance.services.audit_file import AuditFile
+from tests.support.limits import largest_file
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> AuditFile:
     return AuditFile(tmp_path / "plant" / "audit.jsonl")
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Let the kernel take *size* bytes of a file at most: the write that reaches it is short."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_append_makes_the_folder_for_its_owner_alone(file: AuditFile) -> None:
