@@ -6,10 +6,11 @@ behind it; the first port that counts is next to the cable or the slave at fault
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import msgspec
 
+from devicebus.errors import FrameLostError
 from devicebus.master.access import Reply, fprd, fpwr
 from devicebus.master.procedure import Procedure
 from devicebus.master.topology import find_joints
@@ -17,7 +18,8 @@ from devicebus.wire.alstatus import ERROR, name_of, state_name
 from devicebus.wire.register import AlStatus, DlStatus, Register
 
 _PORTS = 4
-_COUNTERS = 0x14
+COUNTERS = 0x14
+"""Bytes of all error counters of a controller."""
 _PER_STEP = 15
 
 
@@ -62,29 +64,45 @@ class BusDiagnosis(msgspec.Struct, frozen=True):
     """All slaves in the order of the line."""
 
     slaves: tuple[SlaveDiagnosis, ...]
-    first_fault: Fault | None
-    """The first port in the order of the frame that has counted errors."""
+    faults: tuple[Fault, ...] = ()
+    """Ports that have counted errors, in the order of the frame."""
+    is_silent: bool = False
+    """Whether no frame came back: then nothing is known about any slave."""
+
+    @property
+    def first_fault(self) -> Fault | None:
+        """The first port in the order of the frame that has counted errors."""
+        return self.faults[0] if self.faults else None
 
 
 def diagnose(stations: Sequence[int]) -> Procedure[BusDiagnosis]:
-    """Read states and counters of slaves, which come in the order of the line.
-
-    Raises FrameLostError if nothing comes back.
-    """
+    """Read states and counters of slaves, which come in the order of the line."""
     found = []
     statuses = []
-    for station, replies in (yield from _read(stations)):
+    try:
+        read = yield from _read(stations)
+    except FrameLostError:
+        silent = tuple(SlaveDiagnosis(station, answers=False) for station in stations)
+        return BusDiagnosis(silent, is_silent=True)
+    for station, replies in read:
         slave, status = _slave(station, replies)
         found.append(slave)
         statuses.append(status)
-    return BusDiagnosis(tuple(found), _first_fault(found, statuses))
+    return BusDiagnosis(tuple(found), tuple(_faults(found, statuses)))
+
+
+def port_counters(octets: bytes) -> tuple[int, ...]:
+    """Return for each port how many errors arose there, of all kinds."""
+    return tuple(
+        octets[2 * port] + octets[2 * port + 1] + octets[16 + port] for port in range(_PORTS)
+    )
 
 
 def clear_counters(stations: Sequence[int]) -> Procedure[None]:
     """Set all error counters back to 0; slaves that do not answer are left out."""
     for start in range(0, len(stations), _PER_STEP):
         part = stations[start : start + _PER_STEP]
-        yield [fpwr(at, Register.RX_ERROR, bytes(_COUNTERS)) for at in part]
+        yield [fpwr(at, Register.RX_ERROR, bytes(COUNTERS)) for at in part]
 
 
 def _read(stations: Sequence[int]) -> Procedure[list[tuple[int, list[Reply]]]]:
@@ -93,7 +111,7 @@ def _read(stations: Sequence[int]) -> Procedure[list[tuple[int, list[Reply]]]]:
         replies, _ = yield [
             fprd(station, Register.AL_STATUS, AlStatus.SIZE),
             fprd(station, Register.DL_STATUS, DlStatus.SIZE),
-            fprd(station, Register.RX_ERROR, _COUNTERS),
+            fprd(station, Register.RX_ERROR, COUNTERS),
         ]
         found.append((station, list(replies)))
     return found
@@ -123,22 +141,21 @@ def _slave(station: int, replies: Sequence[Reply]) -> tuple[SlaveDiagnosis, DlSt
     return SlaveDiagnosis(station, True, shown, status.code, text, ports), dl_status
 
 
-def _first_fault(slaves: Sequence[SlaveDiagnosis], statuses: Sequence[DlStatus]) -> Fault | None:
+def _faults(slaves: Sequence[SlaveDiagnosis], statuses: Sequence[DlStatus]) -> Iterator[Fault]:
     joints = find_joints(statuses)
     for position, slave in enumerate(slaves):
+        joint = joints[position]
         for port in slave.ports:
             if not port.total:
                 continue
-            joint = joints[position]
             if port.port == joint.entry_port:
                 parent = joint.parent
-                return Fault(
-                    slave.station, port.port, None if parent is None else slaves[parent].station
+                far = None if parent is None else slaves[parent].station
+            else:
+                children = (
+                    slaves[number].station
+                    for number, each in enumerate(joints)
+                    if (each.parent, each.parent_port) == (position, port.port)
                 )
-            children = (
-                slaves[number].station
-                for number, each in enumerate(joints)
-                if (each.parent, each.parent_port) == (position, port.port)
-            )
-            return Fault(slave.station, port.port, next(children, None))
-    return None
+                far = next(children, None)
+            yield Fault(slave.station, port.port, far)

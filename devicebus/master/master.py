@@ -18,6 +18,8 @@ from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
 from devicebus.master.look import look_around
 from devicebus.master.mailstats import MailboxStats
+from devicebus.master.porterrors import PERIOD_NS as ERRORS_NS
+from devicebus.master.porterrors import PortErrorLog, look_at_errors
 from devicebus.master.procedure import Procedure
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import shut_down, start_up
@@ -47,6 +49,9 @@ class Master:
 
     The user starts tasks, the driver feeds frames and time, and whoever has the clock of the plant
     calls :meth:`start_cycle`.
+
+    Attributes:
+        port_errors: When the error counters of ports have grown.
     """
 
     def __init__(self, settings: MasterSettings | None = None) -> None:
@@ -54,6 +59,8 @@ class Master:
         self._running: Task[None] | None = None
         self._look_ns = 0
         self._look: Task[None] | None = None
+        self.port_errors = PortErrorLog()
+        self._errors_ns = 0
 
     @property
     def units(self) -> dict[int, Unit]:
@@ -169,6 +176,9 @@ class Master:
             self._look_ns = now_ns + LOOK_NS
             if self._look is None or self._look.is_done:
                 self._look = self.run(look_around(self._bus), now_ns, "looking into mailboxes")
+        if now_ns >= self._errors_ns and self._bus.cycle is not None:
+            self._errors_ns = now_ns + ERRORS_NS
+            self.run(look_at_errors(self._bus, self.port_errors), now_ns, "reading error counters")
 
     def next_event(self) -> Event | None:
         """Take the oldest event."""

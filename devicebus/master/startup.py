@@ -11,6 +11,7 @@ from devicebus.master.bus import Bus, Unit
 from devicebus.master.cycle import Cycle
 from devicebus.master.esm import POLL_NS, TIMEOUT_NS
 from devicebus.master.expected import arrange, check_bus
+from devicebus.master.findings import join_errors
 from devicebus.master.image import BusImage
 from devicebus.master.layout import SlaveShape, lay_out
 from devicebus.master.pdo import Channel, channels_from_sii
@@ -158,9 +159,8 @@ class _Crew:
         self.fit = [unit for unit, error in done if not isinstance(error, EapError)]
 
     def check(self) -> None:
-        """Raise what went wrong: one error as it is, several as one that lists them."""
-        if len(self.errors) == 1:
-            raise self.errors[0][1]
+        """Raise what went wrong: one error as it is, several as one with a line for each cause."""
         if self.errors:
-            lines = "\n  ".join(f"{unit.name}: {error}" for unit, error in self.errors)
-            raise BusError(f"{len(self.errors)} slaves have failed:\n  {lines}")
+            raise join_errors(
+                [(f"{unit.name} ({unit.station})", error) for unit, error in self.errors]
+            )

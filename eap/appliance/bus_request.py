@@ -71,6 +71,10 @@ class Bring(Message, frozen=True, kw_only=True, tag="bring"):
     target: int
 
 
+class Forget(Message, frozen=True, tag="forget"):
+    """Forget the faults that are over: answered when done."""
+
+
 class Ping(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="ping"):
     """Say that there is an engine: answered without anything."""
 
@@ -83,8 +87,16 @@ class Cancel(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="can
     id: int
 
 
-BusRequest: TypeAlias = Describe | AskMailbox | Transfer | Bring
+BusRequest: TypeAlias = Describe | AskMailbox | Transfer | Bring | Forget
 Request: TypeAlias = BusRequest | Ping | Cancel | StationRequest
+
+
+class PortErrorReport(msgspec.Struct, frozen=True, array_like=True):
+    """How many nanoseconds ago the error counters of a port grew first and last."""
+
+    port: int
+    since_ns: int
+    until_ns: int
 
 
 class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -122,6 +134,14 @@ class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
     """AL status code when it last did."""
     fault: str = ""
     """Why it is not where it belongs."""
+    past_fault: str = ""
+    """The same of the last time, if that is over."""
+    since_ns: int | None = None
+    """How many nanoseconds ago *fault* or *past_fault* began."""
+    until_ns: int | None = None
+    """How many nanoseconds ago *past_fault* was over."""
+    port_errors: tuple[PortErrorReport, ...] = ()
+    """Ports whose errors were counted while the master looked."""
 
 
 class BusReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,6 +152,10 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     fault: str = ""
     """Why not."""
     slaves: tuple[SlaveReport, ...] = ()
+    silent_since_ns: int | None = None
+    """How many nanoseconds ago frames stopped coming back, the last time."""
+    silent_until_ns: int | None = None
+    """How many nanoseconds ago they came back again."""
     frames_sent: int = 0
     frames_received: int = 0
     frames_late: int = 0

@@ -26,6 +26,7 @@ BUS_METHODS = (
     "bus_transfer",
     "bus_bring",
     "bus_fault",
+    "bus_forget",
 )
 
 MAX_CONVERSATIONS = 16
@@ -110,6 +111,10 @@ class BusFaultParameters(BusParameters, frozen=True, kw_only=True):
     """``bus_fault``: what a simulated segment is told."""
 
     command: dict[str, Any]
+
+
+class BusForgetParameters(BusParameters, frozen=True, kw_only=True):
+    """``bus_forget``: faults that are over are not shown any more."""
 
 
 def protocol_of(kind: MailboxType) -> str:

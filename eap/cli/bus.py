@@ -98,19 +98,45 @@ def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
 @click.command(cls=BusCommand)
 @bus_options
 @click.argument("slave", required=False, metavar="[SLAVE]")
+@click.option("--full", is_flag=True, help="Show slaves without errors too, however many.")
+@click.option("--reset", is_flag=True, help="Clear error counters, forget what is over.")
 @json_option("Print one object.")
-def diag(slave: str | None, bus: Place, as_json: bool) -> None:
-    """Show states, errors of ports, and where they start."""
+def diag(slave: str | None, bus: Place, full: bool, reset: bool, as_json: bool) -> None:
+    """Show what is wrong with a bus, and what was.
+
+    One line for each cause, below a table of states and error counters of ports.  A running station
+    tells since when, or until when; behind an interface the counters are those since the slaves
+    were switched on, or the last --reset.
+    """
+    if reset:
+        if slave is not None:
+            raise click.UsageError("--reset is for the whole bus: leave SLAVE out")
+        _reset(bus, as_json=as_json)
+        return
+    from time import time
+
     from eap.appliance.commands.bus_info import diagnosis
 
     with open_session(bus) as session:
-        found = diagnosis(session, slave)
+        found = diagnosis(session, slave, time())
     if as_json:
         write_json(found)
         return
     from eap.cli.bus_view import diagnosis_tables
 
-    write_tables(diagnosis_tables(found))
+    write_tables(diagnosis_tables(found, time(), is_full=full))
+
+
+def _reset(bus: Place, *, as_json: bool) -> None:
+    from eap.appliance.commands.bus_info import reset_diagnosis
+    from eap.cli.words import count
+
+    with open_session(bus) as session:
+        done = reset_diagnosis(session)
+    if as_json:
+        write_json(done)
+    else:
+        write_text(f"error counters of {count(len(done['reset']), 'slave')} cleared")
 
 
 @click.group()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
 from rich.text import Text
@@ -14,6 +14,9 @@ from eap.ids import ObjectId
 Row: TypeAlias = dict[str, Any]
 
 _SHOWN_OCTETS = 32
+_LISTED = 3
+_MANY_SLAVES = 16
+"""Of more slaves only those with errors are shown."""
 _COMMAND_STATES = {0x0: "idle", 0x3: "done", 0x7: "executing", 0xF: "failed"}
 _COUNTERS = ("invalid_frames", "physical", "forwarded", "lost_links")
 
@@ -31,7 +34,7 @@ def scan_tables(rows: Iterable[Row]) -> Iterator[TextTable | Text]:
         "State",
         Column("Mailbox", rank=1, wraps=True),
     )
-    faults = []
+    faults: dict[str, list[str]] = {}
     for row in rows:
         numbers = (f"0x{row[key]:X}" for key in ("vendor", "product", "revision"))
         table.add_row(
@@ -44,11 +47,12 @@ def scan_tables(rows: Iterable[Row]) -> Iterator[TextTable | Text]:
             "?" if row["mailbox"] is None else " ".join(row["mailbox"]),
         )
         if row["fault"]:
-            faults.append(f"{row['name']} ({row['address']}): {row['fault']}")
+            faults.setdefault(row["fault"], []).append(f"{row['name']} ({row['address']})")
     yield table
     if faults:
         yield Text()
-    yield from map(Text, faults)
+    for fault, names in faults.items():
+        yield Text(f"{_listed(names)}: {fault}")
 
 
 def state_table(rows: Iterable[Row]) -> TextTable:
@@ -59,8 +63,64 @@ def state_table(rows: Iterable[Row]) -> TextTable:
     return table
 
 
-def diagnosis_tables(found: Row) -> Iterator[TextTable | Text]:
-    """Yield the table of all ports, and in words where trouble starts."""
+def diagnosis_tables(
+    found: Row, now_s: float, *, is_full: bool = False
+) -> Iterator[TextTable | Text]:
+    """Yield the table of all ports, and below it what is and what was wrong.
+
+    Args:
+        found: The diagnosis.
+        now_s: Unix time.
+        is_full: Whether slaves without errors are shown where there are many.
+    """
+    slaves = found["slaves"]
+    shown = slaves
+    if len(slaves) > _MANY_SLAVES and not is_full:
+        first = {each["address"] for row in found["findings"] for each in row["slaves"][:1]}
+        shown = [row for row in slaves if row["address"] in first or _has_errors(row)]
+    if shown:
+        yield _port_table(shown)
+    if len(shown) < len(slaves):
+        rest = count(len(slaves) - len(shown), "slave")
+        yield Text(f"not shown: {rest} without errors at their ports (--full)", style="dim")
+    yield Text()
+    frames = found["frames"]
+    yield Text(
+        f"{count(frames['sent'], 'frame')} sent, {frames['late']} late, {frames['lost']} lost,"
+        f" {frames['retried']} sent again; round trip {duration(frames['round_trip_us'])}, time-out"
+        f" {duration(frames['timeout_us'])}"
+    )
+    for row in found["findings"]:
+        yield Text(finding_line(row, now_s), style="dim" if row["is_over"] else "red")
+
+
+def finding_line(row: Row, now_s: float) -> str:
+    """Return one finding as a line: what is or was wrong, since or until when, what to do."""
+    if not row["is_over"]:
+        since = "" if row["since"] is None else f"since {_ago(row['since'], now_s)} ago: "
+        return f"{since}{row['what']}" + (f"; {row['advice']}" if row["advice"] else "")
+    until = "before the master looked"
+    if row["until"] is not None:
+        until = f"until {_ago(row['until'], now_s)} ago"
+    return f"was, {until}: {row['what']}; --reset clears this"
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the names of slaves; of many, how many they are, the first and the last."""
+    if len(names) > _LISTED:
+        return f"{len(names)} slaves from {names[0]} to {names[-1]}"
+    return ", ".join(names)
+
+
+def _ago(at_s: float, now_s: float) -> str:
+    return duration(max(0, round((now_s - at_s) * 1e6)))
+
+
+def _has_errors(row: Row) -> bool:
+    return any(port[key] for port in row["ports"] for key in _COUNTERS)
+
+
+def _port_table(slaves: Iterable[Row]) -> TextTable:
     table = TextTable(
         "Slave",
         Column("Name", rank=2),
@@ -72,7 +132,7 @@ def diagnosis_tables(found: Row) -> Iterator[TextTable | Text]:
         Column("Forwarded", rank=1, is_number=True),
         Column("Lost link", is_number=True),
     )
-    for row in found["slaves"]:
+    for row in slaves:
         state = row["state"] if row["answers"] else None
         first = (str(row["address"]), row["name"], _state(state))
         for port in row["ports"] or [{}]:
@@ -83,25 +143,7 @@ def diagnosis_tables(found: Row) -> Iterator[TextTable | Text]:
             numbers = (str(each or "") for each in errors)
             table.add_row(*first, str(port.get("port", "")), is_open, *numbers)
             first = ("", "", Text())
-    yield table
-    yield Text()
-    for row in found["slaves"]:
-        if row["reason"]:
-            yield Text(f"{row['name']} ({row['address']}): {_reason(row)}")
-    frames = found["frames"]
-    yield Text(
-        f"{count(frames['sent'], 'frame')} sent, {frames['late']} late, {frames['lost']} lost,"
-        f" {frames['retried']} sent again; round trip {duration(frames['round_trip_us'])}, time-out"
-        f" {duration(frames['timeout_us'])}"
-    )
-    start = found["starts_at"]
-    if start is not None:
-        far = f" to slave {start['neighbour']}" if start["neighbour"] is not None else ""
-        yield Text(
-            f"errors start at port {start['port']} of {start['name']} ({start['slave']}):"
-            f" check its cable{far} first",
-            style="red",
-        )
+    return table
 
 
 def eeprom_lines(content: Row, image: bytes) -> Iterator[str]:

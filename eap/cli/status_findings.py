@@ -12,7 +12,6 @@ moment, and the one-screen view leaves them out.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -266,16 +265,8 @@ def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
         yield _error(where, lines.replace(":; ", ": "), advice)
     elif not bus["is_up"]:
         yield _warning(where, "not up yet")
-    by_fault = defaultdict(list)
-    for slave in bus["slaves"]:
-        if slave["fault"] and bus["is_up"]:  # else it follows from that of the bus
-            by_fault[slave["fault"]].append(slave)
-    for fault, slaves in by_fault.items():
-        names = [f"{slave['name']} ({slave['address']})" for slave in slaves]
-        if len(names) <= _LISTED:
-            yield from (_error(f"{where} {name}", fault, advice) for name in names)
-        else:
-            yield _error(f"{where}: {len(names)} slaves from {names[0]} on", fault, advice)
+    for each in bus.get("findings", []):
+        yield _error(where, each["what"], each["advice"] or advice, each["since"])
     for key, noun, text in _BUS_COUNTERS:
         if number := bus.get(key):
             yield _info(where, f"{words.count(number, noun)} {text}")

@@ -71,8 +71,12 @@ def bus_port(name: str = "bus0", **more: Any) -> dict[str, Any]:
         {"address": 1001, "name": "drive", "state": "OP", "target": "OP", "fault": ""},
         {"address": 1002, "name": "press", "state": None, "target": "OP", "fault": "is lost"},
     ]
-    bus = {"is_up": True, "fault": "", "slaves": slaves, "cycles": 12, "lost": 3, "wkc_errors": 0,
-           "expected_wkc": 3, "received_wkc": 2, "trip_us": 480, "max_trip_us": 999}  # fmt: skip
+    lost = {"what": "press (1002) is lost", "advice": "", "port": None, "is_over": False,
+            "slaves": [{"address": 1002, "name": "press"}],
+            "since": None, "until": None}  # fmt: skip
+    bus = {"is_up": True, "fault": "", "findings": [lost], "slaves": slaves, "cycles": 12,
+           "lost": 3, "wkc_errors": 0, "expected_wkc": 3, "received_wkc": 2,
+           "trip_us": 480, "max_trip_us": 999}  # fmt: skip
     where = "sim:///plants/buses/line.yaml"
     port = {"name": name, "kind": "bus", "net_id": "5.1.1.1.3.1", "interface": where, "link": "up"}
     return port | {"bus": bus | more}

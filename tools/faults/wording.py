@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 
 from devicebus.master.diagnosis import BusDiagnosis, SlaveDiagnosis
@@ -15,6 +15,7 @@ from devicebus.master.event import (
     SlaveLeft,
     SlaveLost,
 )
+from devicebus.master.findings import SlaveView, find_causes, find_silence
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import MasterStats
 from devicebus.wire.alstatus import name_of, state_name
@@ -63,35 +64,21 @@ def counters(before: MasterStats, now: MasterStats) -> str:
 
 
 def describe_diagnosis(found: BusDiagnosis, names: Names, ahead_ns: int | None) -> str:
-    """Write what is not as it should be: states, counters, and where errors start."""
-    lines = [line for slave in found.slaves for line in _slave(slave, names)]
-    if found.first_fault is not None:
-        fault = found.first_fault
-        there = f", next to `{names[fault.neighbour]}`" if fault.neighbour is not None else ""
-        lines.append(f"errors start at `{names[fault.station]}`, port {fault.port}{there}")
+    """Write what is not as it should be: one sentence for each cause, with what to do."""
+    views = [_view(slave, names) for slave in found.slaves]
+    causes = [find_silence(views)] if found.is_silent else find_causes(views, found)
+    lines = [each.what + (f" ({each.advice})" if each.advice else "") for each in causes]
     if ahead_ns is not None:
         lines.append(f"the clock is {ahead_ns} ns ahead of the reference")
-    return "; ".join(lines) or "nothing"
+    return ". ".join(lines) or "nothing"
 
 
-def _slave(slave: SlaveDiagnosis, names: Names) -> Iterator[str]:
-    name = f"`{names[slave.station]}`"
-    if not slave.answers:
-        yield f"{name} does not answer"
-        return
-    if slave.state != "OP":
-        code = f", 0x{slave.code:04X} {slave.text}" if slave.code else ""
-        yield f"{name} in {slave.state}{code}"
-    for port in slave.ports:
-        kinds = (
-            (port.invalid_frames, "invalid frames"),
-            (port.physical, "physical errors"),
-            (port.forwarded, "forwarded errors"),
-            (port.lost_links, "lost links"),
-        )
-        shown = ", ".join(f"{count} {what}" for count, what in kinds if count)
-        if shown:
-            yield f"{name} port {port.port}: {shown}"
+def _view(slave: SlaveDiagnosis, names: Names) -> SlaveView:
+    trouble = ""
+    if slave.answers and slave.state != "OP":
+        code = f": {slave.text} (0x{slave.code:04X})" if slave.code else ""
+        trouble = f"in {slave.state}{code}"
+    return SlaveView(slave.station, names[slave.station], slave.answers, trouble)
 
 
 def _time_of(event: Event) -> int | None:

@@ -133,6 +133,17 @@ class GatewayBus:
         procedure.close()
         _refuse(name)
 
+    def known(self) -> Sequence[Slave]:
+        """Return the slaves that the gateway tells of."""
+        return self.scan()
+
+    def history(self) -> None:
+        """Return nothing: a gateway tells no times."""
+        return
+
+    def forget(self) -> None:
+        """Do nothing: a gateway has no such service."""
+
     def frame_counts(self) -> FrameCounts:
         """Refuse likewise."""
         _refuse("counters of frames")

@@ -9,13 +9,18 @@ import msgspec
 
 from devicebus.errors import SiiError, WorkingCounterError
 from devicebus.master import eeprom
-from devicebus.master.diagnosis import diagnose
+from devicebus.master.diagnosis import BusDiagnosis, SlaveDiagnosis, clear_counters, diagnose
 from devicebus.master.esm import read_status
+from devicebus.master.findings import SlaveView, find_causes, find_silence
+from devicebus.master.procedure import Procedure, Sleep
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from devicebus.wire.sii import SiiProtocol
-from eap.appliance.commands.bus_slave import Slave, SlaveBus
+from eap.appliance.bus_findings import finding_row
+from eap.appliance.commands.bus_slave import Slave, SlaveBus, choose
 
+_TRIES = 3
+_PAUSE_NS = 100_000_000
 STATES = tuple(state.name for state in AlState)
 
 
@@ -38,19 +43,29 @@ def state_rows(bus: SlaveBus, slave: str | None, target: str | None) -> list[dic
     return [_state(bus, unit) for unit in units]
 
 
-def diagnosis(bus: SlaveBus, slave: str | None) -> dict[str, Any]:
-    """Return states and error counters of one slave or of all, and where on the line errors start.
+def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> dict[str, Any]:
+    """Return states and error counters of one slave or of all, and what is or was wrong.
+
+    Args:
+        bus: Reaches the slaves.
+        slave: Name or station address of the one that is shown; None for all.
+        now_s: Unix time, for the times of findings.
 
     Raises:
         BusError: there is no such slave.
     """
-    names = {each.station: each.name for each in bus.scan()}
-    wanted = {bus.find(slave).station} if slave is not None else {*names}
-    found = bus.run(diagnose(list(names)), "diagnosis")
-    fault = found.first_fault
+    known = bus.known()
+    names = {each.station: each.name for each in known}
+    wanted = {choose(known, slave).station} if slave is not None else {*names}
+    found = bus.run(_diagnose(list(names)), "diagnosis")
+    views = [_view(each, there) for each, there in zip(known, found.slaves, strict=True)]
+    history = bus.history()
+    causes = [find_silence(views)] if found.is_silent else find_causes(views, found, history)
     frames = bus.frame_counts()
+    fault = found.first_fault
     return {
         "frames": frames._asdict(),
+        "findings": [finding_row(each, names, now_s) for each in causes],
         "starts_at": None
         if fault is None
         else {
@@ -73,6 +88,34 @@ def diagnosis(bus: SlaveBus, slave: str | None) -> dict[str, Any]:
             if each.station in wanted
         ],
     }
+
+
+def _diagnose(stations: Sequence[int]) -> Procedure[BusDiagnosis]:
+    """Read registers of slaves, again if nothing came back: a frame that is lost is no silence."""
+    for _ in range(_TRIES - 1):
+        found = yield from diagnose(stations)
+        if not found.is_silent:
+            return found
+        yield Sleep(_PAUSE_NS)
+    return (yield from diagnose(stations))
+
+
+def reset_diagnosis(bus: SlaveBus) -> dict[str, Any]:
+    """Clear the error counters of all slaves, and forget faults that are over."""
+    stations = [each.station for each in bus.known()]
+    bus.run(clear_counters(stations), "clearing error counters")
+    bus.forget()
+    return {"reset": stations}
+
+
+def _view(slave: Slave, there: SlaveDiagnosis) -> SlaveView:
+    """Return a slave as its registers show it, with why it is not where its master keeps it."""
+    trouble = ""
+    if there.answers and there.state.endswith("ERROR"):
+        trouble = f"in {there.state}: {there.text} (0x{there.code:04X})"
+    elif there.answers and slave.target and there.state != state_name(slave.target):
+        trouble = slave.fault or f"in {there.state}, not yet in {state_name(slave.target)}"
+    return SlaveView(slave.station, slave.name, there.answers, trouble, slave.since_ns)
 
 
 def read_eeprom(bus: SlaveBus, slave: str) -> tuple[dict[str, Any], bytes]:

@@ -18,11 +18,13 @@ from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.access import Reply, fprd
+from devicebus.master.findings import History
 from devicebus.master.procedure import Answer, Procedure, Sleep, Step
 from devicebus.master.topology import find_joints
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.appliance import control_bus
+from eap.appliance.bus_findings import history_of
 from eap.appliance.bus_request import BusReport, SlaveReport
 from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
 from eap.appliance.commands.client import Client, connect_station
@@ -52,14 +54,24 @@ class RunningBus:
     def __init__(self, client: Client, station: str, port: str) -> None:
         self._client = client
         self._where = {"station": station, "port": port}
+        self._report = BusReport(is_up=False)
         self._reports: dict[int, SlaveReport] = {}
 
     def scan(self) -> Sequence[Slave]:
         """Return the slaves that the running master knows, and where they are now."""
-        reports = self._describe().slaves
-        self._reports = {report.station: report for report in reports}
-        registers = self.run(_look(list(self._reports)))
+        slaves = self.known()
+        registers = self.run(_look([slave.station for slave in slaves]))
         joints = find_joints([dl_status for _, dl_status in registers])
+        return [
+            msgspec.structs.replace(slave, status=al_status, parent=joint.parent, ports=joint.ports)
+            for slave, (al_status, _), joint in zip(slaves, registers, joints, strict=True)
+        ]
+
+    def known(self) -> Sequence[Slave]:
+        """Return the slaves as the running master has them, without asking them."""
+        self._report = self._describe()
+        reports = self._report.slaves
+        self._reports = {report.station: report for report in reports}
         return [
             Slave(
                 station=report.station,
@@ -69,14 +81,24 @@ class RunningBus:
                 revision=report.revision,
                 serial=report.serial,
                 alias=report.alias,
-                status=al_status,
+                status=AlStatus(report.state),
                 protocols=report.protocols,
-                parent=joint.parent,
-                ports=joint.ports,
+                parent=None,
+                ports=(),
                 fault=report.fault,
+                target=report.target,
+                since_ns=report.since_ns if report.fault else None,
             )
-            for report, (al_status, _), joint in zip(reports, registers, joints, strict=True)
+            for report in reports
         ]
+
+    def history(self) -> History:
+        """Return when the running master has seen faults, as of the last call of :meth:`known`."""
+        return history_of(self._report)
+
+    def forget(self) -> None:
+        """Have the running master forget faults that are over."""
+        self._request(control_bus.PATIENCE_S, "bus_forget")
 
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name; raise BusError if that is not one."""

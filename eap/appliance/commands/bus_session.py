@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
-from devicebus.errors import BusError
 from devicebus.master.attach import attach
 from devicebus.master.bring import bring, read_process_data
 from devicebus.master.bus import Bus, MasterSettings, Unit
+from devicebus.master.findings import join_errors
 from devicebus.master.procedure import Procedure, together
 from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import set_up_cycle
@@ -136,17 +136,29 @@ class BusSession:
             round_trip_us=stats.round_trip_ns // 1000,
         )
 
+    def known(self) -> Sequence[Slave]:
+        """Return the slaves that a scan has found, which is made if there was none."""
+        return self._slaves or self.scan()
+
+    def history(self) -> None:
+        """Return nothing: this master has not been there before."""
+        return
+
+    def forget(self) -> None:
+        """Do nothing: this master remembers nothing."""
+
     def _bring_all(self, units: Sequence[Unit], target: AlState) -> None:
         self._run_all(units, [bring(self._bus, unit, target) for unit in units])
 
     def _run_all(self, units: Sequence[Unit], procedures: Sequence[Procedure[None]]) -> None:
         results = self.run(together(procedures))
-        errors = [result for result in results if isinstance(result, EapError)]
-        if len(errors) == 1:
-            raise errors[0]
+        errors = [
+            (f"{unit.name} ({unit.station})", result)
+            for unit, result in zip(units, results, strict=True)
+            if isinstance(result, EapError)
+        ]
         if errors:
-            lines = "; ".join(map(str, errors))
-            raise BusError(f"{len(errors)} of {len(units)} slaves have failed: {lines}")
+            raise join_errors(errors)
 
     def _finish(self, task: Task[T], meanwhile: Callable[[], None] | None = None) -> T:
         look_ns = 0

@@ -14,6 +14,7 @@ import msgspec
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.findings import History
 from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus
@@ -41,6 +42,10 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """Open ports."""
     fault: str = ""
     """Why not all is known of it, or why it is not where it belongs."""
+    target: int = 0
+    """AL state where the master of a running station keeps it."""
+    since_ns: int | None = None
+    """How many nanoseconds ago *fault* began, if that is known."""
 
 
 class FrameCounts(NamedTuple):
@@ -89,6 +94,15 @@ class SlaveBus(Protocol):
 
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the master's frames."""
+
+    def known(self) -> Sequence[Slave]:
+        """Return all slaves in the order of the line, without asking those that are known."""
+
+    def history(self) -> History | None:
+        """Return when faults were seen; None where nobody has looked before."""
+
+    def forget(self) -> None:
+        """Forget faults that are over."""
 
 
 def choose(slaves: Sequence[Slave], name: str) -> Slave:

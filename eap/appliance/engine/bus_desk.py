@@ -31,6 +31,7 @@ from eap.appliance.bus_request import (
     Cancel,
     Describe,
     Failure,
+    Forget,
     Heard,
     Hello,
     Outcome,
@@ -141,7 +142,10 @@ class BusDesk:
             bus = self._buses[request.bus]
             match request:
                 case Describe():
-                    self._send(Answer(id=request.id, report=self._report(bus)))
+                    self._send(Answer(id=request.id, report=self._report(bus, now_ns)))
+                case Forget():
+                    bus.forget_past()
+                    self._send(Answer(id=request.id))
                 case AskMailbox():
                     self._ask(bus, request, now_ns)
                 case Transfer():
@@ -151,9 +155,9 @@ class BusDesk:
         except EapError as exc:
             self._send(Answer(id=request.id, failure=to_failure(exc)))
 
-    def _report(self, bus: EngineBus) -> BusReport:
+    def _report(self, bus: EngineBus, now_ns: int) -> BusReport:
         return msgspec.structs.replace(
-            report_bus(bus), malformed=self.malformed, dropped=self.dropped
+            report_bus(bus, now_ns), malformed=self.malformed, dropped=self.dropped
         )
 
     def _ask(self, bus: EngineBus, request: AskMailbox, now_ns: int) -> None:

@@ -5,26 +5,31 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from devicebus.master.bus import Unit
-from eap.appliance.bus_request import BusReport, SlaveReport
+from devicebus.master.findings import NO_ANSWER
+from eap.appliance.bus_request import BusReport, PortErrorReport, SlaveReport
+from eap.appliance.engine.bus_faults import WHOLE_BUS
 from eap.appliance.engine.engine_bus import EngineBus
 from eap.pd.spec import BusSlaveSpec
 
 
-def report_bus(bus: EngineBus) -> BusReport:
+def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
     """Return what *bus* knows now; before its slaves are known, those that are expected."""
     stats = bus.master.stats()
     units = bus.master.units.values()
     presets = _link_presets(units)
     slaves = (
-        [_found(bus, unit, presets.get(unit.found.position, 0)) for unit in units]
+        [_found(bus, unit, presets.get(unit.found.position, 0), now_ns) for unit in units]
         if units
         else [_expected(slave) for slave in bus.spec.slaves]
     )
     cycle = stats.cycle
+    silence = bus.faults.last(WHOLE_BUS)
     return BusReport(
         is_up=bus.is_up,
         fault=bus.fault,
         slaves=tuple(slaves),
+        silent_since_ns=now_ns - silence.since_ns if silence.text else None,
+        silent_until_ns=None if silence.until_ns is None else now_ns - silence.until_ns,
         frames_sent=stats.link.sent,
         frames_received=stats.link.received,
         frames_late=stats.link.late,
@@ -59,8 +64,9 @@ def _link_presets(units: Collection[Unit]) -> dict[int, int]:
     return presets
 
 
-def _found(bus: EngineBus, unit: Unit, link_preset: int) -> SlaveReport:
+def _found(bus: EngineBus, unit: Unit, link_preset: int, now_ns: int) -> SlaveReport:
     identity, sii = unit.found.identity, unit.found.sii
+    last = bus.faults.last(unit.station)
     past = bus.faults.past(unit.station)
     sizes = unit.mailbox.sizes if unit.mailbox is not None else None
     return SlaveReport(
@@ -84,8 +90,23 @@ def _found(bus: EngineBus, unit: Unit, link_preset: int) -> SlaveReport:
         losses=past.losses,
         departures=past.departures,
         al_code=past.al_code,
-        fault=bus.faults.of(unit.station),
+        fault=_fault(bus, unit),
+        past_fault=last.text if last.until_ns is not None else "",
+        since_ns=now_ns - last.since_ns if last.text else None,
+        until_ns=None if last.until_ns is None else now_ns - last.until_ns,
+        port_errors=tuple(
+            PortErrorReport(port, now_ns - seen.since_ns, now_ns - seen.until_ns)
+            for port, seen in bus.master.port_errors.of(unit.station).items()
+        ),
     )
+
+
+def _fault(bus: EngineBus, unit: Unit) -> str:
+    """Return why a slave is not where it belongs, as it is at this moment."""
+    fault = bus.faults.of(unit.station)
+    if fault == NO_ANSWER and unit.is_busy and unit.state is not None:
+        return f"it answers again and is on its way to {unit.target.name}"
+    return fault
 
 
 def _expected(slave: BusSlaveSpec) -> SlaveReport:

@@ -7,6 +7,7 @@ from functools import partial
 
 from devicebus.errors import BusError
 from devicebus.master.bus import Unit
+from devicebus.master.findings import join_errors
 from devicebus.master.master import Master
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
@@ -55,10 +56,10 @@ class _Together:
             try:
                 task = master.request_state(unit.station, target, now_ns)
             except BusError as exc:
-                self._end(unit.name, exc)
+                self._end(f"{unit.name} ({unit.station})", exc)
             else:
                 self._tasks.append(task)
-                task.watch(partial(self._take, unit.name))
+                task.watch(partial(self._take, f"{unit.name} ({unit.station})"))
 
     def _take(self, name: str, task: Task[None]) -> None:
         self._end(name, task.error)
@@ -71,11 +72,8 @@ class _Together:
             return
         if not self._errors:
             self.task.finish(None)
-        elif len(self._errors) == 1:
-            self.task.fail(self._errors[0][1])
         else:
-            lines = "\n  ".join(f"{name}: {error}" for name, error in self._errors)
-            self.task.fail(BusError(f"{len(self._errors)} slaves have failed:\n  {lines}"))
+            self.task.fail(join_errors(self._errors))
 
     def _stop(self) -> None:
         for task in self._tasks:

@@ -27,7 +27,6 @@ SILENT_RETRY_NS = 100_000_000
 """The same while nothing comes back at all: nobody is disturbed then."""
 BATCH = 16
 """Frames taken in one go; the rest waits until the cycles have had their turn."""
-NO_FRAME = "no frame comes back: check the cable to the first slave and its power"
 _LONG_CYCLE_NS = 20_000_000
 _MOST_STALE = 4096
 
@@ -75,12 +74,8 @@ class EngineBus:
     @property
     def fault(self) -> str:
         """Why the bus is not wholly as it should be, empty if it is."""
-        faults = (self._wire_fault, self._silence, self._start_fault, *self._ties.missing)
+        faults = (self._wire_fault, self._start_fault, *self._ties.missing)
         return "\n".join(filter(None, faults))
-
-    @property
-    def _silence(self) -> str:
-        return NO_FRAME if self.master.is_lost and not self._wire_fault else ""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when a frame waits."""
@@ -110,6 +105,11 @@ class EngineBus:
             self.tasks.add(task)
             task.watch(self.tasks.discard)
         self._guarded(self._send, now_ns)
+
+    def forget_past(self) -> None:
+        """Forget faults that are over, and when errors of ports were counted."""
+        self.faults.forget_past()
+        self.master.port_errors.clear()
 
     def prepare_ties(
         self, port: PortSpec, image: Image, memory_of: Callable[[Writer], memoryview]

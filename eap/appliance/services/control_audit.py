@@ -29,7 +29,7 @@ BeginChange: TypeAlias = Callable[[str, str, dict[str, Any]], str]
 _CHANGES = frozenset(
     (
         *("write", "stop", "od_write", "request_state", "apply", "rollback"),
-        *("bus_bring", "bus_fault", "bus_transfer", "gateway_start", "gateway_stop"),
+        *("bus_bring", "bus_fault", "bus_forget", "bus_transfer", "gateway_start", "gateway_stop"),
         *("routes_add", "routes_remove", "routes_import", "routes_introduce"),
         *("routing_apply", "routing_rollback"),
     )

@@ -145,7 +145,7 @@ def _station(
     for port in station["ports"]:
         if port["kind"] == PortKind.BUS:
             report = buses.get(PortName(station["name"], port["name"]))
-            port.update(bus_document(report), link=bus_link(report))
+            port.update(bus_document(report, time_ns() / 1e9), link=bus_link(report))
         else:
             port["link"] = link_state(port["interface"])
     counts = station["discarded"]

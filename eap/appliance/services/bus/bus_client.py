@@ -21,6 +21,7 @@ from eap.appliance.bus_request import (
     BusReport,
     Datagram,
     Describe,
+    Forget,
     Heard,
     Transfer,
 )
@@ -187,6 +188,11 @@ class BusClient:
         await self._link.ask(
             lambda number: Bring(id=number, bus=bus, station=station, target=target), BRING_S
         )
+
+    async def forget(self, port: PortName) -> None:
+        """Have the engine forget the faults of a bus that are over; raises EngineGoneError."""
+        bus = self._numbers[port]
+        await self._link.ask(lambda number: Forget(id=number, bus=bus), DESCRIBE_S)
 
     async def _be_up(self, port: PortName) -> None:
         if port not in self._up:

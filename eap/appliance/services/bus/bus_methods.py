@@ -111,6 +111,7 @@ class BusConnection:
             "bus_transfer": self._transfer,
             "bus_bring": self._bring,
             "bus_fault": self._fault,
+            "bus_forget": self._forget,
         }
 
     async def call(self, method: str, params: dict[str, Any]) -> Any:
@@ -196,6 +197,12 @@ class BusConnection:
             await segment.command(wanted.command)
         except ValueError as exc:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
+        return {"ok": True}
+
+    async def _forget(self, params: dict[str, Any]) -> dict[str, Any]:
+        wanted = parameters(params, control_bus.BusForgetParameters)
+        client, port = self._buses.find(wanted)
+        await client.forget(port)
         return {"ok": True}
 
     def _of(self, number: int) -> _Held:

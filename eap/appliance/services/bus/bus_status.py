@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from devicebus.wire.alstatus import state_name
+from eap.appliance.bus_findings import finding_row, report_findings
 from eap.appliance.bus_request import BusReport
 
 
@@ -15,14 +16,17 @@ def bus_link(report: BusReport | None) -> str:
     return "up" if not report.slaves or any(slave.state for slave in report.slaves) else "down"
 
 
-def bus_document(report: BusReport | None) -> dict[str, Any]:
-    """Return the key ``bus`` of a port, or nothing while there is no report."""
+def bus_document(report: BusReport | None, now_s: float) -> dict[str, Any]:
+    """Return the key ``bus`` of a port at *now_s* (Unix time), or nothing without a report."""
     if report is None:
         return {}
+    names = {slave.station: slave.name for slave in report.slaves}
+    found = report_findings(report) if report.is_up else []
     return {
         "bus": {
             "is_up": report.is_up,
             "fault": report.fault,
+            "findings": [finding_row(each, names, now_s) for each in found],
             "slaves": [
                 {
                     "address": slave.station,

@@ -119,8 +119,20 @@ def test_whoever_refuses_is_named():
         line.wait(line.core.bring_up(line.now_ns))
     lines = str(caught.value).splitlines()
     assert lines[0] == "2 slaves have failed:"
-    assert lines[1].startswith("  b: slave 1002: refuses OP")
-    assert lines[2].startswith("  c: slave 1003: refuses OP")
+    assert lines[1].startswith("  b (1002): refuses OP")
+    assert lines[2].startswith("  c (1003): refuses OP")
+
+
+def test_startup_slaves_that_fail_for_one_reason_are_one_line():
+    line = line_of(*(slave(f"s{number}") for number in range(32)))
+    for each in line.segment.slaves[3:]:
+        each.refuses[AlState.OP] = 0x19
+    with pytest.raises(BusError) as caught:
+        line.wait(line.core.bring_up(line.now_ns))
+    assert str(caught.value) == (
+        "29 slaves from s3 (1004) to s31 (1032): refuses OP and stands in SAFEOP+ERROR:"
+        " AL status code 0x0019, no valid outputs"
+    )
 
 
 def test_one_that_refuses_does_not_keep_the_others_from_running():

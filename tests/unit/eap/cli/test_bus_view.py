@@ -12,6 +12,7 @@ from eap.cli.bus_view import (
     dump_table,
     eeprom_lines,
     entry_name,
+    finding_line,
     idn_lines,
     idn_table,
     object_table,
@@ -60,30 +61,48 @@ def test_state_with_its_reason():
     assert "it does not answer (" not in text
 
 
-def test_diagnosis():
-    row = {"address": 1002, "name": "b", "state": "OP", "code": 0x1B, "reason": "watchdog",
-           "answers": True,
-           "ports": [port(0, invalid_frames=3), port(1), port(2, lost_links=9)]}  # fmt: skip
-    gone = {"address": 1003, "name": "c", "state": "", "code": 0, "reason": "",
-            "answers": False, "ports": []}  # fmt: skip
-    found = {
-        "slaves": [row, gone],
-        "frames": {
-            "sent": 1,
-            "late": 3,
-            "lost": 0,
-            "retried": 2,
-            "timeout_us": 2000,
-            "round_trip_us": 480,
-        },
-        "starts_at": {"slave": 1002, "name": "b", "port": 0, "neighbour": 1001},
-    }
-    text = shown(*diagnosis_tables(found))
-    assert "errors start at port 0 of b (1002): check its cable to slave 1001 first" in text
-    assert "b (1002): watchdog (0x001B)" in text
-    words = " ".join(text.split())
-    assert "1 frame sent, 3 late, 0 lost, 2 sent again; round trip 480 µs, time-out 2.0 ms" in words
-    assert "no answer" in text
+FRAMES = {"sent": 1, "late": 3, "lost": 0, "retried": 2, "timeout_us": 2000, "round_trip_us": 480}
+NOW_S = 1_000_000_000.0
+OVER = {"what": "b (1002) did not answer", "advice": "check", "port": None, "is_over": True,
+        "slaves": [{"address": 1002, "name": "b"}],
+        "since": NOW_S - 30, "until": NOW_S - 12}  # fmt: skip
+PRESENT = OVER | {"what": "c (1003) does not answer", "is_over": False, "until": None}
+
+
+def diagnosed(address, **more):
+    row = {"address": address, "name": f"s{address}", "state": "OP", "code": 0, "reason": "",
+           "answers": True, "ports": [port(0), port(1)]}  # fmt: skip
+    return row | more
+
+
+def test_diagnosis_shows_ports_frames_and_findings():
+    bad = diagnosed(1002, ports=[port(0, invalid_frames=3), port(1), port(2, lost_links=9)])
+    gone = diagnosed(1003, state="", answers=False, ports=[])
+    found = {"slaves": [bad, gone], "frames": FRAMES, "findings": [PRESENT, OVER]}
+    lines = [line.rstrip() for line in shown(*diagnosis_tables(found, NOW_S)).splitlines()]
+    assert lines[-3:] == [
+        "1 frame sent, 3 late, 0 lost, 2 sent again; round trip 480 µs, time-out 2.0 ms",
+        "since 30.0 s ago: c (1003) does not answer; check",
+        "was, until 12.0 s ago: b (1002) did not answer; --reset clears this",
+    ]
+    assert any("no answer" in line for line in lines)
+
+
+def test_diagnosis_of_many_slaves_shows_those_with_errors_unless_all_are_wanted():
+    rows = [diagnosed(1001 + number) for number in range(100)]
+    rows[49] = diagnosed(1050, ports=[port(0, lost_links=1)])
+    found = {"slaves": rows, "frames": FRAMES, "findings": [PRESENT]}
+    short = shown(*diagnosis_tables(found, NOW_S))
+    assert "not shown: 98 slaves without errors at their ports (--full)" in short
+    assert "s1002" in short
+    assert "s1050" in short
+    assert "s1100" in shown(*diagnosis_tables(found, NOW_S, is_full=True))
+
+
+def test_diagnosis_of_counters_of_an_unknown_time_says_so():
+    assert finding_line(OVER | {"until": None}, NOW_S) == (
+        "was, before the master looked: b (1002) did not answer; --reset clears this"
+    )
 
 
 def test_eeprom():

@@ -231,10 +231,10 @@ def test_engine_that_runs_no_station_is_one_finding() -> None:
 
 
 def test_buses_and_their_slaves() -> None:
-    down = bus_port("bus1", is_up=False, fault="no frame comes back\nso far", slaves=[], lost=0)
-    starting = bus_port("bus2", is_up=False, slaves=[], lost=0)
+    down = bus_port("bus1", is_up=False, fault="no frame comes back\nso far", findings=[], lost=0)
+    starting = bus_port("bus2", is_up=False, findings=[], lost=0)
     assert texts(ports=[bus_port(wkc_errors=4), down, starting]) == [
-        "error mixer/bus0 press (1002): is lost; 'eapctl bus diag mixer/bus0' says more",
+        "error mixer/bus0: press (1002) is lost; 'eapctl bus diag mixer/bus0' says more",
         "error mixer/bus1: no frame comes back; so far; 'eapctl bus diag mixer/bus1' says more",
         "warning mixer/bus2: not up yet",
         "info mixer/bus0: 4 cycles with a wrong working counter",
@@ -243,7 +243,7 @@ def test_buses_and_their_slaves() -> None:
 
 
 def test_findings_tell_late_exchanges_from_lost_ones() -> None:
-    (*_, late, skipped) = texts(ports=[bus_port(lost=0, slaves=[], late=2, skipped=1)])
+    (*_, late, skipped) = texts(ports=[bus_port(lost=0, findings=[], late=2, skipped=1)])
     assert late == "info mixer/bus0: 2 exchanges late: the bus or this host was busy"
     assert skipped == "info mixer/bus0: 1 exchange left out: others were under way"
 
@@ -251,21 +251,14 @@ def test_findings_tell_late_exchanges_from_lost_ones() -> None:
 def test_bus_that_is_down_is_one_finding() -> None:
     slaves = [{"address": 1001, "name": "a", "state": None, "fault": "has not been found yet"}]
     fault = "the bus is not as configured:\n  a is missing"
-    assert texts(ports=[bus_port(slaves=slaves, is_up=False, fault=fault, lost=0)]) == [
+    assert texts(
+        ports=[bus_port(slaves=slaves, findings=[], is_up=False, fault=fault, lost=0)]
+    ) == [
         (
             "error mixer/bus0: the bus is not as configured: a is missing;"
             " 'eapctl bus diag mixer/bus0' says more"
         )
     ]
-
-
-def test_many_slaves_with_the_same_fault_are_one_finding() -> None:
-    slaves = [
-        {"address": 1000 + n, "name": f"s{n}", "state": None, "target": "OP", "fault": "is lost"}
-        for n in range(1, 33)
-    ]
-    (only,) = texts(ports=[bus_port(slaves=slaves, lost=0)])
-    assert only.startswith("error mixer/bus0: 32 slaves from s1 (1001) on: is lost; ")
 
 
 def test_what_happened_since_the_start_are_remarks() -> None:

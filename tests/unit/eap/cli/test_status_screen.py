@@ -30,7 +30,8 @@ def plant(stations: int, **more: Any) -> dict[str, Any]:
 
 
 def test_screen_of_a_plant_without_faults() -> None:
-    port = bus_port(slaves=[{"name": "a", "address": 1001, "state": "OP", "fault": ""}], lost=0)
+    slaves = [{"name": "a", "address": 1001, "state": "OP", "fault": ""}]
+    port = bus_port(slaves=slaves, findings=[], lost=0)
     status = plant(2, ports=[port], overruns=2)
     status["processes"]["segments"] = {
         name: {"pid": 7, "cpu": 2.0, "rss": 20e6, "restarts": n} for n, name in enumerate("ab")
@@ -56,7 +57,7 @@ def test_screen_shows_errors_first_with_their_counts() -> None:
     )  # fmt: skip
     lines = show(status)
     assert lines[0] == "line: 2 errors, 1 warning (1 station, 1 PD)"
-    assert lines[1].startswith("error    mixer/bus0 press (1002): is lost")
+    assert lines[1].startswith("error    mixer/bus0: press (1002) is lost")
     assert lines[2] == " " * 9 + "more"
     assert lines[3].startswith("error    mixer ← left: stale: nothing received within")
     row = next(line for line in lines if line.startswith("mixer"))

@@ -9,6 +9,7 @@ from devicebus.wire import sii
 from eap.appliance.commands.bus_info import (
     diagnosis,
     read_eeprom,
+    reset_diagnosis,
     scan_rows,
     state_rows,
     write_eeprom,
@@ -61,7 +62,7 @@ def test_slave_that_refused_says_why(line):
 
 def test_diagnosis_of_a_sound_bus(line):
     with line.session() as bus:
-        found = diagnosis(bus, None)
+        found = diagnosis(bus, None, 100.0)
     assert found["starts_at"] is None
     assert found["frames"]["lost"] == 0
     slave = found["slaves"][1]
@@ -74,11 +75,40 @@ def test_diagnosis_names_where_damage_starts(line):
     memory[0x0300] = 3
     memory[0x0311] = 2
     with line.session() as bus:
-        found = diagnosis(bus, None)
-        (only,) = diagnosis(bus, "buttons")["slaves"]
+        found = diagnosis(bus, None, 100.0)
+        (only,) = diagnosis(bus, "buttons", 100.0)["slaves"]
     assert found["starts_at"] == {"slave": 1002, "name": "buttons", "port": 0, "neighbour": 1001}
+    (finding,) = found["findings"]
+    assert finding["what"] == "errors start at port 0 of buttons (1002): 3 invalid frames"
+    assert finding["advice"] == "check its cable to coupler (1001) first"
+    assert (finding["is_over"], finding["until"]) == (False, None)
     assert only["ports"][0]["invalid_frames"] == 3
     assert only["ports"][1]["lost_links"] == 2
+
+
+def test_diagnosis_of_a_silent_bus_is_one_finding(line):
+    with line.session() as bus:
+        bus.scan()
+        line.fault(kind="loss")
+        found = diagnosis(bus, None, 100.0)
+    assert [each["what"] for each in found["findings"]] == [
+        "no frame comes back: 3 slaves cannot be reached"
+    ]
+    assert not any(each["answers"] for each in found["slaves"])
+
+
+def test_diagnosis_of_a_bus_that_loses_a_frame_is_no_silence(line):
+    with line.session() as bus:
+        bus.scan()
+        line.fault(kind="loss", for_ms=20)
+        assert diagnosis(bus, None, 100.0)["findings"] == []
+
+
+def test_reset_diagnosis_clears_the_counters(line):
+    line.segment.segment.slaves[1].esc.memory[0x0300] = 3
+    with line.session() as bus:
+        assert reset_diagnosis(bus) == {"reset": [1001, 1002, 1003]}
+        assert diagnosis(bus, None, 100.0)["findings"] == []
 
 
 def test_eeprom_there_and_back(line):

@@ -15,7 +15,7 @@ def test_before_it_is_up_the_expected_slaves_are_told(tmp_path):
     rig.wire.is_deaf = True
     rig.start()
     rig.run(2000 * MS)
-    report = report_bus(rig.bus)
+    report = report_bus(rig.bus, rig.now_ns)
     assert not report.is_up
     assert "no frame came back" in report.fault
     assert [(each.station, each.name, each.state) for each in report.slaves] == [
@@ -31,7 +31,7 @@ def test_a_bus_that_runs(tmp_path):
     rig = BusRig(tmp_path).start()
     rig.wait_op()
     rig.run(100 * MS)
-    report = report_bus(rig.bus)
+    report = report_bus(rig.bus, rig.now_ns)
     assert (report.is_up, report.fault) == (True, "")
     # Of two slaves with process data one counts 3, as it reads and writes; so does the other.
     assert (report.expected_wkc, report.received_wkc) == (6, 6)
@@ -66,14 +66,17 @@ def test_a_slave_that_is_gone_says_why(tmp_path):
     rig.wait_op()
     rig.fault(kind="power", slave="level")
     rig.run(100 * MS)
-    lost = report_bus(rig.bus).slaves[2]
+    lost = report_bus(rig.bus, rig.now_ns).slaves[2]
     assert (lost.state, lost.target, lost.fault) == (0, AlState.OP, "it does not answer")
 
 
 def shown_states(rig, place, duration_ns):
     """Run the bus; return what image and report say of a slave's state, without repeats."""
     name = rig.bus.spec.slaves[place].name
-    ways = (lambda: rig.value(f"{name}.state"), lambda: report_bus(rig.bus).slaves[place].state)
+    ways = (
+        lambda: rig.value(f"{name}.state"),
+        lambda: report_bus(rig.bus, rig.now_ns).slaves[place].state,
+    )
     shown = [[], []]
     end_ns = rig.now_ns + duration_ns
     while rig.now_ns < end_ns:
@@ -118,4 +121,4 @@ def test_report_other_product_in_place_of_a_slave_has_no_state(tmp_path):
     image, report = shown_states(rig, 1, 2_500 * MS)
     assert image == [8, 0]
     assert report == [8, 0]
-    assert "in place of io" in report_bus(rig.bus).slaves[1].fault
+    assert "in place of io" in report_bus(rig.bus, rig.now_ns).slaves[1].fault

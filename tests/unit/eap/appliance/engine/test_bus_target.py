@@ -53,7 +53,7 @@ def test_those_that_fail_are_named():
     line.segment.slaves[2].refuses[AlState.OP] = 0x19
     with pytest.raises(BusError) as caught:
         line.wait(bring_all(line.core, AlState.OP, line.now_ns))
-    assert str(caught.value).startswith("2 slaves have failed:\n  s0: slave 1001: refuses OP")
+    assert str(caught.value).startswith("2 slaves have failed:\n  s0 (1001): refuses OP")
 
 
 def test_one_that_is_on_its_way_is_named():

@@ -1,0 +1,351 @@
+"""Findings about a bus: one for each cause, however many slaves show it.
+
+A cut cable silences all slaves behind it, and a frame that does not come back says nothing about
+any of them.  A finding therefore names the first slave concerned and what still answers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
+from types import MappingProxyType
+from typing import NamedTuple
+
+import msgspec
+
+from devicebus.errors import BusError, FrameLostError
+from devicebus.master.diagnosis import BusDiagnosis, Fault, PortErrors
+from eap.errors import EapError
+
+NO_ANSWER = "it does not answer"
+SAME_TIME_NS = 2_000_000_000
+"""Faults that ended within this time of each other had one cause: errors are read each second."""
+RECENT_NS = 2_500_000_000
+"""Errors of a port that were counted within this time go on."""
+_LISTED = 3
+"""So many slaves are named one by one."""
+_SLAVE = re.compile(r"^slave \d+(?: \([^)]*\))?:? ")
+_NO_FRAME = "no frame came back"
+
+
+class SlaveView(NamedTuple):
+    """One slave as it shows itself."""
+
+    station: int
+    name: str
+    answers: bool = True
+    trouble: str = ""
+    """Why it is not in the state where it belongs, empty if it is."""
+    since_ns: int | None = None
+    """How many nanoseconds ago it stopped answering, or *trouble* began, if that is known."""
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.station})"
+
+
+class Times(NamedTuple):
+    """How many nanoseconds ago a fault began and was over."""
+
+    since_ns: int
+    until_ns: int
+
+
+class BusFinding(msgspec.Struct, frozen=True, kw_only=True):
+    """One cause of trouble."""
+
+    what: str
+    advice: str = ""
+    slaves: tuple[int, ...] = ()
+    """Station addresses of the slaves concerned, in the order of the line."""
+    port: int | None = None
+    """Where errors start, or a link was lost."""
+    is_over: bool = False
+    since_ns: int | None = None
+    """How many nanoseconds ago it began, if that is known."""
+    until_ns: int | None = None
+    """How many nanoseconds ago it was over, if it is and that is known."""
+
+
+class History(NamedTuple):
+    """What a running master has noted of its slaves; nothing else knows times."""
+
+    over: tuple[tuple[SlaveView, Times], ...] = ()
+    """Slaves with the trouble that they had, in the order of the line."""
+    silence: Times | None = None
+    """When no frame came back the last time, if that is over."""
+    ports: Mapping[tuple[int, int], Times] = MappingProxyType({})
+    """When errors were counted, by station address and port."""
+
+
+def find_causes(
+    slaves: Sequence[SlaveView],
+    diagnosis: BusDiagnosis | None = None,
+    history: History | None = None,
+) -> list[BusFinding]:
+    """Return what is wrong, and behind that what was; for a bus whose frames come back.
+
+    Args:
+        slaves: All slaves in the order of the line.
+        diagnosis: Their registers, if these were read.
+        history: Times; without it errors that were counted are taken for those of now.
+    """
+    faults = list(diagnosis.faults) if diagnosis is not None else []
+    found = []
+    for first, count in _silent_runs(slaves):
+        before = slaves[first - 1].station if first else None
+        there = next((each for each in faults if each.station == before), None)
+        found.append(_no_answer(slaves, first, count, there.port if there else None))
+        if there is not None:  # the link that was lost there has the same cause
+            faults.remove(there)
+    for trouble, group in _by_trouble([each for each in slaves if each.answers]):
+        found.append(
+            BusFinding(
+                what=_says(group, trouble), slaves=_stations(group), since_ns=_since_ns(group)
+            )
+        )
+    if diagnosis is not None:
+        found += _port_findings(slaves, diagnosis, faults, history)
+    past = _past(slaves, history) if history is not None else []
+    return [*(each for each in found if not each.is_over), *_merged(past, found)]
+
+
+def find_silence(slaves: Sequence[SlaveView], since_ns: int | None = None) -> BusFinding:
+    """Return the finding that no frame comes back, which says nothing about any slave."""
+    if not slaves:
+        return BusFinding(what="no frame comes back", advice="check the interface and the cable")
+    return BusFinding(
+        what=f"no frame comes back: {_count(len(slaves))} cannot be reached",
+        advice=f"check the interface, the cable to {slaves[0]} and its power",
+        slaves=_stations(slaves),
+        since_ns=since_ns,
+    )
+
+
+def _port_findings(
+    slaves: Sequence[SlaveView],
+    diagnosis: BusDiagnosis,
+    faults: Sequence[Fault],
+    history: History | None,
+) -> Iterator[BusFinding]:
+    """Yield the first of the ports whose errors are new, and the first of those of each time."""
+    ports = history.ports if history is not None else {}
+    told: list[int | None] = []
+    for fault in faults:
+        times = ports.get((fault.station, fault.port))
+        is_over = history is not None and (times is None or times.until_ns > RECENT_NS)
+        moment = times.until_ns if times is not None and is_over else None if is_over else 0
+        if any(_same_time(moment, each) for each in told):
+            continue
+        told.append(moment)
+        finding = _errors(slaves, diagnosis, fault, "started" if is_over else "start")
+        yield msgspec.structs.replace(
+            finding,
+            is_over=is_over,
+            since_ns=times.since_ns if times is not None else None,
+            until_ns=times.until_ns if times is not None and is_over else None,
+        )
+
+
+def _past(slaves: Sequence[SlaveView], history: History) -> list[BusFinding]:
+    """Return what was wrong and is over, what ended at one time as one finding."""
+    groups: list[list[tuple[SlaveView, Times]]] = []
+    silence = history.silence
+    for slave, times in history.over:
+        if silence is not None and any(_same_time(times.since_ns, each) for each in silence):
+            continue  # it was missed because of the silence, or its watchdog ran out then
+        for group in groups:
+            same = _same_time(group[0][1].until_ns, times.until_ns)
+            if group[0][0].trouble == slave.trouble and same:
+                group.append((slave, times))
+                break
+        else:
+            groups.append([(slave, times)])
+    found = []
+    if silence is not None:
+        what = f"no frame came back, so that {_count(len(slaves))} could not be reached"
+        found.append(
+            BusFinding(what=what, slaves=_stations(slaves), is_over=True, **silence._asdict())
+        )
+    return found + [
+        BusFinding(
+            what=_said([slave for slave, _ in group], group[0][0].trouble),
+            slaves=_stations([slave for slave, _ in group]),
+            is_over=True,
+            since_ns=max(times.since_ns for _, times in group),
+            until_ns=min(times.until_ns for _, times in group),
+        )
+        for group in groups
+    ]
+
+
+def _merged(past: Sequence[BusFinding], found: Sequence[BusFinding]) -> Iterator[BusFinding]:
+    """Yield what is over; errors of a port that began with the trouble of slaves belong to it."""
+    ports = [each for each in found if each.is_over]
+    for each in past:
+        there = [port for port in ports if _belongs(port, each)]
+        ports = [port for port in ports if port not in there]
+        if not there:
+            yield each
+            continue
+        first = there[0]
+        yield msgspec.structs.replace(
+            each, what=f"{each.what}; {first.what}", advice=first.advice, port=first.port
+        )
+    yield from ports
+
+
+def _belongs(port: BusFinding, trouble: BusFinding) -> bool:
+    """Whether errors of a port came with a trouble of slaves, or with the end of it at one."""
+    return _same_time(port.since_ns, trouble.since_ns) or (
+        port.slaves[0] in trouble.slaves and _same_time(port.since_ns, trouble.until_ns)
+    )
+
+
+def _same_time(one_ns: int | None, other_ns: int | None) -> bool:
+    if one_ns is None or other_ns is None:
+        return one_ns is other_ns
+    return abs(one_ns - other_ns) < SAME_TIME_NS
+
+
+def join_errors(errors: Sequence[tuple[str, EapError]]) -> EapError:
+    """Return one error for those of several slaves, with one line for each cause.
+
+    Args:
+        errors: Names of slaves, and what went wrong with each; at least one.
+    """
+    if len(errors) == 1:
+        return errors[0][1]
+    causes: dict[str, list[str]] = {}
+    for name, error in errors:
+        causes.setdefault(_cause(error), []).append(name)
+    if list(causes) == [_NO_FRAME]:
+        return FrameLostError(
+            f"frames to {_listed([name for name, _ in errors])} did not come back: they are lost"
+            " on a cable, or this machine is too busy; it is tried again"
+        )
+    lines = [f"{_listed(names)}: {cause}" for cause, names in causes.items()]
+    if len(lines) == 1:
+        return BusError(lines[0])
+    return BusError(f"{_count(len(errors))} have failed:\n  " + "\n  ".join(lines))
+
+
+def describe_counters(port: PortErrors) -> str:
+    """Return the error counters of a port that are not 0, in words."""
+    kinds = (
+        (port.invalid_frames, "invalid frame"),
+        (port.physical, "physical error"),
+        (port.forwarded, "forwarded error"),
+        (port.lost_links, "lost link"),
+    )
+    return ", ".join(f"{n} {what}{'s' * (n != 1)}" for n, what in kinds if n)
+
+
+def _cause(error: EapError) -> str:
+    """Return what went wrong without the slave that it went wrong with."""
+    return _NO_FRAME if isinstance(error, FrameLostError) else _SLAVE.sub("", str(error))
+
+
+def _silent_runs(slaves: Sequence[SlaveView]) -> list[tuple[int, int]]:
+    """Return position and length of each run of slaves that do not answer."""
+    runs = []
+    for answers, run in groupby(enumerate(slaves), key=lambda each: each[1].answers):
+        positions = [position for position, _ in run]
+        if not answers:
+            runs.append((positions[0], len(positions)))
+    return runs
+
+
+def _no_answer(slaves: Sequence[SlaveView], first: int, count: int, port: int | None) -> BusFinding:
+    """Return the finding about *count* slaves from position *first* on that do not answer.
+
+    Args:
+        slaves: All of the line.
+        first: Position of the first silent one.
+        count: How many do not answer.
+        port: Port of the slave before that has lost its link, if one has.
+    """
+    silent = slaves[first]
+    run = slaves[first : first + count]
+    if count == len(slaves) > 1:
+        return BusFinding(
+            what=f"none of the {count} slaves answers, although frames come back",
+            advice="look whether these are other slaves, or were switched off and on together",
+            slaves=_stations(run),
+            since_ns=_since_ns(run),
+        )
+    who = f"{silent} does not answer"
+    if count > 1:
+        who = f"{silent} and {_count(count - 1)} behind it do not answer"
+    parts = [who]
+    if first:
+        lost = "" if port is None else f", whose port {port} has lost its link"
+        parts.append(f"the last that answers before it is {slaves[first - 1]}{lost}")
+    if first + count < len(slaves):
+        parts.append(f"{slaves[first + count]} behind answers")
+    return BusFinding(
+        what="; ".join(parts),
+        advice=f"check the cable to {silent} and its power",
+        slaves=_stations(run),
+        port=port,
+        since_ns=_since_ns(run),
+    )
+
+
+def _errors(
+    slaves: Sequence[SlaveView], diagnosis: BusDiagnosis, fault: Fault, verb: str
+) -> BusFinding:
+    """Return the finding about the port at which errors start, or started."""
+    names = {each.station: str(each) for each in slaves}
+    port = next(
+        port
+        for slave in diagnosis.slaves
+        if slave.station == fault.station
+        for port in slave.ports
+        if port.port == fault.port
+    )
+    far = f" to {names[fault.neighbour]}" if fault.neighbour is not None else ""
+    place = f"port {fault.port} of {names[fault.station]}"
+    return BusFinding(
+        what=f"errors {verb} at {place}: {describe_counters(port)}",
+        advice=f"check its cable{far} first",
+        slaves=(fault.station,),
+        port=fault.port,
+    )
+
+
+def _by_trouble(slaves: Sequence[SlaveView]) -> list[tuple[str, list[SlaveView]]]:
+    groups: dict[str, list[SlaveView]] = {}
+    for each in slaves:
+        if each.trouble:
+            groups.setdefault(each.trouble, []).append(each)
+    return list(groups.items())
+
+
+def _says(slaves: Sequence[SlaveView], trouble: str) -> str:
+    return f"{_listed([str(each) for each in slaves])}: {trouble}"
+
+
+def _said(slaves: Sequence[SlaveView], trouble: str) -> str:
+    """Return what was wrong with slaves, in the past."""
+    if trouble == NO_ANSWER:
+        return f"{_listed([str(each) for each in slaves])} did not answer"
+    return _says(slaves, trouble)
+
+
+def _listed(names: Sequence[str]) -> str:
+    if len(names) > _LISTED:
+        return f"{_count(len(names))} from {names[0]} to {names[-1]}"
+    return ", ".join(names)
+
+
+def _stations(slaves: Iterable[SlaveView]) -> tuple[int, ...]:
+    return tuple(each.station for each in slaves)
+
+
+def _since_ns(slaves: Iterable[SlaveView]) -> int | None:
+    return max((each.since_ns for each in slaves if each.since_ns is not None), default=None)
+
+
+def _count(number: int) -> str:
+    return f"{number} slave{'s' * (number != 1)}"
