@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import resource
 from pathlib import Path
@@ -14,7 +15,12 @@ from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.appliance.services import status
-from eap.appliance.services.status import ProcessMeter, appliance_status, link_state
+from eap.appliance.services.status import (
+    ProcessMeter,
+    appliance_status,
+    link_state,
+    take_snapshot,
+)
 from eap.net.connections import ListenerStats
 from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
@@ -102,6 +108,29 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     assert right["discarded"] == {}
     assert left["pd"]["tx"][0]["name"] == "state"
     assert right["pd"]["rx"][0]["lost"] == 0
+
+
+def test_snapshot_within_a_cycle_is_taken_after_it_while_others_go_on(files):
+    image = files["left"].image
+    image.words[StationWord.CYCLE] = 1
+
+    async def scene():
+        async with asyncio.TaskGroup() as group:
+            taken = group.create_task(take_snapshot(image))
+            await asyncio.sleep(0)
+            assert not taken.done()
+            image.words[StationWord.OVERRUNS] = 5
+            image.words[StationWord.FUTEX] = 1
+        return taken.result()
+
+    assert asyncio.run(scene()).words[StationWord.OVERRUNS] == 5
+
+
+def test_snapshot_of_an_engine_that_hangs_within_a_cycle_is_what_it_left(files, monkeypatch):
+    monkeypatch.setattr(status, "SNAPSHOT_PAUSES", 2)
+    image = files["left"].image
+    image.words[StationWord.CYCLE] = 1
+    assert asyncio.run(take_snapshot(image)).words[StationWord.CYCLE] == 1
 
 
 def test_buses_and_segments(tmp_path):
