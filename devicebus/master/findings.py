@@ -74,6 +74,8 @@ class History(NamedTuple):
     """Slaves with the trouble that they had, in the order of the line."""
     silence: Times | None = None
     """When no frame came back the last time, if that is over."""
+    silent_since_ns: int | None = None
+    """How many nanoseconds ago frames stopped coming back, if they have."""
     ports: Mapping[tuple[int, int], Times] = MappingProxyType({})
     """When errors were counted, by station address and port."""
 
@@ -128,16 +130,24 @@ def _port_findings(
     faults: Sequence[Fault],
     history: History | None,
 ) -> Iterator[BusFinding]:
-    """Yield the first of the ports whose errors are new, and the first of those of each time."""
+    """Yield the first of the ports whose errors are new, and the first of those of each time.
+
+    Both ends of a cable count its errors: only the end that comes first is told.
+    """
     ports = history.ports if history is not None else {}
-    told: list[int | None] = []
-    for fault in faults:
-        times = ports.get((fault.station, fault.port))
-        is_over = history is not None and (times is None or times.until_ns > RECENT_NS)
+    timed = [(fault, ports.get((fault.station, fault.port))) for fault in faults]
+    if history is not None:
+        timed.sort(key=lambda each: _is_over(each[1]))
+    moments: list[int | None] = []
+    cables: set[frozenset[int]] = set()
+    for fault, times in timed:
+        is_over = history is not None and _is_over(times)
         moment = times.until_ns if times is not None and is_over else None if is_over else 0
-        if any(_same_time(moment, each) for each in told):
+        cable = frozenset((fault.station, fault.neighbour or 0))
+        if cable in cables or any(_same_time(moment, each) for each in moments):
             continue
-        told.append(moment)
+        moments.append(moment)
+        cables.add(cable)
         finding = _errors(slaves, diagnosis, fault, "started" if is_over else "start")
         yield msgspec.structs.replace(
             finding,
@@ -145,6 +155,10 @@ def _port_findings(
             since_ns=times.since_ns if times is not None else None,
             until_ns=times.until_ns if times is not None and is_over else None,
         )
+
+
+def _is_over(times: Times | None) -> bool:
+    return times is None or times.until_ns > RECENT_NS
 
 
 def _past(slaves: Sequence[SlaveView], history: History) -> list[BusFinding]:
@@ -323,7 +337,10 @@ def _by_trouble(slaves: Sequence[SlaveView]) -> list[tuple[str, list[SlaveView]]
 
 
 def _says(slaves: Sequence[SlaveView], trouble: str) -> str:
-    return f"{_listed([str(each) for each in slaves])}: {trouble}"
+    names = _listed([str(each) for each in slaves])
+    if len(slaves) == 1 and trouble.startswith("it "):
+        return f"{names} {trouble.removeprefix('it ')}"
+    return f"{names}: {trouble.removeprefix('it ')}"
 
 
 def _said(slaves: Sequence[SlaveView], trouble: str) -> str:

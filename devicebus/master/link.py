@@ -397,7 +397,10 @@ def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, in
 
 def _lost(item: _Item) -> FrameLostError:
     command, adp, ado, _, _ = item.access
+    # A frame to one slave that is lost says nothing about the others; a broadcast reaches any.
+    is_blind = command is Command.BRD
+    advice = "; check the cable to the first slave and its power" if is_blind else ""
     return FrameLostError(
-        f"{command.name} 0x{adp:04X}:0x{ado:04X}: no frame came back, sent {item.tries} times;"
-        " check the cable to the first slave and its power"
+        f"{command.name} 0x{adp:04X}:0x{ado:04X}: no frame came back, sent {item.tries} times"
+        f"{advice}"
     )

@@ -43,7 +43,8 @@ def history_of(report: BusReport) -> History:
             over.append((view, Times(slave.since_ns, slave.until_ns)))
         for each in slave.port_errors:
             ports[slave.station, each.port] = Times(each.since_ns, each.until_ns)
-    return History(tuple(over), silence, ports)
+    since_ns = report.silent_since_ns if is_silent(report) else None
+    return History(tuple(over), silence, since_ns, ports)
 
 
 def finding_row(finding: BusFinding, names: Mapping[int, str], now_s: float) -> dict[str, Any]:

@@ -76,13 +76,14 @@ def diagnosis_tables(
     slaves = found["slaves"]
     shown = slaves
     if len(slaves) > _MANY_SLAVES and not is_full:
-        first = {each["address"] for row in found["findings"] for each in row["slaves"][:1]}
+        lasting = [row for row in found["findings"] if not row["is_over"]]
+        first = {each["address"] for row in lasting for each in row["slaves"][:1]}
         shown = [row for row in slaves if row["address"] in first or _has_errors(row)]
     if shown:
         yield _port_table(shown)
     if len(shown) < len(slaves):
         rest = count(len(slaves) - len(shown), "slave")
-        yield Text(f"not shown: {rest} without errors at their ports (--full)", style="dim")
+        yield Text(f"not shown: {rest} without errors of their own (--full)", style="dim")
     yield Text()
     frames = found["frames"]
     yield Text(

@@ -60,7 +60,10 @@ def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> dict[str, Any]:
     found = bus.run(_diagnose(list(names)), "diagnosis")
     views = [_view(each, there) for each, there in zip(known, found.slaves, strict=True)]
     history = bus.history()
-    causes = [find_silence(views)] if found.is_silent else find_causes(views, found, history)
+    if found.is_silent:
+        causes = [find_silence(views, history.silent_since_ns if history is not None else None)]
+    else:
+        causes = find_causes(views, found, history)
     frames = bus.frame_counts()
     fault = found.first_fault
     return {

@@ -90,6 +90,8 @@ def test_lost_link_before_a_silent_slave_is_the_same_finding():
 def test_slaves_with_the_same_trouble_are_one_finding():
     trouble = "in SAFEOP+ERROR: watchdog"
     assert whats(line(b=trouble, c=trouble)) == [f"b (1002), c (1003): {trouble}"]
+    assert whats(line(b="it refuses OP")) == ["b (1002) refuses OP"]
+    assert whats(line(b="it refuses OP", c="it refuses OP")) == ["b (1002), c (1003): refuses OP"]
     everyone = line(a=trouble, b=trouble, c=trouble, d=trouble)
     assert whats(everyone) == [f"4 slaves from a (1001) to d (1004): {trouble}"]
 
@@ -119,6 +121,17 @@ def test_new_errors_are_found_behind_a_port_with_old_ones():
     assert [(each.slaves, each.is_over) for each in found] == [((1003,), False), ((1001,), True)]
 
 
+def test_both_ends_of_a_cable_are_one_finding_whenever_they_were_counted():
+    history = History(
+        ports={
+            (1002, 1): Times(37 * SECOND, 37 * SECOND),
+            (1003, 0): Times(24 * SECOND, 24 * SECOND),
+        }
+    )
+    (finding,) = find_causes(line(), diagnosis(Fault(1002, 1, 1003), Fault(1003, 0, 1002)), history)
+    assert (finding.slaves, finding.port, finding.is_over) == ((1002,), 1, True)
+
+
 def test_errors_from_before_the_master_looked_are_over_at_an_unknown_time():
     (finding,) = find_causes(line(), diagnosis(Fault(1002, 0, 1001)), History())
     assert (finding.is_over, finding.until_ns) == (True, None)
@@ -131,7 +144,7 @@ def test_cut_that_was_mended_is_one_finding_for_slaves_and_both_ends_of_the_cabl
     (finding,) = find_causes(
         line(),
         diagnosis(Fault(1002, 1, 1003), Fault(1003, 0, 1002)),
-        History(tuple(over), None, ports),
+        History(tuple(over), ports=ports),
     )
     assert finding.what == (
         "c (1003), d (1004) did not answer; errors started at port 1 of b (1002): 1 lost link"

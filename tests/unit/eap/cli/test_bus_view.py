@@ -93,7 +93,7 @@ def test_diagnosis_of_many_slaves_shows_those_with_errors_unless_all_are_wanted(
     rows[49] = diagnosed(1050, ports=[port(0, lost_links=1)])
     found = {"slaves": rows, "frames": FRAMES, "findings": [PRESENT]}
     short = shown(*diagnosis_tables(found, NOW_S))
-    assert "not shown: 98 slaves without errors at their ports (--full)" in short
+    assert "not shown: 98 slaves without errors of their own (--full)" in short
     assert "s1002" in short
     assert "s1050" in short
     assert "s1100" in shown(*diagnosis_tables(found, NOW_S, is_full=True))
