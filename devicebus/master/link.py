@@ -54,6 +54,7 @@ _TYPE_WORD = FrameType.DATAGRAM << 12
 _MORE = 0x8000
 _LENGTH = 0x07FF
 _BY_STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW))
+_BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
 _FIXED_ADP = _BY_STATION | {Command.LRD, Command.LWR, Command.LRW}
 
 
@@ -397,9 +398,8 @@ def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, in
 
 def _lost(item: _Item) -> FrameLostError:
     command, adp, ado, _, _ = item.access
-    # A frame to one slave that is lost says nothing about the others; a broadcast reaches any.
-    is_blind = command is Command.BRD
-    advice = "; check the cable to the first slave and its power" if is_blind else ""
+    # A frame to one slave that is lost says nothing about the others; a broadcast goes to any.
+    advice = "; check the cable to the first slave and its power" if command in _BROADCAST else ""
     return FrameLostError(
         f"{command.name} 0x{adp:04X}:0x{ado:04X}: no frame came back, sent {item.tries} times"
         f"{advice}"

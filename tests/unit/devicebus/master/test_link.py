@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import Reply, fprd, fpwr, logical
+from devicebus.master.access import Reply, brd, fprd, fpwr, logical
 from devicebus.master.link import (
     INDEXES,
     LINGER_NS,
@@ -356,3 +356,20 @@ def test_short_datagrams_cost_more_of_the_budget_than_their_octets():
     link.start_cycle()
     (frame,) = link.frames_to_send(0)
     assert len(accesses_of(frame)) == 4
+
+
+@pytest.mark.parametrize(
+    ("access", "is_blamed"), [(fprd(1001, 0x130, 2), False), (brd(0, 1), True)]
+)
+def test_link_lost_frame_blames_the_first_cable_only_after_a_broadcast(access, is_blamed):
+    link = Link(retries=0)
+    outcomes = []
+    link.submit([access], lambda outcome, now_ns: outcomes.append(outcome))
+    now_ns = 0
+    while not outcomes:
+        link.frames_to_send(now_ns)
+        now_ns = link.next_timeout()
+        link.handle_timeout(now_ns)
+    (error,) = outcomes
+    assert isinstance(error, FrameLostError)
+    assert ("check the cable to the first slave" in str(error)) is is_blamed
