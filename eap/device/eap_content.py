@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 from eap.codec.pd import FIRST_PD, PdHeader
@@ -146,6 +147,10 @@ class EapContent(EapObjects):
             if item.entries[subindex].value == index:
                 return item.index, subindex
         return None
+
+    def at_one_moment(self) -> AbstractContextManager[None]:
+        """Show live counters of one moment for the length of a block."""
+        return self.live.at_one_moment()
 
     def _live(self, index: int, key: str, size: int) -> bytes:
         """Return what *key* shows of what the object is about; zero if that does not run."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol
 
 
@@ -15,6 +16,9 @@ class LiveValues(Protocol):
         or no longer, part of what runs.
         """
 
+    def at_one_moment(self) -> AbstractContextManager[None]:
+        """Show counters of one moment for the length of a block."""
+
 
 class NothingRuns:
     """The live values of a device whose engine does not run."""
@@ -22,3 +26,7 @@ class NothingRuns:
     def octets(self, key: str, name: str) -> bytes | None:
         """Return None for everything."""
         return None
+
+    def at_one_moment(self) -> AbstractContextManager[None]:
+        """Do nothing."""
+        return nullcontext()

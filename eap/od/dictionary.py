@@ -7,6 +7,7 @@ succeeds.  Data is in the form in which CoE transfers it (ETG.1000.6).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 
 from eap.codec import pdo
 from eap.codec.datatypes import DataType
@@ -104,10 +105,15 @@ class ObjectDictionary:
         chosen = self._whole(index, first)
         plan = pdo.layout([entry.kind for _, entry in chosen])
         data = bytearray(plan.size)
-        for (_, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
-            if entry.access & state.read_right:
-                _put_bits(data, bit_offset, entry)
+        with self.at_one_moment():
+            for (_, entry), bit_offset in zip(chosen, plan.bit_offsets, strict=True):
+                if entry.access & state.read_right:
+                    _put_bits(data, bit_offset, entry)
         return bytes(_count_word(self[index]) + data if first == 0 else data)
+
+    def at_one_moment(self) -> AbstractContextManager[None]:
+        """Have the values that change by themselves be of one moment for the length of a block."""
+        return nullcontext()
 
     def download_complete(self, index: int, first: int, data: bytes, state: OdState) -> None:
         """Write a whole object from subindex *first* on; read-only entries are passed over.

@@ -6,7 +6,8 @@ newest then.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from eap.appliance.station_image import StationImage
@@ -18,7 +19,14 @@ from eap.od.profiles.eap1000keys import Live
 from eap.pd import outcome
 from eap.pd.frame_status import frame_state
 from eap.pd.image import Image
-from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, RxPlace, TxPlace
+from eap.pd.layout import (
+    FRAME_CTRL,
+    VAR_CTRL,
+    FramePlace,
+    ImageLayout,
+    RxPlace,
+    TxPlace,
+)
 from eap.pd.report import account_word, quality, tx_status, var_state
 from eap.pd.words import (
     DISCARD_INDEX,
@@ -48,6 +56,7 @@ class ImageValues:
     def __init__(self, station: StationImage) -> None:
         self._station = station
         self._found: _Places | None = None
+        self._moment: Image | None = None
 
     def octets(self, key: str, name: str) -> bytes | None:
         """Return what *key* shows of the object called *name*, None if that does not run."""
@@ -55,35 +64,47 @@ class ImageValues:
             image = self._station.image
             if key == Live.VALUE:
                 return _value(image, name)
-            number = self._places(image).number(key, name)
+            # What programs write has no place in a snapshot: it may be cut in two there.
+            source = image if key in _CONTROLS else self._moment or image
+            number = self._places(source.layout).number(source, key, name)
         except ImageError:
             return None
         return None if number is None else _encode(_KINDS[key], number)
 
-    def _places(self, image: Image) -> _Places:
-        if self._found is None or self._found.image is not image:
-            self._found = _Places(image)
+    @contextmanager
+    def at_one_moment(self) -> Iterator[None]:
+        """Show counters of one moment between two cycles for the length of a block."""
+        with suppress(ImageError):
+            self._moment = self._station.image.snapshot()
+        try:
+            yield
+        finally:
+            self._moment = None
+
+    def _places(self, layout: ImageLayout) -> _Places:
+        if self._found is None or self._found.layout is not layout:
+            self._found = _Places(layout)
         return self._found
 
 
 class _Places:
-    """What lies in one image, by name."""
+    """What lies in images of one layout, by name."""
 
-    def __init__(self, image: Image) -> None:
-        self.image = image
-        self._frames = {place.name: place for place in image.layout.frames}
-        self._tx = {place.name: place for place in image.layout.tx}
-        self._rx = {place.name: place for place in image.layout.rx}
+    def __init__(self, layout: ImageLayout) -> None:
+        self.layout = layout
+        self._frames = {place.name: place for place in layout.frames}
+        self._tx = {place.name: place for place in layout.tx}
+        self._rx = {place.name: place for place in layout.rx}
 
-    def number(self, key: str, name: str) -> int | None:
+    def number(self, image: Image, key: str, name: str) -> int | None:
         if key in _OF_STATION:
-            return int(self.image.words[_OF_STATION[key]])
+            return int(image.words[_OF_STATION[key]])
         if key in _OF_FRAME:
-            return _applied(_OF_FRAME[key], self.image, self._frames.get(name))
+            return _applied(_OF_FRAME[key], image, self._frames.get(name))
         if key in _OF_TX:
-            return _applied(_OF_TX[key], self.image, self._tx.get(name))
+            return _applied(_OF_TX[key], image, self._tx.get(name))
         if key in _OF_RX:
-            return _applied(_OF_RX[key], self.image, self._rx.get(name))
+            return _applied(_OF_RX[key], image, self._rx.get(name))
         return None
 
 
@@ -146,6 +167,7 @@ def _cycle_index(image: Image, place: RxPlace) -> int:
     return last & 0xFFFF if _account(RxWord.RECEIVED)(image, place) else 0
 
 
+_CONTROLS = frozenset((Live.FRAME_CTRL, Live.TX_VAR_CTRL))
 _OF_STATION: dict[str, int] = {
     Live.STATION_CYCLE: StationWord.CYCLE,
     Live.STATION_OVERRUNS: StationWord.OVERRUNS,

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from msgspec.structs import replace
 
@@ -36,9 +38,22 @@ def test_identity_can_be_another():
 
 
 class Recorder:
-    """Live values that tell what they were asked for."""
+    """Live values that tell what they were asked for, and within which moment."""
+
+    def __init__(self) -> None:
+        self.moments = 0
+        self.is_in_moment = False
+        self.seen: list[bool] = []
+
+    @contextmanager
+    def at_one_moment(self) -> Iterator[None]:
+        self.moments += 1
+        self.is_in_moment = True
+        yield
+        self.is_in_moment = False
 
     def octets(self, key: str, name: str) -> bytes | None:
+        self.seen.append(self.is_in_moment)
         return {("value", "level"): b"\x34\x12", ("tx_skipped", "txpd0"): bytes(3)}.get((key, name))
 
 
@@ -49,6 +64,15 @@ def test_live_entries_show_what_runs_and_zero_when_nothing_does():
     assert _read(dictionary, 0xF110, 1) == 0
     variable(dictionary, 0x6001, "other")
     assert _read(dictionary, 0x6001, Var.VALUE) == 0
+
+
+def test_whole_object_shows_live_entries_of_one_moment():
+    live = Recorder()
+    dictionary = sender(EapDictionary(BLANK, "eap0", live))
+    dictionary.upload_complete(0xB000, 1, OdState.OP)
+    assert live.moments == 1
+    assert len(live.seen) > 1
+    assert all(live.seen)
 
 
 def test_lengths_counts_and_free_indexes_are_computed(udp):

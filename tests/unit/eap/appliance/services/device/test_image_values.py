@@ -51,6 +51,31 @@ def test_values_of_variables(values, files):
     assert left.octets(Live.VALUE, "nobody") is None
 
 
+def test_counters_of_one_moment_do_not_change_and_values_of_programs_do(values, files):
+    image = files["right"].image
+    first = image.layout.rx[0].words
+    right = values["right"]
+
+    def arrive(count: int) -> None:
+        image.words[first + RxWord.RECEIVED] = image.words[first + RxWord.LAST_CYCLE] = count
+
+    def seen() -> tuple[int, int]:
+        keys = Live.RX_RECEIVED, Live.RX_CYCLE_INDEX
+        return tuple(number(right, key, "left-state") for key in keys)
+
+    arrive(5)
+    with right.at_one_moment():
+        received, _ = seen()
+        arrive(6)
+        assert seen() == (received, 5)
+    assert seen() == (6, 6)
+    left = values["left"]
+    with left.at_one_moment(), files["left"].image.writing(Writer.APPLICATION):
+        files["left"].image.write("state.VarCtrl", 2)
+    with left.at_one_moment():
+        assert number(left, Live.TX_VAR_CTRL, "state") == 2
+
+
 def test_counters_of_the_station(values, files):
     words = files["left"].image.words
     words[StationWord.CYCLE] = 70_000
