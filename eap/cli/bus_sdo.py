@@ -49,7 +49,10 @@ def read(
     bus: Place,
     as_json: bool,
 ) -> None:
-    """Read an entry."""
+    """Read an entry.
+
+    INDEX and SUB are hexadecimal, with or without 0x: 0x1018:01, 1018:1.
+    """
     from eap.appliance.commands.bus_sdo import read_entry
 
     with open_session(bus) as session:
@@ -80,8 +83,8 @@ def write(
 ) -> None:
     """Write an entry.
 
-    VALUE is as the type has it: 12, 0xC, -1.5e3, true, text; hexadecimal digits for a block and
-    with --complete.
+    INDEX and SUB are hexadecimal, with or without 0x: 0x8000:01, 8000:1.  VALUE is as the type has
+    it: 12, 0xC, -1.5e3, true, text; hexadecimal digits for a block and with --complete.
     """
     from eap.appliance.commands.bus_sdo import write_entry
 
