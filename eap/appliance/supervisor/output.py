@@ -27,6 +27,7 @@ class Output:
 
     def __init__(self, fd: int) -> None:
         self.left_out = 0
+        self._is_cut = False
         self._fd = fd
         self._poll = select.poll()
         self._poll.register(fd, select.POLLOUT)
@@ -35,20 +36,28 @@ class Output:
         """Write a line, behind a note on those that were left out before it."""
         if self.left_out:
             line = f"({self.left_out} lines left out here, which nobody took)\n{line}"
+        if self._is_cut:  # a full pipe or disk took a part of the line before: it ends there
+            line = f"\n{line}"
         octets = f"{line}\n".encode("utf-8", "replace")
         for start in range(0, len(octets), _PIECE):
-            if not self._take(octets[start : start + _PIECE]):
+            piece = octets[start : start + _PIECE]
+            taken = self._take(piece)
+            if taken < len(piece):
                 self.left_out += 1
+                if written := octets[: start + taken]:
+                    self._is_cut = not written.endswith(b"\n")
                 return
         self.left_out = 0
+        self._is_cut = False
 
-    def _take(self, octets: bytes) -> bool:
+    def _take(self, octets: bytes) -> int:
+        """Write what is taken at once; return how much that was."""
         if not self._poll.poll(0):
-            return False
+            return 0
         try:
-            return os.write(self._fd, octets) == len(octets)
-        except OSError:  # the reader has gone
-            return False
+            return os.write(self._fd, octets)
+        except OSError:  # the reader has gone, or the disk is full
+            return 0
 
 
 STDERR = Output(2)

@@ -8,6 +8,7 @@ import select
 import pytest
 
 from eap.appliance.supervisor.output import Output
+from tests.support.limits import largest_file
 
 
 @pytest.fixture
@@ -49,3 +50,28 @@ def test_a_reader_that_has_gone_is_no_fault(pipe):
     os.close(null)
     output.write("nobody sees this")
     assert output.left_out == 1
+
+
+def test_line_after_one_that_a_full_disk_cut_begins_anew(tmp_path):
+    with (tmp_path / "log").open("wb") as file:
+        output = Output(file.fileno())
+        output.write("first")
+        with largest_file(10):
+            output.write("second is long")
+            output.write("third")
+        assert output.left_out == 2
+        output.write("fourth")
+        output.write("fifth")
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert lines == [
+        "first", "seco", "(2 lines left out here, which nobody took)", "fourth", "fifth",
+    ]  # fmt: skip
+
+
+def test_line_after_one_that_a_full_pipe_cut_begins_anew(pipe):
+    output = Output(pipe[1])
+    output.write("y" * 100_000)
+    found = read(pipe[0])
+    assert set(found) == {"y"}
+    output.write("next")
+    assert read(pipe[0]) == "\n(1 lines left out here, which nobody took)\nnext\n"
