@@ -61,6 +61,8 @@ class ApplianceInfo(msgspec.Struct):
     services: ProcessInfo = msgspec.field(default_factory=ProcessInfo)
     segments: dict[str, ProcessInfo] = {}
     """Simulated buses by ``STATION/PORT``."""
+    audit_required: bool = False
+    """Whether changes that cannot be recorded are refused."""
 
 
 def runtime_root() -> Path:

@@ -69,6 +69,7 @@ class PlantLink:
         file: The plant file.
         absent: Its stations that do not run here.
         routing: What it says of their routers.
+        audit_required: Whether it wants changes refused that cannot be recorded.
 
     Attributes:
         file: The plant file, as it was named.
@@ -81,9 +82,12 @@ class PlantLink:
         file: Path,
         absent: tuple[str, ...] = (),
         routing: Mapping[str, RoutingSpec] = MappingProxyType({}),
+        *,
+        audit_required: bool = False,
     ) -> None:
         self.routing = RoutingLink(self._ask, routing)
         self._clients = clients
+        self._audit_required = audit_required
         self.file = file
         self._file = str(file.resolve())
         self.absent = absent
@@ -106,6 +110,9 @@ class PlantLink:
         answer = self._ask("plan", spec.name, spec=msgspec.to_builtins(spec))
         router = self.routing.plan(spec.name)
         notes, refused = answer["station"] + router.changes, answer["refused"] + router.refused
+        if self._clients[spec.name].info.audit_required != self._audit_required:
+            duty = "required" if self._audit_required else "optional"
+            refused += [f"access: audit becomes {duty}: this needs a new start of the appliance"]
         return StationPlan(spec.name, answer["changes"], notes, refused)
 
     def apply(self, spec: StationSpec, cause: str) -> Outcome:
@@ -150,7 +157,7 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
         order = [station.name for station in plant.stations]
         here = {name: found[name] for name in order if name in found}
         absent = tuple(name for name in order if name not in found)
-        yield PlantLink(here, file, absent, plant.routing)
+        yield PlantLink(here, file, absent, plant.routing, audit_required=plant.audit_required)
     finally:
         for client in clients:
             client.close()

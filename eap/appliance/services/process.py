@@ -149,7 +149,9 @@ class Services:
             try:
                 image = StationImage(self._folder.image(station))
             except ImageError as exc:
-                self._startup.step(f"waiting for the engine: {exc}", waits_for="engine")
+                is_made = self._folder.image(station).exists()
+                why = str(exc) if is_made else f"no image of station {station} yet"
+                self._startup.step(f"waiting for the engine: {why}", waits_for="engine")
             else:
                 self._resources.callback(image.close)
                 return image

@@ -172,6 +172,7 @@ class Supervisor:
     ) -> None:
         self._clock = clock
         self._info = info
+        info.audit_required = plant.audit_required
         self._folder = folder
         bytecode = str(folder.bytecode)
         self._engine = Child("engine", "eap.appliance.engine.process", bytecode)

@@ -47,6 +47,15 @@ def test_nothing_runs(stack):
         link_to(PLANT, FILE).__enter__()
 
 
+def test_plan_refuses_another_duty_of_the_audit(stack):
+    PlantStub("line", PLANT.stations, stack)
+    with link_to(replace(PLANT, audit_required=True), FILE) as link:
+        plan = link.plan(PLANT.stations[0])
+    assert plan.refused == [
+        "access: audit becomes required: this needs a new start of the appliance"
+    ]
+
+
 def test_requests(stack):
     stub = PlantStub("line", PLANT.stations, stack)
     faster = replace(PLANT.stations[0], cycle_us=5000)
