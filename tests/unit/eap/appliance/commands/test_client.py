@@ -162,7 +162,7 @@ def test_status_of_several_becomes_one():
     merged = merge_status([first, second])
     assert merged["processes"] == {"engine": {}}
     assert [station["name"] for station in merged["stations"]] == ["a", "b"]
-    none = {"findings": [], "audit": None}
+    none = {"findings": [], "audit": None, "listeners": []}
     assert merged["appliances"] == [
         {"plant": "p", "stations": ["a"], "processes": {"engine": {}}} | none,
         {"plant": "q", "stations": ["b"], "processes": {}} | none,
