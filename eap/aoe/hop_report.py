@@ -47,6 +47,8 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         state: Of the route: ``up``, ``down`` or ``unknown``.
         why: Why it passes nothing on; empty if it does.
         may: What access rules let the asker do: true, false, or null if that depends on the object.
+        interrupted: How many subscriptions to the NetID it is restoring.
+        interrupted_s: For how many seconds; None for none.
         error: Of ADS, why the router that was asked next did not answer; 0 if there was none.
     """
 
@@ -63,14 +65,19 @@ class HopReport(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     why: str = ""
     may: dict[AccessService, bool | None] = {}
     error: int = 0
+    interrupted: int = 0
+    interrupted_s: int | None = None
 
 
-def report_of(station: str, net_id: NetId, target: NetId, location: Location) -> HopReport:
+def report_of(
+    station: str, net_id: NetId, target: NetId, location: Location, now_ns: int
+) -> HopReport:
     """Return what the router of *station* says of *target*, for which it found *location*."""
-    found = location.route
+    found, since_ns = location.route, location.interrupted_at_ns
     report = HopReport(
         station=station, net_id=str(net_id), is_here=location.is_here, why=location.why,
-        may=location.may,
+        may=location.may, interrupted=location.interrupted,
+        interrupted_s=None if since_ns is None else (now_ns - since_ns) // 1_000_000_000,
     )  # fmt: skip
     if found is None:
         return report

@@ -68,6 +68,9 @@ class Location(NamedTuple):
     route: RouteReport | None
     why: str
     may: dict[AccessService, bool | None]
+    interrupted: int = 0
+    """Subscriptions to ports of the NetID to which nothing comes."""
+    interrupted_at_ns: int | None = None
 
 
 def report_route(

@@ -410,10 +410,10 @@ class Restorer:
         session.waiting.appendleft(subscription)
         session.is_trying = True
         self._schedule(session, now_ns + max(RETRY_NS, len(self._sessions) * SPACING_NS))
-        if subscription.interrupted_at_ns is None:
-            return self.interrupt([subscription], text, now_ns)
         subscription.why = text
-        return []
+        # What waits for its check has the same server, and nothing comes from it either.
+        quiet = [each for each in session.waiting if each.interrupted_at_ns is None]
+        return self.interrupt(quiet, text, now_ns)
 
     def _give_up(
         self, session: _Session, subscription: Subscription, text: str, now_ns: int

@@ -249,7 +249,11 @@ class Router:
             return Location(True, None, "" if header.target_port in ports else text, may)
         found = self._passage.find_route(header, way)
         route, why = (found.route, found.text) if isinstance(found, Refusal) else (found, "")
-        return Location(False, None if route is None else self.report(route), why, may)
+        found_route = None if route is None else self.report(route)
+        missing = [each for each in self.interruptions() if each.asked[:6] == header.target]
+        number = sum(each.number for each in missing)
+        since_ns = min((each.since_ns for each in missing), default=None)
+        return Location(False, found_route, why, may, number, since_ns)
 
     def connections(self) -> list[ConnectionReport]:
         """Return who asks, or asked and is still connected."""

@@ -54,6 +54,8 @@ def hop_row(report: HopReport, took_us: int, spent_us: int, *, is_opaque: bool) 
         "address": report.address,
         "state": report.state,
         "why": report.why,
+        "interrupted": report.interrupted,
+        "interrupted_s": report.interrupted_s,
         "may": {str(service): allowed for service, allowed in report.may.items()},
         "took_us": took_us,
         "spent_us": spent_us,

@@ -241,6 +241,26 @@ class RequestRow(Document, frozen=True, kw_only=True):
     text: str = ""
 
 
+class InterruptionRow(Document, frozen=True, kw_only=True):
+    """Subscriptions of one client at one server to which nothing comes; they are being restored.
+
+    Attributes:
+        client: Address and door of the client.
+        source: NetID and AMS port of the client.
+        target: NetID and AMS port of the server.
+        count: How many subscriptions there are.
+        since_s: For how many seconds nothing has come.
+        why: What was wrong last.
+    """
+
+    client: str
+    source: str
+    target: str
+    count: int
+    since_s: int
+    why: str
+
+
 class RouterRow(Document, frozen=True, kw_only=True):
     """The router of one station; *total* routes match, of which *routes* are some."""
 
@@ -250,6 +270,7 @@ class RouterRow(Document, frozen=True, kw_only=True):
     total: int
     connections: list[ConnectionRow] = []
     requests: list[RequestRow] = []
+    interruptions: list[InterruptionRow] = []
     warnings: list[str] = []
 
 
@@ -340,3 +361,11 @@ def read_document(document: Any, kind: type[DocumentT]) -> DocumentT:
         return msgspec.convert(document, kind)
     except msgspec.ValidationError as exc:
         raise ControlError(f"the answer: {exc}", code=ErrorCode.BAD_REQUEST) from None
+
+
+def interruption_text(row: InterruptionRow) -> str:
+    """Return in words what is interrupted."""
+    noun = "subscription is" if row.count == 1 else "subscriptions are"
+    return (
+        f"{row.count} {noun} interrupted, of {row.source} ({row.client}) at {row.target}: {row.why}"
+    )

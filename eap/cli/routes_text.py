@@ -111,6 +111,8 @@ def summary(stations: list[RouterRow]) -> str:
     connections = sum(len(each.connections) for each in stations)
     parts = [words.count(total, "route") + (f", {down} down" if down else "")]
     parts.append(words.count(connections, "connection"))
+    if interrupted := sum(row.count for each in stations for row in each.interruptions):
+        parts.append(f"{words.count(interrupted, 'subscription')} interrupted")
     if warnings := sum(len(each.warnings) for each in stations):
         parts.append(words.count(warnings, "warning"))
     return ", ".join(parts)

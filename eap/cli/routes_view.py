@@ -7,7 +7,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from rich.console import RenderableType
 from rich.text import Text
 
-from eap.appliance.control_routes import ImportRow, NeighbourRow, RouteRow, RouterRow, TestResult
+from eap.appliance.control_routes import (
+    ImportRow,
+    NeighbourRow,
+    RouteRow,
+    RouterRow,
+    TestResult,
+    interruption_text,
+)
 from eap.cli import routes_text
 from eap.cli.table import Column, TextTable
 
@@ -121,6 +128,8 @@ def _connections(stations: Sequence[RouterRow]) -> RenderableType:
 
 
 def _remarks(station: RouterRow) -> Iterator[str]:
+    for each in station.interruptions:
+        yield f"{interruption_text(each)}, for {routes_text.age(each.since_s)}"
     yield from station.warnings
     yield from _dead_hops(station.routes)
     for row in station.routes:

@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from eap.cli.table import Column, TextTable
-from eap.cli.words import duration
+from eap.cli.words import count, duration
 from eap.codec.ads import AdsState
 
 Row: TypeAlias = dict[str, Any]
@@ -38,6 +38,11 @@ def trace_tables(found: Row) -> Iterator[RenderableType]:
         refused = [service for service, allowed in hop["may"].items() if allowed is False]
         if refused:
             yield Text(f"{hop['station']}: its access rules refuse {', '.join(refused)}")
+    for hop in found["hops"]:
+        if number := hop.get("interrupted"):  # an older appliance does not tell
+            many = count(number, "subscription")
+            text = f"{hop['station']}: {many} interrupted for {hop['interrupted_s']} s"
+            yield Text(text, style="bold red")
     if found["why"]:
         yield Text(f"not reached: {found['why']}", style="bold red")
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 from tests.support.namespaces import Namespace, row
 
 pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
@@ -131,7 +131,7 @@ class Line:
         self.places = dict(zip(NAMES, places, strict=True))
         self.stations: dict[str, Appliance] = {}
         for name in NAMES:
-            self._start(name)
+            self.start(name)
         self.client = self._subscribe()
 
     def kill(self, name: str, process: str) -> float:
@@ -147,7 +147,7 @@ class Line:
             station.process.wait()
             wait_until(lambda: not any(map(is_alive, before.values())), PATIENCE_S)
             station.close()
-            self._start(name)
+            self.start(name)
         else:
             wait_until(lambda: self._pid(name, process) not in {0, before[process]}, PATIENCE_S)
         back_s = time.monotonic()
@@ -164,13 +164,18 @@ class Line:
         assert firsts is not None
         return max(firsts) - since_s
 
-    def interruptions(self) -> list[dict[str, object]]:
-        """Return what the first station says of subscriptions that are interrupted."""
+    def interrupted(self) -> int:
+        """Return how many subscriptions the first station says are interrupted."""
         (router,) = self.stations["first"].request("routes_list")
-        found: list[dict[str, object]] = router["interruptions"]
-        return found
+        return sum(row["count"] for row in router["interruptions"])
 
-    def _start(self, name: str) -> None:
+    def trace(self, target: str) -> str:
+        """Return the way to *target*, which may end before it."""
+        runtime = self.stations["first"].runtime
+        return run_eapctl(runtime, "trace", target, "--json").stdout
+
+    def start(self, name: str) -> None:
+        """Start a station, or start it again."""
         place = self.places[name]
         self.stations[name] = self._farm.run(self._plant, "--station", name, prefix=place.prefix)
 
@@ -210,13 +215,24 @@ def places() -> Iterator[list[Namespace]]:
 
 
 @pytest.mark.skipif(IS_LONG, reason="the long campaign has these kills, too")
-def test_subscriptions_survive_killed_services_on_the_way(
+def test_subscriptions_survive_killed_services_and_a_station_that_is_away(
     farm: Plants, places: list[Namespace]
 ) -> None:
     line = Line(farm, places, "udp")
     try:
-        for name in ("middle", "last"):
-            line.recovery_s(line.kill(name, "services"))
+        line.recovery_s(line.kill("middle", "services"))
+        first, last = line.stations["first"], line.stations["last"]
+        last.stop()
+        wait_until(lambda: line.interrupted() == SUBSCRIPTIONS)
+        target = f"{LAST}.2.1"
+        assert f"{SUBSCRIPTIONS} subscriptions are interrupted" in first.command("routes")
+        assert "subscriptions are interrupted" in first.command("status", "--full")
+        (hop, *_) = json.loads(line.trace(target))["hops"]
+        assert hop["interrupted"] == SUBSCRIPTIONS
+        line.start("last")
+        line.recovery_s(time.monotonic())
+        wait_until(lambda: line.interrupted() == 0)
+        assert first.status()["findings"] == []
     finally:
         line.client.close()
 

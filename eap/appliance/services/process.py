@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from time import time
 from typing import TYPE_CHECKING, Any
 
 from eap.aoe.directory import Directory
@@ -46,7 +47,7 @@ from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
 from eap.appliance.services.routes.ams_methods import AmsMethods
 from eap.appliance.services.routes.route_methods import RouteMethods
-from eap.appliance.services.routes.route_rows import RouterView
+from eap.appliance.services.routes.route_rows import RouterView, interruption_findings
 from eap.appliance.services.routes.routing_methods import RoutingMethods
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sockets import open_doors
@@ -215,7 +216,10 @@ class Services:
                 meter,
                 reports,
                 self._listeners.stats(),
-            ) | {"audit": audit.report()}
+            ) | {
+                "audit": audit.report(),
+                "findings": interruption_findings(devices.routers.values(), time()),
+            }
 
         return Methods(
             identity,

@@ -5,23 +5,29 @@ Only figures that routers keep anyway are read here; 10,000 routes are told in p
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from time import monotonic_ns, time
+from typing import Any
 
 from eap.aoe.action import Outcome, Trace
 from eap.aoe.record import reason_of
 from eap.aoe.report import ConnectionReport, RouteReport
+from eap.aoe.restorer import Interruption
 from eap.aoe.routes import Origin, Route
 from eap.appliance.control_routes import (
     ConnectionRow,
+    InterruptionRow,
     OriginName,
     RequestRow,
     RouteRow,
     RouterRow,
     RoutesListParameters,
+    interruption_text,
 )
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.codec.ams import AmsCommand
+from eap.codec.ams import ADDRESSES, AmsCommand
+from eap.ids import NetId
 
 MAX_LOOPS = 5
 """Circles that are told of; each as it was seen last."""
@@ -58,6 +64,7 @@ class RouterView:
             total=len(found),
             connections=[connection_row(each, now_ns) for each in self.router.connections()],
             requests=[request_row(each, now_ns) for each in _last(latest, wanted.requests)],
+            interruptions=[interruption_row(each, now_ns) for each in self.router.interruptions()],
             warnings=[*self.warnings(), *_loops(latest)],
         )
 
@@ -79,6 +86,38 @@ class RouterView:
         origin = "derived" if self.routes.is_derived(route) else _ORIGINS[route.origin]
         words = (route.name, str(route.net_id), *route.hop, origin, report.state, report.why)
         return " ".join(words).lower()
+
+
+def interruption_row(found: Interruption, now_ns: int) -> InterruptionRow:
+    """Return in plain values what is interrupted for one client."""
+    target, port, source, source_port = ADDRESSES.unpack(found.asked)
+    return InterruptionRow(
+        client=str(found.way),
+        source=f"{NetId(source)}:{source_port}",
+        target=f"{NetId(target)}:{port}",
+        count=found.number,
+        since_s=(now_ns - found.since_ns) // _S,
+        why=found.why,
+    )
+
+
+def interruption_findings(routers: Iterable[StationRouter], now_s: float) -> list[dict[str, Any]]:
+    """Return what is interrupted as findings of ``status``."""
+    now_ns = monotonic_ns()
+    found = []
+    for router in routers:
+        for each in router.interruptions():
+            row = interruption_row(each, now_ns)
+            found.append(
+                {
+                    "severity": "warning",
+                    "where": router.name,
+                    "what": interruption_text(row),
+                    "advice": "they are restored when the way is back: see 'eapctl trace'",
+                    "since": now_s - (now_ns - each.since_ns) / _S,
+                }
+            )
+    return found
 
 
 def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow:

@@ -134,7 +134,7 @@ async def answer_question(
     """
     header = AmsHeader(question.target, question.port, source, 0, 0)
     location = station.locate(header, way)
-    report = report_of(station.name, station.net_id, question.target, location)
+    report = report_of(station.name, station.net_id, question.target, location, monotonic_ns())
     if not question.further or report.is_here or report.why or not report.next_net_id:
         return report
     further = min(question.further, MAX_FURTHER) - 1

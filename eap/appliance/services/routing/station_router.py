@@ -29,6 +29,7 @@ from eap.aoe.judged import AuditEntry
 from eap.aoe.prober import Prober
 from eap.aoe.record import Record, Stats
 from eap.aoe.report import ConnectionReport, Location, RouteReport
+from eap.aoe.restorer import Interruption
 from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
@@ -114,6 +115,10 @@ class StationRouter:
     def connections(self) -> list[ConnectionReport]:
         """Return who asks, or asked and is still connected."""
         return self._router.connections()
+
+    def interruptions(self) -> list[Interruption]:
+        """Return the subscriptions to which nothing comes, by client and server."""
+        return self._router.interruptions()
 
     @property
     def access(self) -> AccessList:

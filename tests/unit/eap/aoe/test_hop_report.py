@@ -25,7 +25,7 @@ SOURCE = NetId.parse("192.168.0.9.1.1")
 def ask(station: Station, net_id: str, port: int, way: Way = LAPTOP) -> HopReport:
     target = NetId.parse(net_id)
     location = station.router.locate(AmsHeader(target, port, SOURCE, 1, 4), way)
-    return report_of("island", NetId.parse(ROUTER), target, location)
+    return report_of("island", NetId.parse(ROUTER), target, location, station.now_ns)
 
 
 def test_question_on_the_wire() -> None:

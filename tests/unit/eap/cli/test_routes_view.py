@@ -3,7 +3,12 @@ from __future__ import annotations
 import msgspec
 from rich.console import Console
 
-from eap.appliance.control_routes import ImportRow, NeighbourRow, TestResult
+from eap.appliance.control_routes import (
+    ImportRow,
+    InterruptionRow,
+    NeighbourRow,
+    TestResult,
+)
 from eap.cli import routes_text
 from eap.cli.routes_view import (
     import_table,
@@ -40,6 +45,20 @@ def test_stations_that_are_well_have_no_remarks() -> None:
     quiet = FakeRoutes().stations["island-02"]
     assert "Worth a look" not in shown(*routes_tables([quiet]))
     assert "Connection" not in shown(*routes_tables([quiet]))
+
+
+def test_routes_name_subscriptions_that_are_interrupted() -> None:
+    row = InterruptionRow(
+        client="127.0.0.1:40112#3 by ams-tcp", source="127.0.0.1.1.1:32905",
+        target="127.0.1.2.2.1:65535", count=20, since_s=12, why="island-02 is down",
+    )  # fmt: skip
+    station = msgspec.structs.replace(FakeRoutes().stations["island-02"], interruptions=[row])
+    text = " ".join(shown(*routes_tables([station])).split())
+    assert (
+        "island-02: 20 subscriptions are interrupted, of 127.0.0.1.1.1:32905"
+        " (127.0.0.1:40112#3 by ams-tcp) at 127.0.1.2.2.1:65535: island-02 is down, for 12 s"
+    ) in text
+    assert "20 subscriptions interrupted" in routes_text.summary([station])
 
 
 def test_results() -> None:

@@ -74,3 +74,9 @@ def test_a_router_that_is_not_ours_and_an_error() -> None:
     assert " ".join(target) == "target 1.8 ms answers: error 0x701"
     unknown = FOUND["answer"] | {"ads_state": 99}
     assert lines(FOUND | {"hops": [opaque], "answer": unknown})[-1][-4] == "99,"
+
+
+def test_trace_names_the_router_that_restores_subscriptions() -> None:
+    first = FIRST | {"interrupted": 20, "interrupted_s": 12}
+    text = " ".join(lines(FOUND | {"hops": [first, LAST | {"interrupted": 0}]})[-1])
+    assert text == "island-01: 20 subscriptions interrupted for 12 s"
