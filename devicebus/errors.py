@@ -8,6 +8,7 @@ EapError
     ├── AlStatusError           a slave refused a state
     ├── StateTimeoutError       a slave did not reach a state in time
     ├── SiiError                an EEPROM cannot be read, written or understood
+    ├── NoMailboxError          a slave has no mailbox, or none in its state
     ├── MailboxClosedError      a slave's mailbox is closed for now, it is being brought back
     ├── MailboxSizeError        a message does not fit a slave's mailbox
     ├── MailboxTimeoutError     a slave did not answer in its mailbox
@@ -61,6 +62,10 @@ class StateTimeoutError(BusError):
 
 class SiiError(BusError):
     """An EEPROM cannot be read, written or understood."""
+
+
+class NoMailboxError(BusError):
+    """A slave has no mailbox at all, or none in the state where it is kept."""
 
 
 class MailboxClosedError(BusError):

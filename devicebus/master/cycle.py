@@ -20,7 +20,7 @@ from devicebus.master.layout import Group, Place
 from devicebus.master.link import Exchange, Link
 from devicebus.wire.datagram import Command
 
-MAX_UNDER_WAY = 4
+MAX_UNDER_WAY = 2
 """Cycles under way at once: more would only make those behind them late, acyclic frames too."""
 
 

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import msgspec
 
-from devicebus.errors import BusError, MailboxClosedError
+from devicebus.errors import BusError, MailboxClosedError, NoMailboxError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.master.bring import bring
 from devicebus.master.bus import Bus, MasterSettings, Unit
@@ -137,7 +137,7 @@ class Master:
         unit = self._unit(station)
         if unit.mailbox is None:
             conversation.close()
-            raise _no_mailbox(unit)
+            raise why_closed(unit)
         return unit.mailbox.converse(conversation, now_ns, name=name, requester=requester)
 
     def run(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
@@ -218,13 +218,13 @@ class Master:
             raise BusError(f"there is no slave {station}; known are {known}") from None
 
 
-def _no_mailbox(unit: Unit) -> BusError:
-    """Return why nothing can be asked of a slave's mailbox."""
+def why_closed(unit: Unit) -> NoMailboxError | MailboxClosedError:
+    """Return why a slave has no open mailbox: never, not in its state, or not yet again."""
     who = f"slave {unit.station} ({unit.name})"
     if unit.is_lost:
         return MailboxClosedError(f"{who} does not answer")
     if unit.found.fault or not standard_mailbox(unit.found.sii.fixed).is_there:
-        return BusError(f"{who} has no mailbox: its EEPROM names none")
+        return NoMailboxError(f"{who} has no mailbox: its EEPROM names none")
     if unit.state is None:
         return MailboxClosedError(f"{who} is being identified: its mailbox is not open yet")
     if unit.target in _WITH_MAILBOX:
@@ -232,4 +232,4 @@ def _no_mailbox(unit: Unit) -> BusError:
             f"{who} is in {unit.state.name} and being brought to {unit.target.name}: its mailbox"
             " is closed until PREOP"
         )
-    return BusError(f"{who} has no mailbox in {unit.state.name}")
+    return NoMailboxError(f"{who} has no mailbox in {unit.state.name}")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from devicebus import errors
-from devicebus.errors import BusError
-from eap.appliance.bus_request import Failure
+from devicebus.errors import BusError, NoMailboxError
+from eap.appliance.bus_request import Failure, SlaveReport
 from eap.errors import EapError
 
 _SHIFT = 16
@@ -42,6 +42,13 @@ def to_error(failure: Failure) -> BusError:
     if isinstance(error, errors.FoeError):
         error.text = ""
     return error
+
+
+def no_mailbox(slave: SlaveReport) -> BusError:
+    """Return why no mailbox of a slave is open, as its master says."""
+    if slave.mailbox_fault is not None:
+        return to_error(slave.mailbox_fault)
+    return NoMailboxError(f"slave {slave.station} ({slave.name}) has no open mailbox")
 
 
 def _detail(error: EapError) -> int:

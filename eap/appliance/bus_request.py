@@ -99,6 +99,15 @@ class PortErrorReport(msgspec.Struct, frozen=True, array_like=True):
     until_ns: int
 
 
+class Failure(msgspec.Struct, frozen=True):
+    """Why a request was not done: the name of one of ``devicebus.errors``, and its text."""
+
+    kind: str
+    message: str
+    detail: int = 0
+    """Mailbox error code."""
+
+
 class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
     """How a slave is."""
 
@@ -114,7 +123,9 @@ class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
     target: int
     to_slave: int = 0
     to_master: int = 0
-    """Octets of the mailboxes, 0 while it has none."""
+    """Octets of the mailboxes, 0 while none is open."""
+    mailbox_fault: Failure | None = None
+    """Why none is open: a NoMailboxError, or a MailboxClosedError that will pass."""
     protocols: int = 0
     """As in its EEPROM."""
     order: str = ""
@@ -182,15 +193,6 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Messages of services that were no request, for all buses of the engine together."""
     dropped: int = 0
     """Answers that services did not take, likewise."""
-
-
-class Failure(msgspec.Struct, frozen=True):
-    """Why a request was not done: the name of one of ``devicebus.errors``, and its text."""
-
-    kind: str
-    message: str
-    detail: int = 0
-    """Mailbox error code."""
 
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="answer"):

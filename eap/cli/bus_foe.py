@@ -105,6 +105,8 @@ def _show(row: dict[str, Any], what: str, *, as_json: bool, is_stdout_taken: boo
     text = (
         f"{what}: {row['octets']} octets in {row['seconds']:.1f} s, {speed}\nsha256 {row['sha256']}"
     )
+    if row["restarts"]:
+        text += f"\nbegan anew {row['restarts']} times: the bus had interrupted it"
     if is_stdout_taken:
         click.echo(text, err=True)
     else:
@@ -112,7 +114,7 @@ def _show(row: dict[str, Any], what: str, *, as_json: bool, is_stdout_taken: boo
 
 
 @contextmanager
-def _progress(name: str, *, hidden: bool) -> Iterator[Callable[[int, int | None], None]]:
+def _progress(name: str, *, hidden: bool) -> Iterator[Callable[[int, int | None, int], None]]:
     """Show a bar on stderr while a file is on its way; only a terminal gets one."""
     from rich.console import Console
     from rich.progress import (
@@ -136,7 +138,8 @@ def _progress(name: str, *, hidden: bool) -> Iterator[Callable[[int, int | None]
     with Progress(*columns, console=console, disable=disable) as bar:
         task = bar.add_task(name, total=None)
 
-        def report(done: int, total: int | None) -> None:
-            bar.update(task, completed=done, total=total)
+        def report(done: int, total: int | None, restarts: int) -> None:
+            again = f" (restart {restarts})" if restarts else ""
+            bar.update(task, completed=done, total=total, description=f"{name}{again}")
 
         yield report

@@ -16,7 +16,7 @@ import msgspec
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.master.access import Access
 from devicebus.master.bus import MasterSettings
-from devicebus.master.master import Master
+from devicebus.master.master import Master, why_closed
 from devicebus.master.procedure import Procedure
 from devicebus.sim.command import obey
 from devicebus.wire.alstatus import AlState
@@ -141,6 +141,7 @@ def _slave(unit: Any) -> SlaveReport:
         target=unit.target,
         to_slave=box.sizes.to_slave if box else 0,
         to_master=box.sizes.to_master if box else 0,
+        mailbox_fault=None if box else to_failure(why_closed(unit)),
         protocols=unit.found.sii.fixed.protocols,
     )
 

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import os
+import select
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
-from devicebus.errors import MailboxSizeError
+from devicebus.errors import BusError, MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
-from devicebus.mailbox.conversation import Progress
+from devicebus.mailbox.conversation import Conversation, Progress
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.commands.bus_slave import Begin, Slave, SlaveBus
 from eap.appliance.durable import whole_file
+from eap.appliance.foe_restart import PAUSE_S, Restarts
 from eap.errors import ConfigError, EapError, EnvironmentalError
 
-Report: TypeAlias = Callable[[int, int | None], None]
-"""Called now and then with the octets done, and how many there are if that is known."""
+Report: TypeAlias = Callable[[int, int | None, int], None]
+"""Called now and then with the octets done, how many there are if that is known, and the number of
+restarts."""
 
 
 def get_file(
@@ -27,7 +31,8 @@ def get_file(
 ) -> dict[str, Any]:
     """Read the file *name* of a slave into *target*, None for stdout.
 
-    A regular file appears once it is complete; a pipe or a device is written as it is.
+    A regular file appears once it is complete; a pipe or a device is written as it is.  A transfer
+    that the bus interrupts begins anew, unless something was written that cannot be taken back.
 
     Raises:
         FoeError: the slave refuses.
@@ -35,26 +40,30 @@ def get_file(
         ConfigError: the slave's mailbox is too small for *name*.
         EnvironmentalError: *target* cannot be written.
     """
-    unit = _find(bus, slave)
     progress = Progress()
-    digest = hashlib.sha256()
     start = time.monotonic()
     with _writing(target) as file, _telling_how_far(progress, "read"):
+        digest = hashlib.sha256()
 
         def sink(data: bytes) -> None:
             file.write(data)
             digest.update(data)
 
-        _converse(
-            bus,
-            unit,
-            lambda sizes: foe_client.read(name, sink, sizes, password=password, progress=progress),
-            f"FoE read of {name!r}",
-            lambda: report(progress.done, None),
-        )
-    report(progress.done, progress.done)
-    return _summary(unit.station, name, target, progress, time.monotonic() - start) | {
-        "sha256": digest.hexdigest()
+        def rewind() -> None:
+            nonlocal digest
+            digest = hashlib.sha256()
+            file.seek(0)
+            file.truncate()
+
+        def begin(sizes: MailboxSizes) -> Conversation[int]:
+            return foe_client.read(name, sink, sizes, password=password, progress=progress)
+
+        transfer = _Transfer(bus, slave, begin, f"FoE read of {name!r}", progress)
+        restarts = transfer.run(rewind if target is not None and file.seekable() else None, report)
+    report(progress.done, progress.done, restarts.count)
+    return transfer.summary(name, target, time.monotonic() - start) | {
+        "sha256": digest.hexdigest(),
+        "restarts": restarts.count,
     }
 
 
@@ -63,38 +72,101 @@ def put_file(
 ) -> dict[str, Any]:
     """Write *source*, None for stdin, to a slave as the file *name*.
 
+    A transfer that the bus interrupts begins anew, unless *source* cannot be read again.
+
     Raises:
         FoeError: the slave refuses.
         BusError: there is no such slave, or it does not answer.
         ConfigError: the slave's mailbox is too small for *name*.
         EnvironmentalError: *source* cannot be read.
     """
-    unit = _find(bus, slave)
-    digest = hashlib.sha256()
     start = time.monotonic()
     with _reading(source) as file:
         is_regular = source is not None and source.is_file()
         progress = Progress(os.fstat(file.fileno()).st_size if is_regular else None)
+        digest = hashlib.sha256()
 
         def take(size: int) -> bytes:
             data = file.read(size)
             digest.update(data)
             return data
 
+        def rewind() -> None:
+            nonlocal digest
+            digest = hashlib.sha256()
+            file.seek(0)
+
+        def begin(sizes: MailboxSizes) -> Conversation[int]:
+            return foe_client.write(name, take, sizes, password=password, progress=progress)
+
+        transfer = _Transfer(bus, slave, begin, f"FoE write of {name!r}", progress)
         with _telling_how_far(progress, "written"):
-            _converse(
-                bus,
-                unit,
-                lambda sizes: foe_client.write(
-                    name, take, sizes, password=password, progress=progress
-                ),
-                f"FoE write of {name!r}",
-                lambda: report(progress.done, progress.total),
-            )
-    report(progress.done, progress.done)
-    return _summary(unit.station, name, source, progress, time.monotonic() - start) | {
-        "sha256": digest.hexdigest()
+            restarts = transfer.run(rewind if is_regular else None, report)
+    report(progress.done, progress.done, restarts.count)
+    return transfer.summary(name, source, time.monotonic() - start) | {
+        "sha256": digest.hexdigest(),
+        "restarts": restarts.count,
     }
+
+
+class _Transfer:
+    """A file on its way to a slave or from it."""
+
+    def __init__(
+        self, bus: SlaveBus, slave: str, begin: Begin[int], name: str, progress: Progress
+    ) -> None:
+        self._bus = bus
+        self._slave = slave
+        self._begin = begin
+        self._name = name
+        self._progress = progress
+        self._unit = _find(bus, slave)
+
+    def run(self, rewind: Callable[[], None] | None, report: Report) -> Restarts:
+        """Transfer the file, again from its beginning after a fault of the bus."""
+        progress = self._progress
+        restarts = Restarts(progress, lambda: rewind is not None, time.monotonic)
+
+        def meanwhile() -> None:
+            report(progress.done, progress.total, restarts.count)
+
+        while True:
+            try:
+                self._bus.converse(self._unit, self._begin, self._name, meanwhile)
+            except MailboxSizeError as exc:
+                raise ConfigError(str(exc)) from None
+            except BusError as exc:
+                if not restarts.allows(exc):
+                    _note_restarts(exc, restarts)
+                    raise
+            else:
+                return restarts
+            assert rewind is not None  # noqa: S101  else no restart is allowed
+            rewind()
+            meanwhile()
+            select.select([], [], [], PAUSE_S)
+            with suppress(BusError):  # the next attempt says why it cannot be reached
+                self._bus.scan()
+                self._unit = _find(self._bus, self._slave)
+
+    def summary(self, name: str, path: Path | None, seconds: float) -> dict[str, Any]:
+        """Return what was transferred, and how fast."""
+        done = self._progress.done
+        return {
+            "slave": self._unit.station,
+            "name": name,
+            "file": "-" if path is None else str(path),
+            "octets": done,
+            "seconds": round(seconds, 3),
+            "rate": round(done / seconds) if seconds else 0,
+        }
+
+
+def _note_restarts(exc: BusError, restarts: Restarts) -> None:
+    if restarts.count:
+        exc.add_note(
+            f"the transfer began anew {restarts.count} times, last after: {restarts.reason}"
+        )
 
 
 @contextmanager
@@ -140,15 +212,6 @@ def _telling_how_far(progress: Progress, done: str) -> Iterator[None]:
         raise
 
 
-def _converse(
-    bus: SlaveBus, unit: Slave, begin: Begin[int], name: str, meanwhile: Callable[[], None]
-) -> None:
-    try:
-        bus.converse(unit, begin, name, meanwhile)
-    except MailboxSizeError as exc:
-        raise ConfigError(str(exc)) from None
-
-
 def _find(bus: SlaveBus, slave: str) -> Slave:
     unit = bus.find(slave)
     bus.require_mailbox(unit)
@@ -172,17 +235,4 @@ def exchange(
         "vendor_id": vendor_id,
         "vendor_type": vendor_type,
         "data": answer.hex(),
-    }
-
-
-def _summary(
-    station: int, name: str, path: Path | None, progress: Progress, seconds: float
-) -> dict[str, Any]:
-    return {
-        "slave": station,
-        "name": name,
-        "file": "-" if path is None else str(path),
-        "octets": progress.done,
-        "seconds": round(seconds, 3),
-        "rate": round(progress.done / seconds) if seconds else 0,
     }

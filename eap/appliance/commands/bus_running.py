@@ -21,12 +21,13 @@ from devicebus.master.access import Reply, fprd
 from devicebus.master.findings import History
 from devicebus.master.procedure import Answer, Procedure, Sleep, Step
 from devicebus.master.topology import find_joints
-from devicebus.wire.alstatus import AlState, state_name
+from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.appliance import control_bus
+from eap.appliance.bus_failure import no_mailbox
 from eap.appliance.bus_findings import history_of
 from eap.appliance.bus_request import BusReport, SlaveReport
-from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
+from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose
 from eap.appliance.commands.client import Client, connect_station
 from eap.appliance.control_bus import ask_parameters, datagram_row, protocol_of, to_replies
 from eap.errors import ControlError
@@ -124,7 +125,7 @@ class RunningBus:
         del name  # the master has its own
         report = self._reports[slave.station]
         if not report.to_slave:
-            raise no_mailbox(slave, state_name(slave.status.state))
+            raise no_mailbox(report)
         conversation = begin(MailboxSizes(report.to_slave, report.to_master))
         try:
             return self._lead(slave, conversation, meanwhile)

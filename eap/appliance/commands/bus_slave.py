@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 import msgspec
 
-from devicebus.errors import BusError
+from devicebus.errors import BusError, NoMailboxError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.findings import History
@@ -126,7 +126,7 @@ def choose(slaves: Sequence[Slave], name: str) -> Slave:
 
 def no_mailbox(slave: Slave, state: str) -> BusError:
     """Return the error of a slave that cannot be talked to in *state*."""
-    return BusError(
+    return NoMailboxError(
         f"slave {slave.station} ({slave.name}) has no mailbox in {state}: nothing but its state,"
         " its EEPROM and its registers can be reached"
     )

@@ -6,6 +6,8 @@ from collections.abc import Collection
 
 from devicebus.master.bus import Unit
 from devicebus.master.findings import NO_ANSWER
+from devicebus.master.master import why_closed
+from eap.appliance.bus_failure import to_failure
 from eap.appliance.bus_request import BusReport, PortErrorReport, SlaveReport
 from eap.appliance.engine.bus_faults import WHOLE_BUS
 from eap.appliance.engine.engine_bus import EngineBus
@@ -81,6 +83,7 @@ def _found(bus: EngineBus, unit: Unit, link_preset: int, now_ns: int) -> SlaveRe
         target=int(unit.target),
         to_slave=sizes.to_slave if sizes else 0,
         to_master=sizes.to_master if sizes else 0,
+        mailbox_fault=None if sizes else to_failure(why_closed(unit)),
         protocols=int(sii.fixed.protocols),
         order=sii.string(sii.general.order) if sii.general else "",
         usual_to_slave=sii.fixed.receive_size,

@@ -69,6 +69,8 @@ _KINDS: tuple[tuple[type[EapError], AdsError], ...] = (
     (errors.StateTimeoutError, AdsError.TIMEOUT),
     (errors.MailboxSizeError, AdsError.SIZE),
     (errors.AlStatusError, AdsError.STATE),
+    (errors.NoMailboxError, AdsError.STATE),
+    (errors.MailboxClosedError, AdsError.NOT_READY),
 )
 
 

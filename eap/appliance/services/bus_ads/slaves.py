@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from devicebus.wire.alstatus import state_name
 from devicebus.wire.sii import SiiProtocol
 from eap.aoe.ads_operation import (
     AdsRefusedError,
@@ -16,6 +15,7 @@ from eap.aoe.ads_operation import (
     WriteControl,
 )
 from eap.aoe.ads_state import DeviceDataSpace, al_state_for, states_of
+from eap.appliance.bus_failure import no_mailbox
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
@@ -24,6 +24,7 @@ from eap.appliance.services.bus_ads.idns import SlaveIdns
 from eap.appliance.services.bus_ads.master_side import MasterSide
 from eap.appliance.services.bus_ads.objects import SlaveObjects
 from eap.appliance.services.bus_ads.passthrough import Passthrough
+from eap.appliance.services.bus_ads.results import refusal
 from eap.appliance.services.bus_ads.slave_space import Asked, SlaveSpace
 from eap.appliance.services.bus_ads.vendor import SlaveVendor
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, device_name
@@ -91,9 +92,7 @@ class Slaves:
         if not slave.state:
             raise AdsRefusedError(AdsError.TIMEOUT, f"slave {slave.station} does not answer")
         if not slave.to_slave:
-            state = state_name(slave.state)
-            why = f"slave {slave.station} is in {state}, where it has no mailbox"
-            raise AdsRefusedError(AdsError.STATE, why)
+            raise refusal(no_mailbox(slave))
         return space if slave.protocols & protocol else None
 
 

@@ -7,19 +7,79 @@ goes to the slave while the next one is on its way here.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
+from hashlib import sha256
+from time import monotonic
 
 from devicebus.errors import BusError
 from devicebus.mailbox import foe_client
 from devicebus.mailbox.conversation import Conversation, Progress
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.appliance.foe_restart import PAUSE_S, Restarts
 from eap.appliance.services.bus.bus_talk import Talk
 from eap.codec.foe import DATA_OVERHEAD, FoeOpcode
 from eap.errors import EapError
 
+KEPT = 16 << 20
+"""Octets of a file on its way to a slave that are kept, to begin anew if the bus interrupts it."""
 AHEAD = 64 << 10
 """Octets that are read before anybody asks for them, or taken before the slave has them."""
+
+logger = logging.getLogger(__name__)
+
+_CHANGED = "the slave's file has changed while the bus was interrupted"
 _ACK = bytes((FoeOpcode.ACK,))
+
+
+class _Past:
+    """What has passed of a file since its beginning, for a transfer that begins anew.
+
+    Of a file that is written the data is kept, as far as KEPT, and given to the slave again.  Of
+    one that is read a hash is enough: what the client has already is read again and compared.
+    """
+
+    def __init__(self, *, is_kept: bool) -> None:
+        self.can_rewind = True
+        self._is_kept = is_kept
+        self._data = bytearray()
+        self._size = self._repeated = 0
+        self._hash, self._hash_again = sha256(), sha256()
+
+    def keep(self, data: bytes) -> None:
+        """Keep what the slave was given."""
+        if self._is_kept and self.can_rewind:
+            self._data += data
+            if len(self._data) > KEPT:
+                self.can_rewind = False
+                self._data.clear()
+
+    def fresh(self, data: bytes) -> bytes:
+        """Return what is new of *data*; raise BusError if the rest is not as it was."""
+        known = min(len(data), self._size - self._repeated)
+        if known:
+            self._hash_again.update(data[:known])
+            self._repeated += known
+            if self._repeated == self._size and self._hash_again.digest() != self._hash.digest():
+                raise BusError(_CHANGED)
+            data = data[known:]
+        self._hash.update(data)
+        self._size += len(data)
+        self._repeated += len(data)
+        return data
+
+    def end(self) -> None:
+        """Raise BusError if the file ends before what the client has already."""
+        if self._repeated < self._size:
+            raise BusError(_CHANGED)
+
+    def rewind(self) -> bytes:
+        """Begin anew; return what the slave has to be given again."""
+        self._repeated = 0
+        self._hash_again = sha256()
+        data = bytes(self._data)
+        self._data.clear()
+        return data
 
 
 class Transfer:
@@ -50,11 +110,30 @@ class Transfer:
         self._buffer = bytearray()
         self._wanted = AHEAD
         self.is_whole = False
+        self._past = _Past(is_kept=is_write)
         self._error: EapError | None = None
         self._changed = asyncio.Event()
 
     async def run(self, open_talk: Callable[[], Awaitable[Talk]]) -> None:
         """Transfer the file; whoever cancels this ends it, at the slave too."""
+        restarts = Restarts(self.progress, lambda: self._past.can_rewind, monotonic)
+        try:
+            while True:
+                try:
+                    return await self._run_once(open_talk)
+                except EapError as exc:
+                    if not restarts.allows(exc):
+                        self._error = exc
+                        return None
+                again = self._past.rewind()
+                if self.is_write:
+                    self._buffer[:0] = again
+                logger.info("%s: restart %d after: %s", self._name, restarts.count, restarts.reason)
+                await asyncio.sleep(PAUSE_S)
+        finally:
+            self._note(has_ended=True)
+
+    async def _run_once(self, open_talk: Callable[[], Awaitable[Talk]]) -> None:
         conversation = self._begin()
         try:
             talk = await open_talk()
@@ -66,11 +145,8 @@ class Transfer:
                 raise
             finally:
                 talk.close()
-        except EapError as exc:
-            self._error = exc
         finally:
             conversation.close()
-            self._note(has_ended=True)
 
     async def wait_open(self) -> None:
         """Wait until the slave has said yes; raise EapError if it says no."""
@@ -104,7 +180,7 @@ class Transfer:
     def _begin(self) -> Conversation[int]:
         if self.is_write:
             return foe_client.write(
-                self._name, self._cut, self._sizes, password=self._password, progress=self.progress
+                self._name, self._give, self._sizes, password=self._password, progress=self.progress
             )
         return foe_client.read(
             self._name, self._take, self._sizes, password=self._password, progress=self.progress
@@ -127,11 +203,17 @@ class Transfer:
                     await self._wait(lambda: self.is_whole or len(self._buffer) >= room)
                 ask = conversation.send(message)
         except StopIteration:
+            self._past.end()
             self.is_complete = True
 
     def _take(self, data: bytes) -> None:
-        self._buffer += data
+        self._buffer += self._past.fresh(data)
         self._note(is_open=True)
+
+    def _give(self, size: int) -> bytes:
+        data = self._cut(size)
+        self._past.keep(data)
+        return data
 
     def _cut(self, size: int) -> bytes:
         data = bytes(self._buffer[:size])

@@ -20,10 +20,12 @@ from devicebus.errors import (
     MailboxRefusedError,
     MailboxSizeError,
     MailboxTimeoutError,
+    NoMailboxError,
 )
 from devicebus.mailbox.conversation import Ask, Message
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import SiiProtocol
+from eap.appliance.bus_failure import no_mailbox
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.services.bus.bus_talk import Talk
 from eap.codec.coe import CoeHeader
@@ -225,17 +227,17 @@ def reason_of(error: EapError) -> Reason:
     """Return why a slave did not answer."""
     if isinstance(error, EngineGoneError):
         return Reason.BUS_DOWN
-    if isinstance(error, MailboxTimeoutError):
-        return Reason.TIMEOUT
+    if isinstance(error, NoMailboxError):
+        return Reason.NO_MAILBOX
     if isinstance(error, MailboxSizeError):
         return Reason.TOO_LONG
-    return Reason.NO_MAILBOX
+    return Reason.TIMEOUT
 
 
 def find_refusal(kind: MailboxType, body: bytes, slave: SlaveReport) -> Reason | None:
     """Return why a request does not even go to the slave it is for."""
     if not slave.to_slave:
-        return Reason.NO_MAILBOX
+        return reason_of(no_mailbox(slave))
     if not slave.protocols & SiiProtocol[kind.name]:
         return Reason.NO_PROTOCOL
     if len(body) + MailboxHeader.SIZE > slave.to_slave:

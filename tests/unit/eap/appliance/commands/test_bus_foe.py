@@ -6,12 +6,19 @@ import hashlib
 import os
 import random
 import re
+from types import SimpleNamespace
 
 import pytest
 
-from devicebus.errors import FoeError
+from devicebus.errors import FoeError, MailboxClosedError
+from devicebus.mailbox.conversation import Message
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.appliance.commands import bus_foe, bus_session
 from eap.appliance.commands.bus_foe import exchange, get_file, put_file
 from eap.appliance.commands.bus_gateway import open_gateway
+from eap.appliance.foe_restart import RESTARTS
+from eap.codec.foe import FoeOpcode, encode_message
+from eap.codec.mailbox import MailboxType
 from eap.errors import ConfigError, EnvironmentalError
 from tests.support.fakegateway import FILE, FakeGateway
 from tests.support.loopbus import LoopBus
@@ -33,14 +40,16 @@ def reports():
 
 
 def get(bus, name, target, reports):
-    def report(done, total):
+    def report(done, total, restarts):
+        del restarts
         reports.append((done, total))
 
     return get_file(bus, "drive", name, target, password=0, report=report)
 
 
 def put(bus, source, name, reports):
-    def report(done, total):
+    def report(done, total, restarts):
+        del restarts
         reports.append((done, total))
 
     return put_file(bus, "drive", source, name, password=0, report=report)
@@ -106,7 +115,8 @@ def test_who_breaks_off_is_told_how_far_it_came(tmp_path):
     source, target = tmp_path / "a.bin", tmp_path / "b.bin"
     source.write_bytes(FILE)
 
-    def leave(done, total):
+    def leave(done, total, restarts):
+        del total, restarts
         if done > 500:
             raise KeyboardInterrupt
 
@@ -136,3 +146,71 @@ def test_vendor_message_is_echoed(bus):
         "vendor_type": 5,
         "data": "010203",
     }
+
+
+@pytest.mark.parametrize("is_write", [True, False])
+def test_transfer_interrupted_by_a_power_fault_begins_anew(
+    tmp_path, reports, monkeypatch, is_write
+):
+    monkeypatch.setattr(bus_foe, "PAUSE_S", 0)
+    source, target = tmp_path / "a.bin", tmp_path / "b.bin"
+    source.write_bytes(CONTENT)
+    line = LoopBus("drive")
+    with line.session() as bus:
+        put(bus, source, "firmware.bin", reports)
+        seen = []
+
+        def interrupt(done, total, restarts):
+            del total
+            if done > 20_000 and 1 not in seen:
+                line.fault(kind="power", slave="drive", for_ms=5)
+                seen.append(1)
+            seen.append(restarts)
+
+        monkeypatch.setattr(bus_session, "LOOK_NS", 1)
+        if is_write:
+            row = put_file(bus, "drive", source, "firmware.bin", password=0, report=interrupt)
+            get(bus, "firmware.bin", target, reports)
+        else:
+            row = get_file(bus, "drive", "firmware.bin", target, password=0, report=interrupt)
+    assert (row["restarts"], row["octets"]) == (1, len(CONTENT))
+    assert row["sha256"] == hashlib.sha256(CONTENT).hexdigest()
+    assert target.read_bytes() == CONTENT
+    assert seen[-1] == 1
+
+
+class BrokenBus:
+    """A bus that takes one packet of a file, and then has a fault."""
+
+    def __init__(self):
+        self.faults = 0
+
+    def scan(self):
+        return []
+
+    def find(self, name):
+        return SimpleNamespace(station=1001, name=name)
+
+    def require_mailbox(self, slave):
+        pass
+
+    def converse(self, slave, begin, name, meanwhile=None):
+        del slave, name, meanwhile
+        conversation = begin(MailboxSizes(64, 64))
+        next(conversation)
+        for number in range(2):
+            conversation.send(Message(MailboxType.FOE, encode_message(FoeOpcode.ACK, number)))
+        self.faults += 1
+        raise MailboxClosedError("the slave's mailbox was closed")
+
+
+def test_transfer_that_is_interrupted_again_and_again_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(bus_foe, "PAUSE_S", 0)
+    source = tmp_path / "a.bin"
+    source.write_bytes(CONTENT)
+    bus = BrokenBus()
+    with pytest.raises(MailboxClosedError) as caught:
+        put_file(bus, "drive", source, "f", password=0, report=lambda *_: None)
+    assert bus.faults == 1 + RESTARTS
+    notes = " ".join(caught.value.__notes__)
+    assert f"the transfer began anew {RESTARTS} times, last after: the slave's mailbox" in notes

@@ -42,7 +42,7 @@ def test_slave_without_a_mailbox_in_its_state():
         await until(is_there)
         outcome = await client.do(DRIVE, Read(IndexGroup.SDO, 0x1018_0001, 4))
         assert outcome.result == AdsError.STATE
-        assert client.why == "slave 1001 is in INIT, where it has no mailbox"
+        assert client.why == "slave 1001 (drive) has no mailbox in INIT"
 
     play(scene)
 

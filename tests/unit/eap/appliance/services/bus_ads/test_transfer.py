@@ -7,11 +7,12 @@ from contextlib import suppress
 
 import pytest
 
-from devicebus.errors import BusError, FoeError
+from devicebus.errors import BusError, FoeError, MailboxClosedError
 from devicebus.mailbox.conversation import Message
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.appliance.services.bus_ads import transfer as transfer_module
 from eap.appliance.services.bus_ads.transfer import AHEAD, Transfer
 from eap.codec.mailbox import MailboxType
 
@@ -137,3 +138,86 @@ def test_end_in_the_middle_is_told_to_the_slave():
 
     play(scene, talk)
     assert talk.end == "abandoned"
+
+
+class BrokenTalk(FakeTalk):
+    """A slave that forgets its file with every *breaks*-th message, *times* times."""
+
+    def __init__(self, content: bytes = b"", *, breaks: int = 100, times: int = 2) -> None:
+        super().__init__(content)
+        self.other: FoeServer | None = None
+        self.breaks = breaks
+        self.times = times
+
+    async def ask(self, ask) -> Message:
+        if self.times and self.asked and not self.asked % self.breaks:
+            self.times -= 1
+            self.server = self.other or self.server
+            self.server.reset()
+            self.asked += 1
+            raise MailboxClosedError("the slave's mailbox was closed")
+        return await super().ask(ask)
+
+
+@pytest.fixture
+def soon(monkeypatch):
+    monkeypatch.setattr(transfer_module, "PAUSE_S", 0)
+
+
+async def write_all(transfer):
+    for start in range(0, len(LONG), 5000):
+        await transfer.write(LONG[start : start + 5000])
+    await transfer.finish()
+
+
+async def read_all(transfer):
+    found = b""
+    while part := await transfer.read(5000):
+        found += part
+    return found
+
+
+def test_transfer_to_a_slave_is_given_again_after_a_fault_of_the_bus(soon):
+    talk = BrokenTalk()
+
+    async def write(transfer, task):
+        await write_all(transfer)
+        assert transfer.is_complete
+
+    async def read(transfer, task):
+        assert await read_all(transfer) == LONG
+
+    play(write, talk, is_write=True)
+    assert talk.times == 0
+    play(read, talk)
+
+
+def test_transfer_from_a_slave_is_read_again_after_a_fault_of_the_bus(soon):
+    talk = BrokenTalk(LONG)
+
+    async def scene(transfer, task):
+        assert await read_all(transfer) == LONG
+
+    play(scene, talk)
+    assert talk.times == 0
+
+
+def test_transfer_of_another_file_after_a_fault_of_the_bus_is_an_error(soon):
+    talk = BrokenTalk(LONG, times=1)
+    talk.other = FakeTalk(LONG[::-1]).server
+
+    async def scene(transfer, task):
+        with pytest.raises(BusError, match="has changed while the bus"):
+            await read_all(transfer)
+
+    play(scene, talk)
+
+
+def test_transfer_too_long_to_be_kept_is_given_up(soon, monkeypatch):
+    monkeypatch.setattr(transfer_module, "KEPT", 10_000)
+
+    async def scene(transfer, task):
+        with pytest.raises(MailboxClosedError):
+            await write_all(transfer)
+
+    play(scene, BrokenTalk(), is_write=True)

@@ -8,9 +8,12 @@ import pytest
 
 from devicebus.errors import (
     BusError,
+    FrameLostError,
+    MailboxClosedError,
     MailboxRefusedError,
     MailboxSizeError,
     MailboxTimeoutError,
+    NoMailboxError,
 )
 from devicebus.mailbox.conversation import Ask, Message
 from eap.aoe.answer import AmsAnswer, response_to
@@ -170,7 +173,10 @@ def test_a_request_that_is_cancelled_leaves_nothing_behind() -> None:
     [
         (MailboxTimeoutError("x"), Reason.TIMEOUT),
         (MailboxSizeError("x"), Reason.TOO_LONG),
-        (BusError("x"), Reason.NO_MAILBOX),
+        (NoMailboxError("x"), Reason.NO_MAILBOX),
+        (MailboxClosedError("x"), Reason.TIMEOUT),
+        (FrameLostError("x"), Reason.TIMEOUT),
+        (BusError("x"), Reason.TIMEOUT),
         (EngineGoneError("x"), Reason.BUS_DOWN),
     ],
 )
