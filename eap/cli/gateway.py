@@ -47,12 +47,15 @@ def stop(target: str, plant: str | None, as_json: bool) -> None:
 
 
 @gateway.command(short_help="Show sockets, clients, and what was asked of whom.")
-@_TARGET
+@click.argument("target", metavar="[STATION[/PORT]]", default="")
 @plant_option
 @_JSON
 def status(target: str, plant: str | None, as_json: bool) -> None:
-    """Show where a gateway is served, its clients, and what was asked of whom."""
-    rows = _ask("gateway_status", target, plant)
+    """Show where a gateway is served, its clients, and what was asked of whom.
+
+    Without STATION, of all gateways that run.
+    """
+    rows = _ask("gateway_status", target, plant) if target else _all_rows(plant)
     if as_json:
         _tell(rows, as_json=True)
         return
@@ -70,6 +73,28 @@ def _ask(method: str, target: str, plant: str | None) -> list[dict[str, Any]]:
         raise click.UsageError(f"{target!r} is no STATION and no STATION/PORT")
     with connect_station(station, plant) as client:
         rows: list[dict[str, Any]] = client.request(method, station=station, port=port)
+    return rows
+
+
+def _all_rows(plant: str | None) -> list[dict[str, Any]]:
+    """Return the gateways of all stations of the running appliances."""
+    from contextlib import ExitStack
+
+    from eap.appliance.commands.client import connect
+    from eap.appliance.control import ErrorCode
+    from eap.errors import ControlError
+
+    rows: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        for client in [stack.enter_context(each) for each in connect(plant)]:
+            for station in client.info.stations:
+                try:
+                    rows += client.request("gateway_status", station=station)
+                except ControlError as exc:
+                    if exc.code != ErrorCode.UNKNOWN_NAME:  # else it has no bus port
+                        raise
+    if not rows:
+        raise ControlError("no running station has a mailbox gateway")
     return rows
 
 

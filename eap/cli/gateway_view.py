@@ -23,10 +23,10 @@ def gateway_tables(row: Row) -> Iterator[RenderableType]:
     served = ", ".join(row["served"]) or "nowhere"
     silent = ", silent" if settings["silent"] else ""
     frames = count(row["turned_away"], "frame")
-    turned_away = f", {frames} turned away" if row["turned_away"] else ""
+    dropped = f", {frames} dropped" if row["turned_away"] else ""
     yield Text(
         f"{row['station']}/{row['port']}: {row['state']} at {served};"
-        f" answers within {settings['answer_ms']} ms{silent}{turned_away}"
+        f" answers within {settings['answer_ms']} ms{silent}{dropped}"
     )
     if row["clients"]:
         yield Text()

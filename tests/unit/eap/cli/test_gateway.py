@@ -8,7 +8,9 @@ from contextlib import ExitStack
 import pytest
 from click.testing import CliRunner
 
+from eap.appliance.control import ErrorCode
 from eap.cli import main
+from eap.errors import ControlError
 from tests.support.controlstub import ControlStub
 from tests.unit.eap.cli.test_gateway_view import ROW
 
@@ -47,6 +49,22 @@ def test_it_is_stopped_and_started(asked):
 def test_status(asked):
     assert json.loads(gateway("status", "mixer", "--json").output) == ROW
     assert "mixer/bus0: running at udp://10.0.0.1:34980" in gateway("status", "mixer").output
+
+
+def test_status_without_a_station_shows_all_gateways(asked):
+    assert json.loads(gateway("status", "--json").output) == ROW
+    assert asked == [{"station": "mixer"}]
+
+
+def test_status_without_a_station_says_that_there_is_no_gateway(runtime):
+    def refuse(params):
+        raise ControlError("station mixer has no gateway", code=ErrorCode.UNKNOWN_NAME)
+
+    with ExitStack() as stack:
+        ControlStub("line", ["mixer"], {"gateway_status": refuse}, stack)
+        found = gateway("status")
+    assert found.exit_code == 1
+    assert "no running station has a mailbox gateway" in found.output
 
 
 @pytest.mark.parametrize("target", ["", "/bus0", "mixer/", "mixer/bus0/1001"])

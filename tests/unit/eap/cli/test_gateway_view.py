@@ -67,5 +67,5 @@ def test_one_that_is_stopped_and_silent():
     quiet = ROW | {"state": "stopped", "turned_away": 3, "served": [], "clients": [], "slaves": []}
     quiet["settings"] = ROW["settings"] | {"silent": True}
     assert shown(quiet) == (
-        "mixer/bus0: stopped at nowhere; answers within 900 ms, silent, 3 frames turned away\n"
+        "mixer/bus0: stopped at nowhere; answers within 900 ms, silent, 3 frames dropped\n"
     )
