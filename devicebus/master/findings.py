@@ -244,6 +244,13 @@ def join_errors(errors: Sequence[tuple[str, EapError]]) -> EapError:
     return BusError(f"{_count(len(errors))} have failed:\n  " + "\n  ".join(lines))
 
 
+def describe_trouble(names: Sequence[str], trouble: str) -> str:
+    """Return what is wrong with the slaves of these *names*, whose number it may begin with."""
+    text = _SLAVE.sub("", trouble)
+    colon = "" if len(names) == 1 and text.startswith("it ") else ":"
+    return f"{_listed(names)}{colon} {text.removeprefix('it ')}"
+
+
 def describe_counters(port: PortErrors) -> str:
     """Return the error counters of a port that are not 0, in words."""
     kinds = (
@@ -337,10 +344,7 @@ def _by_trouble(slaves: Sequence[SlaveView]) -> list[tuple[str, list[SlaveView]]
 
 
 def _says(slaves: Sequence[SlaveView], trouble: str) -> str:
-    names = _listed([str(each) for each in slaves])
-    if len(slaves) == 1 and trouble.startswith("it "):
-        return f"{names} {trouble.removeprefix('it ')}"
-    return f"{names}: {trouble.removeprefix('it ')}"
+    return describe_trouble([str(each) for each in slaves], trouble)
 
 
 def _said(slaves: Sequence[SlaveView], trouble: str) -> str:

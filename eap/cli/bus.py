@@ -55,7 +55,7 @@ def bus() -> None:
 @json_option("Print one object.")
 def scan(bus: Place, as_json: bool) -> None:
     """Show all slaves: identity, state, alias, mailbox protocols."""
-    from eap.appliance.commands.bus_info import scan_rows
+    from eap.appliance.commands.bus_info import fault_lines, scan_rows
 
     with open_session(bus) as session:
         rows = scan_rows(session)
@@ -64,7 +64,7 @@ def scan(bus: Place, as_json: bool) -> None:
         return
     from eap.cli.bus_view import scan_tables
 
-    write_tables(scan_tables(rows))
+    write_tables(scan_tables(rows, fault_lines(rows)))
 
 
 @click.command(cls=BusCommand)

@@ -14,15 +14,14 @@ from eap.ids import ObjectId
 Row: TypeAlias = dict[str, Any]
 
 _SHOWN_OCTETS = 32
-_LISTED = 3
 _MANY_SLAVES = 16
 """Of more slaves only those with errors are shown."""
 _COMMAND_STATES = {0x0: "idle", 0x3: "done", 0x7: "executing", 0xF: "failed"}
 _COUNTERS = ("invalid_frames", "physical", "forwarded", "lost_links")
 
 
-def scan_tables(rows: Iterable[Row]) -> Iterator[TextTable | Text]:
-    """Yield the table of a scan, and in words what is wrong with slaves."""
+def scan_tables(rows: Iterable[Row], faults: Sequence[str]) -> Iterator[TextTable | Text]:
+    """Yield the table of a scan, and the lines *faults* that say what is wrong with slaves."""
     table = TextTable(
         "Slave",
         "Name",
@@ -34,7 +33,6 @@ def scan_tables(rows: Iterable[Row]) -> Iterator[TextTable | Text]:
         "State",
         Column("Mailbox", rank=1, wraps=True),
     )
-    faults: dict[str, list[str]] = {}
     for row in rows:
         numbers = (f"0x{row[key]:X}" for key in ("vendor", "product", "revision"))
         table.add_row(
@@ -46,13 +44,10 @@ def scan_tables(rows: Iterable[Row]) -> Iterator[TextTable | Text]:
             _state(row["state"]),
             "?" if row["mailbox"] is None else " ".join(row["mailbox"]),
         )
-        if row["fault"]:
-            faults.setdefault(row["fault"], []).append(f"{row['name']} ({row['address']})")
     yield table
     if faults:
         yield Text()
-    for fault, names in faults.items():
-        yield Text(f"{_listed(names)}: {fault}")
+    yield from map(Text, faults)
 
 
 def state_table(rows: Iterable[Row]) -> TextTable:
@@ -88,8 +83,8 @@ def diagnosis_tables(
     frames = found["frames"]
     yield Text(
         f"{count(frames['sent'], 'frame')} sent, {frames['late']} late, {frames['lost']} lost,"
-        f" {frames['retried']} sent again; round trip {duration(frames['round_trip_us'])}, time-out"
-        f" {duration(frames['timeout_us'])}"
+        f" {frames['retried']} sent again\nround trip {duration(frames['round_trip_us'])},"
+        f" time-out {duration(frames['timeout_us'])}"
     )
     for row in found["findings"]:
         yield Text(finding_line(row, now_s), style="dim" if row["is_over"] else "red")
@@ -104,13 +99,6 @@ def finding_line(row: Row, now_s: float) -> str:
     if row["until"] is not None:
         until = f"until {_ago(row['until'], now_s)} ago"
     return f"was, {until}: {row['what']}; --reset clears this"
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Return the names of slaves; of many, how many they are, the first and the last."""
-    if len(names) > _LISTED:
-        return f"{len(names)} slaves from {names[0]} to {names[-1]}"
-    return ", ".join(names)
 
 
 def _ago(at_s: float, now_s: float) -> str:
@@ -154,7 +142,8 @@ def eeprom_lines(content: Row, image: bytes) -> Iterator[str]:
         yield f"  {key:9} 0x{content[key]:08X}"
     intact = "right" if content["intact"] else "WRONG"
     kinds = ", ".join(f"{each['type']} ({each['octets']})" for each in content["categories"])
-    yield f"  check sum {intact}; {content['octets']} octets; categories {kinds or 'none'}"
+    yield f"  check sum {intact}; {content['octets']} bytes"
+    yield f"  categories (bytes) {kinds or 'none'}"
     for offset in range(0, len(image), 16):
         yield f"{offset:04x}  {image[offset : offset + 16].hex(' ')}"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -11,7 +11,7 @@ from devicebus.errors import SiiError, WorkingCounterError
 from devicebus.master import eeprom
 from devicebus.master.diagnosis import BusDiagnosis, SlaveDiagnosis, clear_counters, diagnose
 from devicebus.master.esm import read_status
-from devicebus.master.findings import SlaveView, find_causes, find_silence
+from devicebus.master.findings import SlaveView, describe_trouble, find_causes, find_silence
 from devicebus.master.procedure import Procedure, Sleep
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
@@ -27,6 +27,15 @@ STATES = tuple(state.name for state in AlState)
 def scan_rows(bus: SlaveBus) -> list[dict[str, Any]]:
     """Return who is there, in the order of the line; raises as a scan does."""
     return [_slave(slave) for slave in bus.scan()]
+
+
+def fault_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what is wrong with the slaves of a scan, one line for each fault."""
+    faults: dict[str, list[str]] = {}
+    for row in rows:
+        if row["fault"]:
+            faults.setdefault(row["fault"], []).append(f"{row['name']} ({row['address']})")
+    return [describe_trouble(names, fault) for fault, names in faults.items()]
 
 
 def state_rows(bus: SlaveBus, slave: str | None, target: str | None) -> list[dict[str, Any]]:
@@ -115,7 +124,7 @@ def _view(slave: Slave, there: SlaveDiagnosis) -> SlaveView:
     """Return a slave as its registers show it, with why it is not where its master keeps it."""
     trouble = ""
     if there.answers and there.state.endswith("ERROR"):
-        trouble = f"in {there.state}: {there.text} (0x{there.code:04X})"
+        trouble = slave.fault or f"in {there.state}: {there.text} (0x{there.code:04X})"
     elif there.answers and slave.target and there.state != state_name(slave.target):
         trouble = slave.fault or f"in {there.state}, not yet in {state_name(slave.target)}"
     return SlaveView(slave.station, slave.name, there.answers, trouble, slave.since_ns)

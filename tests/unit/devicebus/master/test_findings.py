@@ -91,6 +91,7 @@ def test_slaves_with_the_same_trouble_are_one_finding():
     trouble = "in SAFEOP+ERROR: watchdog"
     assert whats(line(b=trouble, c=trouble)) == [f"b (1002), c (1003): {trouble}"]
     assert whats(line(b="it refuses OP")) == ["b (1002) refuses OP"]
+    assert whats(line(b="slave 1002: refuses OP")) == ["b (1002): refuses OP"]
     assert whats(line(b="it refuses OP", c="it refuses OP")) == ["b (1002), c (1003): refuses OP"]
     everyone = line(a=trouble, b=trouble, c=trouble, d=trouble)
     assert whats(everyone) == [f"4 slaves from a (1001) to d (1004): {trouble}"]

@@ -8,6 +8,7 @@ from devicebus.errors import BusError, SiiError
 from devicebus.wire import sii
 from eap.appliance.commands.bus_info import (
     diagnosis,
+    fault_lines,
     read_eeprom,
     reset_diagnosis,
     scan_rows,
@@ -41,6 +42,12 @@ def test_scan(line):
         "fault": "",
     }
     assert [row["parent"] for row in rows] == [None, 0, 1]
+
+
+def test_fault_lines_name_the_slaves_of_each_fault_together():
+    faults = {"a": "it does not answer", "b": "it does not answer", "c": "", "d": "no end"}
+    rows = [{"address": 1, "name": name, "fault": fault} for name, fault in faults.items()]
+    assert fault_lines(rows) == ["a (1), b (1): does not answer", "d (1): no end"]
 
 
 def test_states(line):

@@ -20,6 +20,7 @@ from eap.appliance.bus_request import (
     Datagram,
     Describe,
     Failure,
+    Forget,
     FromEngine,
     Heard,
     Hello,
@@ -116,6 +117,15 @@ def test_a_bus_is_described(office):
         (1002, "io", AlState.OP),
         (1003, "level", AlState.OP),
     ]
+
+
+def test_desk_forgets_faults_that_are_over_on_request(office):
+    office.rig.fault(kind="power", slave="level", for_ms=50)
+    office.rig.run(1_000 * MS)
+    assert office.ask(Describe(id=7, bus=0)).report.slaves[2].past_fault == "it does not answer"
+    assert office.ask(Forget(id=8, bus=0)).failure is None
+    slave = office.ask(Describe(id=9, bus=0)).report.slaves[2]
+    assert (slave.past_fault, slave.since_ns, slave.until_ns) == ("", None, None)
 
 
 def test_a_mailbox_answers(office):

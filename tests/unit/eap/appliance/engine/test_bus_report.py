@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import pytest
 
+from devicebus.master.findings import History
 from devicebus.wire.alstatus import AlState
+from eap.appliance.bus_findings import history_of, report_findings
 from eap.appliance.bus_request import SlaveReport
 from eap.appliance.engine.bus_report import report_bus
 from tests.support import enginebus
@@ -122,3 +124,49 @@ def test_report_other_product_in_place_of_a_slave_has_no_state(tmp_path):
     assert image == [8, 0]
     assert report == [8, 0]
     assert "in place of io" in report_bus(rig.bus, rig.now_ns).slaves[1].fault
+
+
+def findings(rig):
+    """What `status` says of the bus, and what `bus diag` says is over."""
+    report = report_bus(rig.bus, rig.now_ns)
+    return [each.what for each in report_findings(report)], history_of(report)
+
+
+def test_report_cut_cable_is_one_finding_and_over_once_it_is_mended(tmp_path):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    rig.run(1_500 * MS)
+    rig.fault(kind="cut", slave="io", for_ms=3_000)
+    rig.run(2_500 * MS)
+    ((only,), _) = findings(rig)
+    assert only == (
+        "io (1002) and 1 slave behind it do not answer; the last that answers before it is"
+        " coupler (1001)"
+    )
+    rig.wait_op()
+    rig.run(5_000 * MS)
+    present, history = findings(rig)
+    assert present == []
+    assert [slave.name for slave, _ in history.over] == ["io", "level"]
+    for _, times in history.over:
+        assert 7_000 * MS < times.since_ns < 9_000 * MS
+        assert 4_000 * MS < times.until_ns < 6_000 * MS
+    assert history.ports[1001, 1].until_ns > 6_000 * MS
+    rig.bus.forget_past()
+    assert findings(rig) == ([], History())
+
+
+def test_report_silent_bus_blames_no_slave_and_has_no_states(tmp_path):
+    rig = BusRig(tmp_path).start()
+    rig.wait_op()
+    rig.fault(kind="loss", for_ms=2_000)
+    rig.run(1_500 * MS)
+    present, _ = findings(rig)
+    assert present == ["no frame comes back: 3 slaves cannot be reached"]
+    assert [each.state for each in report_bus(rig.bus, rig.now_ns).slaves] == [0, 0, 0]
+    rig.wait_op()
+    rig.run(1_000 * MS)
+    present, history = findings(rig)
+    assert present == []
+    assert history.silence is not None
+    assert 900 * MS < history.silence.until_ns < 2_000 * MS
