@@ -100,6 +100,8 @@ class Verdict(NamedTuple):
     """The rule, in words."""
     is_by_rule: bool = False
     """Whether the plant file says so, and not only the default."""
+    is_recordable: bool = True
+    """Whether the audit can record it, where that is required."""
 
 
 class Grants:

@@ -148,6 +148,14 @@ class Reason(Enum):
         FoeErrorCode.NO_RIGHTS,
         AdsError.ACCESS_DENIED,
     )
+    NOT_RECORDED = _Codes(
+        "change refused: the audit is required and cannot record it",
+        MailboxError.SERVICE_IN_WORK,
+        AbortCode.LOCAL_CONTROL,
+        SoeErrorCode.VALUE_PROTECTED,
+        FoeErrorCode.NO_RIGHTS,
+        AdsError.ACCESS_DENIED,
+    )
 
     @property
     def text(self) -> str:

@@ -235,7 +235,8 @@ class Audit:
 
     def _lose(self, count: int, error: str) -> None:
         if not self.lost.error:
-            logger.error("audit %s: changes are not recorded: %s", self.path, error)
+            effect = "refused" if self.is_required else "not recorded"
+            logger.error("audit %s: changes are %s: %s", self.path, effect, error)
         self.lost = self.lost._replace(error=error)
         if count:
             now = self._now()

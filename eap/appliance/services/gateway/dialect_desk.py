@@ -11,7 +11,7 @@ from eap.aoe.ads_operation import Operation, ReadWrite
 from eap.aoe.way import Way
 from eap.appliance.services.gateway.dialect_elsewhere import perform_elsewhere
 from eap.appliance.services.gateway.dialect_task import FAILURES, DialectError, perform
-from eap.appliance.services.gateway.guard import Guard, Target
+from eap.appliance.services.gateway.guard import Guard, Target, reason_of_refusal
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import LinkTo
 from eap.appliance.services.gateway.slave_book import SlaveBook
@@ -108,7 +108,7 @@ class DialectDesk:
         result: int | None = AdsError.GENERAL
         try:
             if not verdict.is_allowed:
-                raise _refusal(Reason.DENIED)
+                raise _refusal(reason_of_refusal(verdict))
             data = await self._perform(kind, task, whom, way)
             result = 0
         finally:

@@ -68,6 +68,7 @@ FAILURES = {
     Reason.TIMEOUT: Failure.NO_RESPONSE,
     Reason.TOO_LONG: Failure.SIZE,
     Reason.DENIED: Failure.READ_ONLY,
+    Reason.NOT_RECORDED: Failure.READ_ONLY,
 }
 """Of what a gateway says itself; everything else is general."""
 

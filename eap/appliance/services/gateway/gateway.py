@@ -23,7 +23,14 @@ from eap.appliance.bus_request import Heard
 from eap.appliance.services.gateway.answering import Answering, Request, Send, refusals
 from eap.appliance.services.gateway.dialect_desk import DialectDesk
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
-from eap.appliance.services.gateway.guard import MASTER_PORT, Guard, Judged, Target, result_of
+from eap.appliance.services.gateway.guard import (
+    MASTER_PORT,
+    Guard,
+    Judged,
+    Target,
+    reason_of_refusal,
+    result_of,
+)
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import LinkTo
 from eap.appliance.services.gateway.remote_session import RemoteSession
@@ -237,7 +244,7 @@ class MailboxGateway:
         replies = (
             master.ask_now(body)
             if judged.is_allowed
-            else refusals(MailboxType.COE, body, Reason.DENIED)
+            else refusals(MailboxType.COE, body, reason_of_refusal(judged.verdict))
         )
         self._finish(request, judged, MASTER_ADDRESS, replies, start_ns)
         return True
@@ -258,7 +265,7 @@ class MailboxGateway:
         station = found.station if isinstance(found, Slave) else address
         judged = self._judge(way, station, self._target(found), operation, by_rule=is_group)
         if not judged.is_allowed:
-            replies = refusals(kind, body, Reason.DENIED)
+            replies = refusals(kind, body, reason_of_refusal(judged.verdict))
         elif isinstance(found, Slave):
             replies = await self._ask_slave(request, station, is_step=operation is None)
         elif isinstance(found, Master):

@@ -25,6 +25,7 @@ from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SdoHeader, SdoRequest
 from eap.codec.soe import SoeHeader
+from eap.gateway.refusal import Reason
 from eap.ids import NetId
 from eap.od.abort import SdoAbortError
 
@@ -108,7 +109,9 @@ class Guard:
         if self.before_change is None or not is_change:
             return verdict
         why = self.before_change(_entry(way, target, change))
-        return verdict._replace(is_allowed=False, why=why) if why else verdict
+        if not why:
+            return verdict
+        return verdict._replace(is_allowed=False, is_recordable=False, why=why)
 
     def tell(
         self, way: Way, target: Target, operation: Operation, verdict: Verdict, result: int | None
@@ -132,6 +135,12 @@ class Guard:
 
 def _entry(way: Way, target: Target, audited: AuditedOperation) -> AuditEntry:
     return AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
+
+
+def reason_of_refusal(verdict: Verdict | None) -> Reason:
+    """Return why a request with this verdict is refused."""
+    is_recordable = verdict is None or verdict.is_recordable
+    return Reason.DENIED if is_recordable else Reason.NOT_RECORDED
 
 
 def result_of(replies: Sequence[Reply]) -> int | None:

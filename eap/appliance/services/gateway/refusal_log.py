@@ -13,6 +13,7 @@ from eap.gateway.refusal import Reason
 _LOGGED = frozenset(
     (
         Reason.DENIED,
+        Reason.NOT_RECORDED,
         Reason.CROWDED,
         Reason.TOO_FAST,
         Reason.TIMEOUT,

@@ -9,7 +9,7 @@ from eap.aoe.ads_operation import Read, Write
 from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, AccessService
 from eap.aoe.way import Way
-from eap.appliance.services.gateway.guard import Guard, Target, result_of
+from eap.appliance.services.gateway.guard import Guard, Target, reason_of_refusal, result_of
 from eap.appliance.services.gateway.slave_session import Reply
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
@@ -51,6 +51,8 @@ def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
     guard.before_change = lambda entry: recorded.append(entry) or "the audit cannot be written"  # type: ignore[func-returns-value]
     verdict = guard.judge(HERE, TARGET, WRITE)
     assert (verdict.is_allowed, verdict.why) == (False, "the audit cannot be written")
+    assert reason_of_refusal(verdict) is Reason.NOT_RECORDED
+    assert reason_of_refusal(guard.judge(ELSEWHERE, TARGET, WRITE)) is Reason.DENIED
     assert guard.judge(HERE, TARGET, READ).is_allowed
     assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
     assert [each.operations[0].operation for each in recorded] == [WRITE]
