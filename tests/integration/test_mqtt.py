@@ -5,13 +5,16 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import socket
+import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.support.ams import Ams
+from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
+from tests.support.ams import ADD_NOTIFICATION, Ams
 from tests.support.appliance import Appliance, plants, wait_until
 from tests.support.mosquitto import Broker, broker
 from tests.support.mqttclient import PahoPeer
@@ -74,6 +77,40 @@ def test_broker_is_restarted_in_mid_run_and_service_resumes(halls, server):
     server.start()
     until_read(SOUTH, by=NORTH)
     until_read(NORTH, by=SOUTH)
+
+
+def test_subscription_outlives_its_broker_and_the_client_may_have_any_net_id(halls, server):
+    until_read(SOUTH, by=NORTH)
+    north, _ = halls
+    body = AddNotification(0xF302, 0x10000000, 4, TransMode.SERVER_CYCLE, 0, 500_000).encode()
+    own = f"{NORTH}.1.1:33000"
+    add = Ams(f"{SOUTH}.2.1:65535", own, ADD_NOTIFICATION, invoke_id=1, body=body).octets()
+    with socket.create_connection((NORTH, 48898)) as client, client.makefile("rb") as stream:
+
+        def next_packet() -> bytes:
+            _, length = struct.unpack("<HI", stream.read(6))
+            return stream.read(length)
+
+        def next_value() -> int:
+            ((sample,),) = (stamp.samples for stamp in decode_notification(next_packet()[32:]))
+            assert sample.handle == handle
+            return int.from_bytes(sample.data, "little")
+
+        def interrupted() -> int:
+            (router,) = north.request("routes_list")
+            return sum(row["count"] for row in router["interruptions"])
+
+        client.settimeout(60)
+        client.sendall(struct.pack("<HI", 0, len(add)) + add)
+        result, handle = struct.unpack("<II", next_packet()[32:])
+        assert result == 0
+        device_type = next_value()
+        server.stop()
+        wait_until(lambda: interrupted() == 1)
+        server.start()
+        wait_until(lambda: interrupted() == 0)
+        for _ in range(100):  # more than waited in the socket
+            assert next_value() == device_type
 
 
 def test_station_whose_services_die_is_down_at_once_and_comes_back(halls):
