@@ -111,6 +111,7 @@ class Prober:
         for way, hop in self._hops.items():
             if way.door == door and address in {None, way.connection}:
                 hop.asked_at_ns, hop.misses, hop.is_down = None, 0, False
+                hop.restart_index = None
 
     def hear(self, hop: Way, now_ns: int) -> None:
         """Note that a hop answered a request."""
@@ -195,6 +196,8 @@ class Prober:
         hop.asked_at_ns = now_ns
         is_found_dead = hop.misses >= MISSES and not hop.is_down
         hop.is_down = hop.is_down or is_found_dead
+        if is_found_dead:
+            hop.restart_index = None  # what came from it is restored anyhow
         return Probe(way, self._header(hop, AmsCommand.READ_STATE), is_found_dead)
 
     def _header(self, hop: _Hop, command: AmsCommand) -> bytes:

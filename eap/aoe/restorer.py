@@ -362,7 +362,10 @@ class Restorer:
             grant = None if error or not pending.handles else _grant_of(pending, step, body)
             return [] if grant is None else self._ending.end([grant], now_ns)
         if error:
+            route = pending.route
             text = AdsError.words_of(error)
+            if route is not None:
+                text += f" from {route.name} ({route.hop}) or from behind it"
             return self._failed(session, subscription, error, text, now_ns)
         if not pending.handles:
             handle = int.from_bytes(body[_SYMBOL - 4 : _SYMBOL], "little")

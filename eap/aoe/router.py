@@ -193,8 +193,10 @@ class Router:
         return self._passage.is_down(hop)
 
     def is_awaited(self, hop: Way) -> bool:
-        """Say whether an answer from a hop is waited for."""
-        return bool(self._passage.in_flight.on(*hop))
+        """Say whether an answer from a hop is waited for, or subscriptions come from it."""
+        return hop in self._passage.notifier.subscriptions.hops or bool(
+            self._passage.in_flight.on(*hop)
+        )
 
     def waiting(self, way: Way) -> int:
         """Return how many requests that came by *way* wait for their answers."""

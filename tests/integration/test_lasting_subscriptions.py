@@ -30,6 +30,8 @@ SUBSCRIPTIONS = 20
 RECOVERY_S = 5.0
 PATIENCE_S = 60.0
 """How long a test waits for what the figures are about: a loaded machine is late, not wrong."""
+RUNS_US = 500_000
+"""A station whose latest cycle is not older runs."""
 FIRST, MIDDLE, EAST, LAST = "10.77.1.1", "10.77.1.2", "10.77.2.1", "10.77.2.2"
 NAMES = ("first", "middle", "last")
 HOPS = {
@@ -149,13 +151,12 @@ class Line:
             station.close()
             self.start(name)
         else:
-            wait_until(lambda: self._pid(name, process) not in {0, before[process]}, PATIENCE_S)
-        back_s = time.monotonic()
+            wait_until(lambda: self._runs_again(name, process, before[process]), PATIENCE_S)
         if name == "first" and process != "engine":
             # The connection of the client has ended, which it sees: it subscribes again.
             self.client.close()
             self.client = self._subscribe()
-        return back_s
+        return time.monotonic()
 
     def recovery_s(self, since_s: float) -> float:
         """Return how long it took until all subscriptions delivered."""
@@ -188,11 +189,13 @@ class Line:
                 if time.monotonic() > end_s:
                     raise
 
-    def _pid(self, name: str, process: str) -> int:
+    def _runs_again(self, name: str, process: str, before: int) -> bool:
         with suppress(Exception):  # while it starts there is no answer, or half of one
-            found = self.stations[name].status()["processes"][process]
-            return int(found["pid"]) if process == "services" or found.get("cpu") is not None else 0
-        return 0
+            status = self.stations[name].status()
+            if status["processes"][process]["pid"] in {None, before}:
+                return False
+            return bool(status["stations"][0]["cycle_age_us"] < RUNS_US)
+        return False
 
 
 def is_alive(pid: int) -> bool:

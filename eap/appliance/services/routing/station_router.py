@@ -198,7 +198,7 @@ class StationRouter:
         return any(route.hop == hop for route in self.table)
 
     def is_awaited(self, hop: Way) -> bool:
-        """Say whether an answer from a hop is waited for."""
+        """Say whether an answer from a hop is waited for, or subscriptions come from it."""
         return self._router.is_awaited(hop)
 
     def locate(self, header: AmsHeader, way: Way) -> Location:

@@ -209,7 +209,8 @@ def test_quiet_subscriptions_are_interrupted_when_their_server_does_not_answer()
     assert scene.station.router.interruptions() == []
     scene.answer(scene.asked[0], b"", 0x1B)
     (missing,) = scene.station.router.interruptions()
-    assert (missing.number, missing.why) == (3, "error 0x1b (the link is down)")
+    where = "far (10.0.0.6 by link) or from behind it"
+    assert (missing.number, missing.why) == (3, f"error 0x1b (the link is down) from {where}")
 
 
 def test_others_of_a_server_are_checked_when_it_has_forgotten_one() -> None:
@@ -256,6 +257,22 @@ def test_hop_with_another_restart_index_has_forgotten_its_subscriptions() -> Non
     assert missing.why == "its router was started again"
 
 
+def test_hop_that_was_lost_is_not_lost_again_by_its_restart_index() -> None:
+    scene = Scene(CYCLIC, is_probing=True)
+
+    def tell(restart_index: int) -> None:
+        scene.passes(SECOND)
+        (state,) = [each for each in scene.asked if each.command == AmsCommand.READ]
+        scene.answer(state, struct.pack("<IIHHH", 0, 16, 5, 0, restart_index) + bytes(10))
+
+    tell(7)
+    scene.lose_hop()
+    scene.passes(0)
+    scene.answer(next(each for each in scene.asked if each.command == ADD_NOTIFICATION), granted(8))
+    tell(9)
+    assert scene.station.router.interruptions() == []
+
+
 def test_hop_without_a_restart_index_is_asked_once() -> None:
     scene = Scene(CYCLIC, is_probing=True)
     scene.passes(SECOND)
@@ -264,6 +281,14 @@ def test_hop_without_a_restart_index_is_asked_once() -> None:
     scene.sample(1)
     scene.passes(SECOND)
     assert not [each for each in scene.asked if each.command == AmsCommand.READ]
+
+
+def test_hop_with_subscriptions_is_awaited() -> None:
+    scene = Scene(CYCLIC)
+    assert scene.station.router.is_awaited(LINK)
+    scene.station.router.connection_closed(*ONE, 0)
+    scene.station.router.handle_timeout(10 * SECOND)
+    assert not scene.station.router.is_awaited(LINK)
 
 
 def test_location_tells_of_interrupted_subscriptions() -> None:
