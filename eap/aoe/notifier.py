@@ -26,6 +26,8 @@ _HANDLE = 4
 _ADD = AmsCommand.ADD_NOTIFICATION.value  # plain numbers: members of enums are slow
 _DELETE = AmsCommand.DELETE_NOTIFICATION.value
 _READ_WRITE = AmsCommand.READ_WRITE.value
+FOLLOWED = frozenset((_ADD, _DELETE, _READ_WRITE))
+"""Commands that may be about notifications."""
 _SYMBOL_HANDLE = IndexGroup.SYMBOL_HANDLE.value
 _SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value
 _SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value
@@ -80,8 +82,6 @@ class Notifier:
 
         None says that it deletes nothing that is known here.
         """
-        if header.command not in {_DELETE, _READ_WRITE}:
-            return None
         handles = deleted_handles(header, data)
         if not handles:
             return None
@@ -92,16 +92,12 @@ class Notifier:
 
     def has_room(self, header: AmsHeader, data: bytes, way: Way) -> bool:
         """Say whether a client may have the notifications that it asks for."""
-        if header.command not in {_ADD, _READ_WRITE}:
-            return True
         count = _count_of(header, data[AmsHeader.SIZE :])
         return not count or self.subscriptions.has_room(way, data[: ADDRESSES.size], count)
 
     def follow_request(self, pending: Pending, body: bytes, way: Way) -> None:
         """Note which notifications a client asks for, and which symbol it looks up."""
         header = pending.header
-        if header.command not in {_ADD, _READ_WRITE}:
-            return
         pending.handles = _count_of(header, body)
         if pending.handles or _group_of(header, body) == _SYMBOL_HANDLE:
             door = self._outlet.doors[way.door]

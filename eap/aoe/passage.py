@@ -15,7 +15,7 @@ from eap.aoe.inflight import InFlight, Pending
 from eap.aoe.invoke import InvokeIds, is_marked
 from eap.aoe.judge import Judge, Limits
 from eap.aoe.judged import Judged
-from eap.aoe.notifier import Notifier, Samples, deleted_handles, encode_deleted
+from eap.aoe.notifier import FOLLOWED, Notifier, Samples, deleted_handles, encode_deleted
 from eap.aoe.outlet import Outlet
 from eap.aoe.passed import Passed
 from eap.aoe.prober import Prober
@@ -119,7 +119,8 @@ class Passage:
 
     def take_request(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
         """Pass a request on that is for nobody here, or refuse it."""
-        own = self.notifier.find_own(header, data, way)
+        is_followed = header.command in FOLLOWED
+        own = self.notifier.find_own(header, data, way) if is_followed else None
         if own is not None and own[0].request is not None:
             return self._delete(header, data, own, way, now_ns)
         found = self._let_on(header, data, way, now_ns)
@@ -128,7 +129,7 @@ class Passage:
         route, data, judged = found
         if own is not None:
             self.notifier.forget(own)
-        if not self.notifier.has_room(header, data, way):
+        if is_followed and not self.notifier.has_room(header, data, way):
             return self._refuse_subscriptions(header, judged, way, now_ns)
         onward = self._onward(header, way, route)
         if not wants_answer(header):
@@ -139,7 +140,8 @@ class Passage:
         if not isinstance(pending, Pending):
             return pending
         pending.judged = judged
-        self.notifier.follow_request(pending, data[AmsHeader.SIZE :], way)
+        if is_followed:
+            self.notifier.follow_request(pending, data[AmsHeader.SIZE :], way)
         return [self._forward(pending.invoke_id, data, onward, route)]
 
     def wait_for_service(
@@ -164,7 +166,10 @@ class Passage:
             body = data[AmsHeader.SIZE :]
             return self.restorer.receive_answer(pending, header, body, now_ns)
         actions: list[Action] = []
-        granted = self.notifier.follow_answer(pending, header, data[AmsHeader.SIZE :], now_ns)
+        granted = None
+        if pending.handles or pending.asked_for:
+            body = data[AmsHeader.SIZE :]
+            granted = self.notifier.follow_answer(pending, header, body, now_ns)
         if granted is not None:
             actions += self._ending.end(granted.surplus, now_ns)
             actions += self.restorer.displaced(granted.displaced, now_ns)
