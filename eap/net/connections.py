@@ -8,9 +8,9 @@ one other host has at most its share.
 Rule 2: when no place is left, a connection that is not in use loses its place: of the newcomer's
 own host, or of a host that holds more than the newcomer's host.  First of the host that holds most,
 there first one that was never used, then the one that has been silent longest.
-Rule 3: if rule 2 finds none, one with requests under way, with a subscription or used within the
-last 10 s loses its place, but only to a host that holds fewer connections even afterwards; and one
-of a program of this host never does.
+Rule 3: if rule 2 finds none, one in use loses its place, but only to a host that holds fewer
+connections even afterwards; and one of a program of this host never does.  In use is a connection
+with requests under way or a subscription, used within the last 10 s, or accepted within 3 s.
 Rule 4: a peer that leaves a frame unfinished, or takes no answers, is overdue after 10 s.
 """
 
@@ -26,6 +26,8 @@ OWN_HOST = ""
 """The host of connections from programs of this machine."""
 SILENT_NS = 10_000_000_000
 """A connection that was used within this time is in use."""
+FRESH_NS = 3_000_000_000
+"""So is one that was accepted within this time: its first request may be on its way."""
 OVERDUE_NS = 10_000_000_000
 """Time that a peer has to finish a frame, or to take answers."""
 
@@ -237,23 +239,26 @@ def _find_victim(
     pool = list(candidates)
     held = Counter(each.host for each in pool)
     mine = held[newcomer_host]
-
-    def rank(each: Connection) -> tuple[bool, int, int, int]:
-        return _is_in_use(each, now_ns), -held[each.host], each.activity, each.used_at_ns
-
-    def may_lose(each: Connection) -> bool:
-        if _is_in_use(each, now_ns):
-            return each.host != OWN_HOST and held[each.host] > mine + 1
-        return each.host == newcomer_host or held[each.host] > mine
-
-    return min(filter(may_lose, pool), key=rank, default=None)
+    victim, best = None, None
+    for each in pool:
+        is_used, count = _is_in_use(each, now_ns), held[each.host]
+        if is_used:
+            may_lose = each.host != OWN_HOST and count > mine + 1
+        else:
+            may_lose = each.host == newcomer_host or count > mine
+        if not may_lose:
+            continue
+        rank = is_used, -count, each.activity, each.used_at_ns
+        if best is None or rank < best:
+            victim, best = each, rank
+    return victim
 
 
 def _is_in_use(connection: Connection, now_ns: int) -> bool:
     activity = connection.activity
-    if activity is Activity.IDLE:
-        return now_ns - connection.used_at_ns < SILENT_NS
-    return activity is not Activity.UNUSED
+    if activity > Activity.IDLE:
+        return True
+    return now_ns - connection.used_at_ns < (SILENT_NS if activity else FRESH_NS)
 
 
 def host_of(peer: str, own: str) -> str:

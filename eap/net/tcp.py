@@ -224,7 +224,7 @@ class TcpReceiver:
         name: The destination of answers.
         host: As above.
         closed: Why the connection ended, empty while it lasts.
-        used_at_ns: When the last frame was complete.
+        used_at_ns: When the last frame was complete; its owner sets the time of its acceptance.
         late_since_ns: Since when a frame is unfinished.
     """
 
@@ -247,6 +247,7 @@ class TcpReceiver:
         self.host = host
         self.closed = ""
         self.used_at_ns = 0
+        self._is_used = False
         self.late_since_ns: int | None = None
         self._sock = sock
         self._source = _peer_of(sock)
@@ -269,6 +270,7 @@ class TcpReceiver:
         if count:
             self.used_at_ns = now_ns
             self.late_since_ns = None
+            self._is_used = True
         elif self._end > self._start and self.late_since_ns is None:
             self.late_since_ns = now_ns
         return count
@@ -276,7 +278,7 @@ class TcpReceiver:
     @property
     def activity(self) -> Activity:
         """Current use: frames are expected whenever the publisher has some."""
-        return Activity.IDLE if self.used_at_ns else Activity.UNUSED
+        return Activity.IDLE if self._is_used else Activity.UNUSED
 
     def source_of(self, data: memoryview) -> bytes:
         """Return the IPv4 address of the peer."""

@@ -71,6 +71,7 @@ class TcpPort:
 
         The policy is that of all listeners (connections.py).
         """
+        receiver.used_at_ns = now_ns
         refusal, victim = self._table.admit(
             self._listener, receiver, now_ns, spare_descriptors=spare_descriptors
         )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import select
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from time import monotonic
 from typing import Any
 
 import msgspec
@@ -19,6 +21,7 @@ from eap.near import near
 
 TIMEOUT_S = 10.0
 """Patience for one answer: services may be on their way back from a restart."""
+_CONNECT_PAUSE_S = 0.02
 
 
 class Client(Closing):
@@ -197,7 +200,7 @@ def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> Client:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.settimeout(TIMEOUT_S)
     try:
-        connection.connect(str(folder.control_socket))
+        _connect(connection, str(folder.control_socket))
     except OSError as exc:
         connection.close()
         raise ControlError(
@@ -206,6 +209,24 @@ def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> Client:
             code=ErrorCode.UNAVAILABLE,
         ) from None
     return Client(connection, info, folder)
+
+
+def _connect(connection: socket.socket, path: str) -> None:
+    """Connect to a Unix socket; where too many wait to be accepted, wait for TIMEOUT_S.
+
+    Raises:
+        OSError: nobody listens, or none was accepted in that time.
+    """
+    end_s = monotonic() + TIMEOUT_S
+    while True:
+        try:
+            connection.connect(path)
+        except BlockingIOError:
+            if monotonic() > end_s:
+                raise
+            select.select([], [], [], _CONNECT_PAUSE_S)
+        else:
+            return
 
 
 def _starting(folder: ApplianceFolder) -> Iterator[str]:

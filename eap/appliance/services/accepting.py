@@ -27,8 +27,9 @@ from eap.net.connections import (
 )
 from eap.net.descriptors import OUT_OF_DESCRIPTORS, descriptor_reserve, spare_descriptors
 
-_PER_TURN = 16
-"""Connections accepted before others have their turn."""
+_TURN_NS, _LOCAL_TURN_NS = 5_000_000, 20_000_000
+"""Time for accepting connections before others have their turn: a crowd that is refused has to go
+quickly, for the clients that get a place wait behind it."""
 _PAUSE_S = 1.0
 """After an error of the listener; connections that wait keep waiting."""
 _REPORT_S = 60.0
@@ -188,7 +189,8 @@ class ListeningSocket(Generic[C]):
 
     def _accept_some(self, group: asyncio.TaskGroup) -> bool:
         """Accept what waits, not too much at a time; return whether to go on at once."""
-        for _ in range(_PER_TURN):
+        end_ns = monotonic_ns() + (_LOCAL_TURN_NS if self._is_local else _TURN_NS)
+        while monotonic_ns() < end_ns:
             try:
                 sock, _ = self._socket.accept()
             except (BlockingIOError, ConnectionAbortedError, InterruptedError):

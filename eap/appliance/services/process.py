@@ -51,7 +51,12 @@ from eap.appliance.services.routes.route_rows import RouterView, interruption_fi
 from eap.appliance.services.routes.routing_methods import RoutingMethods
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.sockets import open_doors
-from eap.appliance.services.status import ProcessMeter, appliance_status, take_snapshot
+from eap.appliance.services.status import (
+    ProcessMeter,
+    SharedAnswer,
+    appliance_status,
+    take_snapshot,
+)
 from eap.appliance.startup import Startup
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
@@ -224,7 +229,7 @@ class Services:
         return Methods(
             identity,
             images,
-            status=status,
+            status=SharedAnswer(status).get,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
             more=self._more_methods(devices) | GatewayMethods(self._handover, gateways).table(),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import resource
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
 from typing import Any
@@ -25,7 +25,7 @@ from eap.pd.words import StationWord
 
 VERSION = 1
 MIN_SAMPLE_NS = 200_000_000
-"""Two questions closer than this get the same CPU share: the kernel counts in ticks of 10 ms."""
+"""Two questions closer than this get the same figures: the kernel counts in ticks of 10 ms."""
 
 SNAPSHOT_PAUSES = 100
 """A tenth of a second: an engine without real-time priority is interrupted for that long."""
@@ -41,7 +41,7 @@ class ProcessMeter:
     """CPU share and memory of processes, by pid, between one question and the next."""
 
     def __init__(self) -> None:
-        self._samples: dict[int, tuple[int, int, float]] = {}
+        self._samples: dict[int, tuple[int, int, dict[str, Any]]] = {}
 
     def measure(self, pid: int, now_ns: int) -> dict[str, Any]:
         """Return CPU share, memory and file descriptors of a process.
@@ -51,6 +51,9 @@ class ProcessMeter:
         their *limit*, None where they may not be seen.  *now_ns* is on the clock of process start
         times (CLOCK_BOOTTIME).
         """
+        at_ns, before_ns, known = self._samples.get(pid, (0, 0, NOTHING_MEASURED))
+        if at_ns and now_ns - at_ns < MIN_SAMPLE_NS:
+            return known
         try:
             fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
             resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
@@ -59,16 +62,40 @@ class ProcessMeter:
             return NOTHING_MEASURED
         used_ns = (int(fields[11]) + int(fields[12])) * _TICK_NS
         started_ns = int(fields[19]) * _TICK_NS
-        at_ns, before_ns, share = self._samples.get(pid, (started_ns, 0, 0.0))
-        if now_ns - at_ns >= MIN_SAMPLE_NS:
-            share = round(100 * (used_ns - before_ns) / (now_ns - at_ns), 1)
-            self._samples[pid] = (now_ns, used_ns, share)
-        return {"cpu": share, "rss": resident, "descriptors": _descriptors(pid)}
+        since_ns = now_ns - (at_ns or started_ns)
+        share = round(100 * (used_ns - before_ns) / since_ns, 1) if since_ns > 0 else 0.0
+        document = {"cpu": share, "rss": resident, "descriptors": _descriptors(pid)}
+        self._samples[pid] = now_ns, used_ns, document
+        return document
+
+
+class SharedAnswer:
+    """An answer that is made once for all clients that ask while another one is being made.
+
+    It is made after they asked, so it is never older than a question; a crowd that asks for
+    something costly does not multiply the cost.
+    """
+
+    def __init__(self, make: Callable[[], Awaitable[dict[str, Any]]]) -> None:
+        self._make = make
+        self._lock = asyncio.Lock()
+        self._next: asyncio.Task[dict[str, Any]] | None = None
+
+    async def get(self) -> dict[str, Any]:
+        """Return the next answer; raises what making it does."""
+        if self._next is None:
+            self._next = asyncio.get_running_loop().create_task(self._run())
+        return await asyncio.shield(self._next)
+
+    async def _run(self) -> dict[str, Any]:
+        async with self._lock:
+            self._next = None
+            return await self._make()
 
 
 def _descriptors(pid: int) -> dict[str, int] | None:
     try:
-        used = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+        used = len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208  ten times as quick
         limit, _ = resource.prlimit(pid, resource.RLIMIT_NOFILE)
     except OSError:
         return None

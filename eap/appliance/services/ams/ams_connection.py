@@ -19,7 +19,7 @@ import itertools
 import logging
 from collections.abc import Callable, Iterable
 from time import monotonic_ns
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import msgspec
 
@@ -50,7 +50,9 @@ _RECEIVED = memoryview(bytearray(64 << 10))
 """Of all connections.  What asyncio takes by default, 256 KB anew for each packet, is asked of the
 kernel and given back each time, which takes longer than all the rest."""
 _PER_TURN = 8
-"""Packets of one connection before others have their turn."""
+"""Packets of one connection before others have their turn, while few have more to do."""
+_FEW = 4
+"""With more connections than these that have more to do, each has one packet a turn."""
 _FIRST_PORT, _LAST_PORT = 32768, 40959
 """AMS ports for clients that ask for one, as a TwinCAT router numbers them."""
 _FIRST_SUFFIX, _LAST_SUFFIX = 0x8001, 0xFEFE
@@ -122,6 +124,9 @@ class AmsConnection(asyncio.BufferedProtocol):
         late_since_ns: Since when a packet is unfinished, or answers are not taken.
         closed: Done, with the reason, when the connection has ended.
     """
+
+    _crowd: ClassVar[int] = 0
+    """Connections of this process that have more to do."""
 
     def __init__(
         self,
@@ -242,6 +247,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     def _schedule(self) -> None:
         if not self._is_scheduled:
             self._is_scheduled = True
+            AmsConnection._crowd += 1
             asyncio.get_running_loop().call_soon(self._go_on)
 
     def _hold(self) -> None:
@@ -253,8 +259,10 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     def _go_on(self) -> None:
         """Take some of the packets that are here, and read on when there are no more."""
-        self._is_scheduled = False
-        for _ in range(_PER_TURN):
+        if self._is_scheduled:
+            self._is_scheduled = False
+            AmsConnection._crowd -= 1
+        for _ in range(_PER_TURN if AmsConnection._crowd <= _FEW else 1):
             if self._transport.is_closing():
                 return
             if not self._is_ours and (self._is_blocked or self._window.is_full):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from eap.net.connections import (
+    FRESH_NS,
     OVERDUE_NS,
     OWN_HOST,
     SILENT_NS,
@@ -29,7 +30,7 @@ A, B, C, D = "10.0.0.1", "10.0.0.2", "10.0.0.3", "10.0.0.4"
 class Peer:
     """A connection as the policy sees it."""
 
-    def __init__(self, host: str, activity: Activity = Activity.UNUSED, at_ns: int = 0) -> None:
+    def __init__(self, host: str, activity: Activity = Activity.UNUSED, at_ns: int = 1) -> None:
         self.host = host
         self.activity = activity
         self.used_at_ns = at_ns
@@ -118,6 +119,13 @@ def test_connection_in_use_is_kept_from_hosts_that_hold_as_many() -> None:
     assert scene.admit(Peer(C), 100 * S + 1)[0]  # that of B has been silent for 10 s now
 
 
+def test_connection_that_was_just_accepted_is_kept_from_its_own_host() -> None:
+    scene = Scene(total=2, reserved=0)
+    scene.fill(Peer(A, BUSY), Peer(A, at_ns=100 * S - FRESH_NS + 1))
+    assert scene.admit(Peer(A)) == (False, None)
+    assert scene.admit(Peer(A), 100 * S + 1)[0]
+
+
 def test_host_with_many_connections_does_not_displace_those_of_others() -> None:
     scene = Scene(total=3, reserved=0)
     single, *_ = scene.fill(Peer(A), Peer(B, BUSY), Peer(B, BUSY))
@@ -192,8 +200,8 @@ class Use(RuleBasedStateMachine):
         self.refused = self.evicted = 0
 
     def in_use(self, peer: Peer) -> bool:
-        is_quiet = self.now_ns - peer.used_at_ns >= SILENT_NS
-        return peer.activity > Activity.IDLE or (peer.activity is Activity.IDLE and not is_quiet)
+        limit_ns = SILENT_NS if peer.activity is Activity.IDLE else FRESH_NS
+        return peer.activity > Activity.IDLE or self.now_ns - peer.used_at_ns < limit_ns
 
     @rule(host=hosts, which=st.sampled_from([0, 1]), spare=st.sampled_from([0, 1, 50]))
     def connect(self, host: str, which: int, spare: int) -> None:

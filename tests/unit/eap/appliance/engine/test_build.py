@@ -15,7 +15,7 @@ from eap.appliance.passing import PassedConnection
 from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EtherCatHeader
-from eap.net import tcpport
+from eap.net import connections, tcpport
 from eap.net.connections import Limits
 from eap.net.image_file import open_image
 from eap.pd.report import station_status
@@ -133,6 +133,7 @@ def test_frames_of_a_passed_connection_reach_the_port_behind_it(start, shared):
 @pytest.mark.net
 def test_host_over_its_share_loses_its_silent_connection_to_a_port(start, shared, monkeypatch):
     monkeypatch.setattr(tcpport, "LIMITS", Limits(total=2, reserved=0, per_host=1))
+    monkeypatch.setattr(connections, "FRESH_NS", 0)
     stations = [left(), right(eap_port(2, tcp=True))]
     running = start(stations, shared(*stations))
     owners = (PortName("right", "eap0"),)

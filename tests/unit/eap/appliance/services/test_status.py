@@ -17,6 +17,7 @@ from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.appliance.services import status
 from eap.appliance.services.status import (
     ProcessMeter,
+    SharedAnswer,
     appliance_status,
     link_state,
     take_snapshot,
@@ -26,6 +27,7 @@ from eap.net.image_file import create_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec
 from eap.pd.words import StationWord
+from tests.support.eventually import eventually
 from tests.unit.eap.appliance.conftest import left
 
 
@@ -156,3 +158,28 @@ def test_buses_and_segments(tmp_path):
     assert (segment["pid"], segment["restarts"]) == (os.getpid(), 3)
     assert segment["step"] == "building the slaves"
     assert "step" not in engines[0]
+
+
+def test_shared_answer_is_made_once_for_all_that_ask_while_another_is_made():
+    made = []
+
+    async def run():
+        go_on = asyncio.Event()
+
+        async def make():
+            made.append(number := len(made))
+            await go_on.wait()
+            return {"number": number}
+
+        shared = SharedAnswer(make)
+        first = asyncio.ensure_future(shared.get())
+        await eventually(lambda: made)
+        others = [asyncio.ensure_future(shared.get()) for _ in range(3)]
+        await asyncio.sleep(0)
+        others.pop().cancel()
+        go_on.set()
+        answers = [await each for each in (first, *others)]
+        return [each["number"] for each in answers]
+
+    assert asyncio.run(run()) == [0, 1, 1]
+    assert made == [0, 1]

@@ -18,6 +18,7 @@ from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams, StreamConnection
 from eap.appliance.services.tcp_door import TcpDoor
 from eap.codec.ethercat import EtherCatHeader
+from eap.net import connections
 from eap.net.connections import OWN_HOST, Activity, Limits
 from tests.support import aoe
 from tests.support.routing import entrance, station
@@ -143,6 +144,7 @@ def test_a_fault_ends_one_connection_only(monkeypatch, caplog):
 
 def test_connection_with_a_frame_goes_before_silent_ones(monkeypatch):
     monkeypatch.setattr(tcp_door, "LIMITS", Limits(total=2, reserved=0))
+    monkeypatch.setattr(connections, "FRESH_NS", 0)
     question = aoe.frame(aoe.packet(TARGET, 4, b""))
 
     async def script(scene):
