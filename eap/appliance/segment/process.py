@@ -85,7 +85,7 @@ class CommandMessages:
         """Return the next message."""
         try:
             data = self._sock.recv(_MAX_COMMAND)
-        except BlockingIOError:
+        except OSError:
             return ()
         return [data] if data else None
 

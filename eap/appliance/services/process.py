@@ -140,7 +140,7 @@ class Services:
             tasks.append(group.create_task(audit.serve()))
             tasks.append(group.create_task(self._log.serve()))
             watch = SubscriberWatch(images, open_ways(self._handover, self._resources))
-            tasks.append(group.create_task(watch.run()))
+            tasks.append(group.create_task(_keep_serving(watch.run)))
             self._startup.finish({})
             await self._stopping.wait()
             for task in tasks:

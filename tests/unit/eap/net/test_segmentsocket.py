@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import select
 import socket
 
@@ -107,3 +108,21 @@ def test_ethernet_frame_goes_back_marked_and_padded(cable):
 def test_ethernet_interface_that_is_not_there():
     with pytest.raises(EnvironmentalError, match="nowhere"):
         open_segment(InterfaceUri.parse("ethernet://nowhere"))
+
+
+def test_segment_socket_survives_errors_of_its_interface():
+    class Broken:
+        family = socket.AF_INET
+
+        def setblocking(self, flag):
+            pass
+
+        def recvfrom(self, size):
+            raise OSError(errno.ENETDOWN, "Network is down")
+
+        def sendto(self, *_):
+            raise OSError(errno.ENETDOWN, "Network is down")
+
+    sock = SegmentSocket(Broken())
+    assert sock.receive() is None
+    sock.send(bytearray(60), ("127.0.0.1", 1))

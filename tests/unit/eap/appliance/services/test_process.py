@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import socket
@@ -16,6 +17,7 @@ from eap.appliance.bus_request import Answer, BusReport, Request
 from eap.appliance.commands.client import Client
 from eap.appliance.handover import Handover
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
+from eap.appliance.services import process
 from eap.appliance.startup import Report
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EtherCatHeader
@@ -157,3 +159,17 @@ def test_services_waits_for_images_as_long_as_the_supervisor_lets_it(tmp_path, s
         assert waiting.step.startswith("waiting for the engine: ")
         services.process.terminate()
         assert services.process.communicate(timeout=20)[1] == ""
+
+
+def test_keep_serving_begins_again_after_an_error_of_a_socket(monkeypatch, caplog):
+    monkeypatch.setattr(process, "_AGAIN_S", 0.0)
+    outcomes = [OSError(24, "Too many open files"), None]
+
+    async def serve():
+        outcome = outcomes.pop(0)
+        if outcome is not None:
+            raise outcome
+
+    asyncio.run(process._keep_serving(serve))
+    assert outcomes == []
+    assert "Too many open files" in caplog.messages[0]
