@@ -109,12 +109,18 @@ def findings(document: Row, now_s: float) -> list[Finding]:
     ]
     for appliance in document["appliances"]:
         plant = appliance["plant"]
-        stations = [row for row in document["stations"] if row["plant"] == plant]
+        stations = stations_of(document, appliance)
         found += [replace(each, plant=plant) for each in _of_engine(plant, stations, now_s)]
         for station in stations:
             found += [replace(each, plant=plant) for each in _of_station(station)]
     order = list(Severity)
     return sorted(found, key=lambda each: order.index(each.severity))
+
+
+def stations_of(document: Row, appliance: Row) -> list[Row]:
+    """Return the stations of one appliance: several of them may run parts of one plant."""
+    names, plant = set(appliance["stations"]), appliance["plant"]
+    return [row for row in document["stations"] if row["plant"] == plant and row["name"] in names]
 
 
 def is_special(frame: Row) -> bool:

@@ -62,9 +62,7 @@ class StatusScreen:
         yield self._layout(findings, stations)
 
     def _layout(self, findings: int, stations: int) -> RenderableType:
-        parts: list[RenderableType] = [
-            verdict(self._document, appliance) for appliance in self._document["appliances"]
-        ]
+        parts: list[RenderableType] = [*verdicts(self._document)]
         if self._findings:
             parts.append(finding_grid(self._findings[:findings], self._now_s))
         if rest := len(self._findings) - findings:
@@ -73,7 +71,10 @@ class StatusScreen:
         if others := self._document["stations"][stations:]:
             parts.append(Text(f"{words.count(len(others), 'more station')}, {_states(others)}"))
         parts.append(Text())
-        parts += map(_processes, self._document["appliances"])
+        parts += (
+            _processes(each, appliance_label(self._document, each))
+            for each in self._document["appliances"]
+        )
         remarks = f", and {words.count(self._remarks, 'remark')}" if self._remarks else ""
         parts.append(Text(f"eapctl status --full: each PD, port and bus{remarks}", style="dim"))
         return Group(*parts)
@@ -123,9 +124,22 @@ class StatusScreen:
         return f"{(total - before[0]) / self._seconds:.0f}"
 
 
-def verdict(document: Row, appliance: Row) -> Text:
-    """Return a line for one appliance: how many errors and warnings, and what it consists of."""
-    plant = appliance["plant"]
+def appliance_label(document: Row, appliance: Row) -> str:
+    """Return the plant of an appliance, with its stations where others run parts of that plant."""
+    plants = [each["plant"] for each in document["appliances"]]
+    plant: str = appliance["plant"]
+    if plants.count(plant) == 1:
+        return plant
+    return f"{plant} ({', '.join(appliance['stations'])})"
+
+
+def verdicts(document: Row) -> list[Text]:
+    """Return a line for each plant: the number of errors and warnings, and its parts."""
+    plants = dict.fromkeys(appliance["plant"] for appliance in document["appliances"])
+    return [_verdict(document, plant) for plant in plants]
+
+
+def _verdict(document: Row, plant: str) -> Text:
     stations = [row for row in document["stations"] if row["plant"] == plant]
     pds = sum(len(row["pd"]["tx"]) + len(row["pd"]["rx"]) for row in stations)
     counts = Counter(row["severity"] for row in document["findings"] if row["plant"] == plant)
@@ -186,13 +200,13 @@ def _bad_count(count: int) -> Text:
     return Text(str(count), style=_STYLES[Severity.ERROR] if count else "")
 
 
-def _processes(appliance: Row) -> RenderableType:
+def _processes(appliance: Row, label: str) -> RenderableType:
     processes = dict(appliance["processes"])
     segments = list(processes.pop("segments", {}).values())
     items = [_process(name, [process]) for name, process in processes.items()]
     if segments:
         items.append(_process(words.count(len(segments), "segment"), segments))
-    return ItemLine(f"{appliance['plant']}:", items)
+    return ItemLine(f"{label}:", items)
 
 
 def _process(name: str, processes: Sequence[Row]) -> Text:

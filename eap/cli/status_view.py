@@ -15,7 +15,7 @@ from rich.text import Text
 
 from eap.cli import words
 from eap.cli.status_findings import LISTENER_COUNTS, REASONS, STATES, Finding, Severity, is_special
-from eap.cli.status_screen import finding_grid, verdict
+from eap.cli.status_screen import appliance_label, finding_grid, verdicts
 from eap.cli.table import Column, TextTable
 
 Row = Mapping[str, Any]
@@ -29,13 +29,13 @@ _STATE_STYLE |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM, _OFF: _DIM}
 def status_tables(document: Row, now_s: float) -> Iterator[RenderableType]:
     """Yield what to print for a status *document* of *now_s*, top to bottom."""
     stations = document["stations"]
-    yield from (verdict(document, appliance) for appliance in document["appliances"])
+    yield from verdicts(document)
     found = [Finding.from_plain(row) for row in document["findings"]]
     if faults := [each for each in found if each.severity is not Severity.INFO]:
         yield finding_grid(faults, now_s)
     for appliance in document["appliances"]:
         yield Text()
-        yield _processes(appliance)
+        yield _processes(appliance, appliance_label(document, appliance))
         if listeners := appliance.get("listeners"):
             yield Text()
             yield _listeners(listeners)
@@ -54,9 +54,9 @@ def status_tables(document: Row, now_s: float) -> Iterator[RenderableType]:
         yield from (Text(each.text(now_s)) for each in remarks)
 
 
-def _processes(appliance: Row) -> RenderableType:
+def _processes(appliance: Row, label: str) -> RenderableType:
     table = TextTable(
-        f"Process of {appliance['plant']}",
+        f"Process of {label}",
         Column("PID", rank=1, is_number=True),
         Column("CPU", is_number=True),
         Column("Memory", is_number=True),

@@ -226,6 +226,7 @@ def test_engine_that_runs_no_station_is_one_finding() -> None:
     status = document(cycle_age_us=3_000_000, ports=[silent_bus])
     (mixer,) = status["stations"]
     status["stations"] = [mixer | {"name": name} for name in ("a", "b", "c")]
+    status["appliances"][0]["stations"] = ["a", "b", "c"]
     ((_, text),) = found(status)
     assert text.startswith("line engine: runs no cycles of any station, since")
 

@@ -26,6 +26,7 @@ def plant(stations: int, **more: Any) -> dict[str, Any]:
     status = document(tx=[tx("state")], rx=[rx("left")], **more)
     (mixer,) = status["stations"]
     status["stations"] = [mixer | {"name": f"island-{n:02}"} for n in range(1, stations + 1)]
+    status["appliances"][0]["stations"] = [each["name"] for each in status["stations"]]
     return status
 
 
@@ -48,6 +49,24 @@ def test_screen_of_a_plant_without_faults() -> None:
         "      2 segments 4 % 40 MB restarted once",
         "eapctl status --full: each PD, port and bus, and 2 remarks",
     ]
+
+
+def test_screen_of_one_plant_in_two_appliances_counts_each_finding_once() -> None:
+    status = plant(2, discarded={"wrong_type": 3}, links_held=1)
+    (whole,) = status["appliances"]
+    names = ["island-01", "island-02"]
+    status["appliances"] = [whole | {"stations": [name]} for name in names]
+    lines = show(status)
+    assert [line for line in lines if "PDs)" in line] == [
+        "line: no errors, 2 warnings (2 stations, 4 PDs)"
+    ]
+    assert [line.split()[1] for line in lines if line.startswith("warning")] == [
+        f"{name}:" for name in names
+    ]
+    assert [line.split(":")[0] for line in lines if "supervisor" in line] == [
+        f"line ({name})" for name in names
+    ]
+    assert lines[-1] == "eapctl status --full: each PD, port and bus, and 2 remarks"
 
 
 def test_screen_shows_errors_first_with_their_counts() -> None:
