@@ -55,8 +55,9 @@ class Simulator:
         self.ready = self._read()
         # Foreign masters give a slave milliseconds: where it may, it answers like hardware, however
         # busy the machine is.
+        self.pid = self._process.pid
         with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, os.sched_param(1))
+            os.sched_setscheduler(self.pid, os.SCHED_FIFO, os.sched_param(1))
 
     def fault(self, **spec: object) -> dict:
         """Let a fault begin, or with ``end=True`` end; return what the simulator says."""

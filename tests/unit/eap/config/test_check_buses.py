@@ -47,6 +47,8 @@ def test_these_are_bus_ports(findings, interface, more):
         ("udp://255.255.255.255", "", "255.255.255.255 is no address of a bus"),
         ("sim://line.yaml", ", target: BOOT", "target is 'BOOT'; one of INIT, PREOP, SAFEOP, OP"),
         ("sim://line.yaml", ", clocks: 1", "clocks is 1; true or false"),
+        ("sim://line.yaml", ", frame_timeout_us: 1999", "frame_timeout_us is 1999; "),
+        ("sim://line.yaml", ", frame_retries: 21", "frame_retries is 21; "),
         ("sim://line.yaml", ", wake: arrival", "bus0 is a port of kind bus, wake belongs to EAP"),
         ("sim://line.yaml", ", vlan: {id: 3}", "bus0 is a port of kind bus, vlan belongs to EAP"),
         ("sim://line.yaml", ", broadcast: false", "bus0 is a port of kind bus, broadcast belongs"),

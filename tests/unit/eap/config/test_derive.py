@@ -179,10 +179,14 @@ def test_a_bus_port_is_complete(stations, tmp_path):
 
 def test_a_real_bus_has_its_interface_and_may_be_described(stations, tmp_path):
     uri = "ethernet://eth1"
-    left, _ = stations(bus_port(", bus: line.yaml, target: SAFEOP, clocks: true", uri))
+    keys = (
+        ", bus: line.yaml, target: SAFEOP, clocks: true, frame_timeout_us: 5000, frame_retries: 1"
+    )
+    left, _ = stations(bus_port(keys, uri))
     assert left.ports[1].interface == uri
     assert left.ports[1].bus.file == str((tmp_path / "line.yaml").resolve())
     assert (left.ports[1].bus.target, left.ports[1].bus.clocks) == ("SAFEOP", True)
+    assert (left.ports[1].bus.frame_timeout_us, left.ports[1].bus.frame_retries) == (5000, 1)
     left, _ = stations(bus_port("", uri))
     assert (left.ports[1].bus.file, left.ports[1].bus.slaves) == ("", ())
     assert [v.name for v in left.variables][2:] == ["bus0.state", "bus0.wkc_ok"]
