@@ -28,14 +28,22 @@ _DELETE = AmsCommand.DELETE_NOTIFICATION.value
 _READ_WRITE = AmsCommand.READ_WRITE.value
 FOLLOWED = frozenset((_ADD, _DELETE, _READ_WRITE))
 """Commands that may be about notifications."""
-_SYMBOL_HANDLE = IndexGroup.SYMBOL_HANDLE.value
+_LOOKUPS = frozenset(
+    (
+        IndexGroup.SYMBOL_HANDLE.value,
+        IndexGroup.SYMBOL_BY_NAME.value,
+        IndexGroup.SYMBOL_ENTRY_BY_NAME.value,
+    )
+)
+"""Groups whose ReadWrite tells by which group and offset a symbol is reached."""
 _SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value
 _SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value
 _SUM_HEAD = 8
 """Bytes of result and length before the answers to the items of a sum command."""
 _MAX_SYMBOLS = 1024
 """Symbol handles that are remembered of one connection; the oldest makes room."""
-_LONGEST_NAME = 256
+_LONGEST_LOOKUP = 272
+_PLACE = struct.Struct("<II")  # group, offset
 BY_HANDLE = frozenset((IndexGroup.VALUE_BY_HANDLE, IndexGroup.SYMBOL_NOTIFICATION))
 """Groups whose offset is the handle of a symbol."""
 _LENGTH = slice(20, 24)
@@ -75,7 +83,7 @@ class Notifier:
     def __init__(self, outlet: Outlet) -> None:
         self.subscriptions = Subscriptions()
         self._outlet = outlet
-        self._symbols: dict[Way, OrderedDict[tuple[bytes, int], bytes]] = {}
+        self._symbols: dict[Way, OrderedDict[tuple[bytes, int, int], bytes]] = {}
 
     def find_own(self, header: AmsHeader, data: bytes, way: Way) -> list[Subscription] | None:
         """Return the subscriptions of this client that a request deletes.
@@ -99,7 +107,7 @@ class Notifier:
         """Note which notifications a client asks for, and which symbol it looks up."""
         header = pending.header
         pending.handles = _count_of(header, body)
-        if pending.handles or _group_of(header, body) == _SYMBOL_HANDLE:
+        if pending.handles or _group_of(header, body) in _LOOKUPS:
             door = self._outlet.doors[way.door]
             # Where clients have no connection it is never known that they are gone.
             is_first = (door.is_stream or door.is_shared) and not is_marked(header.invoke_id)
@@ -183,23 +191,38 @@ class Notifier:
         return self.subscriptions.close(way)
 
     def _note_symbol(self, pending: Pending, body: bytes, way: Way) -> None:
-        head = AdsReadWrite.decode(pending.asked_for)
-        name = pending.asked_for[AdsReadWrite.SIZE :][: head.write_length]
-        if len(body) < _SUM_HEAD + _HANDLE or any(body[:4]) or len(name) > _LONGEST_NAME:
+        place = symbol_place(pending.asked_for, body)
+        if place is None or len(pending.asked_for) > _LONGEST_LOOKUP:
             return
-        handle = int.from_bytes(body[_SUM_HEAD : _SUM_HEAD + _HANDLE], "little")
         mine = self._symbols.setdefault(way, OrderedDict())
-        key = _addresses(pending.header), handle
-        mine[key] = name
+        key = _addresses(pending.header), *place
+        mine[key] = pending.asked_for
         mine.move_to_end(key)
         if len(mine) > _MAX_SYMBOLS:
             mine.popitem(last=False)
 
     def _symbol_of(self, way: Way, asked: bytes, request: AddNotification | None) -> bytes:
-        if request is None or request.group not in BY_HANDLE:
-            return b""
         mine = self._symbols.get(way)
-        return b"" if mine is None else mine.get((asked, request.offset), b"")
+        if request is None or mine is None:
+            return b""
+        group = IndexGroup.VALUE_BY_HANDLE if request.group in BY_HANDLE else request.group
+        return mine.get((asked, group, request.offset), b"")
+
+
+def symbol_place(lookup: bytes, answer: bytes) -> tuple[int, int] | None:
+    """Return group and offset of a symbol from the answer to its *lookup*, None if it has none."""
+    group = int.from_bytes(lookup[:4], "little")
+    if group == IndexGroup.SYMBOL_HANDLE:
+        if len(answer) < _SUM_HEAD + _HANDLE or any(answer[:4]):
+            return None
+        handle = int.from_bytes(answer[_SUM_HEAD : _SUM_HEAD + _HANDLE], "little")
+        return IndexGroup.VALUE_BY_HANDLE, handle
+    # An entry has its length before group and offset.
+    at = _SUM_HEAD + (4 if group == IndexGroup.SYMBOL_ENTRY_BY_NAME else 0)
+    if len(answer) < at + _PLACE.size or any(answer[:4]):
+        return None
+    found: tuple[int, int] = _PLACE.unpack_from(answer, at)
+    return found
 
 
 def deleted_handles(header: AmsHeader, data: bytes) -> Sequence[int]:

@@ -30,13 +30,13 @@ from eap.aoe.ending import Ending, header_to
 from eap.aoe.inflight import InFlight, Pending
 from eap.aoe.invoke import InvokeIds
 from eap.aoe.judge import Limits
-from eap.aoe.notifier import BY_HANDLE
+from eap.aoe.notifier import BY_HANDLE, symbol_place
 from eap.aoe.outlet import Outlet
 from eap.aoe.refusal import Refusal, Refuser
 from eap.aoe.routes import Route
 from eap.aoe.subscriptions import Grant, Subscription, Subscriptions, key_of
 from eap.aoe.way import Way
-from eap.codec.ads import AdsError, AdsReadWrite, IndexGroup
+from eap.codec.ads import AdsError
 from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
 
 RETRY_NS = 500_000_000
@@ -56,8 +56,6 @@ MAX_ENDS = 3
 _SOON_NS = 20_000_000
 _GRANTED = 8
 """Bytes of the answer of AddNotification: result and handle."""
-_SYMBOL = 12
-"""Bytes of the answer with the handle of a symbol: result, length and handle."""
 _OF_THE_WAY = frozenset(
     (
         AdsError.MAILBOX_FULL, AdsError.TARGET_MACHINE, AdsError.PORT_NOT_CONNECTED,
@@ -309,20 +307,23 @@ class Restorer:
 
     def _ask_for(
         self, session: _Session, subscription: Subscription, now_ns: int,
-        symbol_handle: int | None = None,
+        place: tuple[int, int] | None = None,
     ) -> list[Action]:  # fmt: skip
         request = subscription.request
         assert request is not None  # noqa: S101  for the type
-        command, body = AmsCommand.ADD_NOTIFICATION, request.encode()
-        if request.group in BY_HANDLE and symbol_handle is None:
-            name = subscription.symbol
-            if not name:
-                text = "it is of a symbol whose name is not known"
-                return self._give_up(session, subscription, text, now_ns)
-            command = AmsCommand.READ_WRITE
-            body = AdsReadWrite(IndexGroup.SYMBOL_HANDLE, 0, 4, len(name)).encode() + name
-        elif symbol_handle is not None:
-            body = body[:4] + symbol_handle.to_bytes(4, "little") + body[8:]
+        command, body, symbol_handle = AmsCommand.ADD_NOTIFICATION, request.encode(), None
+        is_by_handle = request.group in BY_HANDLE
+        if place is not None:
+            group, offset = place
+            symbol_handle = offset if is_by_handle else None
+            group = request.group if is_by_handle else group
+            body = group.to_bytes(4, "little") + offset.to_bytes(4, "little") + body[8:]
+        elif subscription.symbol:
+            # Where a symbol is may be another place since its server was started again.
+            command, body = AmsCommand.READ_WRITE, subscription.symbol
+        elif is_by_handle:
+            text = "it is of a symbol whose name is not known"
+            return self._give_up(session, subscription, text, now_ns)
         step = _Step(session, subscription, symbol_handle=symbol_handle)
         invoke_id = self._ids.take(self._in_flight)
         header = header_to(subscription.asked, command, invoke_id)
@@ -355,8 +356,8 @@ class Restorer:
         """Act on what a server says to the request for a subscription or a symbol."""
         session, subscription = step.session, step.subscription
         assert subscription is not None  # noqa: S101  for the type
-        size = _GRANTED if pending.handles else _SYMBOL
-        if not error and len(body) < size:
+        place = None if pending.handles else symbol_place(subscription.symbol, body)
+        if not error and (len(body) < _GRANTED if pending.handles else place is None):
             error = AdsError.GENERAL
         if subscription.is_closed:
             grant = None if error or not pending.handles else _grant_of(pending, step, body)
@@ -368,8 +369,7 @@ class Restorer:
                 text += f" from {route.name} ({route.hop}) or from behind it"
             return self._failed(session, subscription, error, text, now_ns)
         if not pending.handles:
-            handle = int.from_bytes(body[_SYMBOL - 4 : _SYMBOL], "little")
-            return self._ask_for(session, subscription, now_ns, symbol_handle=handle)
+            return self._ask_for(session, subscription, now_ns, place)
         return self._establish(session, subscription, _grant_of(pending, step, body), now_ns)
 
     def _establish(
@@ -452,7 +452,8 @@ class Restorer:
             self._sessions.pop(session.asked, None)
             if session.restored and session.interrupted_at_ns is not None:
                 took_s = (now_ns - session.interrupted_at_ns) / 1e9
-                text = f"{session.restored} subscriptions restored after {took_s:.1f} s"
+                noun = "subscription" if session.restored == 1 else "subscriptions"
+                text = f"{session.restored} {noun} restored after {took_s:.1f} s"
                 self._note(session, Outcome.RESTORED, text, now_ns)
         elif session.at_ns <= now_ns:
             self._schedule(session, now_ns + _SOON_NS)

@@ -57,7 +57,7 @@ class Subscription:
         handle: That the client knows.
         grant: What the server gave last; None if it is known to be gone.
         request: Parameters, if this router restores the subscription; None if another one does.
-        symbol: Name of the symbol whose handle the request has, as it was looked up; empty if none.
+        symbol: Request by which the client looked up the symbol that is watched; empty if none.
         is_closed: Whether the client has ended it.
         is_queued: Whether it is to be established again.
         interrupted_at_ns: Since when nothing comes; None while it is established.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 
+import msgspec
 import pytest
 
 from eap.aoe.action import Action, Forward, Outcome
@@ -170,6 +171,29 @@ def test_symbol_is_looked_up_again_by_its_name() -> None:
     ended = [parse(*each.packets) for each in scene.station.router.connection_closed(*ONE, 1)]
     assert [each.command for each in ended] == [DELETE_NOTIFICATION, AmsCommand.WRITE]
     assert ended[1].body == struct.pack("<IIII", 0xF006, 0, 4, 66)
+
+
+@pytest.mark.parametrize(("group", "head"), [(0xF007, 8), (0xF009, 12)])
+def test_place_of_a_symbol_is_looked_up_again(group: int, head: int) -> None:
+    scene = Scene()
+    name = b"MAIN.level\0"
+    look_up = ADD._replace(
+        command=READ_WRITE, body=struct.pack("<IIII", group, 0, 64, len(name)) + name
+    )
+
+    def entry(offset: int) -> bytes:
+        return bytes(head) + struct.pack("<III", 0x4040, offset, 4)
+
+    scene.station.replied(scene.station.forwarded(look_up, ONE).answer(entry(8)), LINK)
+    add = ADD._replace(invoke_id=2, body=CYCLIC.encode())
+    scene.station.replied(scene.station.forwarded(add, ONE).answer(granted(1)), LINK)
+    scene.lose_hop()
+    scene.passes(0)
+    assert scene.asked[0].body == look_up.body
+    scene.answer(scene.asked[0], entry(16))
+    assert scene.asked[1].body == msgspec.structs.replace(CYCLIC, offset=16).encode()
+    scene.answer(scene.asked[1], granted(7))
+    assert scene.sample(7)
 
 
 def test_symbol_handle_of_unknown_name_is_not_trusted() -> None:
