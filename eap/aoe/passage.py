@@ -21,7 +21,7 @@ from eap.aoe.passed import Passed
 from eap.aoe.prober import Prober
 from eap.aoe.record import Record, describe
 from eap.aoe.refusal import Refusal, Refuser, wants_answer
-from eap.aoe.report import Obstacle
+from eap.aoe.report import Obstacle, RouteState
 from eap.aoe.restorer import Restorer
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.subscriptions import MAX_PER_CLIENT, MAX_TOTAL, Subscription
@@ -84,7 +84,8 @@ class Passage:
     ) -> list[Action]:
         """Hand samples to the clients that subscribed, whatever NetID these have.
 
-        What no client here subscribed to goes on by a route, or is ended where it comes from.
+        Samples that no client here subscribed to go on by a route.  Where that leads nowhere, or to
+        a client that does not listen, the server is told to end them.
 
         Args:
             header: Of the notification.
@@ -105,11 +106,23 @@ class Passage:
             actions = [*samples.replies, *self.restorer.ended(samples.ended, now_ns)]
             return actions + self._end_unwanted(header, samples, way)
         found = None if is_own else self._judge.find_route(header, way)
-        if isinstance(found, Route) or (found and found.error != AdsError.TARGET_MACHINE):
+        if found is not None and not self._is_refused_for_good(found):
             return self.take_request(header, data, way, now_ns)
         text = "no client here subscribed to it, or not any more"
         self._refuser.drop(way, header, Outcome.LATE, text, now_ns)
         return self._end_unwanted(header, samples, way)
+
+    def _is_refused_for_good(self, found: Route | Refusal) -> bool:
+        """Return whether samples for a client that is not connected here can never reach it.
+
+        A client that does not listen gets samples by its own connection only, and that has ended.
+        """
+        if isinstance(found, Route):
+            return False
+        if found.error == AdsError.TARGET_MACHINE:
+            return True
+        obstacle = None if found.route is None else self._judge.find_obstacle(found.route)
+        return obstacle is not None and obstacle.state is RouteState.CLIENT
 
     def _end_unwanted(self, header: AmsHeader, samples: Samples, way: Way) -> list[Action]:
         """Have one notification ended that no client has; the others come again."""

@@ -77,6 +77,21 @@ def test_notification_for_the_router_that_no_client_has_is_ended() -> None:
     assert (way, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
 
 
+def test_notification_for_a_client_that_does_not_listen_is_ended() -> None:
+    station = Station([route("192.168.0.9.1.1", SECOND_LINK, is_client=True)])
+    notice = NOTICE._replace(body=stream((5, {9: b"data"})))
+    station.forwarded(notice, LINK)  # nothing is known of it yet
+    station.router.hop_down(SECOND_LINK.door, SECOND_LINK.connection, "connection refused", 0)
+    way, end = station.replied(notice, LINK)
+    assert (way, end.command, end.body) == (LINK, DELETE_NOTIFICATION, b"\x09\0\0\0")
+
+
+def test_notification_for_a_router_that_is_down_for_now_is_not_ended() -> None:
+    station = Station([route("192.168.0.9.1.1", SECOND_LINK)])
+    station.router.hop_down(SECOND_LINK.door, SECOND_LINK.connection, "connection refused", 0)
+    assert station.give(NOTICE._replace(body=stream((5, {9: b"data"}))), LINK) == []
+
+
 def test_notification_comes_from_the_address_that_was_asked() -> None:
     virtual = route("10.0.0.6.1.1", LINK, real=NetId.parse(FAR))
     station = subscribed(ONE, routes=(virtual,))
