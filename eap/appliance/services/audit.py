@@ -102,8 +102,12 @@ class Audit:
 
     async def serve(self) -> None:
         """Write what was left out and what was lost, until cancelled."""
-        while True:
-            await asyncio.sleep(_TELL_AFTER_S)
+        try:
+            while True:
+                await asyncio.sleep(_TELL_AFTER_S)
+                self.tell_skipped()
+                self.tell_lost()
+        finally:
             self.tell_skipped()
             self.tell_lost()
 
@@ -123,19 +127,21 @@ class Audit:
         return "" if self._append(lines, are_counted=False) else self._why_required()
 
     def begin_request(self, who: str, station: str, words: dict[str, Any]) -> str:
-        """Write down what a client of the control socket changes, if that is required.
+        """Write down what a client of the control socket changes, or is refused, if required.
 
         Returns:
             Why it cannot be recorded, and hence not be done; empty if it can.
         """
         if not self.is_required:
             return ""
-        now = self._clock()
-        if not self._client(station, CONTROL, who).take(now):
-            return TOO_MANY
-        head = {"time": self._time(), "station": station, "door": CONTROL, "from": who}
-        line = head | words | {"begins": True}
-        return "" if self._append([line], are_counted=False) else self._why_required()
+        why = TOO_MANY
+        if self._client(station, CONTROL, who).take(self._clock()):
+            line = self._request_head(who, station) | words | {"begins": True}
+            if self._append([line], are_counted=False):
+                return ""
+            why = self._why_required()
+        self._write_limited(who, station, words | {"error": why})
+        return why
 
     def _why_required(self) -> str:
         return f"the audit is required and cannot be written: {self.lost.error}"
@@ -157,14 +163,25 @@ class Audit:
             self._append(lines)
 
     def write_request(self, who: str, station: str, words: dict[str, Any]) -> None:
-        """Write down what a client of the control socket did, or was refused."""
+        """Write down what a client of the control socket did, or was refused.
+
+        If that is required, :meth:`begin_request` has limited it already.
+        """
+        if self.is_required:
+            self._append([self._request_head(who, station) | words])
+        else:
+            self._write_limited(who, station, words)
+
+    def _write_limited(self, who: str, station: str, words: dict[str, Any]) -> None:
         client = self._client(station, CONTROL, who)
         now = self._clock()
-        if self.is_required or (client.take(now) and self._door(station, CONTROL).take(now)):
-            head = {"time": self._time(), "station": station, "door": CONTROL, "from": who}
-            self._append([head | words])
+        if client.take(now) and self._door(station, CONTROL).take(now):
+            self._append([self._request_head(who, station) | words])
         else:
             client.skipped += 1
+
+    def _request_head(self, who: str, station: str) -> dict[str, Any]:
+        return {"time": self._time(), "station": station, "door": CONTROL, "from": who}
 
     def tell_skipped(self) -> None:
         """Write how many lines were left out, for each client that had some."""

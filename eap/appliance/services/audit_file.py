@@ -10,15 +10,21 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+from contextlib import suppress
 from pathlib import Path
+from time import monotonic
 
 MAX_BYTES = 8 << 20
 """Of the file before it is put aside."""
 KEPT = 4
 """Older files."""
 _FLAGS = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-_TRIES = 200
-"""For the lock, which others hold as long as it takes to write a few lines."""
+LOCK_S = 0.2
+"""Longest wait for the lock, which others hold as long as it takes to write a few lines.
+
+All clients of the process wait meanwhile, so after one wait in vain there is none until the lock
+was had again: another process may be stopped while it holds it.
+"""
 
 
 class AuditFile:
@@ -30,6 +36,7 @@ class AuditFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._wait_s = LOCK_S
 
     def append(self, lines: bytes) -> None:
         """Append *lines*, all of them or nothing.
@@ -48,22 +55,34 @@ class AuditFile:
                 os.ftruncate(fd, size)
                 raise
             if size + len(lines) >= MAX_BYTES:
-                self._put_aside()
+                with suppress(OSError):  # the lines are written; the next ones try it again
+                    self._put_aside()
         finally:
             os.close(fd)
 
     def _open_locked(self) -> int:
-        """Open the file, which may have been moved away since the last time, and lock it."""
-        for _ in range(_TRIES):
-            fd = self._open()
-            try:
+        """Open the file and lock it."""
+        deadline_s = monotonic() + self._wait_s
+        while (fd := self._try_lock()) < 0:
+            if monotonic() >= deadline_s:
+                self._wait_s = 0.0
+                raise OSError(errno.EAGAIN, "another process holds its lock")
+            os.sched_yield()
+        self._wait_s = LOCK_S
+        return fd
+
+    def _try_lock(self) -> int:
+        """Return the locked file, -1 if another process has its lock or has just moved it away."""
+        fd = self._open()
+        is_locked = False
+        try:
+            with suppress(BlockingIOError, FileNotFoundError):
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.path.samestat(os.fstat(fd), self.path.stat()):
-                    return fd
-            except (BlockingIOError, FileNotFoundError):
-                os.sched_yield()
-            os.close(fd)
-        raise OSError(errno.EAGAIN, "another process holds its lock")
+                is_locked = os.path.samestat(os.fstat(fd), self.path.stat())
+        finally:
+            if not is_locked:
+                os.close(fd)
+        return fd if is_locked else -1
 
     def _open(self) -> int:
         try:

@@ -278,10 +278,10 @@ class _Client:
         talk = None
         if request.method == "bus_ask":
             talk = self._bus.opened(request.params["conversation"])
+        if self._begin is not None and (why := self._begin(station, words)):
+            raise ControlError(why, code=ErrorCode.REFUSED)
         error: str | None = None  # as long as nobody knows
         try:
-            if self._begin is not None and (why := self._begin(station, words)):
-                raise ControlError(why, code=ErrorCode.REFUSED)
             result = await self._call(request)
             error = refusal_in(result, talk)
         except EapError as exc:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -265,7 +266,8 @@ def test_required_audit_says_why_a_change_cannot_be_recorded(tmp_path: Path, clo
     why = "the audit is required and cannot be written: No space left on device"
     assert audit.begin("island-01", entry()) == why
     assert audit.begin_request("uid 0, pid 7", "island-01", {}) == why
-    assert audit.lost == (0, None, None, "No space left on device")  # nothing was changed
+    # A refusal that is not recorded is lost; of those by ADS the gate has lines written.
+    assert audit.lost == (1, 1_700_000_000.0, 1_700_000_000.0, "No space left on device")
     file.error = ""
     assert audit.begin("island-01", entry()) == ""
     assert audit.lost.error == ""
@@ -277,6 +279,30 @@ def test_required_audit_refuses_what_is_more_than_it_records(tmp_path: Path, clo
     assert audit.begin("island-01", entry()) == module.TOO_MANY
     audit.write("island-01", entry(count=BURST))
     assert len(lines(audit)) == 2 * BURST  # what was begun is told to its end
+
+
+def test_required_audit_limits_the_lines_of_a_control_client_that_it_refuses(
+    tmp_path: Path, clock: Clock
+) -> None:
+    audit = required(AuditFile(tmp_path / "audit.jsonl"), clock)
+    words = {"operation": "od_write"}
+    found = [audit.begin_request("uid 0, pid 7", "island-01", words) for _ in range(BURST + 3)]
+    assert found == [""] * BURST + [module.TOO_MANY] * 3
+    audit.tell_skipped()
+    assert len(lines(audit)) == BURST + 1
+    assert lines(audit)[-1]["skipped"] == 3
+
+
+def test_audit_that_ends_writes_what_was_left_out(audit: Audit) -> None:
+    async def serve_and_end() -> None:
+        serving = asyncio.create_task(audit.serve())
+        await asyncio.sleep(0)
+        serving.cancel()
+        await asyncio.wait([serving])
+
+    audit.write("island-01", entry(count=BURST + 2))
+    asyncio.run(serve_and_end())
+    assert lines(audit)[-1]["skipped"] == 2
 
 
 def test_audit_that_is_not_required_begins_nothing(audit: Audit) -> None:

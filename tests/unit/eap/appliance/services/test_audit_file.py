@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import stat
@@ -52,8 +53,8 @@ def test_append_follows_a_file_that_was_moved_away(file: AuditFile) -> None:
 def test_append_fails_while_another_process_holds_the_lock(
     file: AuditFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_TRIES", 2)
     file.append(b"one\n")
+    monkeypatch.setattr(file, "_wait_s", 0.0)
     other = os.open(file.path, os.O_RDONLY)
     fcntl.flock(other, fcntl.LOCK_EX)
     with pytest.raises(OSError, match="another process holds its lock"):
@@ -61,6 +62,67 @@ def test_append_fails_while_another_process_holds_the_lock(
     os.close(other)
     file.append(b"three\n")
     assert file.path.read_bytes() == b"one\nthree\n"
+
+
+def test_append_waits_for_the_lock_of_another_process(
+    file: AuditFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.append(b"one\n")
+    other = os.open(file.path, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    pauses: list[float] = []
+
+    def pause() -> None:
+        pauses.append(0.01)
+        if len(pauses) == 3:
+            os.close(other)
+
+    monkeypatch.setattr(os, "sched_yield", pause)
+    monkeypatch.setattr(module, "monotonic", lambda: sum(pauses))
+    file.append(b"two\n")
+    assert file.path.read_bytes() == b"one\ntwo\n"
+
+
+def test_append_waits_only_once_for_a_lock_that_is_not_given_back(
+    file: AuditFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.append(b"one\n")
+    other = os.open(file.path, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    pauses: list[float] = []
+    monkeypatch.setattr(os, "sched_yield", lambda: pauses.append(0.01))
+    monkeypatch.setattr(module, "monotonic", lambda: sum(pauses))
+    for _ in range(3):
+        with pytest.raises(OSError, match="another process holds its lock"):
+            file.append(b"two\n")
+    os.close(other)
+    assert sum(pauses) == pytest.approx(module.LOCK_S, rel=0.1)
+
+
+def test_append_that_cannot_lock_leaves_no_descriptor_open(
+    file: AuditFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.append(b"one\n")
+
+    def refuse(_fd: int, _operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    before = sorted(Path("/proc/self/fd").iterdir())
+    with pytest.raises(OSError, match="No locks available"):
+        file.append(b"two\n")
+    assert sorted(Path("/proc/self/fd").iterdir()) == before
+
+
+def test_append_succeeds_where_a_full_file_cannot_be_put_aside(
+    file: AuditFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MAX_BYTES", 4)
+    monkeypatch.setattr(module, "KEPT", 1)
+    file.path.with_name("audit.jsonl.1").joinpath("x").mkdir(parents=True)
+    file.append(b"one\n")
+    file.append(b"two\n")
+    assert file.path.read_bytes() == b"one\ntwo\n"
 
 
 def test_append_does_not_follow_a_link(file: AuditFile, tmp_path: Path) -> None:

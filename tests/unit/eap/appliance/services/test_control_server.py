@@ -139,7 +139,7 @@ def test_change_that_cannot_be_recorded_is_refused(images):
     error = asyncio.run(talk())["error"]
     assert (error["code"], error["message"]) == ("refused", "the disk is full")
     assert not done
-    assert told[0][2]["error"] == "the disk is full"
+    assert not told  # what refuses it writes that down
 
 
 def test_refusals_of_dictionaries_carry_their_abort_code(images):
