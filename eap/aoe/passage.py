@@ -149,10 +149,9 @@ class Passage:
             if judged is not None:
                 self._gate.give_up(judged)
             return self._pass_once(header, data, onward, way, route, now_ns)
-        pending = self._admit(header, data, onward, way, route, now_ns)
+        pending = self._admit(header, data, onward, way, route, judged, now_ns)
         if not isinstance(pending, Pending):
             return pending
-        pending.judged = judged
         if is_followed:
             self.notifier.follow_request(pending, data[AmsHeader.SIZE :], way)
         return [self._forward(pending.invoke_id, data, onward, route)]
@@ -161,11 +160,8 @@ class Passage:
         self, header: AmsHeader, data: bytes, way: Way, judged: Judged | None, now_ns: int
     ) -> int | list[Action]:
         """Remember a request that a service of this station gets; return its ticket, or refuse."""
-        pending = self._admit(header, data, data[: ADDRESSES.size], way, None, now_ns)
-        if not isinstance(pending, Pending):
-            return pending
-        pending.judged = judged
-        return pending.invoke_id
+        pending = self._admit(header, data, data[: ADDRESSES.size], way, None, judged, now_ns)
+        return pending.invoke_id if isinstance(pending, Pending) else pending
 
     def take_answer(self, header: AmsHeader, data: bytes, way: Way, now_ns: int) -> list[Action]:
         """Send an answer back to who asked, unless it is late or comes from somewhere else."""
@@ -354,15 +350,19 @@ class Passage:
 
     def _admit(
         self, header: AmsHeader, data: bytes, onward: bytes, way: Way, route: Route | None,
-        now_ns: int,
+        judged: Judged | None, now_ns: int,
     ) -> Pending | list[Action]:  # fmt: skip
         """Remember a request that has an answer, unless something speaks against it."""
         if self._judge.is_again(header, onward, way):
+            if judged is not None:
+                self._gate.give_up(judged)
             text = "the same request waits already"
             return self._refuser.drop(way, header, Outcome.DROPPED, text, now_ns)
         why = None if route is None else self._judge.find_circle(header, onward, route)
         why = why or self._judge.find_room(way)
         if why is not None:
+            if judged is not None:
+                self._gate.give_up(judged, why.error)
             return self._refuser.refuse(header, way, why, now_ns)
         invoke_id = header.invoke_id
         if route is None or not is_marked(invoke_id) or invoke_id in self.in_flight:
@@ -372,6 +372,7 @@ class Passage:
             allowed = route.timeout_ns or allowed
             self._record.routes.of(route.key, now_ns).ask(len(data))
         pending = Pending(invoke_id, header, way, route, onward, now_ns, now_ns + allowed)
+        pending.judged = judged
         self.in_flight.add(pending)
         return pending
 

@@ -9,10 +9,11 @@ from eap.aoe.ads_part import encode_sum
 from eap.aoe.ads_request import AdsRequest
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.gate import MAX_ENTRIES
+from eap.aoe.judge import Limits
 from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, ObjectRange
 from eap.aoe.way import Way
-from eap.codec.ads import IndexGroup
+from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
 from tests.support.ams import NOTIFICATION, READ, READ_WRITE, Ams
 from tests.support.aoerouter import CLIENT, DEVICE, FAR, FAR_DEVICE, LINK, Station, route
@@ -123,6 +124,14 @@ class TestNoAnswer:
         here.router.connection_closed(*LAPTOP, 5)
         here.give(onward.answer(), LINK)
         assert [results(each) for each in entries(here)] == [[None], [None]]
+
+    def test_a_change_for_which_there_is_no_room_is_told(self) -> None:
+        here = Station([route(FAR, LINK, "far")], rules=[DRIVES], limits=Limits(per_connection=1))
+        here.forwarded(ask(WRITE, SDO_WRITE, FAR_DEVICE), LAPTOP)
+        for target in (DEVICE, FAR_DEVICE):
+            second = ask(WRITE, SDO_WRITE, target, invoke_id=2)
+            assert here.replied(second, LAPTOP)[1].error == AdsError.MAILBOX_FULL
+        assert [results(each) for each in entries(here)] == [[AdsError.MAILBOX_FULL]] * 2
 
 
 class TestSums:
