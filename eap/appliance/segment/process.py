@@ -34,6 +34,9 @@ from eap.net.segmentsocket import SegmentSocket, open_segment
 
 _BATCH = 64
 _MS = 1_000_000
+_STALL_NS = 2_000_000
+"""Lateness from which frames that wait are taken before the watchdogs of slaves are looked at."""
+_NEVER_NS = 1 << 63
 _MAX_COMMAND = 65536
 
 
@@ -162,6 +165,8 @@ class _Loop:
         self._segment = segment
         self._sockets = sockets
         self._commands = commands
+        self._late_ns = 0
+        """Time after which this process has not run for a while, though there was work."""
 
     def run(self, end_fd: int) -> None:
         poll = select.poll()
@@ -179,14 +184,18 @@ class _Loop:
                 self._pass_frames(side, sock)
 
     def _patience_ms(self) -> float | None:
-        due = self._segment.next_timeout()
-        return None if due is None else max(0.0, (due - time.monotonic_ns()) / _MS)
+        due, now_ns = self._segment.next_timeout(), time.monotonic_ns()
+        self._late_ns = _NEVER_NS if due is None else max(due, now_ns) + _STALL_NS
+        return None if due is None else max(0.0, (due - now_ns) / _MS)
 
     def _pass_frames(self, side: Side, sock: SegmentSocket) -> None:
         segment = self._segment
         for _ in range(_BATCH):
             arrival = sock.receive()
             now_ns = time.monotonic_ns()
+            if arrival is not None and now_ns > self._late_ns:
+                segment.segment.postpone_timeouts(now_ns)
+            self._late_ns = now_ns + _STALL_NS
             if arrival is None:
                 segment.handle_timeout(now_ns)
             else:

@@ -239,3 +239,29 @@ def test_whole_assignment_in_one_transfer():
     dictionary.download_complete(0x1C13, 0, b"\1\0\0\x1a", bench.slaves[0].device.od_state())
     bench.ask(AlState.SAFEOP | 0x10)
     assert bench.status() == (AlState.SAFEOP, 0)
+
+
+@pytest.mark.parametrize("was_late", [True, False])
+def test_outputs_that_waited_for_a_late_process_keep_the_watchdog_alive(was_late):
+    bench = line(1)
+    bench.bring(AlState.OP)
+    bench.cycle()
+    bench.now_ns = 150_000_000  # the watchdog ran out 50 ms ago
+    if was_late:
+        bench.segment.postpone_timeouts(bench.now_ns)
+    bench.send(Command.BRD, 0, 0, b"\0")
+    bench.now_ns += 5_000_000
+    bench.cycle()
+    bench.now_ns += 50_000_000
+    assert bench.status()[0] == (AlState.OP if was_late else AlState.SAFEOP | 0x10)
+
+
+def test_postponed_watchdog_still_runs_out():
+    bench = line(1)
+    bench.bring(AlState.OP)
+    bench.cycle()
+    bench.now_ns = 150_000_000
+    bench.segment.postpone_timeouts(bench.now_ns)
+    assert bench.status()[0] == AlState.OP
+    bench.now_ns = bench.segment.next_timeout()
+    assert bench.status()[0] == AlState.SAFEOP | 0x10

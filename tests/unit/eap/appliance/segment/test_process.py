@@ -11,10 +11,15 @@ import socket
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import pytest
 
+from devicebus.sim.devices.build import build_slave
+from devicebus.sim.fault import FaultySegment
+from devicebus.sim.segment import Segment
 from devicebus.sim.spec import BusSpec
+from devicebus.sim.wiring import Side
 from devicebus.wire.datagram import Command, encode_frame, iter_datagrams
 from eap.appliance.busfile import Bus
 from eap.appliance.handover import SegmentHandover
@@ -245,3 +250,38 @@ def test_child_of_a_supervisor_that_has_gone_does_not_start(bus_file):
     with Child(bus_file, supervisor=1) as child:
         child.process.communicate(timeout=20)
         assert child.process.returncode == -signal.SIGKILL
+
+
+class StalledSocket:
+    """One frame waits; the process runs on *stall_ns* after it should have."""
+
+    def __init__(self, clock, stall_ns):
+        self.clock = clock
+        self.stall_ns = stall_ns
+        self.arrivals = [SimpleNamespace(frame=bytearray(SCAN), origin=None), None]
+        self.end_fd = None
+
+    def receive(self):
+        self.clock.now_ns += self.stall_ns
+        self.stall_ns = 0
+        return self.arrivals.pop(0)
+
+    def send(self, frame, origin):
+        pass
+
+
+@pytest.mark.parametrize(("stall_ms", "postponed"), [(0, 0), (150, 1)])
+def test_frames_that_waited_for_a_late_process_come_before_watchdogs(
+    monkeypatch, stall_ms, postponed
+):
+    clock = SimpleNamespace(now_ns=10**9)
+    monkeypatch.setattr(segment_process.time, "monotonic_ns", lambda: clock.now_ns)
+    segment = FaultySegment(Segment([build_slave(generic())]))
+    calls = []
+    monkeypatch.setattr(Segment, "postpone_timeouts", lambda _, now_ns: calls.append(now_ns))
+    sock = StalledSocket(clock, stall_ms * 1_000_000)
+    loop = segment_process._Loop(segment, {Side.PRIMARY: sock}, None)
+    monkeypatch.setattr(FaultySegment, "next_timeout", lambda _: 10**9 + 100_000_000)
+    loop._patience_ms()
+    loop._pass_frames(Side.PRIMARY, sock)
+    assert len(calls) == postponed
