@@ -387,5 +387,8 @@ def _report(readers: list[Reader], *moments: dict[str, Any]) -> None:
             f" {ordered[len(ordered) // 2] * 1e3:.0f}, p99"
             f" {ordered[len(ordered) * 99 // 100] * 1e3:.0f}, max {ordered[-1] * 1e3:.0f}"
         )
+    kinds = Counter(failure for each in readers for failure in each.failures)
+    for failure, times in kinds.most_common(20):
+        print(f"{times} times: {failure}")
     for name, moment in zip(("before", "a third", "end"), moments, strict=True):
         print(f"{name}: {json.dumps(moment, default=sorted)}")
