@@ -111,7 +111,7 @@ class Prober:
         for way, hop in self._hops.items():
             if way.door == door and address in {None, way.connection}:
                 hop.asked_at_ns, hop.misses, hop.is_down = None, 0, False
-                hop.restart_index = None
+                hop.restart_index, hop.has_restart_index = None, True
 
     def hear(self, hop: Way, now_ns: int) -> None:
         """Note that a hop answered a request."""
@@ -197,7 +197,8 @@ class Prober:
         is_found_dead = hop.misses >= MISSES and not hop.is_down
         hop.is_down = hop.is_down or is_found_dead
         if is_found_dead:
-            hop.restart_index = None  # what came from it is restored anyhow
+            # What came from it is restored anyhow, and another router may answer next.
+            hop.restart_index, hop.has_restart_index = None, True
         return Probe(way, self._header(hop, AmsCommand.READ_STATE), is_found_dead)
 
     def _header(self, hop: _Hop, command: AmsCommand) -> bytes:

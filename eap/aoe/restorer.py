@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from itertools import count
 from typing import NamedTuple, TypeAlias
 
@@ -48,12 +48,16 @@ GROUP = 32
 MAX_ASKED = 128
 """Requests of restorations that wait for answers."""
 TIMEOUT_NS = 2_000_000_000
-"""How long an answer may take; then the same is asked again."""
+"""How long an answer may take; then the same is asked again, and twice as long if that is in vain,
+up to what requests of clients have: a slow server is restored too."""
 PATIENCE_NS = 5_000_000_000
 """How long a server may refuse with an error that may pass, as while it starts."""
 MAX_ENDS = 3
 """How often a server may end a subscription without having sent a sample."""
 _SOON_NS = 20_000_000
+_MAX_DOUBLINGS = 8
+_SPARE_CHECKS = 256
+"""Checks of subscriptions that have ended, before they are dropped ahead of their time."""
 _GRANTED = 8
 """Bytes of the answer of AddNotification: result and handle."""
 _OF_THE_WAY = frozenset(
@@ -81,7 +85,7 @@ class _Session:
     """Subscriptions with the same addresses of server and client that are to be established."""
 
     __slots__ = ("asked", "at_ns", "interrupted_at_ns", "is_trying", "outstanding", "restored",
-                 "stale", "waiting", "way")  # fmt: skip
+                 "stale", "timeouts", "waiting", "way")  # fmt: skip
 
     def __init__(self, way: Way, asked: bytes, at_ns: int) -> None:
         self.way = way
@@ -91,6 +95,7 @@ class _Session:
         self.restored = 0
         self.is_trying = True
         self.outstanding = 0
+        self.timeouts = 0
         self.waiting: deque[Subscription] = deque()
         self.stale: list[tuple[Grant, bool]] = []
 
@@ -154,6 +159,9 @@ class Restorer:
     def watch(self, subscription: Subscription) -> None:
         """Check from time to time whether samples come."""
         if subscription.request is not None:
+            if len(self._checks) > 2 * len(self._subscriptions) + _SPARE_CHECKS:
+                self._checks = [each for each in self._checks if not each[2].is_closed]
+                heapify(self._checks)
             at_ns = subscription.heard_at_ns + subscription.quiet_limit_ns()
             heappush(self._checks, (at_ns, next(self._numbers), subscription))
 
@@ -213,6 +221,19 @@ class Restorer:
         """Act on the answer to a request of a restoration."""
         step = pending.step
         assert isinstance(step, _Step)  # noqa: S101  for the type
+        step.session.timeouts = 0
+        return self._end_step(pending, step, header, body, now_ns)
+
+    def request_failed(self, pending: Pending, error: AdsError, now_ns: int) -> list[Action]:
+        """Act on a request of a restoration that nothing came back for."""
+        step = pending.step
+        assert isinstance(step, _Step)  # noqa: S101  for the type
+        step.session.timeouts += error is AdsError.TIMEOUT
+        return self._end_step(pending, step, _failed(pending.header, error), b"", now_ns)
+
+    def _end_step(
+        self, pending: Pending, step: _Step, header: AmsHeader, body: bytes, now_ns: int
+    ) -> list[Action]:
         self._asked -= 1
         step.session.outstanding -= 1
         error = header.error_code or int.from_bytes(body[:4], "little")
@@ -224,10 +245,6 @@ class Restorer:
         elif step.subscription is not None:
             actions += self._answered(pending, step, error, body, now_ns)
         return actions + self._go_on(step.session, now_ns)
-
-    def request_failed(self, pending: Pending, error: AdsError, now_ns: int) -> list[Action]:
-        """Act on a request of a restoration that nothing came back for."""
-        return self.receive_answer(pending, _failed(pending.header, error), b"", now_ns)
 
     def interruptions(self) -> list[Interruption]:
         """Return what is interrupted now, by client and server."""
@@ -340,9 +357,10 @@ class Restorer:
         self, step: _Step, header: AmsHeader, packet: bytes, onward: bytes, route: Route,
         handles: int, now_ns: int,
     ) -> list[Action]:  # fmt: skip
-        pending = Pending(
-            header.invoke_id, header, None, route, onward, now_ns, now_ns + TIMEOUT_NS
-        )
+        usual_ns = max(TIMEOUT_NS, route.timeout_ns or self._limits.timeout_ns)
+        allowed_ns = TIMEOUT_NS << min(step.session.timeouts, _MAX_DOUBLINGS)
+        deadline_ns = now_ns + min(allowed_ns, usual_ns)
+        pending = Pending(header.invoke_id, header, None, route, onward, now_ns, deadline_ns)
         pending.handles = handles
         pending.step = step
         self._in_flight.add(pending)
@@ -367,7 +385,10 @@ class Restorer:
             text = AdsError.words_of(error)
             if route is not None:
                 text += f" from {route.name} ({route.hop}) or from behind it"
-            return self._failed(session, subscription, error, text, now_ns)
+            failed = self._failed(session, subscription, error, text, now_ns)
+            if step.symbol_handle is not None and error not in _OF_THE_WAY:
+                failed += self._ending.release(_grant_of(pending, step, bytes(_GRANTED)), now_ns)
+            return failed
         if not pending.handles:
             return self._ask_for(session, subscription, now_ns, place)
         return self._establish(session, subscription, _grant_of(pending, step, body), now_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import struct
 
 import msgspec
@@ -9,7 +10,9 @@ import pytest
 
 from eap.aoe.action import Action, Forward, Outcome
 from eap.aoe.invoke import InvokeIds
-from eap.aoe.restorer import GROUP, MAX_ENDS, PATIENCE_NS, RETRY_NS
+from eap.aoe.judge import Limits
+from eap.aoe.restorer import GROUP, MAX_ENDS, PATIENCE_NS, RETRY_NS, TIMEOUT_NS
+from eap.aoe.subscriptions import Subscription
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader, decode_packet
 from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, READ_WRITE, Ams, parse
@@ -305,6 +308,69 @@ def test_hop_without_a_restart_index_is_asked_once() -> None:
     scene.sample(1)
     scene.passes(SECOND)
     assert not [each for each in scene.asked if each.command == AmsCommand.READ]
+
+
+def test_hop_that_comes_back_is_asked_for_its_restart_index_again() -> None:
+    scene = Scene(CYCLIC, is_probing=True)
+    scene.passes(SECOND)
+    (state,) = [each for each in scene.asked if each.command == AmsCommand.READ]
+    scene.answer(state, b"", 6)  # its system service has not started yet
+    scene.lose_hop()
+    scene.passes(0)
+    scene.answer(next(each for each in scene.asked if each.command == ADD_NOTIFICATION), granted(8))
+    scene.passes(SECOND)
+    assert [each for each in scene.asked if each.command == AmsCommand.READ]
+
+
+def test_restoration_waits_longer_for_a_server_that_does_not_answer_in_time() -> None:
+    scene = Scene(CYCLIC)
+    scene.lose_hop()
+    scene.passes(0)
+    for limit_ns in (TIMEOUT_NS, 2 * TIMEOUT_NS, Limits().timeout_ns, Limits().timeout_ns):
+        (add,) = scene.asked
+        scene.passes(limit_ns - 1)
+        assert scene.asked == []
+        scene.passes(1)
+        scene.passes(RETRY_NS)
+    (add,) = scene.asked
+    scene.passes(Limits().timeout_ns - 1)
+    scene.answer(add, granted(7))
+    assert [each.body for each in scene.sample(7)] == [stream((5, {1: b"data"}))]
+
+
+def test_symbol_handle_of_a_refused_subscription_is_given_back() -> None:
+    scene = Scene()
+    name = b"MAIN.level\0"
+    look_up = ADD._replace(
+        command=READ_WRITE, body=struct.pack("<IIII", 0xF003, 0, 4, len(name)) + name
+    )
+    found = struct.pack("<III", 0, 4, 55)
+    scene.station.replied(scene.station.forwarded(look_up, ONE).answer(found), LINK)
+    request = AddNotification(0xF005, 55, 4, TransMode.SERVER_CYCLE, 0, 500_000)
+    add = ADD._replace(invoke_id=2, body=request.encode())
+    scene.station.replied(scene.station.forwarded(add, ONE).answer(granted(1)), LINK)
+    scene.lose_hop()
+    scene.passes(0)
+    scene.answer(scene.asked[0], struct.pack("<III", 0, 4, 66))
+    scene.answer(scene.asked[1], b"", 6)  # its server is starting
+    given_back = scene.asked[2]
+    assert given_back.command == AmsCommand.WRITE
+    assert given_back.body == struct.pack("<IIII", 0xF006, 0, 4, 66)
+
+
+def test_subscriptions_that_were_deleted_are_not_kept_for_their_checks() -> None:
+    scene = Scene()
+    seldom = AddNotification(0x4040, 8, 4, TransMode.SERVER_CYCLE, 0, 0xFFFF_FFFF)
+    for number in range(1, 1500):
+        add = ADD._replace(invoke_id=number, body=seldom.encode())
+        scene.station.replied(scene.station.forwarded(add, ONE).answer(granted(number)), LINK)
+        delete = ADD._replace(
+            command=DELETE_NOTIFICATION, invoke_id=number, body=number.to_bytes(4, "little")
+        )
+        scene.take(scene.station.give(delete, ONE))
+        scene.answer(scene.asked.pop(), bytes(4))
+    kept = sum(isinstance(each, Subscription) for each in gc.get_objects())
+    assert kept < 1000
 
 
 def test_hop_with_subscriptions_is_awaited() -> None:
