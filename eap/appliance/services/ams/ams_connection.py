@@ -176,6 +176,9 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     def buffer_updated(self, nbytes: int) -> None:
         """Take octets (asyncio)."""
+        if self._is_ours and not self._is_blocked:
+            # Answers of 4 MB take longer than 10 s by a slow link: the latest byte counts.
+            self.late_since_ns = None
         packet = self._cutter.receive_one(bytes(_RECEIVED[:nbytes]))
         if packet is None:
             self._go_on()

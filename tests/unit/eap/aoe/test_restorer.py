@@ -152,7 +152,8 @@ def test_client_deletes_an_interrupted_subscription() -> None:
     assert scene.station.router.interruptions() == []
 
 
-def test_symbol_is_looked_up_again_by_its_name() -> None:
+def lose_symbol() -> tuple[Scene, Ams]:
+    """Return the scene behind the loss of a subscription by symbol handle, and its lookup."""
     scene = Scene()
     name = b"MAIN.level\0"
     look_up = ADD._replace(
@@ -165,6 +166,11 @@ def test_symbol_is_looked_up_again_by_its_name() -> None:
     scene.station.replied(scene.station.forwarded(add, ONE).answer(granted(1)), LINK)
     scene.lose_hop()
     scene.passes(0)
+    return scene, look_up
+
+
+def test_symbol_is_looked_up_again_by_its_name() -> None:
+    scene, look_up = lose_symbol()
     assert (scene.asked[0].command, scene.asked[0].body) == (READ_WRITE, look_up.body)
     scene.answer(scene.asked[0], struct.pack("<III", 0, 4, 66))
     assert AddNotification.decode(scene.asked[1].body).offset == 66
@@ -339,18 +345,7 @@ def test_restoration_waits_longer_for_a_server_that_does_not_answer_in_time() ->
 
 
 def test_symbol_handle_of_a_refused_subscription_is_given_back() -> None:
-    scene = Scene()
-    name = b"MAIN.level\0"
-    look_up = ADD._replace(
-        command=READ_WRITE, body=struct.pack("<IIII", 0xF003, 0, 4, len(name)) + name
-    )
-    found = struct.pack("<III", 0, 4, 55)
-    scene.station.replied(scene.station.forwarded(look_up, ONE).answer(found), LINK)
-    request = AddNotification(0xF005, 55, 4, TransMode.SERVER_CYCLE, 0, 500_000)
-    add = ADD._replace(invoke_id=2, body=request.encode())
-    scene.station.replied(scene.station.forwarded(add, ONE).answer(granted(1)), LINK)
-    scene.lose_hop()
-    scene.passes(0)
+    scene, _ = lose_symbol()
     scene.answer(scene.asked[0], struct.pack("<III", 0, 4, 66))
     scene.answer(scene.asked[1], b"", 6)  # its server is starting
     given_back = scene.asked[2]

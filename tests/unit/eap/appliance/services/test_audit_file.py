@@ -20,6 +20,14 @@ def file(tmp_path: Path) -> AuditFile:
     return AuditFile(tmp_path / "plant" / "audit.jsonl")
 
 
+def hold_lock(file: AuditFile) -> int:
+    """Return a descriptor that holds the lock of *file*, which has one line."""
+    file.append(b"one\n")
+    other = os.open(file.path, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    return other
+
+
 def test_append_makes_the_folder_for_its_owner_alone(file: AuditFile) -> None:
     file.append(b"one\n")
     assert stat.S_IMODE(file.path.parent.stat().st_mode) == 0o700
@@ -53,10 +61,8 @@ def test_append_follows_a_file_that_was_moved_away(file: AuditFile) -> None:
 def test_append_fails_while_another_process_holds_the_lock(
     file: AuditFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file.append(b"one\n")
     monkeypatch.setattr(file, "_wait_s", 0.0)
-    other = os.open(file.path, os.O_RDONLY)
-    fcntl.flock(other, fcntl.LOCK_EX)
+    other = hold_lock(file)
     with pytest.raises(OSError, match="another process holds its lock"):
         file.append(b"two\n")
     os.close(other)
@@ -67,9 +73,7 @@ def test_append_fails_while_another_process_holds_the_lock(
 def test_append_waits_for_the_lock_of_another_process(
     file: AuditFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file.append(b"one\n")
-    other = os.open(file.path, os.O_RDONLY)
-    fcntl.flock(other, fcntl.LOCK_EX)
+    other = hold_lock(file)
     pauses: list[float] = []
 
     def pause() -> None:
@@ -86,9 +90,7 @@ def test_append_waits_for_the_lock_of_another_process(
 def test_append_waits_only_once_for_a_lock_that_is_not_given_back(
     file: AuditFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file.append(b"one\n")
-    other = os.open(file.path, os.O_RDONLY)
-    fcntl.flock(other, fcntl.LOCK_EX)
+    other = hold_lock(file)
     pauses: list[float] = []
     monkeypatch.setattr(os, "sched_yield", lambda: pauses.append(0.01))
     monkeypatch.setattr(module, "monotonic", lambda: sum(pauses))

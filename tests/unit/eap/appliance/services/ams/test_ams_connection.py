@@ -319,6 +319,19 @@ def test_silence_between_packets_may_last() -> None:
     talk(script, patience_s=0.05)
 
 
+def test_own_connection_is_not_late_while_bytes_of_a_long_answer_come() -> None:
+    async def script(reader, writer, taker):
+        connection = taker.connection
+        answer = prefixed(bytes(4000))
+        writer.write(answer[:1000])
+        await eventually(lambda: connection.late_since_ns is not None)
+        before_ns = connection.late_since_ns
+        writer.write(answer[1000:2000])
+        await eventually(lambda: connection.late_since_ns > before_ns)
+
+    assert talk(script, is_ours=True).refused == []
+
+
 def test_packets_that_wait_for_their_turn_are_not_slow() -> None:
     """The last one is not whole yet, which is our doing: we do not read."""
 
