@@ -220,11 +220,13 @@ class Subscriber:
         return None
 
     def _learn(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
-        """Make the plan of a layout not seen before from *source*; drop what is no PD frame."""
+        """Make the plan of a layout not seen before from *source*, None without PDs."""
         pds = walk(data, size)
         if isinstance(pds, Discard):
             self._discard(pds, 1)
             return None
+        if not pds:
+            return None  # nothing to take: what is kept is bounded by the PDs of all layouts
         publisher = bytes(data[PD_FRAME_START : PD_FRAME_START + 6])
         chosen: list[tuple[Subscription, PdHeader, int]] = []
         refused = []
@@ -250,8 +252,6 @@ class Subscriber:
             roaming={s.account for s in taking if not s.place.publisher},
             publisher=publisher,
         )
-        if size < _SHORTEST:
-            return plan
         if self._pds_planned > _PDS_PLANNED:
             self._forget_plans()
         self._pds_planned += 1 + len(pds)

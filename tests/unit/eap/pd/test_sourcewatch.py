@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -119,3 +121,15 @@ def test_only_frames_of_the_expected_source_count_as_received(source, sent):
     assert (r.image.read("x"), r.image.read("y")) == (taken[7], taken[8])
     dropped = sum(row["discarded"].get("wrong_source", 0) for row in rows(r))
     assert dropped == (sum(host != 1 for _, host in sent) if source else 0)
+
+
+def test_subscriber_keeps_nothing_of_frames_without_pds():
+    r = receiver()
+    tracemalloc.start()
+    try:
+        for number in range(2000):
+            r.give(octets([], publisher=f"10.66.{number >> 8}.{number & 255}.1.1"), 1 * MS, OTHER)
+        kept = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert kept < 100_000
