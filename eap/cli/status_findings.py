@@ -87,8 +87,10 @@ class Finding:
 
     def text(self, now_s: float) -> str:
         """Return the finding as a sentence: what happened, since when; what to do."""
+        fault, *details = self.what.split("; ")
         since = "" if self.since is None else f", since {_moment(self.since, now_s)}"
-        return f"{self.where}: {self.what}{since}" + (f"; {self.advice}" if self.advice else "")
+        parts = [f"{self.where}: {fault}{since}", *details, self.advice]
+        return "; ".join(filter(None, parts))
 
     @classmethod
     def from_plain(cls, row: Row) -> Finding:
@@ -175,7 +177,7 @@ def _of_audit(where: str, audit: Row) -> Iterator[Finding]:
     lost, error = words.count(audit["lines"], "line"), audit["error"]
     if error:
         effect = "changes are refused" if audit["required"] else "changes are not recorded"
-        advice = f"{lost} lost; make room for {audit['file']}, or its folder writable"
+        advice = f"{lost} lost; make room for {audit['file']}, or make its folder writable"
         yield _error(where, f"cannot be written: {error}; {effect}", advice, audit["since"])
     elif audit["lines"]:
         yield _warning(where, f"{lost} lost, written again", since=audit["since"])
@@ -239,6 +241,7 @@ def _of_station(station: Row) -> Iterator[Finding]:
         yield from _of_silent(station)
     for row in station["pd"]["rx"]:
         yield from _of_received(f"{station['name']} ← {row['name']}", row)
+    yield from _of_sources(station)
 
 
 def _of_cycles(station: Row) -> Iterator[Finding]:
@@ -325,9 +328,6 @@ def _of_received(where: str, row: Row) -> Iterator[Finding]:
     if wrong := {_OTHER_VERSION: "version", _OTHER_LENGTH: "length"}.get(row.get("var_state", 0)):
         advice = "compare the plant files of both stations"
         yield _error(where, f"dropped: another {wrong} than expected", advice)
-    for key in ("wrong_source", "other_source"):
-        if source := row.get(key):
-            yield _of_source(where, key, source, row)
     remarks = []
     if row.get("timeouts"):
         remarks.append(f"timed out {words.times(row['timeouts'])}")
@@ -338,17 +338,26 @@ def _of_received(where: str, row: Row) -> Iterator[Finding]:
         yield _info(where, "; ".join(remarks))
 
 
-def _of_source(where: str, key: str, source: Row, row: Row) -> Finding:
-    """Return the finding about a second sender with the publisher ID of a subscription."""
-    ago = words.duration(source["age_us"])
-    if key == "wrong_source":
-        what = f"{source['address']} sends with this publisher ID, last {ago} ago: dropped"
-    else:
-        both = f"{row['source']} and {source['address']}"
-        what = f"two senders with this publisher ID: {both}, last {ago} ago"
-    if source["age_us"] > _RECENT_US:
-        return _info(where, what)
-    return _warning(where, what, "find out which of them should not send")
+def _of_sources(station: Row) -> Iterator[Finding]:
+    """Yield one finding for each address that sends with the publisher ID of somebody else."""
+    wrong: dict[str, list[Row]] = {}
+    for row in station["pd"]["rx"]:
+        if source := row.get("wrong_source"):
+            what = f"{source['address']} sends with this publisher ID: dropped"
+            wrong.setdefault(what, []).append(row | {"ago_us": source["age_us"]})
+        if source := row.get("other_source"):
+            both = " and ".join(sorted((row["source"], source["address"])))
+            what = f"two senders with this publisher ID: {both}"
+            wrong.setdefault(what, []).append(row | {"ago_us": source["age_us"]})
+    for what, rows in wrong.items():
+        ago_us = min(row["ago_us"] for row in rows)
+        first, last = f"{station['name']} ← {rows[0]['name']}", words.duration(ago_us)
+        where = f"{first} and {words.count(len(rows) - 1, 'other')}" if len(rows) > 1 else first
+        text = f"{what}; last {last} ago"
+        if ago_us > _RECENT_US:
+            yield _info(where, text)
+        else:
+            yield _warning(where, text, "find out which of them should not send")
 
 
 def _counts(counts: Row) -> str:

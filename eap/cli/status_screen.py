@@ -115,13 +115,15 @@ class StatusScreen:
         if self._earlier is None:
             return str(total)
         before = [
-            _total(row, direction, key)
+            row
             for row in self._earlier["stations"]
             if (row["plant"], row["name"]) == (station["plant"], station["name"])
         ]
-        if not before or total < before[0]:
+        if not before or total < (total_before := _total(before[0], direction, key)):
             return ""  # it was not there, or its counters started anew
-        return f"{(total - before[0]) / self._seconds:.0f}"
+        # Not the time between the looks: counters are of a moment that the look does not know.
+        seconds = _station_s(station) - _station_s(before[0])
+        return f"{(total - total_before) / (seconds if seconds > 0 else self._seconds):.0f}"
 
 
 def appliance_label(document: Row, appliance: Row) -> str:
@@ -166,6 +168,13 @@ def finding_grid(found: Iterable[Finding], now_s: float) -> RenderableType:
 
 def _total(station: Row, direction: str, key: str) -> int:
     return sum(row[key] for row in station["pd"][direction])
+
+
+def _station_s(station: Row) -> float:
+    """Return the time of a station's counters: its cycles since the first, also those left out."""
+    cycles: int = station.get("cycle", 0) + station.get("overruns", 0)
+    cycle_us: int = station.get("cycle_us", 0)
+    return cycles * cycle_us / 1e6
 
 
 def _states(stations: Iterable[Row]) -> str:

@@ -70,10 +70,24 @@ def test_second_sender_with_a_publisher_id_is_a_warning_for_a_minute(
     other = {"address": "10.0.0.9", "age_us": age_s * 1_000_000}
     rows = [rx("a", wrong_source=other), rx("b", source="10.0.0.1", other_source=other)]
     first, second = texts(rx=rows)
-    assert first.startswith(f"{severity} mixer ← a: 10.0.0.9 sends with this publisher ID, last ")
+    assert first.startswith(f"{severity} mixer ← a: 10.0.0.9 sends with this publisher ID: dropped")
     assert second.startswith(
-        f"{severity} mixer ← b: two senders with this publisher ID: 10.0.0.1 and 10.0.0.9, last "
+        f"{severity} mixer ← b: two senders with this publisher ID: 10.0.0.1 and 10.0.0.9; last "
     )
+
+
+def test_second_sender_of_many_pds_is_one_finding() -> None:
+    other = {"address": "10.0.0.9", "age_us": 2_000_000}
+    rows = [rx(f"pd{n}", wrong_source=other | {"age_us": n * 1_000_000}) for n in range(1, 6)]
+    (only,) = texts(rx=rows)
+    assert only.startswith("warning mixer ← pd1 and 4 others: 10.0.0.9 sends with")
+    assert "last 1.0 s ago" in only
+
+
+def test_finding_names_its_beginning_behind_the_fault() -> None:
+    fault = Finding(Severity.ERROR, "a/bus0", "b does not answer; c is the last", "d", NOW_S - 2)
+    since = f"since {clock(NOW_S - 2)} (2.0 s)"
+    assert fault.text(NOW_S) == f"a/bus0: b does not answer, {since}; c is the last; d"
 
 
 def test_engine_without_realtime_is_one_warning() -> None:
@@ -118,9 +132,9 @@ def test_audit_that_cannot_be_written_is_an_error(required: bool, effect: str) -
         "until": NOW_S, "error": "No space left on device",
     }  # fmt: skip
     text = (
-        f"line audit: cannot be written: No space left on device; {effect}, since"
-        f" {clock(NOW_S - 5)} (5.0 s); 7 lines lost; make room for /state/audit.jsonl, or its"
-        " folder writable"
+        "line audit: cannot be written: No space left on device, since"
+        f" {clock(NOW_S - 5)} (5.0 s); {effect}; 7 lines lost; make room for /state/audit.jsonl, or"
+        " make its folder writable"
     )
     assert found(status) == [("error", text)]
 

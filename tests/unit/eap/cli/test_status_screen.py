@@ -106,6 +106,13 @@ def test_screen_shows_rates_after_the_first_look() -> None:
     assert rows[4].split()[3:] == ["100", "25", "0", "0", "0"]
 
 
+def test_screen_takes_rates_from_the_time_of_the_station() -> None:
+    before, after = plant(1, cycle=1000, overruns=3), plant(1, cycle=1180, overruns=23)
+    after["stations"][0]["pd"] = {"tx": [tx("state", sent=109)], "rx": []}
+    rows = show(after, earlier=before, seconds=1.6)  # of the client: its first look took 0.4 s
+    assert rows[4].split()[3] == "50"
+
+
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (60, 15), (120, 40)])
 @pytest.mark.parametrize("stations", [3, 15, 60])
 @pytest.mark.parametrize("faults", [0, 30])
