@@ -124,6 +124,7 @@ class FakeBus:
             frames_received=link.received,
             timeout_ns=link.timeout_ns,
             round_trip_ns=link.round_trip_ns,
+            silent_since_ns=0 if self.master.is_lost else None,
         )
 
 
@@ -137,7 +138,7 @@ def _slave(unit: Any) -> SlaveReport:
         revision=identity.revision,
         serial=identity.serial,
         alias=unit.found.alias,
-        state=0 if unit.is_lost else unit.state,
+        state=unit.al_state,
         target=unit.target,
         to_slave=box.sizes.to_slave if box else 0,
         to_master=box.sizes.to_master if box else 0,

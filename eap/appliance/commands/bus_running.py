@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from devicebus.errors import BusError
+from devicebus.errors import BusError, FrameLostError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.access import Reply, fprd
@@ -25,7 +25,7 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.appliance import control_bus
 from eap.appliance.bus_failure import no_mailbox
-from eap.appliance.bus_findings import history_of
+from eap.appliance.bus_findings import history_of, is_silent, report_findings
 from eap.appliance.bus_request import BusReport, SlaveReport
 from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose
 from eap.appliance.commands.client import Client, connect_station
@@ -61,6 +61,9 @@ class RunningBus:
     def scan(self) -> Sequence[Slave]:
         """Return the slaves that the running master knows, and where they are now."""
         slaves = self.known()
+        if is_silent(self._report):
+            finding, *_ = report_findings(self._report)
+            raise FrameLostError(f"{finding.what}; {finding.advice}")
         registers = self.run(_look([slave.station for slave in slaves]))
         joints = find_joints([dl_status for _, dl_status in registers])
         return [

@@ -17,6 +17,7 @@ from eap.appliance.commands.bus_running import open_running
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
 from eap.od.abort import SdoAbortError
+from tests.support.appliance import wait_until
 from tests.support.fakeappliance import Appliance
 
 pytestmark = pytest.mark.net
@@ -111,6 +112,21 @@ def test_procedures(bus, works):
     works.lines[0].fault(kind="loss")
     with pytest.raises(FrameLostError):
         bus.run(read(1003, Register.TYPE, 1))
+
+
+def test_scan_of_a_silent_bus_names_the_cause(bus, works):
+    works.lines[0].fault(kind="loss")
+    message = ""
+
+    def is_named():
+        nonlocal message
+        with pytest.raises(FrameLostError) as caught:
+            bus.scan()
+        message = str(caught.value)
+        return message.startswith("no frame comes back")
+
+    wait_until(is_named)
+    assert message.startswith("no frame comes back: 3 slaves cannot be reached; check the")
 
 
 def test_frames_are_counted(bus):
