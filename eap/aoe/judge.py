@@ -29,7 +29,10 @@ class Limits(NamedTuple):
     per_connection: int = 512
     """Requests of one connection that wait."""
     per_door: int = 2048
-    """Requests of all connections of a door: a flood by one leaves room for the others."""
+    """Requests of all connections of a door: a flood by one leaves room for the others.
+
+    One connection may have as many as others leave, so however many flood, some room remains.
+    """
     timeout_ns: int = 4_500_000_000
     """How long an answer may take: an error comes back before clients lose patience at 5 s."""
 
@@ -144,11 +147,13 @@ class Judge:
 
     def find_room(self, way: Way) -> Refusal | None:
         """Say whether too many requests wait for one more."""
-        if self._in_flight.count(way) >= self._limits.per_connection:
+        waiting = self._in_flight.count(way)
+        of_door = self._in_flight.count_of_door(way.door)
+        if waiting >= self._limits.per_connection:
             text = f"{self._limits.per_connection} requests of the connection wait already"
             return Refusal(AdsError.MAILBOX_FULL, text)
-        if self._in_flight.count_of_door(way.door) >= self._limits.per_door:
-            text = f"{self._limits.per_door} requests by {way.door} wait already"
+        if waiting >= self._limits.per_door - of_door:
+            text = f"{of_door} requests by {way.door} wait already, {waiting} of this connection"
             return Refusal(AdsError.MAILBOX_FULL, text)
         if len(self._in_flight) >= self._limits.in_flight and not self._in_flight.make_room():
             text = f"{self._limits.in_flight} requests wait already"

@@ -8,9 +8,11 @@ another one, because the subscription was restored.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+from eap.aoe.access import host_of
 from eap.aoe.routes import Route
 from eap.aoe.way import Way
 from eap.codec.adsnotification import (
@@ -27,9 +29,9 @@ from eap.ids import NetId
 
 MAX_PER_CLIENT = 1024
 """Subscriptions of one AMS address of one connection; TwinCAT's limit as well."""
-MAX_PER_WAY = 8192
-"""Those of one connection, which may bring all clients of another router."""
 MAX_TOTAL = 16_384
+"""Of one router.  A host, which may be another router with all its clients, has at most as many as
+it leaves: one takes a half, two take three quarters, and some remain for others."""
 _FIRST_OWN_HANDLE = 0xC000_0000
 _ON_CHANGE = frozenset((TransMode.SERVER_ON_CHANGE, TransMode.SERVER_ON_CHANGE_2))
 _SHORTEST_QUIET_NS = 2_000_000_000
@@ -145,7 +147,8 @@ class Subscriptions:
         self.hops: dict[Way, int] = {}
         self._by_grant: dict[tuple[bytes, int], Subscription] = {}
         self._by_client: dict[Way, dict[bytes, dict[int, Subscription]]] = {}
-        self._counts: dict[Way, int] = {}
+        self._counts: Counter[str] = Counter()
+        """By host."""
         self._own_handle = 0
         self._total = 0
 
@@ -162,8 +165,7 @@ class Subscriptions:
         mine = self._by_client.get(way, {}).get(asked, ())
         return (
             len(mine) + count <= MAX_PER_CLIENT
-            and self._counts.get(way, 0) + count <= MAX_PER_WAY
-            and self._total + count <= MAX_TOTAL
+            and self._counts[host_of(way)] + count <= MAX_TOTAL - self._total
         )
 
     def add(self, subscription: Subscription) -> Subscription | None:
@@ -184,7 +186,7 @@ class Subscriptions:
             subscription.handle = _FIRST_OWN_HANDLE + self._own_handle % (1 << 30)
             self._own_handle += 1
         mine[subscription.handle] = subscription
-        self._counts[way] = self._counts.get(way, 0) + 1
+        self._counts[host_of(way)] += 1
         self._total += 1
         if grant is not None:
             self.attach(subscription, grant)
@@ -240,10 +242,13 @@ class Subscriptions:
         del clients[asked][subscription.handle]
         if not clients[asked]:
             del clients[asked]
-        self._counts[way] -= 1
+        host = host_of(way)
+        self._counts[host] -= 1
+        if not self._counts[host]:
+            del self._counts[host]
         self._total -= 1
         if not clients:
-            del self._by_client[way], self._counts[way]
+            del self._by_client[way]
         subscription.is_closed = True
         return self.detach(subscription)
 

@@ -310,7 +310,16 @@ def test_flood_by_one_door_leaves_room_for_the_others() -> None:
         station.forwarded(ASKED, Way("segment", str(number)))
     there = Way("segment", "2")
     assert station.replied(ASKED, there) == (there, ASKED.answer(b"", 4))
-    assert "2 requests by segment wait already" in station.events()[0][1]
+    assert "2 requests by segment wait already, 0 of this" in station.events()[0][1]
+    assert station.forwarded(ASKED, ONE)
+
+
+def test_flood_by_some_connections_of_a_door_leaves_room_for_another_one() -> None:
+    station = Station([route(FAR, LINK)], limits=Limits(per_door=16))
+    for port in range(4):
+        way = Way("tcp", f"10.0.0.5:{port}")
+        while isinstance(station.give(ASKED, way)[0], Forward):
+            pass
     assert station.forwarded(ASKED, ONE)
 
 

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import struct
+from itertools import count
 
 import pytest
 
+from eap.aoe import subscriptions as module
 from eap.aoe.routes import Route
 from eap.aoe.subscriptions import (
     MAX_PER_CLIENT,
@@ -92,6 +94,19 @@ def test_subscriptions_suspended_keeps_what_is_to_be_deleted_unless_it_was_given
     assert all_.detach(first) is None  # 1 is that of the second now
     assert all_.find(ONWARD, 1) is second
     assert second.handle == 2
+
+
+def test_subscriptions_of_few_hosts_leave_room_for_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "MAX_TOTAL", 100)
+    all_ = Subscriptions()
+    hosts = ("10.0.0.5", "10.0.0.6", "10.0.0.7")
+    handles = count()
+    for way in [Way("ams-tcp", f"{host}:{port}") for host in hosts for port in range(32)]:
+        while all_.has_room(way, ASKED, 1):
+            added(all_, one(next(handles), way))
+    assert all_.has_room(Way("ams-tcp", "10.0.0.8:1"), ASKED, 6)
 
 
 def test_subscriptions_has_room_for_so_many_of_a_client() -> None:
