@@ -24,6 +24,10 @@ from eap.aoe.answer import AmsAnswer
 from eap.codec.ads import AdsDeviceInfo, AdsError
 from eap.codec.adsnotification import AddNotification
 
+FIRST_CHANGE_NS = 100_000_000
+"""AdsLib drops samples that come before its caller has seen the answer with their handle.  Where a
+value does not change, that is the only one."""
+
 Control: TypeAlias = Callable[[WriteControl], None]
 """Acts on a WriteControl, or raises AdsRefusedError."""
 
@@ -57,7 +61,7 @@ class AdsDevice:
         control: Control = refuse_control,
         first_handle: int = 1,
     ) -> None:
-        self.notifications = NotificationTable(first_handle)
+        self.notifications = NotificationTable(first_handle, FIRST_CHANGE_NS)
         self._info = info
         self._states = states
         self._spaces = (*spaces, DeviceDataSpace(states))

@@ -2,7 +2,7 @@
 
 Rule 1: values are sampled when the caller says that a cycle is over (``handle_cycle``), never in
 between, and never in the cycle in which a notification was added: its first sample always follows
-the answer that tells its handle.
+the answer that tells its handle, that of a value on change by ``first_change_ns`` at least.
 Rule 2: a sample waits for others of its client at most as long as that client allows, and less if
 a packet is full: nothing is ever dropped here, and what waits is bounded.
 Rule 3: a source that fails for good ends its notification; the client is told by a sample without
@@ -90,7 +90,7 @@ class _Notification:
     )
 
     def __init__(
-        self, client: Client, handle: int, asked: AddNotification, source: Source, now_ns: int
+        self, client: Client, handle: int, asked: AddNotification, source: Source, first_ns: int
     ) -> None:
         self.client = client
         self.handle = handle
@@ -99,8 +99,8 @@ class _Notification:
         self.cycle_ns = asked.cycle * UNIT_NS
         self.delay_ns = asked.max_delay * UNIT_NS
         self.last: bytes | None = None
-        self._due_ns = now_ns
-        self.next_ns = now_ns + 1
+        self._due_ns = first_ns - 1
+        self.next_ns = first_ns
 
     def advance(self, now_ns: int) -> None:
         """Set the next time; the mean distance stays what was asked for, if cycles allow it."""
@@ -143,12 +143,14 @@ class NotificationTable:
     Args:
         first_handle: Another one at each start keeps a router that missed the start from taking a
             handle for one that it knows.
+        first_change_ns: Time between a request for changes and its first sample.
 
     Attributes:
         on_add: Called whenever there is one more.
     """
 
-    def __init__(self, first_handle: int = 1) -> None:
+    def __init__(self, first_handle: int = 1, first_change_ns: int = 1) -> None:
+        self._first_change_ns = first_change_ns
         self.on_add: Callable[[], None] | None = None
         self._notifications: dict[int, _Notification] = {}
         self._clients: dict[Client, _Pending] = {}
@@ -162,7 +164,7 @@ class NotificationTable:
         return len(self._notifications)
 
     def add(self, client: Client, asked: AddNotification, source: Source, now_ns: int) -> int:
-        """Return the handle of a new notification; its first sample is due in the next cycle.
+        """Return the handle of a new notification; its first sample is due later.
 
         Raises:
             AdsRefusedError: TRANS_MODE, WATCH_SIZE or NO_MORE_HANDLES.
@@ -180,7 +182,8 @@ class NotificationTable:
             raise AdsRefusedError(AdsError.NO_MORE_HANDLES)
         handle = self._take_handle()
         pending.handles.add(handle)
-        notification = _Notification(client, handle, asked, source, now_ns)
+        first_ns = now_ns + (self._first_change_ns if asked.mode in _ON_CHANGE else 1)
+        notification = _Notification(client, handle, asked, source, first_ns)
         self._notifications[handle] = notification
         heappush(self._due, (notification.next_ns, handle))
         if self.on_add is not None:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.aoe.ads_device import AdsDevice
+from eap.aoe.ads_device import FIRST_CHANGE_NS, AdsDevice
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import Read, Write
 from eap.aoe.ads_request import MAX_ANSWER
@@ -111,11 +111,11 @@ def test_notifications_are_added_told_and_deleted(bench) -> None:
     )
     result, handle = struct.unpack("<2I", added.data)
     assert not result
-    ((client, data),) = bench.device.notifications.handle_cycle(1, 99)
+    ((client, data),) = bench.device.notifications.handle_cycle(FIRST_CHANGE_NS, 99)
     assert client == CLIENT
     assert decode_notification(data) == [(99, ((handle, b"\x01\x80"),))]
     assert bench.result(AmsCommand.DELETE_NOTIFICATION, "I", handle) == 0
-    assert bench.device.notifications.handle_cycle(2, 100) == []
+    assert bench.device.notifications.handle_cycle(FIRST_CHANGE_NS + 1, 100) == []
 
 
 def test_sums_are_done_item_by_item(bench) -> None:

@@ -78,6 +78,20 @@ def test_first_sample_never_comes_in_the_moment_of_the_request(table) -> None:
     assert len(cycle(table, 5.1)) == 1
 
 
+@pytest.mark.parametrize(
+    ("mode", "reads"), [(CYCLE, [1, 1, 2, 2, 2, 3]), (CHANGE, [0, 1, 1, 1, 2, 2])]
+)
+def test_first_sample_on_change_is_delayed_and_cyclic_ones_are_not(mode: int, reads: list[int]):
+    table = NotificationTable(first_change_ns=20 * MS)
+    value = Value(b"a")
+    table.add(ME, asked(mode, cycle_ms=30), value, 0)
+    found = []
+    for now in range(10, 70, 10):
+        cycle(table, now)
+        found.append(value.reads)
+    assert found == reads
+
+
 def test_a_cycle_of_zero_is_every_cycle(table) -> None:
     table.add(ME, asked(CYCLE), Value(), 0)
     assert [len(cycle(table, now)) for now in (1, 2, 3)] == [1, 1, 1]

@@ -84,8 +84,9 @@ def test_notifications_leave_by_the_router(ads, router, carrier, stations, files
         added = ask(router, carrier, target, AmsCommand.ADD_NOTIFICATION, watch)
         await asyncio.sleep(0)
         image.words[StationWord.CYCLE] = 1
-        image.words[StationWord.CYCLE_AT_NS] = monotonic_ns()
-        sampler.end_cycle(1, monotonic_ns())
+        ran_ns = monotonic_ns()
+        image.words[StationWord.CYCLE_AT_NS] = ran_ns
+        sampler.end_cycle(1, ran_ns)
         count = len(carrier.sent)
         async with asyncio.timeout(5):
             while len(carrier.sent) == count:  # noqa: ASYNC110
