@@ -42,7 +42,9 @@ from eap.codec.ams import ADDRESSES, AmsCommand, AmsHeader, encode_packet
 RETRY_NS = 500_000_000
 """Between two attempts for one pair of addresses."""
 SPACING_NS = 10_000_000
-"""Between two attempts at all, on the average: many pairs are tried less often."""
+"""Between two requests at all, on the average: many pairs are tried less often."""
+_LOOK_SPACING_NS = 1_000_000
+"""Likewise, between two looks for a way that find none, which cost no packet."""
 GROUP = 32
 """Subscriptions of one pair of addresses that are asked for at a time."""
 MAX_ASKED = 128
@@ -347,7 +349,9 @@ class Restorer:
         packet = encode_packet(header, body)
         found = self._find_way(header, packet, subscription.way, now_ns)
         if isinstance(found, Refusal):
-            return self._failed(session, subscription, found.error, found.text, now_ns)
+            return self._failed(
+                session, subscription, found.error, found.text, now_ns, _LOOK_SPACING_NS
+            )
         route, onward = found
         packet = onward + packet[ADDRESSES.size :]
         handles = int(command == AmsCommand.ADD_NOTIFICATION)
@@ -419,8 +423,9 @@ class Restorer:
         return self.interrupt([subscription], "its server was started again", now_ns)
 
     def _failed(
-        self, session: _Session, subscription: Subscription, error: int, text: str, now_ns: int
-    ) -> list[Action]:
+        self, session: _Session, subscription: Subscription, error: int, text: str, now_ns: int,
+        spacing_ns: int = SPACING_NS,
+    ) -> list[Action]:  # fmt: skip
         """Try again later, or give up."""
         passes = error in _OF_THE_WAY
         if passes:
@@ -433,7 +438,7 @@ class Restorer:
             return self._give_up(session, subscription, text, now_ns)
         session.waiting.appendleft(subscription)
         session.is_trying = True
-        self._schedule(session, now_ns + max(RETRY_NS, len(self._sessions) * SPACING_NS))
+        self._schedule(session, now_ns + max(RETRY_NS, len(self._sessions) * spacing_ns))
         subscription.why = text
         # What waits for its check has the same server, and nothing comes from it either.
         quiet = [each for each in session.waiting if each.interrupted_at_ns is None]

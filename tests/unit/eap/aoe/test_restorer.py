@@ -11,7 +11,7 @@ import pytest
 from eap.aoe.action import Action, Forward, Outcome
 from eap.aoe.invoke import InvokeIds
 from eap.aoe.judge import Limits
-from eap.aoe.restorer import GROUP, MAX_ENDS, PATIENCE_NS, RETRY_NS, TIMEOUT_NS
+from eap.aoe.restorer import GROUP, MAX_ASKED, MAX_ENDS, PATIENCE_NS, RETRY_NS, TIMEOUT_NS
 from eap.aoe.subscriptions import Subscription
 from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import SYSTEM_PORT, AmsCommand, AmsHeader, decode_packet
@@ -136,6 +136,20 @@ def test_restoration_tries_one_subscription_and_then_asks_in_groups() -> None:
     for number, add in enumerate(scene.asked[:]):
         scene.answer(add, granted(200 + number))
     assert [each.command for each in scene.asked[GROUP:]] == [DELETE_NOTIFICATION] * GROUP
+
+
+def test_many_clients_are_tried_soon_after_their_hop_comes_back() -> None:
+    scene = Scene()
+    for number in range(1, 201):
+        client = f"192.168.0.9.1.1:{30000 + number}"
+        packet = ADD._replace(source=client, invoke_id=number, body=CYCLIC.encode())
+        onward = scene.station.forwarded(packet, ONE)
+        scene.station.replied(onward.answer(granted(number)), LINK)
+    scene.take(scene.station.router.hop_down(*LINK, "no link", scene.station.now_ns))
+    scene.passes(0)
+    scene.station.router.hop_up(*LINK)
+    scene.passes(RETRY_NS)
+    assert len(scene.asked) == MAX_ASKED
 
 
 def test_client_deletes_an_interrupted_subscription() -> None:
