@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterable
+from contextlib import ExitStack
 from typing import Any
 
 import msgspec
@@ -80,27 +81,33 @@ class Child:
         self, handover: Handover | SegmentHandover, descriptors: Iterable[int], now_ns: int
     ) -> None:
         """Start the process; *descriptors* are those that *handover* speaks of."""
-        self.report_fd, report_end = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
-        self.error_fd, error_end = os.pipe2(os.O_CLOEXEC)
-        os.set_blocking(self.error_fd, False)
-        described = handover.to_descriptor()
-        command = [sys.executable, "-m", _LAUNCHER, self._module, str(described), str(report_end)]
-        # A SIGINT before the child can take one would end it with a traceback: it waits.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            self._process = subprocess.Popen(  # noqa: S603  our own module
-                [*command, self._bytecode],
+        with ExitStack() as theirs:
+            self.report_fd, report_end = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+            theirs.callback(os.close, report_end)
+            self.error_fd, error_end = os.pipe2(os.O_CLOEXEC)
+            theirs.callback(os.close, error_end)
+            os.set_blocking(self.error_fd, False)
+            described = handover.to_descriptor()
+            theirs.callback(os.close, described)
+            command = [sys.executable, "-m", _LAUNCHER, self._module]
+            # A SIGINT before the child can take one would end it with a traceback: it waits.
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            theirs.callback(signal.pthread_sigmask, signal.SIG_SETMASK, mask)
+            process = subprocess.Popen(  # noqa: S603  our own module
+                [*command, str(described), str(report_end), self._bytecode],
                 stdin=subprocess.DEVNULL,
                 stdout=error_end,
                 stderr=error_end,
                 pass_fds=(described, report_end, *descriptors),
                 process_group=0,  # a terminal's Ctrl-C reaches the supervisor alone
             )
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            for fd in (described, report_end, error_end):
-                os.close(fd)
-        self.pid_fd = os.pidfd_open(self._process.pid)
+        try:
+            self.pid_fd = os.pidfd_open(process.pid)
+        except OSError:  # its end would not be noticed
+            process.kill()
+            process.wait()
+            raise
+        self._process = process
         self.started_ns = now_ns
         self.watch.begin(now_ns)
         self.is_ready = False
@@ -156,6 +163,7 @@ class Child:
         while self.error_fd >= 0 and self.forward_output():
             pass
         self.close()
+        self.is_ready = False
         self.watch.end()
         self._process = None
         return code, self._last_lines[-1] if self._last_lines else "it said nothing"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import signal
@@ -80,6 +81,7 @@ def test_from_start_to_end(tmp_path, monkeypatch, capfd):
     wait(child.pid_fd)
     assert child.reap() == (3, "no newline")
     assert (child.pid, child.pid_fd, child.error_fd) == (0, -1, -1)
+    assert not child.is_ready
     assert capfd.readouterr().err == "first line\nno newline\n"
 
 
@@ -95,6 +97,24 @@ def test_one_that_dies_before_it_is_ready(tmp_path, monkeypatch):
     assert not child.is_ready
     assert child.reap() == (-signal.SIGKILL, "it said nothing")
     child.ask_to_end(signal.SIGTERM)  # nobody is there: nothing happens
+
+
+@pytest.mark.net
+@pytest.mark.parametrize("call", ["memfd_create", "pidfd_open"])
+def test_child_that_cannot_be_started_leaves_nothing_behind(tmp_path, monkeypatch, call):
+    def refuse(*_):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    child = make(tmp_path, monkeypatch, "import time; time.sleep(60)")
+    monkeypatch.setattr(os, call, refuse)
+    before = sorted(Path("/proc/self/fd").iterdir())
+    with pytest.raises(OSError, match="Too many open files"):
+        child.start(HANDOVER, [], monotonic_ns())
+    child.close()
+    assert child.pid == 0
+    assert sorted(Path("/proc/self/fd").iterdir()) == before
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
 
 
 @pytest.mark.net
