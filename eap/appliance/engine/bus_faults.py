@@ -71,6 +71,12 @@ class SlaveFaults:
         """Forget the troubles that are over; what was counted stays."""
         self._troubles = {at: each for at, each in self._troubles.items() if each.until_ns is None}
 
+    def end_all(self, now_ns: int) -> None:
+        """End the troubles that last: a master that is replaced reports no end of them."""
+        for station, each in self._troubles.items():
+            if each.until_ns is None:
+                self._end(station, now_ns)
+
     def take_events(self, master: Master) -> None:
         """Take what has happened."""
         while (event := master.next_event()) is not None:

@@ -173,6 +173,8 @@ class EngineBus:
 
     def _begin_anew(self, exc: Exception, now_ns: int) -> None:
         """The master cannot go on: replace it."""
+        self.faults.take_events(self.master)
+        self.faults.end_all(now_ns)
         self.master = Master(self._settings)
         self._ties.lay_out(None)
         self._starting = None

@@ -7,6 +7,8 @@ import pytest
 
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import AlState
+from eap.appliance.bus_findings import is_silent
+from eap.appliance.engine.bus_report import report_bus
 from eap.appliance.engine.engine_bus import RETRY_NS, SILENT_RETRY_NS
 from eap.pd.spec import BusTarget
 from tests.support.cyclic import MS
@@ -177,6 +179,20 @@ def test_master_that_breaks_is_replaced(rig, monkeypatch):
     assert "ZeroDivisionError" in str(task.error)
     assert rig.wait(lambda: rig.bus.is_up) <= RETRY_NS + 100 * MS
     assert rig.bus.fault == ""
+
+
+def test_bus_that_was_silent_is_not_silent_with_a_new_master(rig, monkeypatch):
+    rig.wire.is_deaf = True
+    rig.wait(lambda: rig.bus.master.is_lost)
+    rig.run(2 * MS)
+    assert is_silent(report_bus(rig.bus, rig.now_ns))
+    broken = rig.bus.master
+    monkeypatch.setattr(broken, "handle_timeout", lambda now_ns: 1 // 0)
+    rig.run(2 * MS)
+    assert rig.bus.master is not broken
+    rig.wire.is_deaf = False
+    rig.wait(lambda: rig.bus.is_up)
+    assert not is_silent(report_bus(rig.bus, rig.now_ns))
 
 
 def test_shut_down_leaves_slaves_at_rest(rig):
