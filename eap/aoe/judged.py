@@ -75,7 +75,7 @@ class Judged(NamedTuple):
 
     @property
     def changes(self) -> AuditEntry:
-        """What of the request changes something, and may be done: none of it has been yet."""
+        """Entry of the changes in the request that are allowed; none of them is done yet."""
         entry = self._entry([None] * len(self.verdicts))
         allowed = tuple(each for each in entry.operations if each.verdict.is_allowed)
         return entry._replace(operations=allowed)

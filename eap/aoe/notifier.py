@@ -50,7 +50,7 @@ _LENGTH = slice(20, 24)
 
 
 class Granted(NamedTuple):
-    """What follows from the answer to a request for notifications."""
+    """Consequences of the answer to a request for notifications."""
 
     body: bytes
     """As the client gets it: with the handles that it knows."""
@@ -62,7 +62,7 @@ class Granted(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """What follows from a notification."""
+    """Consequences of a notification."""
 
     replies: list[Reply]
     ended: list[Subscription]

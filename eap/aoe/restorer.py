@@ -50,12 +50,12 @@ GROUP = 32
 MAX_ASKED = 128
 """Requests of restorations that wait for answers."""
 TIMEOUT_NS = 2_000_000_000
-"""How long an answer may take; then the same is asked again, and twice as long if that is in vain,
-up to what requests of clients have: a slow server is restored too."""
+"""Limit for an answer; then the request is repeated with twice the limit, up to that of requests of
+clients: a slow server is restored too."""
 PATIENCE_NS = 5_000_000_000
-"""How long a server may refuse with an error that may pass, as while it starts."""
+"""Limit for refusals with an error that may pass, as while a server starts."""
 MAX_ENDS = 3
-"""How often a server may end a subscription without having sent a sample."""
+"""Ends of a subscription by its server without a sample between them."""
 _SOON_NS = 20_000_000
 _MAX_DOUBLINGS = 8
 _SPARE_CHECKS = 256

@@ -275,7 +275,7 @@ class Subscriptions:
 
 
 class Division(NamedTuple):
-    """What becomes of the samples of one notification."""
+    """Samples of one notification, divided by client."""
 
     parts: list[tuple[Way, bytes, bytes]]
     """Connection of a client, the addresses that it asked with, and the data that it gets."""

@@ -18,9 +18,9 @@ from devicebus.mailbox.conversation import Progress
 from eap.errors import EapError
 
 RESTARTS = 3
-"""How often a transfer begins anew at most."""
+"""Restarts of one transfer at most."""
 RETURN_S = 30.0
-"""How long the slave may take to come back each time."""
+"""Limit for the return of the slave after each fault."""
 PAUSE_S = 0.5
 """Between two attempts to reach it."""
 

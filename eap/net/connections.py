@@ -193,7 +193,7 @@ class ConnectionTable:
         return Admission(victim=victim)
 
     def shed(self, now_ns: int) -> Connection | None:
-        """Forget and return the connection that is missed least, None if all are in use.
+        """Forget and return the connection that rule 2 or 3 names, None if there is none.
 
         For a process that has no descriptor left even to accept a connection.
         """

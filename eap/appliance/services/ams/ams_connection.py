@@ -231,7 +231,7 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     @property
     def activity(self) -> Activity:
-        """How much would be lost with it."""
+        """Current use, for the policy for connections."""
         if self._window.subscriptions:
             return Activity.SUBSCRIBED
         if self._window.requests:

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 class AmsClients:
-    """Who has connected to any listener of this process, by name; the carrier of their door.
+    """Connections to all AMS/TCP listeners of this process, by name; the carrier of their door.
 
     Attributes:
         addresses: For clients that ask for an AMS address.

@@ -33,7 +33,7 @@ _ACK = bytes((FoeOpcode.ACK,))
 
 
 class _Past:
-    """What has passed of a file since its beginning, for a transfer that begins anew.
+    """Beginning of a file that was transferred already, for a transfer that begins anew.
 
     Of a file that is written the data is kept, as far as KEPT, and given to the slave again.  Of
     one that is read a hash is enough: what the client has already is read again and compared.

@@ -88,7 +88,7 @@ class ImageValues:
 
 
 class _Places:
-    """What lies in images of one layout, by name."""
+    """Places in images of one layout, by name."""
 
     def __init__(self, layout: ImageLayout) -> None:
         self.layout = layout
