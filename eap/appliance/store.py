@@ -9,6 +9,7 @@ is kept for a rollback.  A file that was applied while the station ran is not ed
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 from collections.abc import Iterable
@@ -33,6 +34,7 @@ from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
 VARIABLE = "EAP_STATE_DIR"
+_FULL = frozenset((errno.ENOSPC, errno.EDQUOT))
 
 logger = logging.getLogger(__name__)
 
@@ -113,9 +115,14 @@ class Store:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             replace_file(path, encode_stored(stored))
         except OSError as exc:
+            remedy = (
+                "make room there"
+                if exc.errno in _FULL
+                else f"set {VARIABLE} to a directory that you may write"
+            )
             raise EnvironmentalError(
                 f"station {station}: its configuration cannot be kept in {path}: {exc.strerror};"
-                f" set {VARIABLE} to a directory that you may write"
+                f" {remedy}"
             ) from None
 
     def set_aside(self, station: str) -> bool:

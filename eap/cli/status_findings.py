@@ -180,7 +180,7 @@ def _of_audit(where: str, audit: Row) -> Iterator[Finding]:
         advice = f"{lost} lost; make room for {audit['file']}, or make its folder writable"
         yield _error(where, f"cannot be written: {error}; {effect}", advice, audit["since"])
     elif audit["lines"]:
-        yield _warning(where, f"{lost} lost, written again", since=audit["since"])
+        yield _warning(where, f"{lost} lost; written again", since=audit["since"])
 
 
 def _of_descriptors(where: str, descriptors: Row | None) -> Iterator[Finding]:

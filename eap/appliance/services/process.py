@@ -223,7 +223,10 @@ class Services:
                 self._listeners.stats(),
             ) | {
                 "audit": audit.report(),
-                "findings": interruption_findings(devices.routers.values(), time()),
+                "findings": [
+                    *interruption_findings(devices.routers.values(), time()),
+                    *(row for each in devices.by_station.values() for row in each.findings()),
+                ],
             }
 
         return Methods(

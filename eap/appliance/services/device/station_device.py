@@ -89,6 +89,23 @@ class StationDevice:
         """What ran before the last change, if anything, which change that was, and if undone."""
         return self._keeper.previous, self._keeper.cause, self._keeper.undone
 
+    def findings(self) -> list[dict[str, Any]]:
+        """Return as findings of ``status`` that what runs is not what a start would bring back."""
+        unkept = self._keeper.unkept
+        if unkept is None:
+            return []
+        reason, _, remedy = unkept.reason.removeprefix(f"station {self.name}: ").rpartition("; ")
+        state = self._keeper.state.name
+        return [
+            {
+                "severity": "error",
+                "where": self.name,
+                "what": f"{reason}; after a start it is as it was before",
+                "advice": f"{remedy}, then 'eapctl state {self.name} {state}'",
+                "since": unkept.since,
+            }
+        ]
+
     @property
     def status(self) -> StateResult:
         """State, and why it is not another one."""

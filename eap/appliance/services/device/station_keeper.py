@@ -11,7 +11,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any, Protocol
+from time import time
+from typing import Any, NamedTuple, Protocol
 
 from msgspec.structs import replace
 
@@ -24,6 +25,13 @@ from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 
 logger = logging.getLogger(__name__)
+
+
+class Unkept(NamedTuple):
+    """Why a configuration is not kept, and since when, as Unix time."""
+
+    reason: str
+    since: float
 
 
 class StationEngine(Protocol):
@@ -56,6 +64,7 @@ class StationKeeper:
         cause: Which change that was.
         undone: Whether it was taken back.
         on_change: Called with a new specification once it runs.
+        unkept: Why what runs is not what a start would bring back; None while both agree.
     """
 
     def __init__(
@@ -68,6 +77,7 @@ class StationKeeper:
         self.cause = ""
         self.undone = False
         self.on_change: Callable[[StationSpec], None] | None = None
+        self.unkept: Unkept | None = None
         self._store = store
         self._engine = engine
         self._base = digest_of(spec)
@@ -80,6 +90,7 @@ class StationKeeper:
             self.undone = stored.undone
             if stored.spec == spec:
                 self.objects = stored.objects
+        self._kept = self._record()
 
     async def change(
         self, spec: StationSpec, objects: dict[str, Any], *, cause: str = "", applied: bool = False
@@ -146,6 +157,8 @@ class StationKeeper:
             DeviceFault: the engine does not go up there; what goes down is down in any case.
         """
         if state is self.state:
+            if self.unkept is not None:
+                await self._save_back()
             return
         try:
             await self._engine.set_state(self.spec.name, state)
@@ -155,10 +168,7 @@ class StationKeeper:
             self._is_unsure = True
             logger.warning("station %s, on the way to %s: %s", self.spec.name, state.name, exc)
         self.state = state
-        try:
-            await self._save(self._record())
-        except EnvironmentalError as exc:
-            logger.warning("%s; after a start it will be in another state", exc)
+        await self._save_back()
 
     async def tell_again(self) -> None:
         """Tell the engine what it is to run, which it may have missed.
@@ -189,9 +199,15 @@ class StationKeeper:
     async def _save(self, record: Stored) -> None:
         # Other clients do not wait for the disk.
         await asyncio.to_thread(self._store.save, self.spec.name, record)
+        self._kept = record
+        self.unkept = None
 
     async def _save_back(self) -> None:
+        """Keep what runs; if something else stays kept, log it once and show it until it is not."""
+        record = self._record()
         try:
-            await self._save(self._record())
+            await self._save(record)
         except EnvironmentalError as exc:
-            logger.warning("%s", exc)
+            if self.unkept is None and record != self._kept:
+                logger.warning("%s; after a start it will be as it was before", exc)
+                self.unkept = Unkept(str(exc), time())

@@ -133,7 +133,7 @@ def test_refused_write_keeps_what_there_was(stations, monkeypatch, caplog):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.os, "fsync", full)
-    with pytest.raises(EnvironmentalError, match=r"station left: .*No space left.*EAP_STATE_DIR"):
+    with pytest.raises(EnvironmentalError, match=r"station left: .*No space left.*make room there"):
         store.save("left", replace(configured(left), base="new"))
     assert [path.name for path in store.path.iterdir()] == ["left.json"]
     assert store.load("left") == configured(left)

@@ -144,7 +144,7 @@ def test_audit_that_is_written_again_is_a_warning_when_lines_are_lost() -> None:
     audit = {"file": "/a", "required": False, "lines": 1, "since": NOW_S - 5, "until": NOW_S}
     status["appliances"][0]["audit"] = audit | {"error": ""}
     assert found(status) == [
-        ("warning", f"line audit: 1 line lost, written again, since {clock(NOW_S - 5)} (5.0 s)")
+        ("warning", f"line audit: 1 line lost, since {clock(NOW_S - 5)} (5.0 s); written again")
     ]
     status["appliances"][0]["audit"] = audit | {"lines": 0, "since": None, "error": ""}
     assert found(status) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 
 import pytest
 from msgspec.structs import replace
@@ -346,3 +347,17 @@ def test_change_while_it_runs_that_cannot_be_is_refused_by_the_dictionary(spec):
 
     asyncio.run(script())
     assert engine.calls == []
+
+
+def test_device_that_cannot_be_kept_has_a_finding(spec, monkeypatch):
+    def full(path, octets):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    device, _ = make_device(spec)
+    assert device.findings() == []
+    monkeypatch.setattr("eap.appliance.store.replace_file", full)
+    asyncio.run(device.request_state(DeviceState.SAFEOP))
+    (only,) = device.findings()
+    assert (only["severity"], only["where"]) == ("error", "left")
+    assert only["what"].endswith(": No space left on device; after a start it is as it was before")
+    assert only["advice"] == "make room there, then 'eapctl state left SAFEOP'"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 
 import pytest
 from msgspec.structs import replace
@@ -111,6 +112,7 @@ def test_what_cannot_be_kept_does_not_run(keeper, engine, changed, monkeypatch):
     with pytest.raises(DeviceFault, match="disk full"):
         asyncio.run(keeper.change(changed, NEW))
     assert engine.calls == []
+    assert keeper.unkept is None  # what runs is still what was kept
 
 
 def test_engine_that_went_away_is_told_again(keeper, engine, spec, changed):
@@ -164,7 +166,7 @@ def test_state_that_cannot_be_kept_is_told(keeper, engine, monkeypatch, caplog):
     monkeypatch.setattr(Store, "save", full)
     asyncio.run(keeper.change_state(DeviceState.SAFEOP))
     assert engine.state is keeper.state is DeviceState.SAFEOP
-    assert "disk full; after a start it will be in another state" in caplog.text
+    assert "disk full; after a start it will be as it was before" in caplog.text
     engine.failure = EngineRefusedError("no")
     with pytest.raises(DeviceFault, match="disk full"):
         asyncio.run(keeper.change(replace(keeper.spec, cycle_us=30_000), NEW))
@@ -235,3 +237,17 @@ def test_changes_of_a_tool_are_changes_of_their_own(engine):
     asyncio.run(keeper.change(new, OLD))
     assert keeper.cause > first
     assert (keeper.previous.spec, keeper.previous.objects) == (new, NEW)
+
+
+def test_state_that_cannot_be_kept_is_shown_until_it_is(keeper, monkeypatch, caplog):
+    def full(path, octets):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("eap.appliance.store.replace_file", full)
+        for state in (DeviceState.SAFEOP, DeviceState.PREOP):
+            asyncio.run(keeper.change_state(state))
+    assert len(caplog.records) == 1
+    assert keeper.unkept.reason.endswith("No space left on device; make room there")
+    asyncio.run(keeper.change_state(DeviceState.PREOP))
+    assert (keeper.unkept, kept().state) == (None, DeviceState.PREOP)
