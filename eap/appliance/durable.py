@@ -10,6 +10,7 @@ import errno
 import hashlib
 import logging
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,7 +82,7 @@ def replace_file(path: Path, data: bytes) -> None:
 def whole_file(target: Path) -> Iterator[BinaryIO]:
     """Open a file that takes the place of *target* once the block is through, and it is on disk.
 
-    A pipe or a device is written as it is.
+    Its rights stay as they are.  A pipe or a device is written as it is.
 
     Raises:
         EnvironmentalError: it cannot be written; what there was is still there.
@@ -97,6 +98,8 @@ def whole_file(target: Path) -> Iterator[BinaryIO]:
             raise PermissionError(errno.EACCES, "it is read only")
         try:
             with partial.open("wb") as file:
+                if whole.exists():
+                    os.fchmod(file.fileno(), stat.S_IMODE(whole.stat().st_mode))
                 yield file
                 file.flush()
                 os.fsync(file.fileno())

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 
 import pytest
 
@@ -81,3 +82,12 @@ def test_whole_file_on_a_full_disk_leaves_what_there_was(tmp_path, before):
     ):
         file.write(bytes(200))
     assert [each.read_bytes() for each in tmp_path.iterdir()] == ([before] if before else [])
+
+
+def test_whole_file_keeps_the_rights_of_the_one_before(tmp_path):
+    target = tmp_path / "secret"
+    target.touch(mode=0o600)
+    with whole_file(target) as file:
+        file.write(b"new")
+    assert target.read_bytes() == b"new"
+    assert stat.S_IMODE(target.stat().st_mode) == 0o600
