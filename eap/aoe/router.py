@@ -318,7 +318,8 @@ class Router:
         hop = prober.take_answer(header, body, way, now_ns, self._outlet.is_from)
         if hop is None:
             return []
-        return self._passage.hop_lost(*hop, "its router was started again", now_ns)
+        # Requests stay: those that were asked since then are answered.
+        return self._passage.subscriptions_lost(*hop, "its router was started again", now_ns)
 
     def _deliver(
         self, header: AmsHeader, data: bytes, way: Way, ports: Container[int], now_ns: int

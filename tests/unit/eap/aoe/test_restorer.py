@@ -304,6 +304,19 @@ def test_hop_with_another_restart_index_has_forgotten_its_subscriptions() -> Non
     assert missing.why == "its router was started again"
 
 
+def test_request_to_a_hop_that_was_started_again_is_answered() -> None:
+    scene = Scene(CYCLIC, is_probing=True)
+    for restart_index in (7, 8):
+        scene.passes(SECOND)
+        (state,) = [each for each in scene.asked if each.command == AmsCommand.READ]
+        request = ADD._replace(command=AmsCommand.READ_STATE, invoke_id=restart_index, body=b"")
+        onward = scene.station.forwarded(request, ONE)
+        found = struct.pack("<IIHHH", 0, 16, 5, 0, restart_index) + bytes(10)
+        assert scene.answer(state, found) == []
+        assert scene.answer(onward, bytes(8)) == [request.answer(bytes(8))]
+    assert scene.station.router.interruptions()[0].why == "its router was started again"
+
+
 def test_hop_that_was_lost_is_not_lost_again_by_its_restart_index() -> None:
     scene = Scene(CYCLIC, is_probing=True)
 
