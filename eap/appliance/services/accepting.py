@@ -15,6 +15,7 @@ from itertools import count
 from time import monotonic_ns
 from typing import Generic, Protocol, TypeVar
 
+from eap.appliance.services.log_limits import caused_by
 from eap.net.connections import (
     OVERDUE_NS,
     Activity,
@@ -32,8 +33,6 @@ _TURN_NS, _LOCAL_TURN_NS = 5_000_000, 20_000_000
 quickly, for the clients that get a place wait behind it."""
 _PAUSE_S = 1.0
 """After an error of the listener; connections that wait keep waiting."""
-_REPORT_S = 60.0
-"""Between two log lines about one listener."""
 _PEER = struct.Struct("3i")
 _numbers = count(1)
 
@@ -117,7 +116,7 @@ class Listeners:
     def __init__(self, patience_ns: int = OVERDUE_NS) -> None:
         self.table = ConnectionTable()
         self._patience_ns = patience_ns
-        self._reported: dict[str, tuple[int, float]] = {}
+        self._reported: dict[str, int] = {}
 
     def stats(self) -> list[ListenerStats]:
         """Return the figures of all listeners."""
@@ -134,15 +133,14 @@ class Listeners:
 
     def _report(self, stats: ListenerStats) -> None:
         total = stats.refused + stats.evicted + stats.overdue
-        before, at_s = self._reported.get(stats.name, (0, -_REPORT_S))
-        now_s = asyncio.get_running_loop().time()
-        if total == before or now_s - at_s < _REPORT_S:
+        if total == self._reported.get(stats.name, 0):
             return
-        self._reported[stats.name] = total, now_s
+        self._reported[stats.name] = total
         logger.warning(
             "%s: too many or too slow connections: %d of %d places taken; since the start %d"
             " refused, %d closed to make room, %d closed as too slow",
             *(stats.name, stats.open, stats.limit, stats.refused, stats.evicted, stats.overdue),
+            extra=caused_by(("connections", stats.name), stats.name),
         )
 
 

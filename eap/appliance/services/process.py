@@ -41,7 +41,7 @@ from eap.appliance.services.device.engine_client import EngineClient
 from eap.appliance.services.devices import Devices
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway_methods import GatewayMethods
-from eap.appliance.services.log_limits import LimitedLogHandler
+from eap.appliance.services.log_limits import LimitedLogHandler, caused_by
 from eap.appliance.services.methods import Methods
 from eap.appliance.services.monitor_ways import open_ways
 from eap.appliance.services.monitoring import SubscriberWatch
@@ -318,7 +318,9 @@ async def _keep_serving(serve: Callable[[], Awaitable[None]]) -> None:
         try:
             await serve()
         except* OSError as group:
-            logger.exception("an error of a socket: %s", group.exceptions[0])
+            error = group.exceptions[0]
+            cause = caused_by(("socket", str(error)), "sockets")
+            logger.exception("an error of a socket: %s", error, extra=cause)
         else:
             return
         await asyncio.sleep(_AGAIN_S)
