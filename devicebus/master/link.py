@@ -216,19 +216,23 @@ class Link:
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
         """Take a frame that came back; one that answers nothing is counted."""
         index = data[3] if len(data) > EtherCatHeader.SIZE + DatagramHeader.SIZE else -1
-        flight = self._flights.get(index) or self._overdue.get(index)
+        flight = self._flights.get(index)
+        is_late = flight is None
         if flight is None:
-            self._unexpected += 1
-            return
+            flight = self._overdue.get(index)
+            if flight is None:
+                self._unexpected += 1
+                return
         results = _match(data, index, flight.items)
         if results is None:
             self._malformed += 1
             return
         self._received += 1
-        if self._overdue.pop(index, None) is None:
-            self._land(index)
-        else:
+        if is_late:
+            del self._overdue[index]
             self._late += 1
+        else:
+            self._land(index)
         self._round_trip.measure(now_ns - flight.sent_ns)
         for item, (reply, wkc) in zip(flight.items, results, strict=True):
             if item.is_over:

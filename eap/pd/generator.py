@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from typing import Any
 
 from eap.codec import datatypes
@@ -52,6 +53,12 @@ def _step(image: Image, source: EngineSource) -> Callable[[int], None]:
     return lambda tick: store((value(tick) - low) % span + low)
 
 
+@lru_cache(maxsize=32)
+def _random_sequence(seed: int, size: int) -> bytes:
+    """Return the bytes of all variables with this seed and size: one copy, since it is large."""
+    return random.Random(seed).randbytes(_POSITIONS + size)  # noqa: S311  test data, not a secret
+
+
 def _random_step(
     image: Image, source: RandomSource, offset: int, size: int
 ) -> Callable[[int], None]:
@@ -60,8 +67,7 @@ def _random_step(
     Drawing new bytes in each cycle would tie the values to the number of cycles that ran, and
     takes longer for all but the smallest variables.
     """
-    generator = random.Random(source.seed)  # noqa: S311  test data, not a secret
-    sequence = generator.randbytes(_POSITIONS + size)
+    sequence = _random_sequence(source.seed, size)
     memory = image.memory[offset : offset + size]
 
     def fill(tick: int) -> None:

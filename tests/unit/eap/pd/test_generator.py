@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -79,3 +80,15 @@ def test_any_cycle_has_a_value_of_the_type(kind, cycle, step):
     (value,) = values(kind, CounterSource("v", step), cycle)
     limits = datatypes.parse(kind).scalar_range
     assert limits[0] <= value <= limits[1]
+
+
+def test_random_variables_of_one_seed_and_size_share_their_bytes() -> None:
+    image, source = make("BLOCK(8)"), RandomSource("x", seed=77)
+    tracemalloc.start()
+    try:
+        made = [Generators(image, [source]) for _ in range(20)]
+        kept = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert len(made) == 20
+    assert kept < 200_000  # one sequence takes 66 kB
