@@ -83,7 +83,7 @@ def test_any_cycle_has_a_value_of_the_type(kind, cycle, step):
 
 
 def test_random_variables_of_one_seed_and_size_share_their_bytes() -> None:
-    image, source = make("BLOCK(8)"), RandomSource("x", seed=77)
+    image, source = make("BLOCK(8)"), RandomSource("v", seed=77)
     tracemalloc.start()
     try:
         made = [Generators(image, [source]) for _ in range(20)]
