@@ -25,6 +25,9 @@ PROBE_PORT = 1
 """AMS port of this router that answers to probes go to."""
 MISSES = 2
 """Questions without an answer that make a hop a dead one."""
+GONE_NS = 60_000_000_000
+"""Time after which a dead hop counts as gone: its notifications are ended.  A router that was cut
+off for as long subscribes again when it is back."""
 _BUSY = 5
 """A hop that answers requests is asked only every so many turns: how long its router takes."""
 _SPACING_NS = 10_000_000
@@ -43,13 +46,15 @@ class Probe(NamedTuple):
     packet: bytes
     is_found_dead: bool
     """Whether the questions before it make the hop a dead one, which it was not yet."""
+    is_gone: bool = False
+    """Whether the hop has been dead for GONE_NS; told once."""
 
 
 class _Hop:
     """What is known of one hop."""
 
-    __slots__ = ("asked_at_ns", "has_restart_index", "heard_at_ns", "is_down", "misses", "number",
-                 "restart_index", "round_trip_ns", "target")  # fmt: skip
+    __slots__ = ("asked_at_ns", "gone_at_ns", "has_restart_index", "heard_at_ns", "is_down",
+                 "misses", "number", "restart_index", "round_trip_ns", "target")  # fmt: skip
 
     def __init__(self, number: int, target: NetId) -> None:
         self.number = number
@@ -58,6 +63,7 @@ class _Hop:
         self.heard_at_ns = -1
         self.misses = 0
         self.is_down = False
+        self.gone_at_ns: int | None = None
         self.round_trip_ns: int | None = None
         self.has_restart_index = True
         self.restart_index: int | None = None
@@ -199,7 +205,11 @@ class Prober:
         if is_found_dead:
             # What came from it is restored anyhow, and another router may answer next.
             hop.restart_index, hop.has_restart_index = None, True
-        return Probe(way, self._header(hop, AmsCommand.READ_STATE), is_found_dead)
+            hop.gone_at_ns = now_ns + GONE_NS
+        is_gone = hop.is_down and hop.gone_at_ns is not None and now_ns >= hop.gone_at_ns
+        if is_gone:
+            hop.gone_at_ns = None
+        return Probe(way, self._header(hop, AmsCommand.READ_STATE), is_found_dead, is_gone)
 
     def _header(self, hop: _Hop, command: AmsCommand) -> bytes:
         return AmsHeader(

@@ -80,6 +80,7 @@ class Router:
         self._outlet = Outlet(doors)
         self._refuser = Refuser(self._outlet, self.record)
         self._prober = prober
+        self._gone: list[Way] = []
         self._answer_now = answer_now
         self._devices: dict[NetId, Container[int]] = {}
         self._fragments = Reassembly()
@@ -222,9 +223,16 @@ class Router:
                 if probe.is_found_dead:
                     text = f"{MISSES} probes without an answer"
                     actions += self._passage.hop_lost(*probe.hop, text, now_ns)
+                if probe.is_gone:
+                    self._gone.append(probe.hop)
                 if probe.hop.door in self._outlet.doors:
                     actions.append(self._outlet.forward(probe.hop, probe.packet, _NOBODY))
         return actions
+
+    def take_gone_hops(self) -> list[Way]:
+        """Return the hops that have been dead for so long that nothing is kept for them."""
+        gone, self._gone = self._gone, []
+        return gone
 
     @property
     def has_news(self) -> bool:

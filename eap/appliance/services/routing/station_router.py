@@ -327,6 +327,8 @@ class StationRouter:
 
     def _handle_timeout(self) -> None:
         actions = self._router.handle_timeout(monotonic_ns())
+        for hop in self._router.take_gone_hops():
+            self.connection_closed(*hop)  # a datagram door has no other end of a connection
         if actions:
             self._act(actions)
         else:

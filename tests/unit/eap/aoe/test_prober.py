@@ -71,6 +71,18 @@ def test_hop_that_misses_two_questions_is_dead_and_lives_when_it_answers() -> No
     assert tick(station, 5 * SECOND) == ([probe], [])
 
 
+def test_hop_that_stays_dead_for_a_minute_is_gone_once() -> None:
+    station = probing()
+    gone = {}
+    for second in range(200):
+        probes, _ = tick(station, second * SECOND)
+        if second == 120:
+            station.give(probes[0].answer(b"", 6), LINK)
+        if found := station.router.take_gone_hops():
+            gone[second] = found
+    assert gone == {62: [LINK], 183: [LINK]}
+
+
 def test_answers_to_requests_are_signs_of_life() -> None:
     station = probing()
     tick(station, 0)

@@ -12,6 +12,7 @@ from eap.aoe.judge import Limits
 from eap.aoe.routes import Route
 from eap.aoe.spec import AccessRule
 from eap.aoe.way import Door, Way
+from eap.appliance.services.routing import station_router
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
@@ -227,6 +228,16 @@ def test_hops_are_asked_for_life_from_the_moment_there_is_a_route(scene):
 def test_services_are_told_of_a_connection_that_is_closed(scene):
     scene.station.connection_closed("in", "peer")
     assert scene.service.gone == [Way("in", "peer")]
+
+
+def test_services_are_told_of_a_hop_that_has_been_dead_for_long(scene, monkeypatch):
+    now_ns = 0
+    monkeypatch.setattr(station_router, "monotonic_ns", lambda: now_ns)
+    scene.station.add_route(Route(NetId.parse("7.7.7.7.1.1"), "far", HOP))
+    for second in range(70):
+        assert scene.service.gone == ([HOP] if second > 62 else [])
+        now_ns = second * 1_000_000_000
+        scene.station._handle_timeout()
 
 
 def test_notifications_go_to_their_clients_and_pass(scene):
