@@ -132,7 +132,7 @@ def _port_findings(
 ) -> Iterator[BusFinding]:
     """Yield the first of the ports whose errors are new, and the first of those of each time.
 
-    Both ends of a cable count its errors: only the end that comes first is told.
+    Both ends of a cable count its errors: only the end that comes first is named.
     """
     ports = history.ports if history is not None else {}
     timed = [(fault, ports.get((fault.station, fault.port))) for fault in faults]

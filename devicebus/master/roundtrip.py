@@ -11,7 +11,7 @@ FLOOR_NS = 2_000_000
 """Shortest time-out: a wire of 200 slaves takes less than 1 ms, the rest is for this machine."""
 CEILING_NS = 1_000_000_000
 """Longest time-out unless the plant file says otherwise."""
-PATIENCE_NS = 100_000_000
+BACKOFF_LIMIT_NS = 100_000_000
 """Time-out before anything is measured, and the end of backing off: a slow bus is known by its late
 frames, and a silent one is to be noticed soon."""
 
@@ -27,25 +27,31 @@ class RoundTrip:
         smoothed_ns: Mean of the latest round trips, 0 before the first.
     """
 
-    __slots__ = ("_ceiling_ns", "_floor_ns", "_patience_ns", "_variation_ns", "smoothed_ns",
-                 "timeout_ns")  # fmt: skip
+    __slots__ = (
+        "_backoff_limit_ns",
+        "_ceiling_ns",
+        "_floor_ns",
+        "_variation_ns",
+        "smoothed_ns",
+        "timeout_ns",
+    )
 
     def __init__(self, ceiling_ns: int = CEILING_NS) -> None:
         self._floor_ns = min(FLOOR_NS, ceiling_ns)
         self._ceiling_ns = ceiling_ns
-        self._patience_ns = min(PATIENCE_NS, ceiling_ns)
+        self._backoff_limit_ns = min(BACKOFF_LIMIT_NS, ceiling_ns)
         self._variation_ns = 0
         self.smoothed_ns = 0
-        self.timeout_ns = self._patience_ns
+        self.timeout_ns = self._backoff_limit_ns
 
     def timeout_of(self, number: int, last: int) -> int:
         """Return how long sending *number* of *last* is waited for.
 
-        Each time twice as long, up to PATIENCE_NS; the last one as long as that at least.
+        Each time twice as long, up to BACKOFF_LIMIT_NS; the last one as long as that at least.
         """
         if number == last > 1:
-            return max(self.timeout_ns, self._patience_ns)
-        return max(self.timeout_ns, min(self.timeout_ns << number - 1, self._patience_ns))
+            return max(self.timeout_ns, self._backoff_limit_ns)
+        return max(self.timeout_ns, min(self.timeout_ns << number - 1, self._backoff_limit_ns))
 
     def measure(self, round_trip_ns: int) -> None:
         """Take a round trip into account."""

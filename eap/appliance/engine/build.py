@@ -54,7 +54,7 @@ class EnginePlant:
 
     Args:
         handover: What to build.
-        step: Is told what is built next.
+        step: Called with the name of each step before it.
 
     Attributes:
         engine: Runs them.

@@ -7,7 +7,7 @@ from devicebus.master.cycle import MAX_UNDER_WAY, Cycle, Presence
 from devicebus.master.image import BusImage
 from devicebus.master.layout import BASE, lay_out
 from devicebus.master.link import LINGER_NS, Link
-from devicebus.master.roundtrip import PATIENCE_NS
+from devicebus.master.roundtrip import BACKOFF_LIMIT_NS
 from devicebus.wire.datagram import Command
 from tests.support.busline import MS, accesses_of, answer
 from tests.unit.devicebus.master.test_layout import shape
@@ -101,10 +101,10 @@ def test_cycle_lost_is_counted_and_neither_sent_again_nor_held_against_slaves():
     f = Fixture()
     f.cycle.start(0)
     f.link.frames_to_send(0)
-    f.link.handle_timeout(PATIENCE_NS)
-    assert f.link.frames_to_send(PATIENCE_NS) == []
+    f.link.handle_timeout(BACKOFF_LIMIT_NS)
+    assert f.link.frames_to_send(BACKOFF_LIMIT_NS) == []
     assert counts(f) == (0, 0, 0, 0)
-    f.link.handle_timeout(PATIENCE_NS + LINGER_NS)
+    f.link.handle_timeout(BACKOFF_LIMIT_NS + LINGER_NS)
     assert counts(f) == (0, 0, 1, 0)
     assert f.troubles == []
 
@@ -113,8 +113,8 @@ def test_cycle_late_is_counted_and_its_inputs_are_taken():
     f = Fixture()
     f.cycle.start(0)
     (frame,) = f.link.frames_to_send(0)
-    f.link.handle_timeout(PATIENCE_NS)
-    f.link.receive_frame(answer(frame, wkc=7, data=b"...WXYZ"), PATIENCE_NS + 1)
+    f.link.handle_timeout(BACKOFF_LIMIT_NS)
+    f.link.receive_frame(answer(frame, wkc=7, data=b"...WXYZ"), BACKOFF_LIMIT_NS + 1)
     assert f.image.inputs == b"WXYZ"
     assert counts(f) == (1, 1, 0, 0)
 
@@ -138,9 +138,9 @@ def test_cycle_with_too_many_under_way_is_skipped():
     f.link.receive_frame(answer(frames[0], wkc=7, data=b"...WXYZ"), MS)
     f.cycle.start(2 * MS)
     assert len(f.link.frames_to_send(2 * MS)) == 1
-    f.link.handle_timeout(PATIENCE_NS + 2 * MS)
-    f.cycle.start(PATIENCE_NS + 2 * MS)
-    assert len(f.link.frames_to_send(PATIENCE_NS + 2 * MS)) == 1
+    f.link.handle_timeout(BACKOFF_LIMIT_NS + 2 * MS)
+    f.cycle.start(BACKOFF_LIMIT_NS + 2 * MS)
+    assert len(f.link.frames_to_send(BACKOFF_LIMIT_NS + 2 * MS)) == 1
 
 
 def test_more_datagrams_go_with_a_cycle():

@@ -17,7 +17,7 @@ from devicebus.master.link import (
     MAX_RIDE,
     Link,
 )
-from devicebus.master.roundtrip import PATIENCE_NS
+from devicebus.master.roundtrip import BACKOFF_LIMIT_NS
 from devicebus.wire.datagram import Command
 from tests.support.busline import MS, accesses_of, answer
 
@@ -320,11 +320,11 @@ def test_who_rode_along_with_an_overdue_frame_is_sent_again():
     exchange = client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
     link.frames_to_send(0)
     assert not exchange.is_overdue
-    link.handle_timeout(PATIENCE_NS)
+    link.handle_timeout(BACKOFF_LIMIT_NS)
     assert exchange.is_overdue
-    (again,) = link.frames_to_send(PATIENCE_NS)
+    (again,) = link.frames_to_send(BACKOFF_LIMIT_NS)
     assert accesses_of(again) == [READ]
-    link.handle_timeout(PATIENCE_NS + LINGER_NS)
+    link.handle_timeout(BACKOFF_LIMIT_NS + LINGER_NS)
     assert [type(outcome) for outcome, _ in client.outcomes] == [FrameLostError]
 
 

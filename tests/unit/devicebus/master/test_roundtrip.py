@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.master.roundtrip import CEILING_NS, FLOOR_NS, PATIENCE_NS, RoundTrip
+from devicebus.master.roundtrip import BACKOFF_LIMIT_NS, CEILING_NS, FLOOR_NS, RoundTrip
 
 MS = 1_000_000
 
 
 def test_round_trip_not_measured_yet_is_waited_for_patiently():
     trip = RoundTrip()
-    assert (trip.timeout_ns, trip.smoothed_ns) == (PATIENCE_NS, 0)
+    assert (trip.timeout_ns, trip.smoothed_ns) == (BACKOFF_LIMIT_NS, 0)
     assert RoundTrip(ceiling_ns=3 * MS).timeout_ns == 3 * MS
 
 

@@ -6,7 +6,7 @@ from devicebus.errors import FrameLostError, WorkingCounterError
 from devicebus.master.access import fprd
 from devicebus.master.link import RETRIES
 from devicebus.master.procedure import Sleep, read
-from devicebus.master.roundtrip import PATIENCE_NS
+from devicebus.master.roundtrip import BACKOFF_LIMIT_NS
 from tests.support.busline import Bench, answer
 
 
@@ -38,8 +38,8 @@ def test_errors_of_a_procedure_are_those_of_its_task(bench):
 def test_lost_frames_are_thrown_into_it(bench):
     task = bench.runner.start(read(1, 0, 1), 0)
     for count in range(1 + RETRIES):
-        bench.frames_to_send(count * PATIENCE_NS)
-        bench.handle_timeout((count + 1) * PATIENCE_NS)
+        bench.frames_to_send(count * BACKOFF_LIMIT_NS)
+        bench.handle_timeout((count + 1) * BACKOFF_LIMIT_NS)
     with pytest.raises(FrameLostError):
         task.result()
     assert bench.next_timeout() is None
