@@ -52,8 +52,15 @@ def disk(farm: Plants, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def start(farm: Plants, access: str) -> Appliance:
     copy(BUSES / "drive.yaml", farm.folder / "drive.yaml")
     appliance = farm.run(farm.write(PLANT.replace("ACCESS", access)))
-    wait_until(lambda: appliance.request("trace", target="press/bus0/1001")["answer"])
+    with AmsClient(STATION, socket.socket()) as client:
+        wait_until(lambda: is_up(client))
     return appliance
+
+
+def is_up(client: AmsClient) -> bool:
+    """Say whether the drive answers, which it does once its bus is up."""
+    error, data = client.ask(BUS, aoe.READ, aoe.read_body(VALUE, 4), port=DRIVE)
+    return not error and not any(data[:4])
 
 
 def fill(disk: Path) -> Path:
