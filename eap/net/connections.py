@@ -7,10 +7,12 @@ Rule 1: a listener has a fixed number of places.  Some are reserved for programs
 one other host has at most its share.
 Rule 2: when no place is left, a connection that is not in use loses its place: of the newcomer's
 own host, or of a host that holds more than the newcomer's host.  First of the host that holds most,
-there first one that was never used, then the one that has been silent longest.
+there first one that was never used, then the one that has been silent longest.  One that was
+accepted within the last 3 s goes last, for its first request may be on its way; but it goes, or
+connections that come in a burst would lock out their host.
 Rule 3: if rule 2 finds none, one in use loses its place, but only to a host that holds fewer
 connections even afterwards; and one of a program of this host never does.  In use is a connection
-with requests under way or a subscription, used within the last 10 s, or accepted within 3 s.
+with requests under way or a subscription, or used within the last 10 s.
 Rule 4: a peer that leaves a frame unfinished, or takes no answers, is overdue after 10 s.
 """
 
@@ -27,7 +29,7 @@ OWN_HOST = ""
 SILENT_NS = 10_000_000_000
 """A connection that was used within this time is in use."""
 FRESH_NS = 3_000_000_000
-"""So is one that was accepted within this time: its first request may be on its way."""
+"""A connection that was accepted within this time is spared while there are others."""
 OVERDUE_NS = 10_000_000_000
 """Time that a peer has to finish a frame, or to take answers."""
 
@@ -248,7 +250,8 @@ def _find_victim(
             may_lose = each.host == newcomer_host or count > mine
         if not may_lose:
             continue
-        rank = is_used, -count, each.activity, each.used_at_ns
+        is_fresh = each.activity is Activity.UNUSED and now_ns - each.used_at_ns < FRESH_NS
+        rank = is_used, is_fresh, -count, each.activity, each.used_at_ns
         if best is None or rank < best:
             victim, best = each, rank
     return victim
@@ -256,9 +259,9 @@ def _find_victim(
 
 def _is_in_use(connection: Connection, now_ns: int) -> bool:
     activity = connection.activity
-    if activity > Activity.IDLE:
-        return True
-    return now_ns - connection.used_at_ns < (SILENT_NS if activity else FRESH_NS)
+    if activity is Activity.IDLE:
+        return now_ns - connection.used_at_ns < SILENT_NS
+    return activity is not Activity.UNUSED
 
 
 def host_of(peer: str, own: str) -> str:

@@ -119,11 +119,20 @@ def test_connection_in_use_is_kept_from_hosts_that_hold_as_many() -> None:
     assert scene.admit(Peer(C), 100 * S + 1)[0]  # that of B has been silent for 10 s now
 
 
-def test_connection_that_was_just_accepted_is_kept_from_its_own_host() -> None:
-    scene = Scene(total=2, reserved=0)
-    scene.fill(Peer(A, BUSY), Peer(A, at_ns=100 * S - FRESH_NS + 1))
-    assert scene.admit(Peer(A)) == (False, None)
-    assert scene.admit(Peer(A), 100 * S + 1)[0]
+def test_connection_that_was_just_accepted_is_spared_while_there_are_others() -> None:
+    scene = Scene(total=3, reserved=0)
+    fresh = 100 * S - FRESH_NS + 1
+    first, silent, _ = scene.fill(
+        Peer(A, at_ns=fresh), Peer(A, Activity.IDLE, 80 * S), Peer(B, at_ns=fresh + 1)
+    )
+    assert scene.admit(Peer(A, at_ns=100 * S)) == (True, silent)
+    assert scene.admit(Peer(C, at_ns=100 * S)) == (True, first)
+
+
+def test_burst_of_silent_connections_does_not_lock_out_its_own_host() -> None:
+    scene = Scene(total=6, reserved=0, per_host=6)
+    oldest, *_ = scene.fill(*(Peer(OWN_HOST, at_ns=100 * S - 6 + n) for n in range(6)))
+    assert scene.admit(Peer(OWN_HOST, at_ns=100 * S)) == (True, oldest)
 
 
 def test_host_with_many_connections_does_not_displace_those_of_others() -> None:
@@ -200,8 +209,9 @@ class Use(RuleBasedStateMachine):
         self.refused = self.evicted = 0
 
     def in_use(self, peer: Peer) -> bool:
-        limit_ns = SILENT_NS if peer.activity is Activity.IDLE else FRESH_NS
-        return peer.activity > Activity.IDLE or self.now_ns - peer.used_at_ns < limit_ns
+        if peer.activity is Activity.IDLE:
+            return self.now_ns - peer.used_at_ns < SILENT_NS
+        return peer.activity is not Activity.UNUSED
 
     @rule(host=hosts, which=st.sampled_from([0, 1]), spare=st.sampled_from([0, 1, 50]))
     def connect(self, host: str, which: int, spare: int) -> None:

@@ -17,7 +17,6 @@ from eap.appliance.services.accepting import (
     TaskConnection,
     connection_name,
 )
-from eap.net import connections
 from eap.net.connections import CloseReason, Limits
 from tests.support.appliance import wait_until
 from tests.support.eventually import eventually
@@ -97,9 +96,7 @@ def test_listener_serves_as_many_as_it_has_places():
     assert serve(script).refused == ["all 2 places are taken"]
 
 
-def test_crowd_that_comes_at_once_is_counted_before_it_runs(monkeypatch):
-    monkeypatch.setattr(connections, "FRESH_NS", 0)
-
+def test_crowd_that_comes_at_once_is_counted_before_it_runs():
     def script(connect, echo, listeners):
         crowd = [connect() for _ in range(40)]
         wait_until(lambda: listeners.stats()[0].evicted == 38)
@@ -141,7 +138,6 @@ def test_failure_of_a_connection_ends_that_one_only(failure, lines, caplog):
 
 def test_listener_without_descriptors_closes_an_unused_connection(monkeypatch):
     errors = [OSError(errno.EMFILE, "Too many open files")]
-    monkeypatch.setattr(connections, "FRESH_NS", 0)
 
     class Short(socket.socket):
         def accept(self):

@@ -14,7 +14,6 @@ from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.ams import ams_door
 from eap.appliance.services.ams.ams_door import AmsClients, AmsDoor
 from eap.appliance.services.routing.entrance import Entrance
-from eap.net import connections
 from eap.net.connections import Limits
 from tests.support import aoe
 from tests.support.amsstation import EchoStation
@@ -171,7 +170,6 @@ def test_client_that_dies_leaves_the_others_alone():
 
 def test_silent_connections_make_room_for_others(monkeypatch):
     monkeypatch.setattr(ams_door, "LIMITS", Limits(total=3, reserved=0))
-    monkeypatch.setattr(connections, "FRESH_NS", 0)
 
     async def script(connect, door):
         async def ask(reader, writer):
