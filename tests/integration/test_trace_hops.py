@@ -73,8 +73,9 @@ def test_every_hop_is_named_and_the_one_that_fails(line: Row) -> None:
     assert " c (" not in log
     first, *repeats = [each for each in log.splitlines() if ": interface east0 has no link" in each]
     assert ": b (" in first
-    assert len(repeats) == 1, "three commands asked by the dead hop"
-    assert re.search(r"; repeated \d+ times in \d+ s$", repeats[0])
+    # One line a minute, and one at the end: three commands asked by the dead hop.
+    assert 1 <= len(repeats) <= 2
+    assert all(re.search(r"; repeated \d+ times in \d+ s$", each) for each in repeats)
 
 
 def test_rules_that_refuse_are_named(line: Row) -> None:
