@@ -22,7 +22,9 @@ from eap.codec.foe import DATA_OVERHEAD, FoeOpcode
 from eap.errors import EapError
 
 KEPT = 16 << 20
-"""Octets of a file on its way to a slave that are kept, to begin anew if the bus interrupts it."""
+"""Bytes of a file on its way to a slave that are kept, to begin anew if the bus interrupts it."""
+ALL_KEPT = 64 << 20
+"""Bytes of all files together; one that finds no room goes on, but does not begin anew."""
 AHEAD = 64 << 10
 """Octets that are read before anybody asks for them, or taken before the slave has them."""
 
@@ -39,6 +41,9 @@ class _Past:
     one that is read a hash is enough: what the client has already is read again and compared.
     """
 
+    all_kept = 0
+    """Bytes that all transfers of the process keep now."""
+
     def __init__(self, *, is_kept: bool) -> None:
         self.can_rewind = True
         self._is_kept = is_kept
@@ -50,9 +55,15 @@ class _Past:
         """Keep what the slave was given."""
         if self._is_kept and self.can_rewind:
             self._data += data
-            if len(self._data) > KEPT:
+            _Past.all_kept += len(data)
+            if len(self._data) > KEPT or _Past.all_kept > ALL_KEPT:
                 self.can_rewind = False
-                self._data.clear()
+                self.forget()
+
+    def forget(self) -> None:
+        """Free what is kept."""
+        _Past.all_kept -= len(self._data)
+        self._data.clear()
 
     def fresh(self, data: bytes) -> bytes:
         """Return what is new of *data*; raise BusError if the rest is not as it was."""
@@ -78,7 +89,7 @@ class _Past:
         self._repeated = 0
         self._hash_again = sha256()
         data = bytes(self._data)
-        self._data.clear()
+        self.forget()
         return data
 
 
@@ -131,6 +142,7 @@ class Transfer:
                 logger.info("%s: restart %d after: %s", self._name, restarts.count, restarts.reason)
                 await asyncio.sleep(PAUSE_S)
         finally:
+            self._past.forget()
             self._note(has_ended=True)
 
     async def _run_once(self, open_talk: Callable[[], Awaitable[Talk]]) -> None:

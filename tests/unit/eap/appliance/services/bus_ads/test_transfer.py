@@ -213,11 +213,20 @@ def test_transfer_of_another_file_after_a_fault_of_the_bus_is_an_error(soon):
     play(scene, talk)
 
 
-def test_transfer_too_long_to_be_kept_is_given_up(soon, monkeypatch):
-    monkeypatch.setattr(transfer_module, "KEPT", 10_000)
+@pytest.mark.parametrize("limit", ["KEPT", "ALL_KEPT"])
+def test_transfer_too_long_to_be_kept_is_given_up(soon, monkeypatch, limit):
+    monkeypatch.setattr(transfer_module, limit, 10_000)
 
     async def scene(transfer, task):
         with pytest.raises(MailboxClosedError):
             await write_all(transfer)
 
     play(scene, BrokenTalk(), is_write=True)
+
+
+def test_transfers_that_ended_keep_nothing(soon):
+    async def scene(transfer, task):
+        await write_all(transfer)
+
+    play(scene, BrokenTalk(), is_write=True)
+    assert transfer_module._Past.all_kept == 0
