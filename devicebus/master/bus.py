@@ -38,7 +38,7 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     frame_timeout_ns: int = CEILING_NS
     """How long a frame may be under way at most; the time-out follows the round trip up to this."""
     frame_retries: int = RETRIES
-    """How often an access is sent again when its frame is overdue."""
+    """Times that an access is sent again when its frame is overdue."""
     acyclic_octets: int = 1536
     """Budget of acyclic datagrams in a cycle."""
     watchdog_ms: int | None = None

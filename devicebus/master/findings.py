@@ -59,7 +59,7 @@ class BusFinding(msgspec.Struct, frozen=True, kw_only=True):
     slaves: tuple[int, ...] = ()
     """Station addresses of the slaves concerned, in the order of the line."""
     port: int | None = None
-    """Where errors start, or a link was lost."""
+    """Port at which errors start, or whose link was lost."""
     is_over: bool = False
     since_ns: int | None = None
     """How many nanoseconds ago it began, if that is known."""
@@ -68,7 +68,7 @@ class BusFinding(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class History(NamedTuple):
-    """What a running master has noted of its slaves; nothing else knows times."""
+    """Notes of a running master about its slaves; nothing else knows times."""
 
     over: tuple[tuple[SlaveView, Times], ...] = ()
     """Slaves with the trouble that they had, in the order of the line."""

@@ -30,7 +30,7 @@ from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.wire import Buffer
 
 RETRIES = 4
-"""How often an access is sent again unless the plant file says otherwise."""
+"""Times that an access is sent again unless the plant file says otherwise."""
 LINGER_NS = 1_000_000_000
 """How long an overdue frame may still come back; then it is lost."""
 INDEXES = 256

@@ -15,7 +15,7 @@ from devicebus.sim.wiring import CABLE_NS, PortAt, Side, Way, dl_status, find_wa
 from devicebus.wire.register import Register
 
 POLL_NS = 1_000_000
-"""How often slaves look at the time on their own, MAX_POLLED of them at once."""
+"""Period in which slaves look at the time on their own, MAX_POLLED of them at once."""
 MAX_POLLED = 64
 """Of 200 slaves each looks at the time every 4 ms: all of them would take half of a processor."""
 CATCH_UP_NS = 20_000_000

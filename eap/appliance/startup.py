@@ -27,7 +27,7 @@ Step: TypeAlias = Callable[[str], None]
 """Reports the beginning of a step."""
 
 _IMPORT_PERIOD_S = 0.5
-"""How often a process that imports says that it goes on."""
+"""Period in which a process that imports reports that it goes on."""
 
 
 class Report(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -37,7 +37,7 @@ class Report(msgspec.Struct, frozen=True, omit_defaults=True):
     waits_for: str = ""
     """Process without which this step cannot end."""
     ready: dict[str, Any] | None = None
-    """What ``status`` says of the process, when it runs."""
+    """Report of the process for ``status``, when it runs."""
 
 
 class Startup:

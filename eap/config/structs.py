@@ -302,7 +302,7 @@ class Defaults(Section, frozen=True):
 
 
 class AuditDuty(StrEnum):
-    """What becomes of changes that the audit cannot record."""
+    """Treatment of changes that the audit cannot record."""
 
     OPTIONAL = "optional"
     """They are made; what is lost is counted."""
@@ -311,7 +311,7 @@ class AuditDuty(StrEnum):
 
 
 class PlantAccess(Section, frozen=True):
-    """What holds for the access to all stations; the rules themselves are those of each."""
+    """Rules for the access to all stations; each has rules of its own beside them."""
 
     audit: AuditDuty = AuditDuty.OPTIONAL
 

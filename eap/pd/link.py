@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias
 
 
 class Origin(Protocol):
-    """Whoever hands a frame to a taker, and can tell whose it is."""
+    """Driver that hands a frame to a taker, and knows the sender of the frame."""
 
     def source_of(self, data: memoryview) -> bytes:
         """Return the address that *data* came from: MAC (6 bytes), IPv4 (4), or none (empty).

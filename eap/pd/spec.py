@@ -312,7 +312,7 @@ class BusPortSpec(Record, frozen=True):
     frame_timeout_us: int = 1_000_000
     """How long a frame may be under way at most before it is sent again."""
     frame_retries: int = 4
-    """How often a frame that is overdue is sent again."""
+    """Times that a frame that is overdue is sent again."""
 
 
 class LinkSpec(Record, frozen=True):

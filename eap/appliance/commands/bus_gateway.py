@@ -47,7 +47,7 @@ class GatewayBus:
         self._mailbox = None if mailbox is None else MailboxSizes(mailbox, mailbox)
         self._slaves: list[MasterSlave] | None = None
         self._reached: set[int] = {MASTER_ADDRESS}
-        """Who has answered; a refusal needs no hint then."""
+        """Slaves that have answered; a refusal needs no hint then."""
 
     def scan(self) -> Sequence[Slave]:
         """Return the slaves that the master tells of.

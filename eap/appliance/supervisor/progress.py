@@ -18,7 +18,7 @@ FIRST_NOTE_NS = 10_000_000_000
 
 
 class StartEvent(Enum):
-    """What time brought."""
+    """Outcome of the time that passed."""
 
     SLOW = "slow"
     """The start takes long, and goes on."""

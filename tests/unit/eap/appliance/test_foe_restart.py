@@ -1,4 +1,4 @@
-"""Which faults let a transfer begin anew, and how often."""
+"""Restarts of a transfer: the faults that allow one, and their number."""
 
 from __future__ import annotations
 
