@@ -7,12 +7,12 @@ Rule 1: a listener has a fixed number of places.  Some are reserved for programs
 one other host has at most its share.
 Rule 2: when no place is left, a connection that is not in use loses its place: of the newcomer's
 own host, or of a host that holds more than the newcomer's host.  First of the host that holds most,
-there first one that was never used, then the one that has been silent longest.  One that was
-accepted within the last 3 s goes last, for its first request may be on its way; but it goes, or
-connections that come in a burst would lock out their host.
+there first one that was never used, then the one that has been silent longest.
 Rule 3: if rule 2 finds none, one in use loses its place, but only to a host that holds fewer
 connections even afterwards; and one of a program of this host never does.  In use is a connection
-with requests under way or a subscription, or used within the last 10 s.
+with requests under way or a subscription, used within the last 10 s, or accepted within 3 s.
+If rule 3 finds none, the oldest of those that were just accepted from the newcomer's own host
+loses its place: a burst of connections does not lock out the host that it comes from.
 Rule 4: a peer that leaves a frame unfinished, or takes no answers, is overdue after 10 s.
 """
 
@@ -29,7 +29,7 @@ OWN_HOST = ""
 SILENT_NS = 10_000_000_000
 """A connection that was used within this time is in use."""
 FRESH_NS = 3_000_000_000
-"""A connection that was accepted within this time is spared while there are others."""
+"""So is one that was accepted within this time: its first request may be on its way."""
 OVERDUE_NS = 10_000_000_000
 """Time that a peer has to finish a frame, or to take answers."""
 
@@ -243,15 +243,20 @@ def _find_victim(
     mine = held[newcomer_host]
     victim, best = None, None
     for each in pool:
-        is_used, count = _is_in_use(each, now_ns), held[each.host]
-        if is_used:
-            may_lose = each.host != OWN_HOST and count > mine + 1
-        else:
-            may_lose = each.host == newcomer_host or count > mine
-        if not may_lose:
-            continue
+        count = held[each.host]
         is_fresh = each.activity is Activity.UNUSED and now_ns - each.used_at_ns < FRESH_NS
-        rank = is_used, is_fresh, -count, each.activity, each.used_at_ns
+        if is_fresh or _is_in_use(each, now_ns):
+            if each.host != OWN_HOST and count > mine + 1:
+                order = 1
+            elif is_fresh and each.host == newcomer_host:
+                order = 2
+            else:
+                continue
+        elif each.host == newcomer_host or count > mine:
+            order = 0
+        else:
+            continue
+        rank = order, -count, each.activity, each.used_at_ns
         if best is None or rank < best:
             victim, best = each, rank
     return victim

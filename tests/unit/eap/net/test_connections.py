@@ -119,14 +119,18 @@ def test_connection_in_use_is_kept_from_hosts_that_hold_as_many() -> None:
     assert scene.admit(Peer(C), 100 * S + 1)[0]  # that of B has been silent for 10 s now
 
 
-def test_connection_that_was_just_accepted_is_spared_while_there_are_others() -> None:
+def test_connection_that_was_just_accepted_is_spared_for_a_silent_one() -> None:
     scene = Scene(total=3, reserved=0)
     fresh = 100 * S - FRESH_NS + 1
-    first, silent, _ = scene.fill(
-        Peer(A, at_ns=fresh), Peer(A, Activity.IDLE, 80 * S), Peer(B, at_ns=fresh + 1)
-    )
+    _, silent, _ = scene.fill(Peer(A, at_ns=fresh), Peer(A, Activity.IDLE, 80 * S), Peer(B, BUSY))
     assert scene.admit(Peer(A, at_ns=100 * S)) == (True, silent)
-    assert scene.admit(Peer(C, at_ns=100 * S)) == (True, first)
+
+
+def test_connection_that_was_just_accepted_is_spared_while_another_host_holds_more() -> None:
+    scene = Scene(total=4, reserved=0)
+    fresh = Peer(C, at_ns=100 * S - FRESH_NS + 1)
+    oldest, *_ = scene.fill(Peer(A, BUSY, 1), Peer(A, BUSY, 2), Peer(A, BUSY, 3), fresh)
+    assert scene.admit(Peer(C, at_ns=100 * S)) == (True, oldest)
 
 
 def test_burst_of_silent_connections_does_not_lock_out_its_own_host() -> None:
@@ -208,7 +212,13 @@ class Use(RuleBasedStateMachine):
         self.open: dict[Peer, Listener] = {}
         self.refused = self.evicted = 0
 
+    def is_fresh(self, peer: Peer) -> bool:
+        is_young = self.now_ns - peer.used_at_ns < FRESH_NS
+        return peer.activity is Activity.UNUSED and is_young
+
     def in_use(self, peer: Peer) -> bool:
+        if self.is_fresh(peer):
+            return True
         if peer.activity is Activity.IDLE:
             return self.now_ns - peer.used_at_ns < SILENT_NS
         return peer.activity is not Activity.UNUSED
@@ -221,8 +231,8 @@ class Use(RuleBasedStateMachine):
         refusal, victim = self.table.admit(listener, peer, self.now_ns, spare_descriptors=spare)
         if refusal:
             self.refused += 1
-            own_quiet = [e for e in at_listener if e.host == host and not self.in_use(e)]
-            assert not own_quiet
+            mine = [e for e in at_listener if e.host == host]
+            assert not any(not self.in_use(e) or self.is_fresh(e) for e in mine)
         else:
             self.open[peer] = listener
         if victim is None:
@@ -234,8 +244,11 @@ class Use(RuleBasedStateMachine):
         held = Counter(e.host for e in before if spare == 0 or before[e] is listener)
         if self.in_use(victim):
             assert not any(not self.in_use(e) and e.host == victim.host for e in at_listener)
-            assert victim.host not in {OWN_HOST, host}
-            assert held[victim.host] > 1
+            if victim.host == host:
+                assert self.is_fresh(victim)
+                return
+            assert victim.host != OWN_HOST
+            assert held[victim.host] > held[host] + 1
         elif victim.host != host:
             assert held[victim.host] >= 1
 
