@@ -49,6 +49,18 @@ def prepare(priority=50, cpus="()", before="", prefix=()):
 
 
 @pytest.mark.host_root
+def test_take_precedence_is_for_those_who_may_and_no_error_for_others():
+    script = "import os\nfrom eap.net.realtime import take_precedence\ntake_precedence(-10)\n"
+    script += "print(os.getpriority(os.PRIO_PROCESS, 0))"
+    command = [sys.executable, "-c", script]
+    shares = [
+        subprocess.run([*prefix, *command], capture_output=True, text=True, check=True).stdout
+        for prefix in ([], ["setpriv", "--bounding-set=-sys_nice"])
+    ]
+    assert shares == ["-10\n", "0\n"]
+
+
+@pytest.mark.host_root
 def test_root_gets_everything():
     report = prepare(cpus="(0,)")
     assert report["scheduler"] == "fifo 50"
