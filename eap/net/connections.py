@@ -9,8 +9,9 @@ Rule 2: when no place is left, a connection that is not in use loses its place: 
 own host, or of a host that holds more than the newcomer's host.  First of the host that holds most,
 there first one that was never used, then the one that has been silent longest.
 Rule 3: if rule 2 finds none, one in use loses its place, but only to a host that holds fewer
-connections even afterwards; and one of a program of this host never does.  In use is a connection
-with requests under way or a subscription, used within the last 10 s, or accepted within 3 s.
+connections even afterwards; and one of a program of this host never does, unless it was just
+accepted.  In use is a connection with requests under way or a subscription, used within the last
+10 s, or accepted within 3 s.
 If rule 3 finds none, the oldest of those that were just accepted from the newcomer's own host
 loses its place: a burst of connections does not lock out the host that it comes from.
 Rule 4: a peer that leaves a frame unfinished, or takes no answers, is overdue after 10 s.
@@ -246,7 +247,7 @@ def _find_victim(
         count = held[each.host]
         is_fresh = each.activity is Activity.UNUSED and now_ns - each.used_at_ns < FRESH_NS
         if is_fresh or _is_in_use(each, now_ns):
-            if each.host != OWN_HOST and count > mine + 1:
+            if (is_fresh or each.host != OWN_HOST) and count > mine + 1:
                 order = 1
             elif is_fresh and each.host == newcomer_host:
                 order = 2

@@ -133,6 +133,14 @@ def test_connection_that_was_just_accepted_is_spared_while_another_host_holds_mo
     assert scene.admit(Peer(C, at_ns=100 * S)) == (True, oldest)
 
 
+def test_burst_of_this_host_leaves_descriptors_to_other_listeners() -> None:
+    scene = Scene(reserved=0)
+    oldest, *_ = scene.fill(*(Peer(OWN_HOST, at_ns=100 * S - 6 + n) for n in range(6)))
+    control = scene.table.add_listener("control", Limits())
+    found = scene.table.admit(control, Peer("process 7"), 100 * S, spare_descriptors=0)
+    assert found == ("", oldest)
+
+
 def test_burst_of_silent_connections_does_not_lock_out_its_own_host() -> None:
     scene = Scene(total=6, reserved=0, per_host=6)
     oldest, *_ = scene.fill(*(Peer(OWN_HOST, at_ns=100 * S - 6 + n) for n in range(6)))
@@ -247,7 +255,7 @@ class Use(RuleBasedStateMachine):
             if victim.host == host:
                 assert self.is_fresh(victim)
                 return
-            assert victim.host != OWN_HOST
+            assert victim.host != OWN_HOST or self.is_fresh(victim)
             assert held[victim.host] > held[host] + 1
         elif victim.host != host:
             assert held[victim.host] >= 1
