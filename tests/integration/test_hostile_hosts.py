@@ -2,12 +2,12 @@
 
 Clients of every kind read once a second meanwhile, and nothing of theirs fails.  ``EAP_LONG=1`` is
 the campaign: 200 connections (``EAP_HOSTILE``) of each kind to each listener, 10 clients of each
-kind, for 600 s (``EAP_SECONDS``).  ``EAP_LOAD=15`` runs that many busy loops beside it.
+kind and 10 receivers of process data, for 600 s (``EAP_SECONDS``).  ``EAP_LOAD=15`` runs that many
+busy loops beside it.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import socket
@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 from tests.support.gatewayplant import BUS, DRIVE
 from tests.support.namespaces import Namespace, enter, namespace
 
+pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
+
 pytestmark = [pytest.mark.net, pytest.mark.root]
 
 IS_LONG = bool(os.environ.get("EAP_LONG"))
@@ -48,6 +51,16 @@ TARGET = f"{ADDRESS}.2.1"
 GATEWAY_PORT = 34990
 LATEST_S = 10.0
 """An answer that takes longer is a failure; a client usually gives up after 5 s or more."""
+PDS = [
+    (f"by-{frame}-{number}", frame) for frame in ("tcp", "udp") for number in range(CLIENTS // 2)
+]
+_SUBSCRIBE = "\n".join(
+    f"      - {{name: {name}, port: eap0, from: far/{name}, timeout_ms: 5000}}" for name, _ in PDS
+)
+_PUBLISH = "\n".join(
+    f"      - {{name: {name}, frame: {frame}, id: {number}, cycle_us: 100000, variables: [ticks]}}"
+    for number, (name, frame) in enumerate(PDS, 1)
+)
 PLANT = f"""\
 plant: besieged
 defaults: {{cycle_us: 10000}}
@@ -63,8 +76,7 @@ stations:
         net_id: {ADDRESS}.4.1
         gateway: {{port: {GATEWAY_PORT}}}
     subscribe:
-      - {{name: by-tcp, port: eap0, from: far/by-tcp, timeout_ms: 5000}}
-      - {{name: by-udp, port: eap0, from: far/by-udp, timeout_ms: 5000}}
+@SUBSCRIBE@
   - name: far
     net_id: {FAR}.1.1
     ports:
@@ -76,9 +88,8 @@ stations:
       - {{name: tcp, port: eap0, to: "tcp://{ADDRESS}"}}
       - {{name: udp, port: eap0, to: "{ADDRESS}"}}
     publish:
-      - {{name: by-tcp, frame: tcp, id: 1, cycle_us: 100000, variables: [ticks]}}
-      - {{name: by-udp, frame: udp, id: 2, cycle_us: 100000, variables: [ticks]}}
-"""
+@PUBLISH@
+""".replace("@SUBSCRIBE@", _SUBSCRIBE).replace("@PUBLISH@", _PUBLISH)
 
 
 @contextmanager
@@ -125,6 +136,10 @@ def attackers(here: Namespace, hosts: list[Namespace], control: Path) -> list[li
     return [*found, [*here.prefix, *start, json.dumps(own)]]
 
 
+Client = tuple[Callable[[], object], Callable[[], None]]
+"""A call that reads once, and one that closes the connection."""
+
+
 class Reader(threading.Thread):
     """A client in a namespace that reads once a second, in a thread of its own.
 
@@ -139,7 +154,7 @@ class Reader(threading.Thread):
         self,
         kind: str,
         host: Namespace,
-        connect: Callable[[], tuple[Callable[[], object], Callable[[], None]]],
+        connect: Callable[[], Client],
         *,
         is_fleeting: bool,
     ) -> None:
@@ -176,12 +191,12 @@ class Reader(threading.Thread):
         self._closed(client)
 
     @staticmethod
-    def _closed(client: tuple[Callable[[], object], Callable[[], None]] | None) -> None:
+    def _closed(client: Client | None) -> None:
         if client is not None:
             client[1]()
 
 
-def by_ams() -> tuple[Callable[[], object], Callable[[], None]]:
+def by_ams() -> Client:
     client = AmsClient(ADDRESS)
     client.socket.settimeout(LATEST_S)
 
@@ -191,15 +206,45 @@ def by_ams() -> tuple[Callable[[], object], Callable[[], None]]:
     return read, client.socket.close
 
 
-def by_pyads() -> tuple[Callable[[], object], Callable[[], None]]:
-    pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
-    connection = pyads.Connection(TARGET, 0xFFFF, ADDRESS)
-    connection.open()
-    octets = ctypes.c_uint8 * 6
-    return lambda: connection.read(0xF302, 0xF9200001, octets), connection.close
+PYADS_PROGRAM = f"""
+import ctypes, sys
+import pyads
+connection = pyads.Connection("{TARGET}", 0xFFFF, "{ADDRESS}")
+for line in sys.stdin:
+    try:
+        connection.open()
+        connection.read(0xF302, 0xF9200001, ctypes.c_uint8 * 6)
+        if line == "close\\n":
+            connection.close()
+    except Exception as exc:
+        connection.close()
+        print(repr(exc), flush=True)
+    else:
+        print("ok", flush=True)
+"""
+"""Reads at each line of its input; AdsLib has one connection for all of a process."""
 
 
-def by_frames(kind: socket.SocketKind) -> tuple[Callable[[], object], Callable[[], None]]:
+def by_pyads(started: ExitStack, *, is_fleeting: bool) -> Client:
+    """Start a process of pyads in the namespace of this thread; it lives until the end."""
+    command = [sys.executable, "-c", PYADS_PROGRAM]
+    pipe = subprocess.PIPE
+    process = started.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True))
+    started.callback(process.kill)
+    assert process.stdin
+    assert process.stdout
+    requests, answers = process.stdin, process.stdout
+
+    def read() -> None:
+        requests.write("close\n" if is_fleeting else "read\n")
+        requests.flush()
+        answer = answers.readline()
+        assert answer == "ok\n", answer
+
+    return read, lambda: None
+
+
+def by_frames(kind: socket.SocketKind) -> Client:
     """Ask by type 5; a datagram that is lost is sent again, as clients do."""
     sock = socket.socket(socket.AF_INET, kind)
     is_stream = kind == socket.SOCK_STREAM
@@ -221,7 +266,7 @@ def by_frames(kind: socket.SocketKind) -> tuple[Callable[[], object], Callable[[
     return read, sock.close
 
 
-def by_gateway(port: int, *, tcp: bool) -> tuple[Callable[[], object], Callable[[], None]]:
+def by_gateway(port: int, *, tcp: bool) -> Client:
     client = GatewayClient(ADDRESS, port, tcp=tcp, timeout_s=2.0, tries=4)
 
     def read() -> None:
@@ -239,12 +284,12 @@ def by_gateway(port: int, *, tcp: bool) -> tuple[Callable[[], object], Callable[
     return read, client.close
 
 
-def by_control(runtime: Path) -> tuple[Callable[[], object], Callable[[], None]]:
+def by_control(runtime: Path) -> Client:
     (client,) = connect_those(lambda info: info.plant == "besieged" and "mill" in info.stations)
     return lambda: client.request_within(LATEST_S, "read", station="mill"), client.close
 
 
-def by_command(runtime: Path) -> tuple[Callable[[], object], Callable[[], None]]:
+def by_command(runtime: Path) -> Client:
     def read() -> None:
         done = run_eapctl(runtime, "status", "--json")
         assert done.returncode == 0, done.stderr
@@ -253,11 +298,10 @@ def by_command(runtime: Path) -> tuple[Callable[[], object], Callable[[], None]]
     return read, lambda: None
 
 
-def clients(here: Namespace, friend: Namespace, runtime: Path) -> list[Reader]:
+def clients(here: Namespace, friend: Namespace, runtime: Path, started: ExitStack) -> list[Reader]:
     """Return all clients: half of them on the plant's host, half of them keep their connection."""
-    kinds: dict[str, Callable[[], tuple[Callable[[], object], Callable[[], None]]]] = {
+    kinds: dict[str, Callable[[], Client]] = {
         "ams": by_ams,
-        "pyads": by_pyads,
         "type 5 TCP": lambda: by_frames(socket.SOCK_STREAM),
         "type 5 UDP": lambda: by_frames(socket.SOCK_DGRAM),
         "gateway TCP": lambda: by_gateway(34980, tcp=True),
@@ -267,10 +311,13 @@ def clients(here: Namespace, friend: Namespace, runtime: Path) -> list[Reader]:
     }
     found = []
     for kind, connect in kinds.items():
-        for number in range(CLIENTS if kind != "pyads" else 1):
+        for number in range(CLIENTS):
             host = here if number % 2 or kind == "control" else friend
             is_fleeting = number % 4 > 1
             found.append(Reader(kind, host, connect, is_fleeting=is_fleeting))
+    for number in range(CLIENTS):
+        connect = partial(by_pyads, started, is_fleeting=number % 4 > 1)
+        found.append(Reader("pyads", (here, friend)[number % 2], connect, is_fleeting=False))
     if IS_LONG:
         found.append(Reader("eapctl", here, lambda: by_command(runtime), is_fleeting=False))
     return found
@@ -326,7 +373,7 @@ def test_clients_are_served_while_three_hosts_attack_every_listener(
         busy = [[sys.executable, "-c", "while True: pass"]] * LOAD
         stack.enter_context(programs(*busy, *attackers(here, hosts, control)))
         wait_until(lambda: all(_is_crowded(row) for row in _rows(appliance)), 60)
-        readers = clients(here, friend, appliance.runtime)
+        readers = clients(here, friend, appliance.runtime, stack)
         for each in readers:
             each.start()
         middle = _watch(appliance, SECONDS)
