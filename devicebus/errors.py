@@ -11,6 +11,7 @@ EapError
     ├── NoMailboxError          a slave has no mailbox, or none in its state
     ├── MailboxClosedError      a slave's mailbox is closed for now, it is being brought back
     ├── MailboxSizeError        a message does not fit a slave's mailbox
+    ├── MailboxBusyError        other clients' transfers kept a slave's mailbox
     ├── MailboxTimeoutError     a slave did not answer in its mailbox
     ├── MailboxRefusedError     a slave answered with a mailbox error
     ├── MailboxProtocolError    a slave's answer breaks the protocol
@@ -74,6 +75,10 @@ class MailboxClosedError(BusError):
 
 class MailboxSizeError(BusError):
     """A message does not fit a slave's mailbox; nothing was sent."""
+
+
+class MailboxBusyError(BusError):
+    """The transfers of other clients kept a slave's mailbox; nothing was sent."""
 
 
 class MailboxTimeoutError(BusError):

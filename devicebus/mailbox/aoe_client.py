@@ -48,6 +48,15 @@ def exchange(
     return answer, bytes(body)
 
 
+def send(header: AmsHeader, data: bytes, sizes: MailboxSizes) -> Conversation[None]:
+    """Send a request that wants no answer; raises MailboxSizeError as exchange() does."""
+    packet = encode_packet(header, data)
+    if len(packet) <= sizes.to_slave - MailboxHeader.SIZE:
+        yield Ask(MailboxType.AOE, packet, expects_reply=False)
+    else:
+        yield from _send_fragments(packet, header.invoke_id, sizes)
+
+
 def _send_fragments(packet: bytes, number: int, sizes: MailboxSizes) -> Conversation[None]:
     room = min(sizes.to_slave, sizes.to_master) - MailboxHeader.SIZE - AmsHeader.SIZE
     if room < 1:

@@ -7,6 +7,7 @@ slave.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NoReturn
 
 from devicebus.errors import MailboxProtocolError
@@ -46,8 +47,11 @@ def upload(
     complete: bool = False,
     progress: Progress | None = None,
     max_size: int = MAX_SIZE,
+    sink: Callable[[int, bytes], object] | None = None,
 ) -> Conversation[bytes]:
     """Read an entry, or with *complete* a whole object from subindex 0 or 1 on.
+
+    *sink* is called with the size and each piece as it comes, for who need not wait for the rest.
 
     Raises:
         SdoAbortError: the slave refuses.
@@ -57,6 +61,8 @@ def upload(
     plain = encode_plain(SdoRequest.UPLOAD, index, subindex, complete=complete)
     head, rest = yield from sdo.ask(plain)
     if head.expedited:
+        if sink is not None:
+            sink(len(head.data), head.data)
         return head.data
     size = head.value
     if size > max_size:
@@ -64,6 +70,8 @@ def upload(
     content = bytearray(rest[:size])
     progress = progress or Progress()
     progress.done, progress.total = len(content), size
+    if sink is not None:
+        sink(size, bytes(content))
     toggle = short = 0
     while len(content) < size:
         asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
@@ -80,6 +88,8 @@ def upload(
             reason = f"{short} short segments" if data else "a segment without data"
             yield from sdo.give_up(AbortCode.GENERAL, reason)
         progress.done = len(content)
+        if sink is not None:
+            sink(size, data)
         toggle ^= 1
     return bytes(content)
 
@@ -117,6 +127,13 @@ def download(
         yield from sdo.ask_segment(segment)
         progress.done += len(piece)
         toggle ^= 1
+
+
+def download_unsized(index: int, subindex: int, octets: bytes) -> Conversation[None]:
+    """Write an entry from four octets; as many count as the entry has.  Raises as download()."""
+    value = int.from_bytes(octets, "little")
+    head = SdoHeader(0, 1, 0, 0, SdoRequest.DOWNLOAD, index, subindex, value)
+    yield from _Sdo(index, subindex).ask(head.encode())
 
 
 class _Sdo:

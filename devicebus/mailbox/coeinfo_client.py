@@ -80,6 +80,14 @@ def read_entry(index: int, subindex: int, value_info: int) -> Conversation[bytes
     return (yield from _ask(what, opcode, request, index=index, subindex=subindex))
 
 
+def read(opcode: SdoInfoOpcode, request: bytes) -> Conversation[bytes]:
+    """Send any request; return the octets of the answer.  Raises as object_list() does."""
+    index = 0 if opcode is SdoInfoOpcode.LIST_REQUEST else int.from_bytes(request[:2], "little")
+    subindex = int.from_bytes(request[2:3], "little")
+    what = f"SDO information {opcode.name} {ObjectId(index, subindex)}"
+    return (yield from _ask(what, opcode, request, index=index, subindex=subindex))
+
+
 def read_pdo(service: CoeService, number: int) -> Conversation[bytes]:
     """Ask for a PDO through the mailbox; *service* is TX_PDO or RX_PDO."""
     remote = {

@@ -27,6 +27,7 @@ from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import RemoteLink
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.mailbox import (
     MailboxHeader,
     MailboxType,
@@ -114,10 +115,18 @@ class _Link:
         )  # fmt: skip
         return BusReport(is_up=True, slaves=(slave,))
 
-    async def open_talk(self, station: int, kind: MailboxType, requester: Hashable) -> Talk:
+    async def open_talk(
+        self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
+    ) -> Talk:
         return cast("Talk", _Talk(self._box))
 
-    async def converse(self, station: int, conversation: Conversation[T], requester: Hashable) -> T:
+    async def converse(
+        self,
+        station: int,
+        conversation: Conversation[T],
+        requester: Hashable,
+        turn_s: float | None = None,
+    ) -> T:
         return await lead(conversation, cast("Talk", _Talk(self._box)), next(conversation))
 
     def listen(self, heard: Callable[[Heard], None]) -> None:
@@ -167,7 +176,7 @@ async def _serve(data: bytes) -> None:
     )
     link = RemoteLink(_ask, _STATION, answer_s=1)
     gateway = MailboxGateway(
-        _Link(dictionary),
+        cast("BusMailboxes", _Link(dictionary)),
         lambda: MasterSession(dictionary, _SETTINGS.room, _nothing, lambda index: bool(index & 1)),
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,

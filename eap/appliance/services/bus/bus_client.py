@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Sequence
 from time import monotonic_ns
 from typing import TypeVar
 
-from devicebus.errors import BusError
+from devicebus.errors import BusError, MailboxBusyError
 from devicebus.mailbox.conversation import Conversation
 from devicebus.master.access import Access, Reply
 from devicebus.master.procedure import Answer, Procedure, Sleep
@@ -99,21 +99,43 @@ class BusClient:
             await asyncio.sleep(_LOOK_S)
 
     async def open_talk(
-        self, port: PortName, station: int, kind: MailboxType, requester: Hashable
+        self,
+        port: PortName,
+        station: int,
+        kind: MailboxType,
+        requester: Hashable,
+        turn_s: float | None = None,
     ) -> Talk:
-        """Wait for a turn at the mailbox of a slave; raises as :meth:`wait_up` does."""
+        """Wait for a turn at the mailbox of a slave, no longer than *turn_s* if that is given.
+
+        Raises:
+            MailboxBusyError: others had it all the time.
+            BusError, EngineGoneError: as :meth:`wait_up` does.
+        """
         await self._be_up(port)
         thing = port, station, kind
-        await self._turns.take(thing, requester)
+        try:
+            async with asyncio.timeout(turn_s):
+                await self._turns.take(thing, requester)
+        except TimeoutError:
+            raise MailboxBusyError(
+                f"slave {station}: the {kind.name} transfers of other clients took {turn_s:g} s"
+            ) from None
         bus = self._numbers[port]
         return Talk(self._link, bus, station, kind, lambda: self._turns.give_back(thing))
 
     async def converse(
-        self, port: PortName, station: int, conversation: Conversation[T], requester: Hashable
+        self,
+        port: PortName,
+        station: int,
+        conversation: Conversation[T],
+        requester: Hashable,
+        turn_s: float | None = None,
     ) -> T:
         """Lead a conversation with a slave to its end; return its result.
 
         Raises:
+            MailboxBusyError: its turn did not come within *turn_s*.
             BusError: the slave has no mailbox, does not answer, or refuses; as its class says.
             SdoAbortError: it refuses an SDO.
             EngineGoneError: there is no engine, or not the one with which it began.
@@ -124,7 +146,7 @@ class BusClient:
             value: T = end.value
             return value
         try:
-            talk = await self.open_talk(port, station, ask.type, requester)
+            talk = await self.open_talk(port, station, ask.type, requester, turn_s)
         except BaseException:
             conversation.close()
             raise

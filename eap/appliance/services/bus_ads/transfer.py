@@ -109,6 +109,7 @@ class Transfer:
         is_open: Whether the slave has said yes.
         is_complete: Whether all of the file went as it should.
         has_ended: Whether nothing more goes to the slave or comes from it.
+        sizes: As given.
     """
 
     def __init__(self, name: str, password: int, sizes: MailboxSizes, *, is_write: bool) -> None:
@@ -117,13 +118,23 @@ class Transfer:
         self.has_turn = self.is_open = self.is_complete = self.has_ended = False
         self._name = name
         self._password = password
-        self._sizes = sizes
+        self.sizes = sizes
         self._buffer = bytearray()
         self._wanted = AHEAD
         self.is_whole = False
         self._past = _Past(is_kept=is_write)
         self._error: EapError | None = None
         self._changed = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self, open_talk: Callable[[], Awaitable[Talk]]) -> None:
+        """Begin the transfer, until it is complete or :meth:`close` ends it."""
+        self._task = asyncio.get_running_loop().create_task(self.run(open_talk))
+
+    def close(self) -> None:
+        """Give the file up if it is not complete, at the slave too."""
+        if self._task is not None:
+            self._task.cancel()
 
     async def run(self, open_talk: Callable[[], Awaitable[Talk]]) -> None:
         """Transfer the file; whoever cancels this ends it, at the slave too."""
@@ -192,14 +203,14 @@ class Transfer:
     def _begin(self) -> Conversation[int]:
         if self.is_write:
             return foe_client.write(
-                self._name, self._give, self._sizes, password=self._password, progress=self.progress
+                self._name, self._give, self.sizes, password=self._password, progress=self.progress
             )
         return foe_client.read(
-            self._name, self._take, self._sizes, password=self._password, progress=self.progress
+            self._name, self._take, self.sizes, password=self._password, progress=self.progress
         )
 
     async def _lead(self, conversation: Conversation[int], talk: Talk) -> None:
-        room = self._sizes.to_slave - DATA_OVERHEAD
+        room = self.sizes.to_slave - DATA_OVERHEAD
         try:
             ask = next(conversation)
             while True:

@@ -15,8 +15,8 @@ from eap.appliance.services.gateway.guard import Guard, Target, reason_of_refusa
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import LinkTo
 from eap.appliance.services.gateway.slave_book import SlaveBook
-from eap.appliance.services.gateway.slave_link import SlaveLink
 from eap.appliance.services.gateway.slave_session import find_refusal, reason_of
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxType
@@ -59,7 +59,7 @@ class DialectDesk:
 
     def __init__(
         self,
-        bus: SlaveLink,
+        bus: BusMailboxes,
         book: SlaveBook,
         guard: Guard,
         open_master: Callable[[], MasterSession],

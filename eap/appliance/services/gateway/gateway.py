@@ -36,12 +36,12 @@ from eap.appliance.services.gateway.remote_link import LinkTo
 from eap.appliance.services.gateway.remote_session import RemoteSession
 from eap.appliance.services.gateway.sessions import SessionKey, Sessions
 from eap.appliance.services.gateway.slave_book import SlaveBook
-from eap.appliance.services.gateway.slave_link import SlaveLink
 from eap.appliance.services.gateway.slave_session import (
     Reply,
     SlaveSession,
     find_refusal,
 )
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.mailbox import MailboxType, decode_frame
 from eap.gateway import dialect
 from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, RemoteSlave, Slave
@@ -98,7 +98,7 @@ class MailboxGateway:
 
     def __init__(
         self,
-        bus: SlaveLink,
+        bus: BusMailboxes,
         open_master: Callable[[], MasterSession],
         access: Callable[[], AccessList],
         settings: Settings,

@@ -11,9 +11,9 @@ from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import RemoteLink
-from eap.appliance.services.gateway.slave_link import PortLink
 from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.gateway.address import AddressMap, Group, RemoteSlave, Slave
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
@@ -65,7 +65,7 @@ def open_gateways(
             name=f"{bus.owner.station}/{bus.owner.port}",
         )
         gateway = MailboxGateway(
-            PortLink(client, bus.owner),
+            BusMailboxes(client, bus.owner),
             partial(MasterSession, desk.dictionary, settings.room, desk.refresh, desk.is_fresh),
             partial(_access_of, router),
             settings,

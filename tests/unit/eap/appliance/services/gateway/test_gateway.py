@@ -18,7 +18,7 @@ from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import RemoteLink
-from eap.appliance.services.gateway.slave_link import PortLink
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.ads import IndexGroup
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.mailbox import (
@@ -74,7 +74,7 @@ class Desk:
         self._link = EngineLink(self.engine.services)
         turns = itertools.cycle((False, True))  # has to be waited for, and has not
         self.gateway = MailboxGateway(
-            PortLink(BusClient(self._link, [PORT]), PORT),
+            BusMailboxes(BusClient(self._link, [PORT]), PORT),
             lambda: MasterSession(MASTER, settings.room, nothing, lambda index: next(turns)),
             lambda: AccessList(rules),
             settings,

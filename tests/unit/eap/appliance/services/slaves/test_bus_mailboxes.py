@@ -1,4 +1,4 @@
-"""The bus of one port."""
+"""Mailboxes of one bus port."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import asyncio
 from devicebus.mailbox import coe_client
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.gateway.slave_link import PortLink
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.mailbox import MailboxType
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
 
-def test_it_names_the_port_for_all_that_is_asked() -> None:
+def test_bus_mailboxes_name_their_port_in_each_request() -> None:
     async def run() -> None:
         engine = FakeEngine(FakeBus(LoopBus("drive")))
         link = EngineLink(engine.services)
-        port = PortLink(BusClient(link, [PORT]), PORT)
+        port = BusMailboxes(BusClient(link, [PORT]), PORT)
         try:
             assert [each.station for each in (await port.describe()).slaves] == [1001]
             talk = await port.open_talk(1001, MailboxType.COE, "me")

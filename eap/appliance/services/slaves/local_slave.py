@@ -1,0 +1,131 @@
+"""Access to a slave of an own bus, through the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import TypeVar
+
+from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client, voe_client
+from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.protocol import MailboxSizes
+from eap.appliance.bus_failure import no_mailbox
+from eap.appliance.bus_request import SlaveReport
+from eap.appliance.services.bus_ads.transfer import Transfer
+from eap.appliance.services.slaves.access import UploadSink
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
+from eap.codec.ams import AmsHeader, StateFlags, encode_packet
+from eap.codec.mailbox import MailboxType
+from eap.codec.sdoinfo import SdoInfoOpcode
+from eap.codec.soe import Idn
+from eap.codec.voe import VoeHeader
+
+T = TypeVar("T")
+
+
+class LocalSlave:
+    """A slave of an own bus, for one requester; a SlaveAccess.
+
+    Args:
+        bus: The mailboxes of its bus.
+        slave: As the engine describes it.
+        requester: Whose operations take turns with those of others.
+        turn_s: Limit for the wait for a turn, which MailboxBusyError ends; None for no limit.
+    """
+
+    def __init__(
+        self,
+        bus: BusMailboxes,
+        slave: SlaveReport,
+        requester: Hashable,
+        *,
+        turn_s: float | None = None,
+    ) -> None:
+        self.bus = bus
+        self._slave = slave
+        self._requester = requester
+        self._turn_s = turn_s
+
+    async def sizes(self) -> MailboxSizes:
+        """Return the sizes of the slave's mailboxes; raise NoMailboxError if none is open."""
+        return self._sizes()
+
+    async def probe(self) -> None:
+        """Do nothing: the engine answers for its slaves."""
+
+    async def read_object(
+        self, index: int, subindex: int, *, complete: bool = False, sink: UploadSink | None = None
+    ) -> bytes:
+        """Read an entry, or with *complete* an object from subindex 0 or 1 on."""
+        return await self._converse(
+            coe_client.upload(index, subindex, complete=complete, sink=sink)
+        )
+
+    async def write_object(
+        self, index: int, subindex: int, data: bytes, *, complete: bool = False
+    ) -> None:
+        """Write an entry, or with *complete* an object from subindex 0 or 1 on."""
+        sizes = self._sizes()
+        await self._converse(coe_client.download(index, subindex, data, sizes, complete=complete))
+
+    async def write_unsized(self, index: int, subindex: int, octets: bytes) -> None:
+        """Write an entry from four octets of which as many count as the entry has."""
+        await self._converse(coe_client.download_unsized(index, subindex, octets))
+
+    async def read_info(self, opcode: SdoInfoOpcode, request: bytes) -> bytes:
+        """Return the body of an SDO information answer, its fragments joined."""
+        return await self._converse(coeinfo_client.read(opcode, request))
+
+    async def read_elements(self, idn: int, elements: int, *, drive: int) -> bytes:
+        """Read elements of an IDN, one behind the other; lists and texts with their heads."""
+        return await self._converse(soe_client.read(Idn.of(idn), elements, drive=drive))
+
+    async def write_elements(self, idn: int, elements: int, data: bytes, *, drive: int) -> None:
+        """Write an element of an IDN; a list or text with its head."""
+        sizes = self._sizes()
+        await self._converse(
+            soe_client.write(Idn.of(idn), data, sizes, elements=elements, drive=drive)
+        )
+
+    def open_file(self, name: str, password: int, *, is_write: bool) -> Transfer:
+        """Begin to move a file; it is closed by the caller."""
+        file = Transfer(name, password, self._sizes(), is_write=is_write)
+        # By the file, not by the requester: two of its files take turns like those of two.
+        file.start(lambda: self.bus.open_talk(self._slave.station, MailboxType.FOE, file))
+        return file
+
+    async def exchange_vendor(self, message: bytes) -> bytes:
+        """Return the answer to a VoE message, both with their VoE headers."""
+        return (await self.exchange(MailboxType.VOE, message)).data
+
+    async def send_vendor(self, message: bytes) -> None:
+        """Send a VoE message that is not answered."""
+        head = VoeHeader.decode(message)
+        data = message[VoeHeader.SIZE :]
+        await self._converse(voe_client.send(head.vendor_id, head.vendor_type, data))
+
+    async def exchange_ads(self, header: AmsHeader, data: bytes) -> bytes:
+        """Return the AMS packet that answers an AoE request; nothing if it wants no answer."""
+        sizes = self._sizes()
+        if header.state_flags & StateFlags.NO_RETURN:
+            await self._converse(aoe_client.send(header, data, sizes))
+            return b""
+        return encode_packet(*await self._converse(aoe_client.exchange(header, data, sizes)))
+
+    async def exchange(
+        self, kind: MailboxType, request: bytes, *, expects_reply: bool = True
+    ) -> Message:
+        """Pass a mailbox message that has no operation here, and return its answer."""
+        return await self._converse(_single(Ask(kind, request, expects_reply=expects_reply)))
+
+    def _sizes(self) -> MailboxSizes:
+        if not self._slave.to_slave:
+            raise no_mailbox(self._slave)
+        return MailboxSizes(self._slave.to_slave, self._slave.to_master)
+
+    async def _converse(self, conversation: Conversation[T]) -> T:
+        station = self._slave.station
+        return await self.bus.converse(station, conversation, self._requester, self._turn_s)
+
+
+def _single(ask: Ask) -> Conversation[Message]:
+    return (yield ask)
