@@ -116,6 +116,8 @@ class SegmentHandover(Handed, frozen=True):
     """This side of the pair with the engine."""
     command_fd: int
     """This side of the pair with services."""
+    realtime: bool = False
+    """As in EngineOptions."""
 
 
 class EngineOptions(Record, frozen=True):

@@ -229,6 +229,9 @@ def main(handover_fd: int, startup: Startup) -> int:
     """Return the exit code: 2 for a bus file that is none."""
     handover = SegmentHandover.from_descriptor(handover_fd)
     realtime.die_with_parent(handover.supervisor)
+    if handover.realtime:
+        # Hardware does not wait for a processor: simulated slaves answer as late as this does.
+        realtime.take_precedence()
     try:
         run_for_appliance(handover, startup)
     except ConfigError as exc:

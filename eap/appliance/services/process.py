@@ -73,8 +73,6 @@ if TYPE_CHECKING:
 STATUS_PATIENCE_S = 0.3
 """How long ``status`` waits for what the engine says of its buses."""
 _IMAGE_PAUSE_S = 0.01
-_NICE = -10
-"""Ten times the share of an ordinary process: a busy machine keeps no operator waiting."""
 _AGAIN_S = 1.0
 """After an error of a socket."""
 
@@ -304,7 +302,7 @@ def main(handover_fd: int, startup: Startup) -> int:
     handover = Handover.from_descriptor(handover_fd)
     realtime.die_with_parent(handover.supervisor)
     if handover.options.realtime:
-        realtime.take_precedence(_NICE)
+        realtime.take_precedence()
     log = LimitedLogHandler()
     logging.basicConfig(format="services: %(message)s", level=logging.INFO, handlers=[log])
     try:

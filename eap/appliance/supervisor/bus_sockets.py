@@ -43,7 +43,11 @@ def open_message_pair(opened: ExitStack) -> tuple[int, int]:
 
 
 def segments(
-    stations: Sequence[StationSpec], buses: Sequence[BusSocket], supervisor: int
+    stations: Sequence[StationSpec],
+    buses: Sequence[BusSocket],
+    supervisor: int,
+    *,
+    realtime: bool,
 ) -> Iterator[tuple[PortName, SegmentHandover]]:
     """Yield what the process of each simulated segment is given."""
     for (name, port), bus in zip(bus_ports(stations), buses, strict=True):
@@ -55,6 +59,7 @@ def segments(
                     port.bus.file,
                     frames_fd=bus.segment_fd,
                     command_fd=bus.segment_command_fd,
+                    realtime=realtime,
                 ),
             )
 

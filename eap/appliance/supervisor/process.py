@@ -411,7 +411,10 @@ def _given_to_segments(
 ) -> dict[Child, tuple[Handover | SegmentHandover, list[int]]]:
     """Add a child for each simulated segment; return what they are given."""
     given: dict[Child, tuple[Handover | SegmentHandover, list[int]]] = {}
-    for owner, handover in segments(common.stations, common.buses, common.supervisor):
+    handovers = segments(
+        common.stations, common.buses, common.supervisor, realtime=common.options.realtime
+    )
+    for owner, handover in handovers:
         name = f"{owner.station}/{owner.port}"
         child = children[name] = Child(f"segment {name}", "eap.appliance.segment.process", bytecode)
         given[child] = handover, [handover.frames_fd, handover.command_fd]

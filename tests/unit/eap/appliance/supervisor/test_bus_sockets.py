@@ -55,11 +55,12 @@ def test_simulated_buses_have_two_pairs_and_others_one_socket():
                 near.send(b"one")
                 near.send(b"two")
                 assert (far.recv(100), far.recv(100)) == (b"one", b"two")
-        ((name, handover),) = segments(plant, (remote, simulated), 77)
+        ((name, handover),) = segments(plant, (remote, simulated), 77, realtime=True)
         assert name == PortName("b", "bus0")
         assert (handover.supervisor, handover.file) == (77, "/plants/io.yaml")
         assert handover.frames_fd == simulated.segment_fd
         assert handover.command_fd == simulated.segment_command_fd
+        assert handover.realtime
 
 
 @pytest.mark.net
