@@ -6,13 +6,14 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+import devicebus.drive
 from devicebus.mailbox.server import MailboxServer
 from devicebus.master.access import Access, Reply
 from devicebus.master.esm import change_state
 from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea, configure
-from devicebus.master.procedure import Answer, Procedure, Sleep
+from devicebus.master.procedure import Answer, Procedure, Sleep, Step
 from devicebus.master.runner import Runner
 from devicebus.master.scan import scan
 from devicebus.master.task import Task
@@ -138,18 +139,16 @@ def accesses_of(frame: bytes) -> list[Access]:
 
 def drive(procedure: Procedure, respond: Callable[[Access], Reply], now_ns: int = 0):
     """Run a procedure against *respond* alone; sleeps take as long as they say."""
-    step = next(procedure)
-    while True:
+
+    def exchange(step: Step) -> Answer:
+        nonlocal now_ns
         if isinstance(step, Sleep):
             now_ns += step.duration_ns
-            outcome = Answer((), now_ns)
-        else:
-            now_ns += TRIP_NS
-            outcome = Answer([respond(access) for access in step], now_ns)
-        try:
-            step = procedure.send(outcome)
-        except StopIteration as end:
-            return end.value
+            return Answer((), now_ns)
+        now_ns += TRIP_NS
+        return Answer([respond(access) for access in step], now_ns)
+
+    return devicebus.drive.drive(procedure, exchange)
 
 
 def slave(name: str, kind: str = "digital", **options) -> SlaveSpec:

@@ -13,6 +13,7 @@ from typing import TypeVar
 
 import pytest
 
+from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.counter import CounterWatch, next_counter
@@ -67,18 +68,7 @@ class Line:
 
     def run(self, talk: Conversation[T]) -> T:
         """Run a conversation to its end."""
-        try:
-            ask = next(talk)
-            while True:
-                try:
-                    message = self._exchange(ask)
-                except (MailboxRefusedError, MailboxTimeoutError) as exc:
-                    ask = talk.throw(exc)
-                else:
-                    ask = talk.send(message)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+        return drive(talk, self._exchange)
 
     def run_partly(self, talk: Conversation[object], steps: int) -> None:
         """Cancel a conversation after so many exchanges, or let it end before."""

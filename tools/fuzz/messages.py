@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
+from devicebus.drive import drive
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.match import answers
@@ -35,17 +36,13 @@ def answer_with(talk: Conversation[T], kind: MailboxType, answers: Iterable[byte
     Every other answer is accepted whatever the conversation says, as if it were expected.
     """
     rest = iter(answers)
-    try:
-        ask = next(talk)
-        while True:
-            if not ask.expects_reply:
-                ask = talk.send(Message(kind, b""))
-                continue
-            found = _next_answer(ask, rest)
-            if found is None:
-                ask = talk.throw(MailboxTimeoutError("no answer is left"))
-            else:
-                ask = talk.send(Message(kind, found))
-    except StopIteration as end:
-        result: T = end.value
-        return result
+
+    def exchange(ask: Ask) -> Message:
+        if not ask.expects_reply:
+            return Message(kind, b"")
+        found = _next_answer(ask, rest)
+        if found is None:
+            raise MailboxTimeoutError("no answer is left")
+        return Message(kind, found)
+
+    return drive(talk, exchange)

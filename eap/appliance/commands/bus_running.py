@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from devicebus.errors import BusError, FrameLostError
+from devicebus.drive import drive
+from devicebus.errors import FrameLostError
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.access import Reply, fprd
@@ -130,10 +131,7 @@ class RunningBus:
         if not report.to_slave:
             raise no_mailbox(report)
         conversation = begin(MailboxSizes(report.to_slave, report.to_master))
-        try:
-            return self._lead(slave, conversation, meanwhile)
-        finally:
-            conversation.close()
+        return self._lead(slave, conversation, meanwhile)
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
         """Bring slaves to a state, where the master keeps them then.
@@ -149,20 +147,7 @@ class RunningBus:
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
         """Run a procedure to its end and return its result, or raise what went wrong."""
         del name
-        try:
-            step = next(procedure)
-            while True:
-                try:
-                    replies = self._do(step)
-                except BusError as exc:
-                    step = procedure.throw(exc)
-                else:
-                    step = procedure.send(Answer(replies, monotonic_ns()))
-        except StopIteration as end:
-            value: T = end.value
-            return value
-        finally:
-            procedure.close()
+        return drive(procedure, self._do)
 
     def frame_counts(self) -> FrameCounts:
         """Return the frames of the master since the engine started."""
@@ -181,35 +166,31 @@ class RunningBus:
         found = self._request(control_bus.PATIENCE_S, "bus_describe", wait=True)
         return msgspec.convert(found, BusReport)
 
-    def _do(self, step: Step) -> list[Reply]:
+    def _do(self, step: Step) -> Answer:
         if isinstance(step, Sleep):
             select.select([], [], [], max(0, step.duration_ns) / _S)
-            return []
+            return Answer((), monotonic_ns())
         rows = [datagram_row(access) for access in step]
         answer = self._request(control_bus.TRANSFER_S, "bus_transfer", datagrams=rows)
-        return to_replies(answer["replies"])
+        return Answer(to_replies(answer["replies"]), monotonic_ns())
 
     def _lead(
         self, slave: Slave, conversation: Conversation[T], meanwhile: Callable[[], None] | None
     ) -> T:
         look_s = 0.0
         number: int | None = None
+
+        def exchange(ask: Ask) -> Message:
+            nonlocal look_s, number
+            if number is None:
+                number = self._open(slave, ask)
+            elif meanwhile is not None and monotonic() >= look_s:
+                meanwhile()
+                look_s = monotonic() + LOOK_S
+            return Message(ask.type, self._ask(number, ask), monotonic_ns())
+
         try:
-            ask = next(conversation)
-            number = self._open(slave, ask)
-            while True:
-                try:
-                    message = Message(ask.type, self._ask(number, ask), monotonic_ns())
-                except BusError as exc:
-                    ask = conversation.throw(exc)
-                else:
-                    ask = conversation.send(message)
-                if meanwhile is not None and monotonic() >= look_s:
-                    meanwhile()
-                    look_s = monotonic() + LOOK_S
-        except StopIteration as end:
-            value: T = end.value
-            return value
+            return drive(conversation, exchange)
         except KeyboardInterrupt:
             number = None  # an answer may be under way: the end of the connection ends it all
             raise

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 
+from devicebus.drive import drive
 from devicebus.errors import BusError
 from devicebus.master import eeprom
 from devicebus.master.access import Access, Reply
 from devicebus.master.layout import SlaveShape, lay_out
 from devicebus.master.pdo import channels_from_sii
-from devicebus.master.procedure import Answer, Procedure, Sleep
+from devicebus.master.procedure import Answer, Sleep, Step
 from devicebus.wire import sii
 from devicebus.wire.register import Register
 from devicebus.wire.sii import CategoryHeader, SiiCategory
@@ -59,21 +60,19 @@ def _decode(image: bytes) -> None:
 
 def _read(image: bytes) -> bytes:
     """Read *image* as a master does, from a controller that gives four octets at a time."""
-    reading: Procedure[bytes] = eeprom.read_image(1001)
-    step = next(reading)
     word = 0
-    while True:
+
+    def exchange(step: Step) -> Answer:
+        nonlocal word
         replies = []
         if not isinstance(step, Sleep):
             for access in step:
                 if access.ado == Register.EEPROM_CONTROL and len(access.data) == 6:
                     word = int.from_bytes(access.data[2:6], "little")
                 replies.append(_reply(access, image, word))
-        try:
-            step = reading.send(Answer(replies, 0))
-        except StopIteration as end:
-            octets: bytes = end.value
-            return octets
+        return Answer(replies, 0)
+
+    return drive(eeprom.read_image(1001), exchange)
 
 
 def _reply(access: Access, image: bytes, word: int) -> Reply:

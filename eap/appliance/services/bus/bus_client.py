@@ -11,10 +11,11 @@ from collections.abc import Callable, Hashable, Sequence
 from time import monotonic_ns
 from typing import TypeVar
 
+from devicebus.drive import drive_async
 from devicebus.errors import BusError, MailboxBusyError
-from devicebus.mailbox.conversation import Conversation
+from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.master.access import Access, Reply
-from devicebus.master.procedure import Answer, Procedure, Sleep
+from devicebus.master.procedure import Answer, Procedure, Sleep, Step
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import (
     Bring,
@@ -27,7 +28,7 @@ from eap.appliance.bus_request import (
 )
 from eap.appliance.control_bus import BRING_S, PATIENCE_S, TRANSFER_S
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus.bus_talk import Talk, lead
+from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.bus.turns import Turns
 from eap.appliance.services.engine_link import EngineLink
 from eap.codec.mailbox import MailboxType
@@ -140,47 +141,35 @@ class BusClient:
             SdoAbortError: it refuses an SDO.
             EngineGoneError: there is no engine, or not the one with which it began.
         """
+        talk: Talk | None = None
+
+        async def exchange(ask: Ask) -> Message:
+            nonlocal talk
+            if talk is None:
+                talk = await self.open_talk(port, station, ask.type, requester, turn_s)
+            return await talk.ask(ask)
+
         try:
-            ask = next(conversation)
-        except StopIteration as end:
-            value: T = end.value
-            return value
-        try:
-            talk = await self.open_talk(port, station, ask.type, requester, turn_s)
-        except BaseException:
-            conversation.close()
-            raise
-        try:
-            value = await lead(conversation, talk, ask)
+            return await drive_async(conversation, exchange)
         except asyncio.CancelledError:
-            talk.abandon()
+            if talk is not None:
+                talk.abandon()
             raise
         finally:
-            conversation.close()
-            talk.close()
-        return value
+            if talk is not None:
+                talk.close()
 
     async def run(self, port: PortName, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; return its result or raise what went wrong."""
         await self._be_up(port)
-        try:
-            step = next(procedure)
-            while True:
-                try:
-                    if isinstance(step, Sleep):
-                        await asyncio.sleep(step.duration_ns / _S)
-                        replies: Sequence[Reply] = ()
-                    else:
-                        replies = await self.transfer(port, step)
-                except BusError as exc:
-                    step = procedure.throw(exc)
-                else:
-                    step = procedure.send(Answer(replies, monotonic_ns()))
-        except StopIteration as end:
-            value: T = end.value
-            return value
-        finally:
-            procedure.close()
+
+        async def exchange(step: Step) -> Answer:
+            if isinstance(step, Sleep):
+                await asyncio.sleep(step.duration_ns / _S)
+                return Answer((), monotonic_ns())
+            return Answer(await self.transfer(port, step), monotonic_ns())
+
+        return await drive_async(procedure, exchange)
 
     async def transfer(self, port: PortName, accesses: Sequence[Access]) -> list[Reply]:
         """Send datagrams, none of them logical, and return what came back for each.

@@ -1,22 +1,18 @@
-"""A turn at a slave's mailbox, and a conversation that is led in it."""
+"""A turn at a slave's mailbox."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
 from time import monotonic_ns
-from typing import TypeVar
 
-from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.conversation import Ask, Message
 from devicebus.mailbox.farewell import FAREWELLS
 from eap.appliance.bus_request import AskMailbox
 from eap.appliance.control_bus import MARGIN_S
 from eap.appliance.services.engine_link import EngineLink
 from eap.codec.mailbox import MailboxType
 from eap.errors import EngineGoneError
-
-T = TypeVar("T")
 
 _S = 1_000_000_000
 
@@ -80,18 +76,3 @@ class Talk:
             delay_ns=ask.delay_ns,
             expects_reply=ask.expects_reply,
         )
-
-
-async def lead(conversation: Conversation[T], talk: Talk, ask: Ask) -> T:
-    """Go through a conversation whose first step is *ask*; return its result or raise."""
-    try:
-        while True:
-            try:
-                message = await talk.ask(ask)
-            except BusError as exc:
-                ask = conversation.throw(exc)
-            else:
-                ask = conversation.send(message)
-    except StopIteration as end:
-        value: T = end.value
-        return value

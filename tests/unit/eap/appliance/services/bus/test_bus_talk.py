@@ -6,10 +6,11 @@ import asyncio
 
 import pytest
 
+from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.conversation import Ask
 from eap.appliance.bus_request import AskMailbox
-from eap.appliance.services.bus.bus_talk import Talk, lead
+from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.engine_link import EngineLink
 from eap.codec.mailbox import MailboxType
 from tests.support.fakeengine import FakeBus, FakeEngine
@@ -60,8 +61,7 @@ def test_errors_are_thrown_into_the_conversation():
 
     async def scene(talk, engine, given):
         engine.buses[0].line.fault(kind="mailbox", slave="drive")
-        conversation = careful()
-        assert await lead(conversation, talk, next(conversation)) == "late"
+        assert await drive_async(careful(), talk.ask) == "late"
 
     play(scene)
 
