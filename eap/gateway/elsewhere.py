@@ -10,53 +10,18 @@ from __future__ import annotations
 from eap.aoe.ads_operation import Read, ReadWrite, Write
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeService
-from eap.codec.foe import FoeErrorCode, FoeOpcode, encode_message, name_of
+from eap.codec.foe import FoeOpcode, encode_message, name_of
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import encode_abort
 from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoHeader, SdoInfoOpcode
 from eap.codec.soe import SoeHeader, SoeOpcode
-from eap.codec.soeerror import SoeErrorCode
 from eap.errors import EapError
-from eap.gateway.refusal import Reason
+from eap.gateway.error_table import Cause, cause_of_result
 from eap.od.abort import AbortCode
 
 ROOM = 0x20002
 """Octets of the longest answer: a list of all indexes there can be."""
 _COMPLETE = 0x100
-_REASONS: dict[int, Reason] = {
-    AdsError.TARGET_PORT: Reason.NO_SLAVE,
-    AdsError.TARGET_MACHINE: Reason.NO_SLAVE,
-    AdsError.HOST_UNREACHABLE: Reason.UNREACHABLE,
-    AdsError.TIMEOUT: Reason.TIMEOUT,
-    AdsError.NOT_READY: Reason.NO_MAILBOX,
-    AdsError.BUSY: Reason.BUSY,
-    AdsError.ACCESS_DENIED: Reason.DENIED,
-}
-_ABORTS: dict[int, AbortCode] = {
-    AdsError.NOT_FOUND: AbortCode.NO_OBJECT,
-    AdsError.SERVICE: AbortCode.UNSUPPORTED_ACCESS,
-    AdsError.ACCESS: AbortCode.READ_ONLY,
-    AdsError.SIZE: AbortCode.LENGTH,
-    AdsError.VALUE: AbortCode.VALUE,
-    AdsError.STATE: AbortCode.DEVICE_STATE,
-}
-_SOE: dict[int, SoeErrorCode] = {
-    AdsError.NOT_FOUND: SoeErrorCode.NO_IDN,
-    AdsError.SIZE: SoeErrorCode.VALUE_TOO_LONG,
-    AdsError.ACCESS: SoeErrorCode.VALUE_READ_ONLY,
-    AdsError.VALUE: SoeErrorCode.INVALID_VALUE,
-    AdsError.STATE: SoeErrorCode.COMMAND_NOT_NOW,
-}
-_FOE: dict[int, FoeErrorCode] = {
-    AdsError.NOT_FOUND: FoeErrorCode.NOT_FOUND,
-    AdsError.SERVICE: FoeErrorCode.ILLEGAL,
-    AdsError.STATE: FoeErrorCode.ILLEGAL,
-    AdsError.ACCESS: FoeErrorCode.ACCESS_DENIED,
-    AdsError.NO_MEMORY: FoeErrorCode.DISK_FULL,
-    AdsError.EXISTS: FoeErrorCode.ALREADY_EXISTS,
-    AdsError.VALUE: FoeErrorCode.CHECKSUM,
-    AdsError.NO_MORE_HANDLES: FoeErrorCode.NO_USER,
-}
 _RESPONSES = {
     SoeOpcode.READ_REQUEST: SoeOpcode.READ_RESPONSE,
     SoeOpcode.WRITE_REQUEST: SoeOpcode.WRITE_RESPONSE,
@@ -71,14 +36,16 @@ class ElsewhereError(EapError):
         self.result = result
 
 
-def reason_for(result: int) -> Reason | None:
+def reason_for(result: int) -> Cause | None:
     """Return why nobody answered, None if it was the slave that refused."""
-    return _REASONS.get(result)
+    cause = cause_of_result(result)
+    return None if cause.is_from_slave else cause
 
 
 def abort_for(result: int) -> AbortCode:
     """Return the SDO abort code that comes nearest to a refusal by ADS."""
-    return _ABORTS.get(result, AbortCode.GENERAL)
+    cause = cause_of_result(result)
+    return cause.sdo if cause.is_from_slave else AbortCode.GENERAL
 
 
 def refusal_for(kind: MailboxType, request: bytes, result: int) -> bytes | None:
@@ -99,11 +66,11 @@ def refusal_for(kind: MailboxType, request: bytes, result: int) -> bytes | None:
         case MailboxType.SOE:
             head = SoeHeader.decode(request)
             if head.opcode in _RESPONSES:
-                opcode, code = _RESPONSES[head.opcode], _SOE.get(result, SoeErrorCode.GENERAL)
+                opcode, code = _RESPONSES[head.opcode], cause_of_result(result).soe
                 told = SoeHeader(opcode, 0, 1, head.drive, head.elements, head.idn)
                 return told.encode() + code.to_bytes(2, "little")
         case MailboxType.FOE:
-            error = _FOE.get(result, FoeErrorCode.NOT_DEFINED)
+            error = cause_of_result(result).foe
             text = f"{name_of(error)}: ADS error 0x{result:x} ({AdsError.name_of(result)})"
             return encode_message(FoeOpcode.ERROR, error, text.encode())
     return None

@@ -1,167 +1,34 @@
-"""Errors in the requester's own protocol: each reason has a code in every protocol.
+"""Error answers of a gateway, in the protocol of the request.
 
-ETG.8200 leaves open what a gateway answers that gets no answer itself.  A tool understands the
-errors of its own protocol best, so an SDO is aborted, an IDN refused, a file transfer ended with a
-text, also by a master or slave that does not speak that protocol.  A mailbox error is for protocols
-without an error of their own (VoE, EoE), and for what is no request.
+A tool understands the errors of its own protocol best, so an SDO is aborted, an IDN refused, a file
+transfer ended with a text, also by a master or slave that does not speak that protocol.  A mailbox
+error is for protocols without an error of their own (VoE, EoE), and for what is no request.
 """
 
 from __future__ import annotations
 
-from enum import Enum
 from typing import NamedTuple
 
 from eap.aoe.answer import AmsAnswer, response_to
-from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.codec.coe import CoeHeader, CoeService
 from eap.codec.coe import encode_message as encode_coe
-from eap.codec.foe import Busy, FoeErrorCode, FoeOpcode
+from eap.codec.foe import Busy, FoeOpcode
 from eap.codec.foe import encode_message as encode_foe
-from eap.codec.mailbox import MailboxError, MailboxErrorReply, MailboxType
+from eap.codec.mailbox import MailboxErrorReply, MailboxType
 from eap.codec.sdo import encode_abort
 from eap.codec.sdoinfo import InfoError, SdoInfoHeader, SdoInfoOpcode
 from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.codec.soe import encode_message as encode_soe
-from eap.codec.soeerror import SoeErrorCode
 from eap.errors import CodecError
-from eap.od.abort import AbortCode
+from eap.gateway.error_table import Cause
 
 _NOT_BEGUN = Busy(0, 100)
 _SUBINDEX = 5
 """Where it stands in an SDO request, CoE header included."""
 
 
-class _Codes(NamedTuple):
-    text: str
-    mailbox: MailboxError
-    sdo: AbortCode
-    soe: SoeErrorCode
-    foe: FoeErrorCode
-    ads: AdsError
-
-
-class Reason(Enum):
-    """Why a request is not answered by whom it was for; its codes in each protocol."""
-
-    NO_SLAVE = _Codes(
-        "there is no such slave",
-        MailboxError.INVALID_HEADER,
-        AbortCode.NO_OBJECT,
-        SoeErrorCode.INVALID_DRIVE,
-        FoeErrorCode.NOT_FOUND,
-        AdsError.TARGET_PORT,
-    )
-    NO_MAILBOX = _Codes(
-        "the slave has no mailbox in its state",
-        MailboxError.UNSUPPORTED_PROTOCOL,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.COMMAND_NOT_NOW,
-        FoeErrorCode.ILLEGAL,
-        AdsError.NOT_READY,
-    )
-    NO_PROTOCOL = _Codes(
-        "it does not speak this protocol",
-        MailboxError.UNSUPPORTED_PROTOCOL,
-        AbortCode.UNSUPPORTED_ACCESS,
-        SoeErrorCode.NO_IDN,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.SERVICE,
-    )
-    TIMEOUT = _Codes(
-        "it did not answer in time",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.TIMEOUT,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.TIMEOUT,
-    )
-    BUS_DOWN = _Codes(
-        "the bus is down",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.HARDWARE,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.HOST_UNREACHABLE,
-    )
-    UNREACHABLE = _Codes(
-        "its bus, or a station on the way to it, is down",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.HARDWARE,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.HOST_UNREACHABLE,
-    )
-    TOO_LONG = _Codes(
-        "the message is longer than its mailbox",
-        MailboxError.INVALID_SIZE,
-        AbortCode.LONGER_THAN_MAILBOX,
-        SoeErrorCode.VALUE_TOO_LONG,
-        FoeErrorCode.DISK_FULL,
-        AdsError.SIZE,
-    )
-    TOO_SHORT = _Codes(
-        "the message is too short",
-        MailboxError.SIZE_TOO_SHORT,
-        AbortCode.COMMAND,
-        SoeErrorCode.VALUE_TOO_SHORT,
-        FoeErrorCode.ILLEGAL,
-        AdsError.SIZE,
-    )
-    SERVICE = _Codes(
-        "it does not offer this service",
-        MailboxError.SERVICE_NOT_SUPPORTED,
-        AbortCode.COMMAND,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.ILLEGAL,
-        AdsError.SERVICE,
-    )
-    BUSY = _Codes(
-        "it is busy with another client's transfer",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.COMMAND_ACTIVE,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.BUSY,
-    )
-    CROWDED = _Codes(
-        "too many requests wait already",
-        MailboxError.NO_MORE_MEMORY,
-        AbortCode.OUT_OF_MEMORY,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NO_USER,
-        AdsError.NO_MEMORY,
-    )
-    TOO_FAST = _Codes(
-        "more requests a second than the plant file allows",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.BUSY,
-    )
-    DENIED = _Codes(
-        "access refused: the plant file has no rule that allows it",
-        MailboxError.SERVICE_NOT_SUPPORTED,
-        AbortCode.UNSUPPORTED_ACCESS,
-        SoeErrorCode.VALUE_PROTECTED,
-        FoeErrorCode.NO_RIGHTS,
-        AdsError.ACCESS_DENIED,
-    )
-    NOT_RECORDED = _Codes(
-        "change refused: the audit is required and cannot record it",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.VALUE_PROTECTED,
-        FoeErrorCode.NO_RIGHTS,
-        AdsError.ACCESS_DENIED,
-    )
-
-    @property
-    def text(self) -> str:
-        """For people."""
-        return self.value.text
-
+Reason = Cause
 
 _ASK_AGAIN = frozenset((Reason.BUSY, Reason.TOO_FAST))
 
@@ -184,9 +51,9 @@ def refuse(kind: MailboxType, request: bytes, reason: Reason, text: str = "") ->
     """
     refuser = _REFUSERS.get(kind)
     if refuser is None:
-        return mailbox_error(reason.value.mailbox)
+        return mailbox_error(reason.mailbox)
     body = refuser(request, reason, text or reason.text)
-    return mailbox_error(reason.value.mailbox) if body is None else Answer(kind, body)
+    return mailbox_error(reason.mailbox) if body is None else Answer(kind, body)
 
 
 def mailbox_error(detail: int) -> Answer:
@@ -198,7 +65,7 @@ def _refuse_coe(request: bytes, reason: Reason, text: str) -> bytes | None:
     del text
     if len(request) < CoeHeader.SIZE:
         return None
-    code, service = reason.value.sdo, request[1] >> 4
+    code, service = reason.sdo, request[1] >> 4
     if service == CoeService.SDO_INFORMATION:
         body = SdoInfoHeader(SdoInfoOpcode.ERROR).encode() + InfoError(code).encode()
         return encode_coe(CoeService.SDO_INFORMATION, body)
@@ -214,7 +81,7 @@ def _refuse_foe(request: bytes, reason: Reason, text: str) -> bytes | None:
         return None
     if reason in _ASK_AGAIN:  # no end of the transfer, only of patience
         return encode_foe(FoeOpcode.BUSY, _NOT_BEGUN.number, words)
-    return encode_foe(FoeOpcode.ERROR, reason.value.foe, words)
+    return encode_foe(FoeOpcode.ERROR, reason.foe, words)
 
 
 def _refuse_soe(request: bytes, reason: Reason, text: str) -> bytes | None:
@@ -225,7 +92,7 @@ def _refuse_soe(request: bytes, reason: Reason, text: str) -> bytes | None:
     return encode_soe(
         SoeOpcode(opcode + 1),
         int.from_bytes(request[2:4], "little"),
-        reason.value.soe.to_bytes(2, "little"),
+        reason.soe.to_bytes(2, "little"),
         drive=request[0] >> 5,
         elements=request[1],
         error=True,
@@ -238,7 +105,7 @@ def _refuse_aoe(request: bytes, reason: Reason, text: str) -> bytes | None:
         asked = AmsHeader.decode(request)
     except CodecError:
         return None
-    return response_to(asked, AmsAnswer(error_code=reason.value.ads))
+    return response_to(asked, AmsAnswer(error_code=reason.ads))
 
 
 _REFUSERS = {

@@ -23,7 +23,6 @@ from eap.aoe.ads_operation import (
     WriteControl,
 )
 from eap.aoe.answer import AmsAnswer
-from eap.appliance.services.ads.ads_result import ads_result
 from eap.appliance.services.ads.ads_service import AdsService
 from eap.appliance.services.ads.image_variables import StationSymbols
 from eap.appliance.services.device.station_device import StationDevice
@@ -37,6 +36,7 @@ from eap.codec.ads import (
 )
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
 from eap.errors import ControlError
+from eap.gateway.error_table import ads_result
 from eap.od.abort import SdoAbortError
 
 _READ, _DONE = AmsCommand.READ.value, AdsError.NONE.value  # members of enums are slow

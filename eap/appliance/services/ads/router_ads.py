@@ -9,12 +9,12 @@ from eap.aoe.ads_io import IoDevice, IoDeviceType, IoSpace
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_objects import ObjectSpace
 from eap.aoe.ads_operation import Operation, OperationOutcome
-from eap.appliance.services.ads.ads_result import ads_result
 from eap.appliance.services.ads.ads_service import AdsService
 from eap.appliance.services.device.station_device import StationDevice
 from eap.codec.ads import AdsDeviceInfo
 from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.device.router_dictionary import RouterDictionary
+from eap.gateway.error_table import ads_result
 from eap.ids import NetId
 from eap.od.model import OdState
 from eap.pd.spec import PortKind, StationSpec

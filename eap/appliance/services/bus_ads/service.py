@@ -32,7 +32,6 @@ from eap.aoe.way import Way
 from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
 from eap.appliance.services.ads.ads_requests import answer_request
-from eap.appliance.services.ads.ads_result import ads_result
 from eap.appliance.services.ads.eap_ads import device_info
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.master_side import MasterSide
@@ -47,6 +46,7 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import DEVICE_PORT
 from eap.errors import EapError
+from eap.gateway.error_table import ads_result
 from eap.ids import NetId
 from eap.od.model import OdState
 

@@ -10,12 +10,12 @@ from devicebus.errors import BusError
 from eap.aoe.ads_operation import Operation, ReadWrite
 from eap.aoe.way import Way
 from eap.appliance.services.gateway.dialect_elsewhere import perform_elsewhere
-from eap.appliance.services.gateway.dialect_task import FAILURES, DialectError, perform
+from eap.appliance.services.gateway.dialect_task import DialectError, perform
 from eap.appliance.services.gateway.guard import Guard, Target, reason_of_refusal
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.remote_link import LinkTo
 from eap.appliance.services.gateway.slave_book import SlaveBook
-from eap.appliance.services.gateway.slave_session import find_refusal, reason_of
+from eap.appliance.services.gateway.slave_session import find_refusal
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.coe import CoeHeader
@@ -35,6 +35,7 @@ from eap.gateway.dialect import (
     encode_done,
     encode_failure,
 )
+from eap.gateway.error_table import cause_of
 from eap.gateway.refusal import Reason
 from eap.gateway.rights import idn, sdo
 
@@ -96,8 +97,8 @@ class DialectDesk:
         except DialectError as exc:
             failure, reason, text, code = exc.failure, exc.reason, str(exc), exc.code
         except (BusError, EngineGoneError) as exc:
-            reason, text = reason_of(exc), str(exc)
-            failure = FAILURES.get(reason, Failure.GENERAL)
+            reason, text = cause_of(exc), str(exc)
+            failure = reason.dialect
         return encode_failure(kind, body, failure, code=code, text=text), reason
 
     async def _judge(
@@ -129,7 +130,7 @@ class DialectDesk:
 
 
 def _refusal(reason: Reason) -> DialectError:
-    return DialectError(FAILURES.get(reason, Failure.GENERAL), reason.text, reason=reason)
+    return DialectError(reason.dialect, reason.text, reason=reason)
 
 
 def operation_of(task: Task) -> Operation:

@@ -7,7 +7,7 @@ import asyncio
 from devicebus.mailbox.foe_server import NotReadyError
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Operation, Read, Write
-from eap.appliance.services.gateway.dialect_task import FAILURES, DialectError, too_long
+from eap.appliance.services.gateway.dialect_task import DialectError, too_long
 from eap.appliance.services.gateway.remote_file import RemoteFile, Wanted
 from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.codec.ads import AdsError, IndexGroup
@@ -31,14 +31,7 @@ from eap.gateway.elsewhere import (
     sdo_offset,
     vendor_query,
 )
-
-_FAILURES: dict[int, Failure] = {
-    AdsError.NOT_FOUND: Failure.MISSING,
-    AdsError.SERVICE: Failure.NOT_SUPPORTED,
-    AdsError.INDEX_GROUP: Failure.NOT_SUPPORTED,
-    AdsError.ACCESS: Failure.READ_ONLY,
-    AdsError.SIZE: Failure.SIZE,
-}
+from eap.gateway.error_table import cause_of_result
 
 
 async def perform_elsewhere(task: Task, link: RemoteLink, room: int) -> bytes:
@@ -97,6 +90,6 @@ async def _read_file(name: str, link: RemoteLink, room: int) -> bytes:
 def _refusal(task: Task, result: int) -> DialectError:
     reason = reason_for(result)
     if reason is not None:
-        return DialectError(FAILURES.get(reason, Failure.GENERAL), reason.text, reason=reason)
+        return DialectError(reason.dialect, reason.text, reason=reason)
     code = abort_for(result) if isinstance(task, ReadSdo | WriteSdo) else None
-    return DialectError(_FAILURES.get(result, Failure.GENERAL), str(ElsewhereError(result)), code)
+    return DialectError(cause_of_result(result).dialect, str(ElsewhereError(result)), code)

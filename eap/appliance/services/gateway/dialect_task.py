@@ -21,9 +21,7 @@ from devicebus.mailbox import coe_client, foe_client, soe_client, voe_client
 from devicebus.mailbox.conversation import Conversation
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_request import SlaveReport
-from eap.codec.foe import FoeErrorCode
 from eap.codec.soe import Idn
-from eap.codec.soeerror import SoeErrorCode
 from eap.codec.voe import VoeHeader
 from eap.errors import EapError
 from eap.gateway.dialect import (
@@ -35,6 +33,7 @@ from eap.gateway.dialect import (
     WriteIdn,
     WriteSdo,
 )
+from eap.gateway.error_table import cause_of
 from eap.gateway.refusal import Reason
 from eap.od.abort import SdoAbortError
 
@@ -59,18 +58,6 @@ class DialectError(EapError):
         self.failure = failure
         self.code = code
         self.reason = reason
-
-
-FAILURES = {
-    Reason.NO_SLAVE: Failure.MISSING,
-    Reason.NO_MAILBOX: Failure.NOT_SUPPORTED,
-    Reason.NO_PROTOCOL: Failure.NOT_SUPPORTED,
-    Reason.TIMEOUT: Failure.NO_RESPONSE,
-    Reason.TOO_LONG: Failure.SIZE,
-    Reason.DENIED: Failure.READ_ONLY,
-    Reason.NOT_RECORDED: Failure.READ_ONLY,
-}
-"""Of what a gateway says itself; everything else is general."""
 
 
 async def perform(
@@ -98,15 +85,9 @@ async def perform(
         raise DialectError(Failure.NO_RESPONSE, "no answer in time") from None
     except SdoAbortError as exc:
         raise DialectError(Failure.GENERAL, str(exc), exc.code) from None
-    except SoeError as exc:
-        raise DialectError(_SOE.get(exc.code, Failure.GENERAL), str(exc)) from None
-    except FoeError as exc:
-        raise DialectError(_FOE.get(exc.code, Failure.GENERAL), str(exc)) from None
-    except MailboxTimeoutError as exc:
-        raise DialectError(Failure.NO_RESPONSE, str(exc)) from None
-    except MailboxSizeError as exc:
-        raise DialectError(Failure.SIZE, str(exc)) from None
-    except MailboxRefusedError as exc:
+    except (SoeError, FoeError, MailboxTimeoutError, MailboxSizeError) as exc:
+        raise DialectError(cause_of(exc).dialect, str(exc)) from None
+    except MailboxRefusedError as exc:  # the dialect has no mailbox errors
         raise DialectError(Failure.NOT_SUPPORTED, str(exc)) from None
     data = bytes(content) if isinstance(task, ReadFile) else result
     if not isinstance(data, bytes):
@@ -155,14 +136,3 @@ def _sink(content: bytearray, room: int) -> Callable[[bytes], None]:
             raise too_long(room)
 
     return take
-
-
-_SOE: dict[int, Failure] = {
-    SoeErrorCode.NO_IDN: Failure.MISSING,
-    SoeErrorCode.INVALID_DRIVE: Failure.MISSING,
-    SoeErrorCode.VALUE_TOO_SHORT: Failure.SIZE,
-    SoeErrorCode.VALUE_TOO_LONG: Failure.SIZE,
-    SoeErrorCode.VALUE_READ_ONLY: Failure.READ_ONLY,
-    SoeErrorCode.VALUE_PROTECTED: Failure.READ_ONLY,
-}
-_FOE: dict[int, Failure] = {FoeErrorCode.NOT_FOUND: Failure.MISSING}

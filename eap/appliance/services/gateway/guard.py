@@ -16,7 +16,6 @@ from eap.aoe.ads_operation import Operation, Read
 from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
-from eap.appliance.services.ads.ads_result import ads_result
 from eap.appliance.services.gateway.slave_session import Reply
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
@@ -25,6 +24,7 @@ from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SdoHeader, SdoRequest
 from eap.codec.soe import SoeHeader
+from eap.gateway.error_table import ads_result
 from eap.gateway.refusal import Reason
 from eap.ids import NetId
 from eap.od.abort import SdoAbortError

@@ -18,9 +18,7 @@ from msgspec.structs import replace
 from devicebus.errors import (
     BusError,
     MailboxRefusedError,
-    MailboxSizeError,
     MailboxTimeoutError,
-    NoMailboxError,
 )
 from devicebus.mailbox.conversation import Ask, Message
 from devicebus.mailbox.protocol import MailboxSizes
@@ -32,6 +30,7 @@ from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxHeader, MailboxType
 from eap.codec.sdoinfo import SdoInfoHeader
 from eap.errors import EapError, EngineGoneError
+from eap.gateway.error_table import cause_of
 from eap.gateway.refusal import Reason, mailbox_error, refuse
 from eap.gateway.transfer import Transfer
 
@@ -168,7 +167,7 @@ class SlaveSession:
             return [Reply(*mailbox_error(exc.detail))]
         except (BusError, EngineGoneError) as exc:
             self.close()
-            return self._refuse(body, reason_of(exc), str(exc))
+            return self._refuse(body, cause_of(exc), str(exc))
 
     async def _take_turn(self, deadline_s: float) -> Talk:
         if self._talk is None:
@@ -223,21 +222,10 @@ class SlaveSession:
             self._timer = None
 
 
-def reason_of(error: EapError) -> Reason:
-    """Return why a slave did not answer."""
-    if isinstance(error, EngineGoneError):
-        return Reason.BUS_DOWN
-    if isinstance(error, NoMailboxError):
-        return Reason.NO_MAILBOX
-    if isinstance(error, MailboxSizeError):
-        return Reason.TOO_LONG
-    return Reason.TIMEOUT
-
-
 def find_refusal(kind: MailboxType, body: bytes, slave: SlaveReport) -> Reason | None:
     """Return why a request does not even go to the slave it is for."""
     if not slave.to_slave:
-        return reason_of(no_mailbox(slave))
+        return cause_of(no_mailbox(slave))
     if not slave.protocols & SiiProtocol[kind.name]:
         return Reason.NO_PROTOCOL
     if len(body) + MailboxHeader.SIZE > slave.to_slave:

@@ -7,22 +7,16 @@ import asyncio
 import pytest
 
 from devicebus.errors import (
-    BusError,
-    FrameLostError,
-    MailboxClosedError,
     MailboxRefusedError,
-    MailboxSizeError,
     MailboxTimeoutError,
-    NoMailboxError,
 )
 from devicebus.mailbox.conversation import Ask, Message
 from eap.aoe.answer import AmsAnswer, response_to
 from eap.aoe.fragment import iter_fragments
 from eap.appliance.bus_request import SlaveReport
-from eap.appliance.services.gateway.slave_session import SlaveSession, find_refusal, reason_of
+from eap.appliance.services.gateway.slave_session import SlaveSession, find_refusal
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
-from eap.errors import EngineGoneError
 from eap.gateway.refusal import Reason
 from eap.ids import NetId
 
@@ -166,22 +160,6 @@ def test_a_request_that_is_cancelled_leaves_nothing_behind() -> None:
         assert talk.ended == "abandoned"
 
     asyncio.run(run())
-
-
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (MailboxTimeoutError("x"), Reason.TIMEOUT),
-        (MailboxSizeError("x"), Reason.TOO_LONG),
-        (NoMailboxError("x"), Reason.NO_MAILBOX),
-        (MailboxClosedError("x"), Reason.TIMEOUT),
-        (FrameLostError("x"), Reason.TIMEOUT),
-        (BusError("x"), Reason.TIMEOUT),
-        (EngineGoneError("x"), Reason.BUS_DOWN),
-    ],
-)
-def test_reasons(error, reason) -> None:
-    assert reason_of(error) is reason
 
 
 def test_what_does_not_even_go_to_the_slave() -> None:
