@@ -8,6 +8,7 @@ from collections.abc import Callable, Hashable, Iterator
 from itertools import cycle
 from typing import TypeVar, cast
 
+from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.conversation import Ask, Conversation, Message
@@ -22,7 +23,7 @@ from eap.aoe.ads_request import take_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
 from eap.appliance.bus_request import BusReport, Heard, SlaveReport
-from eap.appliance.services.bus.bus_talk import Talk, lead
+from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
@@ -127,7 +128,7 @@ class _Link:
         requester: Hashable,
         turn_s: float | None = None,
     ) -> T:
-        return await lead(conversation, cast("Talk", _Talk(self._box)), next(conversation))
+        return await drive_async(conversation, _Talk(self._box).ask)
 
     def listen(self, heard: Callable[[Heard], None]) -> None:
         """It says nothing unasked."""
