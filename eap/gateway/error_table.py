@@ -375,6 +375,7 @@ _BY_EXCEPTION: dict[type[EapError], tuple[Cause, AdsError]] = {
     errors.NoMailboxError: (Cause.NO_MAILBOX, AdsError.STATE),
     errors.MailboxClosedError: (Cause.TIMEOUT, AdsError.NOT_READY),
     errors.MailboxSizeError: (Cause.TOO_LONG, AdsError.SIZE),
+    errors.MailboxBusyError: (Cause.BUSY, AdsError.BUSY),
     errors.MailboxTimeoutError: (Cause.TIMEOUT, AdsError.TIMEOUT),
     errors.FrameLostError: (Cause.TIMEOUT, AdsError.TIMEOUT),
     errors.StateTimeoutError: (Cause.TIMEOUT, AdsError.TIMEOUT),

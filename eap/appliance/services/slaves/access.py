@@ -17,22 +17,10 @@ from eap.codec.ams import AmsHeader
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.errors import EapError
+from eap.gateway.error_table import cause_of_result
 
 UploadSink: TypeAlias = Callable[[int, bytes], object]
 """Called with the size of an object and each piece of it, in their order, as the slave sends it."""
-
-
-_OF_WAY = frozenset(
-    (
-        AdsError.TARGET_PORT,
-        AdsError.TARGET_MACHINE,
-        AdsError.HOST_UNREACHABLE,
-        AdsError.TIMEOUT,
-        AdsError.NOT_READY,
-        AdsError.BUSY,
-        AdsError.ACCESS_DENIED,
-    )
-)
 
 
 class RemoteAccessError(EapError):
@@ -46,7 +34,7 @@ class RemoteAccessError(EapError):
     def __init__(self, result: int) -> None:
         super().__init__(AdsError.words_of(result))
         self.result = result
-        self.is_of_way = result in _OF_WAY
+        self.is_of_way = not cause_of_result(result).is_from_slave
 
 
 class FileStream(Protocol):

@@ -21,6 +21,7 @@ from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
 from eap.codec.soeerror import SoeErrorCode, name_of
+from eap.gateway.error_table import cause_of_result
 from eap.od.abort import AbortCode, SdoAbortError
 
 LONGEST_ANSWER = 0x20002
@@ -30,21 +31,6 @@ _ADDRESSES, _SLAVES = 0xF020, 0x8000
 _TO_SLAVE, _TO_MASTER = 33, 34
 _LISTS, _LISTED = 16, 255
 """Objects from 0xF020 on, and addresses in each."""
-_ABORTS: dict[int, AbortCode] = {
-    AdsError.NOT_FOUND: AbortCode.NO_OBJECT,
-    AdsError.SERVICE: AbortCode.UNSUPPORTED_ACCESS,
-    AdsError.ACCESS: AbortCode.READ_ONLY,
-    AdsError.SIZE: AbortCode.LENGTH,
-    AdsError.VALUE: AbortCode.VALUE,
-    AdsError.STATE: AbortCode.DEVICE_STATE,
-}
-_SOE: dict[int, SoeErrorCode] = {
-    AdsError.NOT_FOUND: SoeErrorCode.NO_IDN,
-    AdsError.SIZE: SoeErrorCode.VALUE_TOO_LONG,
-    AdsError.ACCESS: SoeErrorCode.VALUE_READ_ONLY,
-    AdsError.VALUE: SoeErrorCode.INVALID_VALUE,
-    AdsError.STATE: SoeErrorCode.COMMAND_NOT_NOW,
-}
 _INFO_GROUPS = {
     SdoInfoOpcode.LIST_REQUEST: IndexGroup.OBJECT_LIST,
     SdoInfoOpcode.OBJECT_REQUEST: IndexGroup.OBJECT_DESCRIPTION,
@@ -271,9 +257,11 @@ def _sdo_error(
 ) -> RemoteAccessError | SdoAbortError:
     if error.is_of_way:
         return error
-    return SdoAbortError(_ABORTS.get(error.result, AbortCode.GENERAL), index, subindex)
+    return SdoAbortError(cause_of_result(error.result).sdo, index, subindex)
 
 
 def _soe_error(error: RemoteAccessError) -> RemoteAccessError | SoeError:
-    code = _SOE.get(error.result)
-    return error if code is None else SoeError(name_of(code), code=code)
+    code = cause_of_result(error.result).soe
+    if error.is_of_way or code is SoeErrorCode.GENERAL:
+        return error
+    return SoeError(name_of(code), code=code)
