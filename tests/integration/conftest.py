@@ -14,3 +14,10 @@ def farm() -> Iterator[Plants]:
     """Runs appliances and ends them."""
     with plants() as folder:
         yield folder
+
+
+@pytest.fixture(scope="module")
+def module_farm() -> Iterator[Plants]:
+    """Runs appliances that the tests of a file share, and ends them."""
+    with plants() as folder:
+        yield folder

@@ -6,7 +6,6 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -47,7 +46,6 @@ handler = AdvancedHandler()
 handler.add_variable(PLCVariable("level", (4711).to_bytes(4, "little"), ads_type=19,
                                  symbol_type="UDINT", index_group=0x4020, index_offset=8))
 with AdsTestServer(handler=handler, ip_address="{PLC}", logging=False) as server:
-    time.sleep(0.2)
     print("ready", flush=True)
     time.sleep(600)
 """
@@ -66,9 +64,9 @@ def controller() -> Iterator[None]:
         server.communicate()
 
 
-@pytest.fixture
-def appliance(farm: Plants) -> Appliance:
-    return farm.run(farm.write(PLANT))
+@pytest.fixture(scope="module")
+def appliance(module_farm: Plants) -> Appliance:
+    return module_farm.run(module_farm.write(PLANT))
 
 
 def own_net_id(target: str) -> str:
@@ -110,22 +108,14 @@ def test_controller_with_several_net_ids_that_comes_and_goes(appliance: Applianc
         assert failure(BEHIND) == HOST_UNREACHABLE
 
 
-def test_peer_has_one_connection_and_may_ask_on_it(farm: Plants) -> None:
+def test_peer_has_one_connection_and_may_ask_on_it(appliance: Appliance) -> None:
     """As routers do that have no other connection to us."""
-    connections = []
+    del appliance
     with socket.create_server((PLC, 48898)) as listener:
-        listener.settimeout(5)
-
-        def accept() -> None:
-            connections.append(listener.accept())
-
-        accepting = threading.Thread(target=accept)
-        accepting.start()
-        farm.run(farm.write(PLANT))
-        accepting.join()
-        ((sock, address),) = connections
+        listener.settimeout(20)
+        sock, address = listener.accept()
         with sock:
-            sock.settimeout(5)
+            sock.settimeout(20)
             assert address[0] == LEFT
             ask = aoe.packet(f"{LEFT}.2.1", aoe.READ, aoe.read_body(0xF9200001), invoke_id=5)
             sock.sendall(struct.pack("<HI", 0, len(ask)) + ask)

@@ -26,7 +26,7 @@ from eap.errors import ControlError
 from eap.od.profiles.eap1000keys import Tx, Var
 from tests.support import aoe
 from tests.support.aoe import UdpClient
-from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.appliance import Appliance, Plants, SharedAppliance, wait_until
 from tests.support.tshark import dissect, write_pcap
 
 pytestmark = pytest.mark.net
@@ -56,6 +56,8 @@ stations:
     subscribe:
       - {{name: left-state, port: eap0, from: left/state}}
 """
+OWN = "127.9.42"
+"""Of a plant that one test has to itself, beside the one that the others share."""
 PREOP, OP = 2, 8
 
 
@@ -69,24 +71,30 @@ def is_free(address: str) -> bool:
     return True
 
 
-def wait_free() -> None:
+def wait_free(*addresses: str) -> None:
     """Wait for the end of processes whose supervisor was killed: they follow it a moment later."""
-    wait_until(lambda: all(map(is_free, (LEFT, RIGHT, BLANK))))
-
-
-@pytest.fixture(autouse=True)
-def _alone() -> None:
-    wait_free()
+    wait_until(lambda: all(map(is_free, addresses)))
 
 
 @pytest.fixture
 def plant(farm: Plants) -> Path:
-    return farm.write(PLANT)
+    return farm.write(PLANT.replace("127.9.41", OWN))
+
+
+@pytest.fixture(scope="module")
+def shared(module_farm: Plants) -> SharedAppliance:
+    plant = module_farm.write(PLANT)
+
+    def begin() -> Appliance:
+        wait_free(LEFT, RIGHT)
+        return module_farm.run(plant)
+
+    return SharedAppliance(begin)
 
 
 @pytest.fixture
-def appliance(farm: Plants, plant: Path) -> Appliance:
-    return farm.run(plant)
+def appliance(shared: SharedAppliance) -> Appliance:
+    return shared.running()
 
 
 @pytest.fixture
@@ -148,9 +156,12 @@ def test_aoe_refusals(appliance: Appliance, left: UdpClient) -> None:
     assert left.read(0x1000).error == 7
     left.target = f"{RIGHT}.2.1"
     assert left.read(0x1000).error == 0  # by a route
+    left.target = f"{LEFT}.2.1"
+    assert bring(left, OP).result == 0
 
 
 def test_configuration_by_aoe_comes_into_force(appliance: Appliance, left: UdpClient) -> None:
+    before = appliance.request("export", station="left")["spec"]
     assert bring(left, PREOP).result == 0
     assert appliance.station("left")["state"] == "PREOP"
     assert left.write(0xD000, Tx.PDO_INDEX, bytes(2)).result == 0
@@ -164,6 +175,7 @@ def test_configuration_by_aoe_comes_into_force(appliance: Appliance, left: UdpCl
     assert bring(left, OP).result == 0
     wait_until(lambda: appliance.station("right")["discarded"].get("unknown_id", 0) > 5)
     assert json.loads(appliance.command("od", "read", "left", "0xD000:3", "--json"))["value"] == 5
+    assert appliance.request("apply", station="left", spec=before)["ok"]
 
 
 def test_both_ways_and_many_clients_at_a_time(appliance: Appliance) -> None:
@@ -219,6 +231,7 @@ def test_long_answer_comes_in_fragments(appliance: Appliance, left: UdpClient) -
     result, size = struct.unpack_from("<II", content, 16)
     assert (result, size) == (0, len(content) - 24)
     assert size > 2 * 800
+    appliance.close()  # and with it all these objects
 
 
 @pytest.mark.tshark
@@ -292,7 +305,7 @@ def test_applied_configuration_outlives_engine_services_and_supervisor(
         wait_until(lambda: holds(appliance))
     os.kill(appliance.process.pid, signal.SIGKILL)
     appliance.finish()
-    wait_free()
+    wait_free(f"{OWN}.1", f"{OWN}.2")
     again = farm.run(plant)
     assert holds(again)
     assert again.request("rollback", station="left")["ok"]
@@ -326,12 +339,12 @@ def test_kill_in_the_middle_of_apply_leaves_a_whole_configuration(
         pid = appliance.pid(victim)
         applying = threading.Thread(target=_try_apply, args=(appliance, wanted))
         applying.start()
-        time.sleep(0.003 * version)
+        time.sleep(0.003 * version)  # another moment of the change each time
         os.kill(pid, signal.SIGKILL)
         applying.join()
         if victim == "supervisor":
             appliance.finish()
-            wait_free()
+            wait_free(f"{OWN}.1", f"{OWN}.2")
             appliance = farm.start(plant, runtime=runtime)
             appliance.wait_ready()
         else:

@@ -79,7 +79,7 @@ def test_blank_station_configured_by_aoe_alone_exchanges_data_with_one_of_a_plan
     farm: Plants,
 ) -> None:
     """Also after it was killed and started again, without any further download."""
-    wait_free()
+    wait_free(LEFT, RIGHT, BLANK)
     words = ("--blank", "blank", "--interface", f"udp://{BLANK}", "--net-id", f"{BLANK}.2.1")
     known = farm.run(farm.write(MEETS_BLANK))
     blank = farm.start(None, *words)

@@ -63,10 +63,10 @@ class Tool:
         return False
 
 
-@pytest.fixture
-def tool(farm: Plants) -> Iterator[Tool]:
+@pytest.fixture(scope="module")
+def tool(module_farm: Plants) -> Iterator[Tool]:
     with cable() as (here, there):
-        farm.run(farm.write(PLANT), prefix=here.prefix)
+        module_farm.run(module_farm.write(PLANT), prefix=here.prefix)
         tool = Tool(there, MacAddr.parse(here.mac()))
         with tool.socket:
             yield tool

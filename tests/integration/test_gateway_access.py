@@ -28,12 +28,13 @@ MASTER = "0020 2b 00a0 02 08000000"
 FILE = "02 00 00000000" + b"parameters.bin".hex()
 
 
-@pytest.fixture
-def there(farm: Plants) -> Iterator[Namespace]:
+@pytest.fixture(scope="module")
+def there(module_farm: Plants) -> Iterator[Namespace]:
     with cable(addresses=True) as (here, there):
         there.ip("addr", "add", f"{OTHER}/24", "dev", "line0")
-        farm.write(BUS, "gateway.yaml")
-        appliance = farm.run(farm.write(plant_of(STATION, RULE)), prefix=here.prefix)
+        module_farm.write(BUS, "gateway.yaml")
+        plant = module_farm.write(plant_of(STATION, RULE))
+        appliance = module_farm.run(plant, prefix=here.prefix)
         wait_until(lambda: is_up(appliance))
         yield there
 

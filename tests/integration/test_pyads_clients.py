@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from contextlib import ExitStack
 
 import pytest
@@ -21,7 +20,7 @@ pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 pytestmark = pytest.mark.net
 
 REQUESTS = 10_000 if os.environ.get("EAP_LONG") else 2000
-ADDRESS, GATE = "127.9.49.1", "127.9.49.2"
+ADDRESS, GATE, TCP_GATE = (f"127.9.49.{number}" for number in (1, 2, 3))
 ROUTER, FIRST, SECOND = (f"{ADDRESS}.{end}" for end in ("1.1", "2.1", "2.2"))
 DEVICE, SDO = 0xFFFF, 0xF302
 PLANT = f"""\
@@ -39,14 +38,16 @@ stations:
       - {{name: out, port: eap0, to: 127.9.49.9}}
     publish:
       - {{name: state, frame: out, id: 77, variables: [level]}}
-"""
-THROUGH = f"""\
   - name: gate
     net_id: {GATE}.1.1
     ports:
       - {{name: eap0, kind: eap, interface: "udp://{GATE}", net_id: {GATE}.2.1}}
+  - name: tcp-gate
+    net_id: {TCP_GATE}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{TCP_GATE}", net_id: {TCP_GATE}.2.1}}
+    routes: [{{to: tower, ams_tcp: tower/eap0}}]
 """
-BY_AMS_TCP = "    routes: [{to: tower, ams_tcp: tower/eap0}]\n"
 CLIENT = """
 import ctypes, random, sys
 import pyads
@@ -86,9 +87,9 @@ print(samples, flush=True)
 """
 
 
-@pytest.fixture
-def appliance(farm: Plants) -> Appliance:
-    return farm.run(farm.write(PLANT))
+@pytest.fixture(scope="module")
+def appliance(module_farm: Plants) -> Appliance:
+    return module_farm.run(module_farm.write(PLANT))
 
 
 def start_client(
@@ -138,18 +139,21 @@ def test_clients_of_one_address_keep_apart_while_others_die(appliance: Appliance
     assert appliance.station("tower")["discarded"] == {}
 
 
-@pytest.mark.parametrize("route", ["", BY_AMS_TCP], ids=["type-5", "ams-tcp"])
+@pytest.mark.parametrize(
+    ("station", "gate"),
+    [("gate", GATE), ("tcp-gate", TCP_GATE)],
+    ids=["type-5", "ams-tcp"],
+)
 def test_clients_of_one_address_keep_apart_through_another_station(
-    farm: Plants, route: str
+    appliance: Appliance, station: str, gate: str
 ) -> None:
-    appliance = farm.run(farm.write(PLANT + THROUGH + route))
-    assert_all_are_answered(GATE)
-    for own in (f"{GATE}.1.1", f"{GATE}.2.1", ROUTER):  # those of the routers and of a port
-        words = [sys.executable, "-c", SUBSCRIBER, GATE, own, FIRST]
+    assert_all_are_answered(gate)
+    for own in (f"{gate}.1.1", f"{gate}.2.1", ROUTER):  # those of the routers and of a port
+        words = [sys.executable, "-c", SUBSCRIBER, gate, own, FIRST]
         run = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
         assert (run.returncode, run.stdout) == (0, "5\n"), run.stderr
-    for station in ("tower", "gate"):
-        assert appliance.station(station)["discarded"] == {}
+    for name in ("tower", station):
+        assert appliance.station(name)["discarded"] == {}
 
 
 def assert_all_are_answered(address: str) -> None:
@@ -160,7 +164,7 @@ def assert_all_are_answered(address: str) -> None:
         for client in dying:
             assert client.poll() is None
             client.kill()
-            time.sleep(0.05)
+            client.wait()
         for client in clients:
             out, errors = client.communicate(timeout=120)
             assert (client.returncode, out) == (0, f"0 wrong of {REQUESTS}\n"), errors
