@@ -10,11 +10,11 @@ import msgspec
 
 from devicebus.master.clocks import Sync0, drift_access
 from devicebus.master.cycle import Cycle, Presence
-from devicebus.master.event import Event
+from devicebus.master.event import BusBack, BusLost, Event
 from devicebus.master.expected import ExpectedSlave
 from devicebus.master.image import BusImage
 from devicebus.master.link import RETRIES, Link
-from devicebus.master.mailboxes import Mailbox
+from devicebus.master.mailboxes import Mailbox, Unsolicited
 from devicebus.master.mailboxport import MailboxArea
 from devicebus.master.pdo import Channel, PdoChoice
 from devicebus.master.roundtrip import CEILING_NS
@@ -53,10 +53,28 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
     """False exchanges process data by LWR and LRD even where slaves know LRW."""
 
 
+class Changes:
+    """Number of changes on a bus that matter to its users: states, mailboxes, slaves, faults."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def note(self) -> int:
+        """Count one more; return the number."""
+        self.count += 1
+        return self.count
+
+
+_NOTED = frozenset(("state", "target", "is_lost", "mailbox", "work"))
+"""Attributes of a unit whose changes matter to users of the bus."""
+_UNSET = object()
+
+
 class Unit:
     """One slave that the master drives.
 
     Attributes:
+        revision: Number of its last change among those of the bus.
         state: Its AL state as it was read last; None until it was read since the slave answers.
         target: Where it belongs.
         is_set_up: Whether its sync managers and FMMUs are set for process data.
@@ -68,7 +86,9 @@ class Unit:
         retry_ns: Not tried again before then.
     """
 
-    def __init__(self, found: FoundSlave, name: str) -> None:
+    def __init__(self, found: FoundSlave, name: str, changes: Changes | None = None) -> None:
+        self._changes = changes or Changes()
+        self.revision = 0
         self.found = found
         self.name = name
         self.station = found.station
@@ -81,6 +101,21 @@ class Unit:
         self.is_lost = False
         self.work: Task[Any] | None = None
         self.retry_ns = 0
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Note a change; here, so that no procedure can forget it."""
+        if name in _NOTED and getattr(self, name, _UNSET) is not value:
+            self.note_change()
+        super().__setattr__(name, value)
+
+    def note_change(self) -> None:
+        """Note that something about it has changed."""
+        self.revision = self._changes.note()
+
+    def begin(self, work: Task[Any]) -> None:
+        """Note that *work* brings it somewhere, and later that this is done."""
+        self.work = work
+        work.watch(lambda _: self.note_change())
 
     @property
     def al_state(self) -> int:
@@ -103,6 +138,7 @@ class Bus:
     """All slaves, their process data, and the wire to them.
 
     Attributes:
+        changes: Noted by units, and here with each event and each new list of units.
         units: By station address, in the order of the line.
         image, cycle: None until process data is laid out.
         reference: Station address of the slave whose clock the others follow.
@@ -118,6 +154,7 @@ class Bus:
             acyclic_octets=settings.acyclic_octets,
         )
         self.runner = Runner(self.link)
+        self.changes = Changes()
         self.units: dict[int, Unit] = {}
         self.image: BusImage | None = None
         self.cycle: Cycle | None = None
@@ -127,8 +164,14 @@ class Bus:
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
 
     def emit(self, event: Event) -> None:
-        """Tell the user."""
+        """Queue an event for the user."""
         self._events.append(event)
+        if isinstance(event, Unsolicited):
+            return
+        if isinstance(event, BusLost | BusBack):
+            self.changes.note()
+        elif (unit := self.units.get(event.station)) is not None:
+            unit.note_change()
 
     def next_event(self) -> Event | None:
         """Take the oldest event."""
@@ -163,6 +206,7 @@ class Bus:
                 unit.work.cancel()
             self.close_mailbox(unit)
         self.units = {}
+        self.changes.note()
         self.image = self.cycle = self.reference = None
         self.link.stop_cycles()
         self.is_lost = self.is_troubled = False

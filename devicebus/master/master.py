@@ -68,6 +68,11 @@ class Master:
         return self._bus.units
 
     @property
+    def changes(self) -> int:
+        """Number of changes so far that matter to users: of states, mailboxes, slaves, faults."""
+        return self._bus.changes.count
+
+    @property
     def image(self) -> BusImage | None:
         """Process data, None before it is laid out."""
         return self._bus.image
@@ -118,8 +123,9 @@ class Master:
         if unit.is_busy:
             raise BusError(f"slave {station} is on its way to {unit.target.name} already")
         unit.target = target
-        unit.work = self.run(bring(self._bus, unit, target), now_ns, f"slave {station}: state")
-        return unit.work
+        work = self.run(bring(self._bus, unit, target), now_ns, f"slave {station}: state")
+        unit.begin(work)
+        return work
 
     def converse(
         self,

@@ -90,7 +90,7 @@ def _identify(bus: Bus, found: Sequence[FoundSlave]) -> Procedure[list[Unit]]:
     """Return the slaves in the order of the line, with the names and stations they are to have."""
     expected = bus.settings.expected
     if not expected:
-        return [Unit(slave, slave.name) for slave in found]
+        return [Unit(slave, slave.name, bus.changes) for slave in found]
     order = arrange(expected, [slave.alias for slave in found])
     check_bus([expected[number] for number in order], found)
     stations = [bus.settings.first_station + number for number in order]
@@ -102,7 +102,7 @@ def _identify(bus: Bus, found: Sequence[FoundSlave]) -> Procedure[list[Unit]]:
     if moved:
         yield from assign_stations(moved)
     return [
-        Unit(slave._replace(station=station), expected[number].name)
+        Unit(slave._replace(station=station), expected[number].name, bus.changes)
         for slave, station, number in zip(found, stations, order, strict=True)
     ]
 

@@ -29,6 +29,7 @@ RETRY_NS = 1_000_000_000
 _PER_STEP = 60
 """Slaves whose states are read together."""
 _WITH_PROCESS_DATA = frozenset((AlState.SAFEOP, AlState.OP))
+_STATES = {int(state): state for state in AlState}
 
 
 def watch(bus: Bus) -> Procedure[None]:
@@ -99,7 +100,7 @@ def _judge(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
     if unit.is_busy:
         return
     if not unit.is_lost:  # of one that was, the identity is compared before its state counts
-        unit.state = AlState(status.state) if status.state in set(AlState) else None
+        unit.state = _STATES.get(status.state)
     if now_ns < unit.retry_ns:
         return
     is_set_up = unit.is_set_up or unit.target not in _WITH_PROCESS_DATA
@@ -143,8 +144,9 @@ def _begin(bus: Bus, unit: Unit, status: AlStatus, now_ns: int) -> None:
             bus.emit(SlaveFailed(unit.station, str(error), now_ns))
 
     work = _revive(bus, unit, stays=stays)
-    unit.work = bus.runner.start(work, now_ns, f"bringing back slave {unit.station}")
-    unit.work.watch(done)
+    task = bus.runner.start(work, now_ns, f"bringing back slave {unit.station}")
+    unit.begin(task)
+    task.watch(done)
 
 
 def _revive(bus: Bus, unit: Unit, *, stays: bool) -> Procedure[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from devicebus import errors
 from devicebus.errors import BusError, NoMailboxError
-from eap.appliance.bus_request import Failure, SlaveReport
+from eap.appliance.bus_request import Failure, SlaveDescription
 from eap.errors import EapError
 
 _SHIFT = 16
@@ -44,7 +44,7 @@ def to_error(failure: Failure) -> BusError:
     return error
 
 
-def no_mailbox(slave: SlaveReport) -> BusError:
+def no_mailbox(slave: SlaveDescription) -> BusError:
     """Return why no mailbox of a slave is open, as its master says."""
     if slave.mailbox_fault is not None:
         return to_error(slave.mailbox_fault)

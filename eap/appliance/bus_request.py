@@ -75,8 +75,12 @@ class Forget(Message, frozen=True, tag="forget"):
     """Forget the faults that are over: answered when done."""
 
 
+class Republish(Message, frozen=True, tag="republish"):
+    """Send a BusChange with all slaves, answered behind it: the sender knows nothing of the bus."""
+
+
 class Ping(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="ping"):
-    """Say that there is an engine: answered without anything."""
+    """Answered without anything; changes that the engine has noticed come before the answer."""
 
     id: int
 
@@ -87,7 +91,7 @@ class Cancel(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="can
     id: int
 
 
-BusRequest: TypeAlias = Describe | AskMailbox | Transfer | Bring | Forget
+BusRequest: TypeAlias = Describe | AskMailbox | Transfer | Bring | Forget | Republish
 Request: TypeAlias = BusRequest | Ping | Cancel | StationRequest
 
 
@@ -108,8 +112,8 @@ class Failure(msgspec.Struct, frozen=True):
     """Mailbox error code."""
 
 
-class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
-    """How a slave is."""
+class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
+    """A slave without times and counters that run: all of it changes by an event only."""
 
     station: int
     name: str
@@ -145,6 +149,11 @@ class SlaveReport(msgspec.Struct, frozen=True, kw_only=True):
     """AL status code when it last did."""
     fault: str = ""
     """Why it is not where it belongs."""
+
+
+class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
+    """A slave with the times of its faults."""
+
     past_fault: str = ""
     """The same of the last time, if that is over."""
     since_ns: int | None = None
@@ -224,4 +233,18 @@ class Heard(msgspec.Struct, frozen=True, tag="heard"):
     """What stands behind its mailbox header."""
 
 
-FromEngine: TypeAlias = Answer | Hello | Heard
+class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):
+    """Slaves of a bus that have changed, and all that is known of the bus beside its slaves.
+
+    It comes before the answer to any request that was done after the change.
+    """
+
+    bus: int
+    is_up: bool
+    fault: str
+    stations: tuple[int, ...]
+    """All slaves in the order of the bus."""
+    slaves: tuple[SlaveDescription, ...]
+
+
+FromEngine: TypeAlias = Answer | Hello | Heard | BusChange

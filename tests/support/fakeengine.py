@@ -26,6 +26,7 @@ from eap.appliance.bus_request import (
     Answer,
     AskMailbox,
     Bring,
+    BusChange,
     BusReport,
     Cancel,
     Describe,
@@ -34,7 +35,9 @@ from eap.appliance.bus_request import (
     Hello,
     Outcome,
     Ping,
+    Republish,
     Request,
+    SlaveDescription,
     SlaveReport,
     Transfer,
 )
@@ -46,6 +49,7 @@ from tests.support.loopbus import LoopBus
 
 PORT = PortName("left", "bus0")
 CYCLE_NS = 2_000_000
+LOOK_S = 0.01
 
 
 class FakeBus:
@@ -83,10 +87,12 @@ class FakeBus:
 
     def do(self, request: Request) -> dict[str, Any]:
         """Return the fields of the answer, or raise."""
-        self._catch_up()
+        self.catch_up()
         master, now_ns = self.master, self.line.now_ns
         if isinstance(request, Describe):
             return {"report": self.report()}
+        if isinstance(request, Republish):
+            return {}
         if isinstance(request, AskMailbox):
             talk = _one(_ask_of(request))
             message = self.finish(master.converse(request.station, talk, now_ns))
@@ -106,7 +112,7 @@ class FakeBus:
         )
         return {}
 
-    def _catch_up(self) -> None:
+    def catch_up(self) -> None:
         """Let some of the time pass that has passed outside: who sleeps there waits for slaves."""
         now_ns = monotonic_ns()
         self.line.now_ns += min(now_ns - self._asked_ns, CYCLE_NS)
@@ -125,6 +131,21 @@ class FakeBus:
             timeout_ns=link.timeout_ns,
             round_trip_ns=link.round_trip_ns,
             silent_since_ns=0 if self.master.is_lost else None,
+        )
+
+    def change(self, number: int) -> BusChange:
+        """Return the message about all of it."""
+        report = self.report()
+        fields = SlaveDescription.__struct_fields__
+        return BusChange(
+            bus=number,
+            is_up=report.is_up,
+            fault=report.fault,
+            stations=tuple(each.station for each in report.slaves),
+            slaves=tuple(
+                SlaveDescription(**{name: getattr(each, name) for name in fields})
+                for each in report.slaves
+            ),
         )
 
 
@@ -186,6 +207,8 @@ class FakeEngine:
         self.holds = False
         self.held_kind: type = object
         self._held: list[Request] = []
+        self._published: dict[int, BusChange] = {}
+        self._timer: asyncio.TimerHandle | None = None
         self._awaited = 0
         self._enough = asyncio.Event()
         self._sock, self.services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -193,12 +216,23 @@ class FakeEngine:
         asyncio.get_running_loop().add_reader(self._sock, self._receive)
 
     def close(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
         asyncio.get_running_loop().remove_reader(self._sock)
         self._sock.close()
 
     def say_hello(self) -> None:
         """Be a new engine."""
         self._send(Hello(1))
+        self._published.clear()
+
+    def publish(self) -> None:
+        """Send what has changed on the buses."""
+        for number, bus in enumerate(self.buses):
+            change = bus.change(number)
+            if change != self._published.get(number):
+                self._published[number] = change
+                self._send(change)
 
     def tell(self, message: Heard) -> None:
         """Pass on what a slave sent unasked."""
@@ -243,7 +277,19 @@ class FakeEngine:
             fields = {"failure": to_failure(exc)}
         except IndexError:
             fields = {"failure": Failure("BusError", "no such bus")}
+        if isinstance(request, Republish):
+            self._published.pop(request.bus, None)
+            self._timer = self._timer or asyncio.get_running_loop().call_later(LOOK_S, self._look)
+        self.publish()
         self._send(Answer(id=request.id, **fields))
+
+    def _look(self) -> None:
+        """Let time go on and send what has changed, as an engine does between its cycles."""
+        if not self.holds:
+            for bus in self.buses:
+                bus.catch_up()
+            self.publish()
+        self._timer = asyncio.get_running_loop().call_later(LOOK_S, self._look)
 
     def _send(self, message: Any) -> None:
         self._sock.send(msgspec.msgpack.encode(message))

@@ -26,6 +26,7 @@ from eap.appliance.bus_request import (
     Answer,
     AskMailbox,
     Bring,
+    BusChange,
     BusReport,
     BusRequest,
     Cancel,
@@ -36,9 +37,11 @@ from eap.appliance.bus_request import (
     Hello,
     Outcome,
     Ping,
+    Republish,
     Request,
     Transfer,
 )
+from eap.appliance.engine.bus_publisher import BusPublisher
 from eap.appliance.engine.bus_report import report_bus
 from eap.appliance.engine.bus_step import one_ask, one_step, to_accesses, to_ask
 from eap.appliance.engine.bus_target import bring_all, bring_one
@@ -84,6 +87,9 @@ class BusDesk:
         self.dropped = 0
         self._sock = sock
         self._buses = buses
+        self._publishers = [
+            BusPublisher(number, bus, self._send) for number, bus in enumerate(buses)
+        ]
         self._serve_station = serve_station
         self._decoder = msgspec.msgpack.Decoder(Request)
         self._errands: dict[int, _Errand] = {}
@@ -106,6 +112,11 @@ class BusDesk:
         """Pass on what a slave of the bus numbered *bus* sent unasked."""
         self._send(Heard(bus, message.station, message.type, message.data))
 
+    def publish(self) -> None:
+        """Send what has changed on the buses."""
+        for each in self._publishers:
+            each.flush()
+
     def serve(self, now_ns: int) -> None:
         """Take a few of the requests that wait."""
         for _ in range(PER_WAKE_UP):
@@ -124,6 +135,7 @@ class BusDesk:
                 case Cancel():
                     self._cancel(request.id)
                 case Ping():
+                    self.publish()
                     self._send(Answer(id=request.id))
                 case Configure() | SetState():
                     self._serve_station(request, now_ns, partial(self._reply, request.id))
@@ -136,16 +148,21 @@ class BusDesk:
 
     def _serve_bus(self, request: BusRequest, now_ns: int) -> None:
         self._cancel(request.id)  # whoever used the number before does not wait any more
+        if not 0 <= request.bus < len(self._buses):
+            error = BusError(f"there is no bus {request.bus}, there are {len(self._buses)}")
+            self._send(Answer(id=request.id, failure=to_failure(error)))
+            return
+        bus = self._buses[request.bus]
         try:
-            if not 0 <= request.bus < len(self._buses):
-                raise BusError(f"there is no bus {request.bus}, there are {len(self._buses)}")
-            bus = self._buses[request.bus]
             match request:
                 case Describe():
-                    self._send(Answer(id=request.id, report=self._report(bus, now_ns)))
+                    self._answer(request, Answer(id=request.id, report=self._report(bus, now_ns)))
                 case Forget():
                     bus.forget_past()
-                    self._send(Answer(id=request.id))
+                    self._answer(request, Answer(id=request.id))
+                case Republish():
+                    self._publishers[request.bus].reset()
+                    self._answer(request, Answer(id=request.id))
                 case AskMailbox():
                     self._ask(bus, request, now_ns)
                 case Transfer():
@@ -153,7 +170,12 @@ class BusDesk:
                 case Bring():
                     self._bring(bus, request, now_ns)
         except EapError as exc:
-            self._send(Answer(id=request.id, failure=to_failure(exc)))
+            self._answer(request, Answer(id=request.id, failure=to_failure(exc)))
+
+    def _answer(self, request: BusRequest, answer: Answer) -> None:
+        """Answer a request behind the changes that it has made, or its sender has not seen."""
+        self._publishers[request.bus].flush()
+        self._send(answer)
 
     def _report(self, bus: EngineBus, now_ns: int) -> BusReport:
         return msgspec.structs.replace(
@@ -211,10 +233,11 @@ class BusDesk:
         def done(task: Task[T]) -> None:
             if self._forget(request.id, task):
                 error = task.error
-                self._send(
+                self._answer(
+                    request,
                     Answer(id=request.id, failure=to_failure(error))
                     if error is not None
-                    else answer(request.id, task.result())
+                    else answer(request.id, task.result()),
                 )
 
         task.watch(done)
@@ -237,11 +260,14 @@ class BusDesk:
             del self._places[errand.place]
         return True
 
-    def _send(self, message: Answer | Hello | Heard) -> None:
+    def _send(self, message: Answer | Hello | Heard | BusChange) -> bool:
+        """Send a message; return False and drop it if there is no room."""
         try:
             self._sock.send(msgspec.msgpack.encode(message))
         except OSError:
-            self.dropped += 1
+            self.dropped += not isinstance(message, BusChange)  # that one is built anew
+            return False
+        return True
 
 
 def _message_answer(number: int, message: Message) -> Answer:

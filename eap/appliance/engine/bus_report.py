@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+
+from msgspec.structs import asdict
 
 from devicebus.master.bus import Unit
 from devicebus.master.findings import NO_ANSWER
 from devicebus.master.master import why_closed
 from eap.appliance.bus_failure import to_failure
-from eap.appliance.bus_request import BusReport, PortErrorReport, SlaveReport
+from eap.appliance.bus_request import (
+    BusReport,
+    PortErrorReport,
+    SlaveDescription,
+    SlaveReport,
+)
 from eap.appliance.engine.bus_faults import WHOLE_BUS
 from eap.appliance.engine.engine_bus import EngineBus
-from eap.pd.spec import BusSlaveSpec
 
 
 def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
     """Return what *bus* knows now; before its slaves are known, those that are expected."""
     stats = bus.master.stats()
     units = bus.master.units.values()
-    presets = _link_presets(units)
+    presets = link_presets(units)
     slaves = (
-        [_found(bus, unit, presets.get(unit.found.position, 0), now_ns) for unit in units]
+        [_report(bus, unit, presets, now_ns) for unit in units]
         if units
-        else [_expected(slave) for slave in bus.spec.slaves]
+        else [SlaveReport(**asdict(each)) for each in expected_slaves(bus)]
     )
     cycle = stats.cycle
     silence = bus.faults.last(WHOLE_BUS)
@@ -52,7 +58,7 @@ def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
     )
 
 
-def _link_presets(units: Collection[Unit]) -> dict[int, int]:
+def link_presets(units: Collection[Unit]) -> dict[int, int]:
     """Return by position which ports led to other slaves when these were found (ETG.1510)."""
     presets: dict[int, int] = {}
     for unit in units:
@@ -66,12 +72,12 @@ def _link_presets(units: Collection[Unit]) -> dict[int, int]:
     return presets
 
 
-def _found(bus: EngineBus, unit: Unit, link_preset: int, now_ns: int) -> SlaveReport:
+def describe_slave(bus: EngineBus, unit: Unit, presets: Mapping[int, int]) -> SlaveDescription:
+    """Return the description of a slave that was found; *presets* as link_presets returns them."""
     identity, sii = unit.found.identity, unit.found.sii
-    last = bus.faults.last(unit.station)
     past = bus.faults.past(unit.station)
     sizes = unit.mailbox.sizes if unit.mailbox is not None else None
-    return SlaveReport(
+    return SlaveDescription(
         station=unit.station,
         name=unit.name,
         vendor=identity.vendor,
@@ -89,11 +95,18 @@ def _found(bus: EngineBus, unit: Unit, link_preset: int, now_ns: int) -> SlaveRe
         usual_to_slave=sii.fixed.receive_size,
         usual_to_master=sii.fixed.send_size,
         port_physics=sii.general.port_physics if sii.general else 0,
-        link_preset=link_preset,
+        link_preset=presets.get(unit.found.position, 0),
         losses=past.losses,
         departures=past.departures,
         al_code=past.al_code,
         fault=_fault(bus, unit),
+    )
+
+
+def _report(bus: EngineBus, unit: Unit, presets: Mapping[int, int], now_ns: int) -> SlaveReport:
+    last = bus.faults.last(unit.station)
+    return SlaveReport(
+        **asdict(describe_slave(bus, unit, presets)),
         past_fault=last.text if last.until_ns is not None else "",
         since_ns=now_ns - last.since_ns if last.text else None,
         until_ns=None if last.until_ns is None else now_ns - last.until_ns,
@@ -112,16 +125,20 @@ def _fault(bus: EngineBus, unit: Unit) -> str:
     return fault
 
 
-def _expected(slave: BusSlaveSpec) -> SlaveReport:
-    return SlaveReport(
-        station=slave.station,
-        name=slave.name,
-        vendor=slave.vendor,
-        product=slave.product,
-        revision=slave.revision or 0,
-        serial=slave.serial or 0,
-        alias=slave.alias or 0,
-        state=0,
-        target=0,
-        fault="it has not been found yet",
-    )
+def expected_slaves(bus: EngineBus) -> list[SlaveDescription]:
+    """Return the slaves of the plant file, for a bus whose slaves have not been found yet."""
+    return [
+        SlaveDescription(
+            station=slave.station,
+            name=slave.name,
+            vendor=slave.vendor,
+            product=slave.product,
+            revision=slave.revision or 0,
+            serial=slave.serial or 0,
+            alias=slave.alias or 0,
+            state=0,
+            target=0,
+            fault="it has not been found yet",
+        )
+        for slave in bus.spec.slaves
+    ]

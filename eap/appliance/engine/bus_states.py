@@ -24,15 +24,19 @@ class BusStates:
             *(f"{port}.{slave.name}.{STATE}" for slave in slaves),
         ]
         self._shown = [-1] * len(self._names)
+        self._seen: tuple[Master, int, bool] | None = None
 
     def show(self, master: Master) -> None:
         """Store what has changed; the caller stands in the engine's writing."""
-        units, cycle = master.units, master.cycle
-        lowest = min([unit.al_state for unit in units.values()], default=0)
-        values = [lowest, int(cycle is not None and cycle.is_full)]
-        values += [units[at].al_state if at in units else 0 for at in self._stations]
-        if values == self._shown:
+        cycle = master.cycle
+        seen = master, master.changes, cycle is not None and cycle.is_full
+        if seen == self._seen:
             return
+        self._seen = seen
+        units = master.units
+        lowest = min([unit.al_state for unit in units.values()], default=0)
+        values = [lowest, int(seen[2])]
+        values += [units[at].al_state if at in units else 0 for at in self._stations]
         for name, value, shown in zip(self._names, values, self._shown, strict=True):
             if value != shown and name in self._image.places:
                 self._image.store(name, bytes((value,)))

@@ -77,6 +77,11 @@ class EngineBus:
         faults = (self._wire_fault, self._start_fault, *self._ties.missing)
         return "\n".join(filter(None, faults))
 
+    @property
+    def revision(self) -> tuple[object, ...]:
+        """Value that changes with anything that a description of the bus shows."""
+        return self.master, self.master.changes, self.is_up, self.fault
+
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when a frame waits."""
         return self._port.fileno()

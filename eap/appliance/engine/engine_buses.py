@@ -55,6 +55,11 @@ class EngineBuses:
         for bus in self.buses:
             bus.start(now_ns)
 
+    def publish(self) -> None:
+        """Send services what has changed on the buses."""
+        if self.desk is not None:
+            self.desk.publish()
+
     def rest(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         """Bring all slaves to INIT, or as far as they get in REST_NS."""
         now_ns = clock()

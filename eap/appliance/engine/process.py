@@ -66,6 +66,7 @@ def run_cycles(
             if now_ns >= look_ns:
                 look_ns = now_ns + LOOK_PERIOD_NS
                 plant.publish_discards()
+                plant.buses.publish()
                 if gc.get_count()[0] > GARBAGE and not rebuilds.is_building:
                     gc.collect()
                 if passed := take_connection(link):

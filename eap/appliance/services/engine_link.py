@@ -16,7 +16,16 @@ from time import monotonic_ns
 import msgspec
 
 from eap.appliance.bus_failure import to_error
-from eap.appliance.bus_request import Answer, Cancel, FromEngine, Heard, Hello, Ping, Request
+from eap.appliance.bus_request import (
+    Answer,
+    BusChange,
+    Cancel,
+    FromEngine,
+    Heard,
+    Hello,
+    Ping,
+    Request,
+)
 from eap.errors import EngineGoneError
 
 LOOK_S = 1.0
@@ -38,6 +47,8 @@ class EngineLink:
     Attributes:
         on_restart: Called when another engine has taken its end of the pair.
         on_heard: Called with each message that a slave sent unasked.
+        on_change: Called with each change of a bus.
+        heard_s: Time of the loop at which the engine has sent something last.
     """
 
     def __init__(self, sock: socket.socket, *, look_s: float = LOOK_S) -> None:
@@ -51,9 +62,15 @@ class EngineLink:
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
         # Numbers of a process before this one do not come again: late answers to it match nothing.
         self._last_id = monotonic_ns()
-        self._heard_s = 0.0
+        self.heard_s = 0.0
         self.on_restart: list[Callable[[], None]] = []
         self.on_heard: list[Callable[[Heard], None]] = []
+        self.on_change: list[Callable[[BusChange], None]] = []
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the engine has sent something within the time after which it counts as gone."""
+        return self._loop.time() < self.heard_s + self._look_s
 
     async def ask(self, make: Callable[[int], Request], timeout_s: float) -> Answer:
         """Send the request that *make* returns for its number, and wait for the answer.
@@ -109,7 +126,7 @@ class EngineLink:
             now_s = self._loop.time()
             if future.done():
                 return future.result()
-            if now_s >= end_s or (looked_s is not None and self._heard_s < looked_s):
+            if now_s >= end_s or (looked_s is not None and self.heard_s < looked_s):
                 raise EngineGoneError("the engine does not answer")
             looked_s = now_s
             self.tell(lambda number: Ping(id=number))
@@ -135,12 +152,15 @@ class EngineLink:
         except msgspec.MsgspecError as exc:
             logger.warning("an answer of the engine cannot be read: %s", exc)
             return
-        self._heard_s = self._loop.time()
+        self.heard_s = self._loop.time()
         if isinstance(message, Hello):
             self._restarted()
         elif isinstance(message, Heard):
             for call in self.on_heard:
                 call(message)
+        elif isinstance(message, BusChange):
+            for notify in self.on_change:
+                notify(message)
         elif (future := self._waiting.get(message.id)) is not None and not future.done():
             future.set_result(message)
 

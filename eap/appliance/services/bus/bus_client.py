@@ -31,6 +31,7 @@ from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.bus.turns import Turns
 from eap.appliance.services.engine_link import EngineLink
+from eap.appliance.services.slaves.bus_view import BusView
 from eap.codec.mailbox import MailboxType
 from eap.errors import EapError, EngineGoneError
 
@@ -47,6 +48,9 @@ class BusClient:
     Args:
         link: To the engine.
         ports: All bus ports in the order that numbers them.
+
+    Attributes:
+        views: Cached descriptions of all buses.
     """
 
     def __init__(self, link: EngineLink, ports: Sequence[PortName]) -> None:
@@ -54,8 +58,7 @@ class BusClient:
         self._link = link
         self._numbers = {port: number for number, port in enumerate(ports)}
         self._turns = Turns()
-        self._up: set[PortName] = set()
-        link.on_restart.append(self._up.clear)
+        self.views = {port: BusView(link, number) for port, number in self._numbers.items()}
 
     def listen(self, port: PortName, heard: Callable[[Heard], None]) -> None:
         """Call *heard* with each message that a slave of a bus sends unasked."""
@@ -76,25 +79,31 @@ class BusClient:
         return answer.report
 
     async def wait_up(self, port: PortName) -> BusReport:
-        """Return how a bus is once it is up.
+        """Return the report of a bus once it is up.
 
         Raises:
             BusError: it is not after PATIENCE_S, with the reason.
             EngineGoneError: there is no engine all the while.
         """
+        await self._be_up(port)
+        return await self.describe(port)
+
+    async def _be_up(self, port: PortName) -> None:
+        """Wait until a bus is up; raises as :meth:`wait_up` does."""
+        if self.views[port].latest.is_up:
+            return
         loop = asyncio.get_running_loop()
         end_s = loop.time() + PATIENCE_S
         while True:
             error: EapError
             try:
-                report = await self.describe(port)
+                bus = await self.views[port].current()
             except EngineGoneError as exc:
                 error = exc
             else:
-                if report.is_up:
-                    self._up.add(port)
-                    return report
-                error = BusError(f"{_name(port)} is not up: {report.fault or 'it begins'}")
+                if bus.is_up:
+                    return
+                error = BusError(f"{_name(port)} is not up: {bus.fault or 'it begins'}")
             if loop.time() >= end_s:
                 raise error
             await asyncio.sleep(_LOOK_S)
@@ -204,10 +213,6 @@ class BusClient:
         """Have the engine forget the faults of a bus that are over; raises EngineGoneError."""
         bus = self._numbers[port]
         await self._link.ask(lambda number: Forget(id=number, bus=bus), DESCRIBE_S)
-
-    async def _be_up(self, port: PortName) -> None:
-        if port not in self._up:
-            await self.wait_up(port)
 
 
 def _name(port: PortName) -> str:

@@ -15,7 +15,7 @@ from devicebus.wire.alstatus import AlState
 from eap.aoe.ads_master import SlaveState
 from eap.aoe.ads_operation import WriteControl
 from eap.aoe.ads_state import INIT, al_state_for, states_of
-from eap.appliance.bus_request import BusReport, SlaveReport
+from eap.appliance.bus_request import SlaveDescription
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.codec.ads import AdsStates
@@ -34,22 +34,20 @@ class MasterSide:
     Args:
         bus: Asks the engine.
         port: Which bus.
-
-    Attributes:
-        report: The bus as it was last; set before anything is asked of this.
     """
 
     def __init__(self, bus: BusClient, port: PortName) -> None:
-        self.report = BusReport(is_up=False)
-        self._bus = bus
+        self._client = bus
+        self._view = bus.views[port]
         self._port = port
         self._requests: dict[int, asyncio.Task[None]] = {}
 
     def state(self) -> int:
         """Return the AL state of the master."""
-        if not self.report.is_up:
+        bus = self._view.latest
+        if not bus.is_up:
             return INIT
-        return max((slave.state for slave in self.report.slaves), default=0) or INIT
+        return max((slave.state for slave in bus.slaves.values()), default=0) or INIT
 
     def states(self) -> AdsStates:
         """Return what ReadState tells."""
@@ -59,7 +57,7 @@ class MasterSide:
         """Return all slaves, in their order on the bus."""
         return [
             SlaveState(slave.station, _state(slave), 0 if slave.state else _NO_LINK)
-            for slave in self.report.slaves
+            for slave in self._view.latest.slaves.values()
         ]
 
     def request_state(self, state: int) -> None:
@@ -84,7 +82,7 @@ class MasterSide:
 
     async def _bring(self, station: int, target: AlState) -> None:
         try:
-            await self._bus.bring(self._port, station, target)
+            await self._client.bring(self._port, station, target)
         except EapError as exc:
             who = f"slave {station}" if station else "all slaves"
             name = f"{self._port.station}/{self._port.port}"
@@ -95,5 +93,5 @@ class MasterSide:
             del self._requests[station]
 
 
-def _state(slave: SlaveReport) -> int:
+def _state(slave: SlaveDescription) -> int:
     return slave.state | (_ERROR if slave.fault else 0)

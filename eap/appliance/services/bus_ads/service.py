@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Container
 from functools import partial
+from itertools import islice
 from time import monotonic_ns
 from typing import TypeAlias
 
@@ -29,7 +30,6 @@ from eap.aoe.ads_operation import (
 )
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
-from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
 from eap.appliance.services.ads.ads_requests import answer_request
 from eap.appliance.services.ads.eap_ads import device_info
@@ -42,6 +42,7 @@ from eap.appliance.services.bus_ads.slave_space import Asked
 from eap.appliance.services.bus_ads.slaves import Slaves
 from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.routing.service import LocalRequest
+from eap.appliance.services.slaves.bus_view import BusDescription
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import DEVICE_PORT
@@ -87,6 +88,7 @@ class BusService:
     ) -> None:
         self.ports: Container[int] = range(1, DEVICE_PORT + 1)
         self._bus = bus
+        self._view = bus.views[port]
         self._port = port
         self._desk = desk
         self._watched: set[int] = set()  # objects that somebody was ever told of
@@ -110,8 +112,7 @@ class BusService:
         client = Client(request.came_by, header.source, header.source_port)
         end_s = asyncio.get_running_loop().time() + ANSWER_S
         try:
-            report = await self._bus.describe(self._port)
-            perform = self._performer(header.target_port, report, client)
+            perform = await self._performer(header.target_port, client)
         except AdsRefusedError as exc:
             return AmsAnswer(error_code=exc.result, why=exc.why)
         except EapError as exc:
@@ -126,35 +127,41 @@ class BusService:
         self._device.notifications.forget(way)
 
     async def _look(self) -> None:
-        self._master.report = await self._bus.describe(self._port)
+        await self._view.confirm()
         for index in self._watched:
             await self._desk.refresh(index)
 
-    def _performer(self, ams_port: int, report: BusReport, client: Client) -> Perform:
-        """Return who does operations for a port, or raise AdsRefusedError if nobody has it."""
+    async def _performer(self, ams_port: int, client: Client) -> Perform:
+        """Return the function that does operations for a port; raise AdsRefusedError for no port.
+
+        A slave that cannot be reached is looked for once more before that is answered.
+        """
+        bus = await self._view.current()
         if ams_port == DEVICE_PORT:
-            return lambda operation: self._perform_of_master(operation, report, client)
-        slave = next((each for each in report.slaves if each.station == ams_port), None)
+            return lambda operation: self._perform_of_master(operation, bus, client)
+        slave = bus.slaves.get(ams_port)
+        if slave is None or not (bus.is_up and slave.to_slave):
+            bus = await self._view.confirm()
+            slave = bus.slaves.get(ams_port)
         if slave is None:
-            known = ", ".join(str(each.station) for each in report.slaves[:_MAX_NAMED]) or "none"
+            known = ", ".join(map(str, islice(bus.slaves, _MAX_NAMED))) or "none"
             why = f"{_name(self._port)} has no slave {ams_port}; known are {known}"
             raise AdsRefusedError(AdsError.TARGET_PORT, why)
         asked = Asked(slave, client)
-        return lambda operation: self._perform_of_slave(operation, report, asked)
+        return lambda operation: self._perform_of_slave(operation, bus, asked)
 
     async def _perform_of_master(
-        self, operation: Operation, report: BusReport, client: Client
+        self, operation: Operation, bus: BusDescription, client: Client
     ) -> OperationOutcome:
         if isinstance(operation, ReadWrite) and operation.group == IndexGroup.RAW_COMMAND:
             commands = RawCommands(operation.data)
-            _check_up(self._port, report)
+            _check_up(self._port, bus)
             answer = commands.encode_answer(
                 await self._bus.transfer(self._port, commands.accesses())
             )
             if len(answer) > operation.length:
                 raise AdsRefusedError(AdsError.SIZE)
             return OperationOutcome(data=answer)
-        self._master.report = report
         group, offset = place_of(operation)
         is_object = group in ObjectSpace.groups
         if is_object:
@@ -165,10 +172,10 @@ class BusService:
         return outcome
 
     async def _perform_of_slave(
-        self, operation: Operation, report: BusReport, asked: Asked
+        self, operation: Operation, bus: BusDescription, asked: Asked
     ) -> OperationOutcome:
         if not isinstance(operation, ReadState | ReadDeviceInfo):
-            _check_up(self._port, report)
+            _check_up(self._port, bus)
         return await self._slaves.perform(asked, operation)
 
 
@@ -186,9 +193,9 @@ async def _perform_until(end_s: float, perform: Perform, operation: Operation) -
         return OperationOutcome(error.result, why=error.why)
 
 
-def _check_up(port: PortName, report: BusReport) -> None:
-    if not report.is_up:
-        fault = report.fault or "it begins"
+def _check_up(port: PortName, bus: BusDescription) -> None:
+    if not bus.is_up:
+        fault = bus.fault or "it begins"
         raise AdsRefusedError(AdsError.HOST_UNREACHABLE, f"{_name(port)} is not up: {fault}")
 
 

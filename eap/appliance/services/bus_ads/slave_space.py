@@ -10,7 +10,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import SiiProtocol
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import AdsRefusedError
-from eap.appliance.bus_request import SlaveReport
+from eap.appliance.bus_request import SlaveDescription
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.codec.ads import AdsError
@@ -21,7 +21,7 @@ T = TypeVar("T")
 class Asked(NamedTuple):
     """A slave, and who wants something of it."""
 
-    slave: SlaveReport
+    slave: SlaveDescription
     client: Client
 
     @property

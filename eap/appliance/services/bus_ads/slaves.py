@@ -16,7 +16,7 @@ from eap.aoe.ads_operation import (
 )
 from eap.aoe.ads_state import DeviceDataSpace, al_state_for, states_of
 from eap.appliance.bus_failure import no_mailbox
-from eap.appliance.bus_request import SlaveReport
+from eap.appliance.bus_request import SlaveDescription
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.files import SlaveFiles
@@ -79,7 +79,7 @@ class Slaves:
                 raise AdsRefusedError(AdsError.SERVICE, why)
         return OperationOutcome(data=data)
 
-    def _space(self, slave: SlaveReport, group: int) -> SlaveSpace | None:
+    def _space(self, slave: SlaveDescription, group: int) -> SlaveSpace | None:
         """Return who serves a group; None means the slave itself."""
         space = next((each for each in self._spaces if group in each.groups), None)
         protocol = SiiProtocol.AOE if space is None else space.protocol
@@ -112,7 +112,7 @@ async def _do(space: SlaveSpace, asked: Asked, operation: Read | Write | ReadWri
     return found
 
 
-def _device_info(slave: SlaveReport) -> AdsDeviceInfo:
+def _device_info(slave: SlaveDescription) -> AdsDeviceInfo:
     """Name the slave as its bus does; the version is its revision, from the highest octet down."""
     revision = slave.revision
     high, middle = revision >> 24 & _OCTET, revision >> 16 & _OCTET

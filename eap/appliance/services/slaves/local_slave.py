@@ -9,7 +9,7 @@ from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client
 from devicebus.mailbox.conversation import Ask, Conversation, Message
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_failure import no_mailbox
-from eap.appliance.bus_request import SlaveReport
+from eap.appliance.bus_request import SlaveDescription
 from eap.appliance.services.bus_ads.transfer import Transfer
 from eap.appliance.services.slaves.access import UploadSink
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
@@ -35,7 +35,7 @@ class LocalSlave:
     def __init__(
         self,
         bus: BusMailboxes,
-        slave: SlaveReport,
+        slave: SlaveDescription,
         requester: Hashable,
         *,
         turn_s: float | None = None,

@@ -16,6 +16,7 @@ from eap.appliance.bus_request import (
     Answer,
     AskMailbox,
     Bring,
+    BusChange,
     Cancel,
     Datagram,
     Describe,
@@ -25,6 +26,7 @@ from eap.appliance.bus_request import (
     Heard,
     Hello,
     Ping,
+    Republish,
     Transfer,
 )
 from eap.appliance.engine.bus_desk import MAX_OUTSTANDING, MAX_PER_SLAVE, PER_WAKE_UP, BusDesk
@@ -50,6 +52,7 @@ class Office:
         self.services.setblocking(False)
         self.desk = BusDesk(engine, [rig.bus], self.serve_station)
         self.heard = {}
+        self.changes = []
         self.asked = []
 
     def serve_station(self, request, now_ns, reply):
@@ -70,6 +73,9 @@ class Office:
                 message = decoder.decode(self.services.recv(1 << 20))
             except BlockingIOError:
                 return self.heard
+            if isinstance(message, BusChange):
+                self.changes.append(message)
+                continue
             assert message.id not in self.heard
             self.heard[message.id] = message
 
@@ -107,6 +113,33 @@ def test_a_new_engine_greets(office):
     office.desk.greet()
     message = msgspec.msgpack.decode(office.services.recv(100), type=FromEngine)
     assert message == Hello(os.getpid())
+
+
+def test_changes_come_before_the_answer_to_what_made_them(office):
+    office.ask(Republish(id=1, bus=0))
+    (first,) = office.changes
+    assert first.stations == (1001, 1002, 1003) == tuple(each.station for each in first.slaves)
+    office.post(Bring(id=2, bus=0, station=1002, target=AlState.PREOP))
+    office.rig.wait(lambda: office.rig.bus.master.units[1002].al_state == AlState.PREOP)
+    office.rig.run(MS)
+    messages = []
+    while not messages or "id" not in messages[-1]:
+        messages.append(msgspec.msgpack.decode(office.services.recv(1 << 16)))
+    states = [slave["state"] for each in messages[:-1] for slave in each["slaves"]]
+    assert (states[-1], messages[-1]["id"]) == (AlState.PREOP, 2)
+
+
+def test_changes_that_nobody_requested_come_with_the_next_look_or_answer(office):
+    office.ask(Republish(id=1, bus=0))
+    for number, publish in enumerate((office.desk.publish, lambda: office.post(Ping(id=2)))):
+        office.changes.clear()
+        office.rig.fault(kind="power", slave="level", for_ms=200)
+        office.rig.wait(lambda: office.rig.value("level.state") == 0)
+        publish()
+        office.collect()
+        assert [each.station for each in office.changes[-1].slaves] == [1003]
+        assert office.changes[-1].slaves[0].losses == number + 1
+        office.rig.wait_op()
 
 
 def test_a_bus_is_described(office):

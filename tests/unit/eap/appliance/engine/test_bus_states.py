@@ -24,6 +24,7 @@ class Master:
     def __init__(self, *units):
         self.units = {1001 + number: unit for number, unit in enumerate(units)}
         self.cycle = None
+        self.changes = 0
 
 
 @pytest.fixture
@@ -44,6 +45,7 @@ def test_the_lowest_state_is_that_of_the_bus(image):
     states.show(master)
     assert read(image) == [4, 8, 4, True]
     master.units[1002].al_state = 0
+    master.changes += 1
     master.cycle.is_full = False
     states.show(master)
     assert read(image) == [0, 8, 0, False]

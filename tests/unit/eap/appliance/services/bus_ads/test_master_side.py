@@ -5,32 +5,38 @@ from __future__ import annotations
 import logging
 
 from eap.aoe.ads_master import SlaveState
-from eap.appliance.bus_request import Bring, BusReport, Cancel, SlaveReport
+from eap.appliance.bus_request import Bring, Cancel, SlaveDescription
 from eap.appliance.services.bus_ads.master_side import MasterSide
+from eap.appliance.services.slaves.bus_view import BusDescription
 from eap.codec.ads import AdsState, AdsStates
 from tests.support.busads import play, until
 from tests.support.fakeengine import PORT
 
 
-def slave(station: int, state: int, fault: str = "") -> SlaveReport:
-    return SlaveReport(
+def slave(station: int, state: int, fault: str = "") -> SlaveDescription:
+    return SlaveDescription(
         station=station, name="s", vendor=1, product=2, revision=3, serial=4, alias=0,
         state=state, target=8, fault=fault,
     )  # fmt: skip
+
+
+def bus(*slaves: SlaveDescription) -> BusDescription:
+    return BusDescription(is_up=True, fault="", slaves={each.station: each for each in slaves})
 
 
 def test_states():
     async def scene(client, engine):
         side = MasterSide(client.bus, PORT)
         assert side.state() == 1
-        side.report = BusReport(is_up=True, slaves=(slave(1001, 8), slave(1002, 4, "AL status")))
+        view = client.bus.views[PORT]
+        view.latest = bus(slave(1001, 8), slave(1002, 4, "AL status"))
         assert side.state() == 8
         assert side.states() == AdsStates(AdsState.RUN, 8)
         assert side.slaves() == [SlaveState(1001, 8, 0), SlaveState(1002, 0x14, 0)]
-        side.report = BusReport(is_up=True, slaves=(slave(1001, 0, "it does not answer"),))
+        view.latest = bus(slave(1001, 0, "it does not answer"))
         assert side.state() == 1
         assert side.slaves() == [SlaveState(1001, 0x10, 1)]
-        side.report = BusReport(is_up=False, slaves=(slave(1001, 8),))
+        view.latest = bus(slave(1001, 8))._replace(is_up=False)
         assert side.state() == 1
 
     play(scene)

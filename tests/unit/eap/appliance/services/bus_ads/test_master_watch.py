@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from eap.aoe.ads_operation import DeleteNotification, WriteControl
-from eap.appliance.bus_request import Describe
+from eap.appliance.bus_request import Ping
 from eap.appliance.services.bus_ads import master_watch
 from eap.codec.ads import AdsState, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
@@ -48,9 +48,9 @@ def test_states_of_a_slave():
         await until(lambda: has(2, 1))
         await client.good(MASTER, DeleteNotification(handle))
         await asyncio.sleep(0.01)
-        looks = len(engine.of(Describe))
+        looks = len(engine.of(Ping))
         await asyncio.sleep(0.02)
-        assert len(engine.of(Describe)) == looks  # nobody looks when nobody wants to know
+        assert len(engine.of(Ping)) == looks  # nobody looks when nobody wants to know
 
     play(scene)
 
