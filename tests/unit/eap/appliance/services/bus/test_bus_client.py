@@ -222,9 +222,9 @@ def test_bus_that_is_not_up_is_waited_for(monkeypatch):
         engine.buses[0].is_up = False
         asyncio.get_running_loop().call_later(0.1, setattr, engine.buses[0], "is_up", True)
         assert await client.converse(PORT, SENSOR, vendor(), 1) == b"\x5a\x0e\0\0"
+        engine.buses[0].is_up = False
         engine.say_hello()
         await asyncio.sleep(0.01)
-        engine.buses[0].is_up = False
         monkeypatch.setattr(bus_client, "PATIENCE_S", 0.1)
         with pytest.raises(BusError, match="left/bus0 is not up: no frame comes back"):
             await client.converse(PORT, SENSOR, vendor(), 1)
