@@ -38,7 +38,8 @@ Modular device profile 5001, sub-profile 1000 (ETG.5001, ETG.1005); the tables a
   is changeable. *T* and *R* mark what can be mapped into sent and received PDOs.
 - **Kept** configuration is what `plan`, `apply` and `rollback` compare and what survives a restart.
   *live* is what the running device shows, *computed* follows from other entries, *fixed* was given
-  at the start.
+  at the start. **Plant file** is the key of the [plant file](plant-file.md) that says the same;
+  all others are keys within `stations`.
 - Objects of **dynamic** ranges are made by a download to any sub-index of a free index and deleted
   by writing 0 to sub-index 0, in PreOp and as long as nothing refers to them. Writing 0 to
   sub-index 0 of a mapping empties it; its entries are written then, and sub-index 0 last.
@@ -83,15 +84,14 @@ def _object(row: ObjectRange) -> Iterator[str]:
     yield f"## {_range(row)} {_title(row)}\n\n{row.code.name}"
     yield ", dynamic" if row.dynamic else ""
     yield f". {row.description}\n\n"
-    yield f"| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}\n"
+    columns = (*_COLUMNS, "Plant file") if row.section else _COLUMNS
+    yield f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}\n"
     if row.code is not ObjectCode.VAR:
-        is_kept = row.list_row is not None and row.list_row.access & CONFIG == CONFIG
-        access = CONFIG if row.dynamic or is_kept else Access.READ_ANY
-        count = EntryRow(0, "Highest sub-index", "USINT", access, _count_text(row),
+        count = EntryRow(0, "Highest sub-index", "USINT", row.count_access, _count_text(row),
                          row.fixed_count)  # fmt: skip
-        yield _entry(count)
+        yield _entry(count, row.section)
     for entry in row.entries:
-        yield _entry(entry)
+        yield _entry(entry, row.section)
 
 
 def _count_text(row: ObjectRange) -> str:
@@ -105,7 +105,7 @@ def _count_text(row: ObjectRange) -> str:
     return " ".join(texts)
 
 
-def _entry(row: EntryRow) -> str:
+def _entry(row: EntryRow, section: str = "") -> str:
     kind = None if row.kind == OWN_TYPE else datatypes.parse(row.kind)
     cells = (
         f"{row.subindex:02X} to {row.last:02X}" if row.last else f"{row.subindex:02X}",
@@ -118,6 +118,7 @@ def _entry(row: EntryRow) -> str:
         _limits(row),
         row.unit.replace("us", "µs"),
         row.description,
+        *([f"`{section}.{row.key}`" if row.key else ""] if section else []),
     )
     return f"| {' | '.join(_cell(cell) for cell in cells)} |\n"
 

@@ -15,12 +15,11 @@ from eap.appliance.control import Parameters
 from eap.appliance.device_change import Plan
 from eap.device.difference import Change
 from eap.device.eap_state import StateResult
-from eap.device.fault import DeviceFault
 from eap.device.rollout import without_alternates
 from eap.od.model import Access, Entry, OdObject
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.table import UNITS
-from eap.pd.device import DeviceState
+from eap.pd.device import DeviceFault, DeviceState
 from eap.pd.spec import StationSpec
 
 PAGE = 1 << 18

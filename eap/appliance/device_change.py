@@ -14,10 +14,10 @@ from eap.device import stored
 from eap.device.difference import Change, compare
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
-from eap.device.eap_read import read_back
-from eap.device.fault import DeviceFault
+from eap.device.eap_records import read_back
 from eap.device.rollout import without_alternates
 from eap.device.stored import StoredError
+from eap.pd.device import DeviceFault
 from eap.pd.spec import PortKind, StationSpec
 
 

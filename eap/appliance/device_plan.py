@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from eap.appliance.change import needs_new_start
-from eap.device.eap_content import bus_variables
-from eap.device.version import kept_versions
+from eap.device.pdlayout import bus_variables, kept_versions
 from eap.pd.spec import LinkSpec, Source, StationSpec, VariableSpec
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from ipaddress import IPv4Address
 
-from eap.config.destination import find_net_id, group_of, is_group, reaches, resolve
+from msgspec.structs import replace
+
+from eap.config.destination import find_net_id, group_of, reaches, resolve
 from eap.config.finding import Report
 from eap.config.index import Index
 from eap.config.structs import Frame, Port, Station
 from eap.ids import Destination, DestinationKind, InterfaceUri, MacAddr
+from eap.pd import rules
 from eap.pd.spec import REQUESTER
-
-MIN_INTERVAL_MS = 100
 
 
 def check_address(
@@ -46,7 +47,9 @@ def _is_heard(index: Index, key: tuple[str, str], station: Station, own: Port) -
         if subscription.port == own.name
         for sent in index.publishers(subscription)
     ]
-    joined = {str(MacAddr.parse(text)) for text in own.join if is_group(text, receiver[1])}
+    joined = {
+        str(MacAddr.parse(text)) for text in own.join if rules.is_group(text, receiver[1].scheme)
+    }
     for (name, _), frame in index.frames.items():
         if (name, frame.port) != key:
             continue
@@ -70,30 +73,12 @@ def check_monitoring(
 
     *destination* is None for frames to who asks.
     """
-    path = f"{frame.at}.monitor_interval_ms"
-    message = f"frame {frame.name!r} is monitored but "
-    if 0 < frame.monitor_interval_ms < MIN_INTERVAL_MS:
-        expected = f"at least {MIN_INTERVAL_MS}, or 0 for never"
-        report.add(path, f"monitor_interval_ms is {frame.monitor_interval_ms}", expected)
-    elif frame.monitor_interval_ms:
-        if destination is None or destination.is_group:
-            target = "many" if destination else "who asks"
-            report.add(path, f"{message}goes to {target}", "it only on a unicast frame")
-        elif destination.kind is DestinationKind.TCP or uri.scheme == "loop":
-            report.add(path, f"{message}goes to {destination} by {uri}", "Ethernet or UDP")
-    if not frame.monitor_ip:
-        return
-    path = f"{frame.at}.monitor_ip"
-    if uri.scheme != "ethernet":
-        message = (
-            f"frame {frame.name!r} has a monitor_ip, but its own address says whom to look for"
-        )
-        report.add(path, message, "monitor_ip only on Ethernet")
-    elif not _is_host(frame.monitor_ip):
+    spec = frame.spec(str(destination))
+    if frame.monitor_ip and uri.scheme == "ethernet" and not _is_host(frame.monitor_ip):
+        path = f"{frame.at}.monitor_ip"
         report.add(path, f"monitor_ip is {frame.monitor_ip!r}", "the IPv4 address of one host")
-    elif not frame.monitor_interval_ms:
-        message = f"frame {frame.name!r} has a monitor_ip but no monitor_interval_ms"
-        report.add(path, message, "both or none")
+        spec = replace(spec, monitor_ip="")
+    report.add_breaches(frame.at, rules.check_monitoring(spec, destination, uri))
 
 
 def _is_host(text: str) -> bool:

@@ -10,7 +10,7 @@ from eap.config.finding import Report, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import Frame, Publish, Station, Subscribe
 from eap.near import near
-from eap.pd.spec import REQUESTER
+from eap.pd import rules
 
 _PUSHED = "a request that is sent by itself"
 _ONE_PORT = "one port for both: an answer goes back as its request came"
@@ -23,7 +23,7 @@ def check_polls(index: Index, report: Report) -> None:
             _check_frame(report, station, frame)
         for pd in station.publish:
             if pd.poll:
-                _check_triggers(report, pd)
+                report.add_breaches(pd.at, rules.check_polled(pd.spec()))
                 _check_answer(index, report, station, pd)
         for subscription in station.subscribe:
             if subscription.poll:
@@ -33,29 +33,11 @@ def check_polls(index: Index, report: Report) -> None:
 
 
 def _check_frame(report: Report, station: Station, frame: Frame) -> None:
-    answers = frame.to == REQUESTER
-    if answers and frame.divider is not None:
-        message = f"frame {frame.name!r} carries answers and has a divider"
-        expected = "none: an answer leaves in the cycle that the request is taken in"
-        report.add(f"{frame.at}.divider", message, expected)
-    line = report.line_of(f"{frame.at}.to")
+    spec, line = frame.spec(frame.to), report.line_of(f"{frame.at}.to")
+    report.add_breaches(frame.at, rules.check_answers(spec))
     for pd in station.publish:
-        if pd.frame != frame.name or bool(pd.poll) is answers:
-            continue
-        if answers:
-            message = f"PD {pd.name!r} goes to who asks for it (frame {frame.name!r}, line {line})"
-            expected = "poll: the subscription that asks, or another frame"
-            report.add(f"{pd.at}.frame", f"{message}, but nothing does", expected)
-        else:
-            message = f"PD {pd.name!r} is polled, but frame {frame.name!r} goes to {frame.to}"
-            report.add(f"{pd.at}.frame", f"{message} (line {line})", f"a frame to: {REQUESTER}")
-
-
-def _check_triggers(report: Report, pd: Publish) -> None:
-    keys = [key for key in ("cycle_us", "divider", "on_change") if getattr(pd, key) is not None]
-    for key in [*keys, "event"] if pd.event else keys:
-        message = f"PD {pd.name!r} has both poll and {key}"
-        report.add(f"{pd.at}.{key}", message, "one of the two")
+        if pd.frame == frame.name:
+            report.add_breaches(pd.at, rules.check_frame_of(pd.spec(), spec, f"line {line}"))
 
 
 def _check_answer(index: Index, report: Report, station: Station, pd: Publish) -> None:

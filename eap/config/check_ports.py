@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from ipaddress import IPv4Address
 
@@ -10,23 +9,30 @@ from eap.codec.amsdiscovery import AMS_UDP_PORT
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.check_buses import INTERFACE, check_bus_port
-from eap.config.destination import is_group, takes_tcp
+from eap.config.destination import takes_tcp
 from eap.config.finding import Report
 from eap.config.index import Index
 from eap.config.structs import Port, Station
 from eap.ids import InterfaceUri, MacAddr, NetId
+from eap.od.profiles import eap1000 as profile
+from eap.pd.rules import NAME, check_phase, doubles, is_group, is_name
 from eap.pd.spec import PortKind
 
-_NAME = re.compile(r"[^\s/]+")
 _EAP_SCHEMES = {"udp", "ethernet", "tcp", "loop"}
 _MAX_INTERFACE_NAME = 15
-NAME = "a text without spaces and slashes"
+_SCHEMES = {row.key.partition(".")[0]: row.schemes for row in profile.row_of(profile.PORT).entries}
+_LIMITED = {
+    "vlan": "has a vlan",
+    "broadcast": "listens to UDP broadcasts",
+    "tcp": "takes type 4 from TCP",
+}
+"""Keys of a port that only some interfaces have, and what they do."""
 
 
 def check_ports(index: Index, report: Report) -> None:
     """Report every station and port that cannot be as it is."""
     plant = index.plant
-    if not _NAME.fullmatch(plant.plant):
+    if not is_name(plant.plant):
         report.add("plant", f"plant name {plant.plant!r}", NAME)
     if not plant.stations:
         report.add("stations", "the plant has no stations", "at least one station")
@@ -38,24 +44,22 @@ def check_ports(index: Index, report: Report) -> None:
         for port in station.ports:
             _check_port(port, report)
         cycle = index.cycle_us(station)
-        if station.phase_us is not None and station.phase_us >= cycle:
-            message = f"phase_us {station.phase_us} is not within the cycle"
-            report.add(f"{station.at}.phase_us", message, f"less than {cycle}")
+        report.add_breaches(station.at, check_phase(cycle, station.phase_us or 0))
     _check_addresses(index, report)
 
 
 def check_names(names: Iterable[tuple[str, str]], what: str, report: Report) -> None:
     """Report names that are malformed or given twice; *names* are (path of the item, name)."""
-    first: dict[str, str] = {}
+    named = []
     for at, name in names:
         path = f"{at}.name" if f"{at}.name" in report.lines else at
-        if not _NAME.fullmatch(name):
-            report.add(path, f"{what} name {name!r}", NAME)
-        elif name in first:
-            line = report.line_of(first[name])
-            report.add(path, f"{what} {name!r} exists already (line {line})", "a name of its own")
+        if is_name(name):
+            named.append((name, (path, name)))
         else:
-            first[name] = path
+            report.add(path, f"{what} name {name!r}", NAME)
+    for (path, name), (first, _) in doubles(named):
+        message = f"{what} {name!r} exists already (line {report.line_of(first)})"
+        report.add(path, message, "a name of its own")
 
 
 def _check_net_ids(stations: tuple[Station, ...], report: Report) -> None:
@@ -141,12 +145,9 @@ def _is_station(mac: str) -> bool:
 
 def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
     only = f"it only on a port of another kind than {uri.scheme}://"
-    if port.vlan is not None and uri.scheme != "ethernet":
-        report.add(f"{port.at}.vlan", f"port {port.name} has a vlan", only)
-    if port.broadcast and uri.scheme != "udp":
-        report.add(f"{port.at}.broadcast", f"port {port.name} listens to UDP broadcasts", only)
-    if port.tcp and uri.scheme not in {"udp", "tcp"}:
-        report.add(f"{port.at}.tcp", f"port {port.name} takes type 4 from TCP", only)
+    for key, does in _LIMITED.items():
+        if getattr(port, key) and uri.scheme not in _SCHEMES[key]:
+            report.add(f"{port.at}.{key}", f"port {port.name} {does}", only)
     _check_ams(port, uri, report)
     if port.mac and uri.scheme != "ethernet":
         report.add(f"{port.at}.mac", f"port {port.name} has a MAC address", only)
@@ -155,7 +156,7 @@ def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
             f"{port.at}.mac", f"mac is {port.mac!r}", "the address of one station's interface"
         )
     for position, group in enumerate(port.join):
-        if not is_group(group, uri):
+        if not is_group(group, uri.scheme):
             kind = "MAC" if uri.scheme == "ethernet" else "IPv4"
             expected = (
                 f"a multicast address ({kind})" if uri.scheme in {"udp", "ethernet"} else only

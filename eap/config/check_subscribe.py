@@ -11,6 +11,7 @@ from eap.config.index import Index, SentPd
 from eap.config.structs import ANY_SOURCE, From, Station, Subscribe
 from eap.ids import NetId
 from eap.near import near
+from eap.pd import rules
 from eap.pd.address import is_group_source, source_octets
 from eap.pd.spec import REQUESTER
 
@@ -155,9 +156,9 @@ def _check_timeout(index: Index, report: Report, station: Station, subscription:
     timeout_us = subscription.timeout_ms * 1000
     shown = f"timeout_ms {subscription.timeout_ms} of {subscription.name!r}"
     cycle = index.cycle_us(station)
-    if timeout_us < cycle:
-        message = f"{shown} is shorter than the device cycle of {cycle} us"
-        report.add(path, message, f"at least {-(-cycle // 1000)}, or 0 for never")
+    breaches = list(rules.check_time_out(subscription.name, subscription.timeout_ms, cycle))
+    report.add_breaches(subscription.at, breaches)
+    if breaches:
         return
     for sent in index.publishers(subscription):
         period = index.step(sent) * index.cycle_us(sent.station)

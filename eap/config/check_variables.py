@@ -12,7 +12,7 @@ from eap.config.finding import Report, one_of
 from eap.config.index import Index
 from eap.config.structs import Station, Variable
 from eap.near import near
-from eap.pd.layout import FRAME_CTRL, VAR_CTRL
+from eap.pd.rules import MADE_SUFFIXES
 from eap.pd.spec import (
     INTERFACE_MEASURES,
     CounterSource,
@@ -61,8 +61,8 @@ def check_variables(index: Index, report: Report, folder: Path) -> None:
 
 
 def _check_variable(path: str, name: str, variable: Variable, report: Report) -> None:
-    if name.endswith((VAR_CTRL, FRAME_CTRL)):
-        message = f"variable {name!r}: {VAR_CTRL} and {FRAME_CTRL} are made by the appliance"
+    if name.endswith(MADE_SUFFIXES):
+        message = f"variable {name!r}: {' and '.join(MADE_SUFFIXES)} are made by the appliance"
         report.add(path, message, "another name")
     try:
         kind = datatypes.parse(variable.type)

@@ -19,7 +19,7 @@ from eap.config.destination import IP_BROADCAST, find_net_id, group_of, resolve
 from eap.config.gateways import gateway_spec
 from eap.config.index import Index, SentPd
 from eap.config.links import ends, in_order, is_bitwise
-from eap.config.structs import ANY_SOURCE, Frame, From, Port, Publish, Station, Subscribe, Variable
+from eap.config.structs import ANY_SOURCE, Frame, From, Port, Station, Subscribe, Variable
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (
@@ -33,9 +33,7 @@ from eap.pd.spec import (
     RxPdSpec,
     Source,
     StationSpec,
-    TriggerSpec,
     TxFrameSpec,
-    TxPdSpec,
     VariableSpec,
     Writer,
 )
@@ -162,18 +160,8 @@ def _source(source: Source, folder: Path) -> Source:
 def _frames(index: Index, station: Station) -> Iterator[TxFrameSpec]:
     for frame in station.frames:
         destination = _destination(index, station, frame)
-        yield TxFrameSpec(
-            name=frame.name,
-            port=frame.port,
-            destination=destination,
-            mac=_mac(index, destination),
-            monitor_interval_ms=frame.monitor_interval_ms,
-            monitor_ip=frame.monitor_ip,
-            pds=tuple(_pd(pd) for pd in station.publish if pd.frame == frame.name),
-            divider=frame.divider or 0,
-            modulo=frame.modulo or 0,
-            changeable=frame.changeable,
-        )
+        pds = tuple(pd.spec() for pd in station.publish if pd.frame == frame.name)
+        yield frame.spec(destination, pds, _mac(index, destination))
 
 
 def _destination(index: Index, station: Station, frame: Frame) -> str:
@@ -189,17 +177,6 @@ def _mac(index: Index, destination: str) -> str:
         return ""
     text = "".join(index.ports[key].mac for key in find_net_id(str(net_id), index))
     return str(MacAddr.parse(text)) if text else ""
-
-
-def _pd(pd: Publish) -> TxPdSpec:
-    trigger = TriggerSpec(
-        cycle_us=pd.cycle_us or 0,
-        divider=pd.divider or 0,
-        modulo=pd.modulo or 0,
-        on_change=pd.on_change,
-        event=pd.event,
-    )
-    return TxPdSpec(pd.name, pd.id, pd.variables, pd.version, trigger, pd.poll, pd.changeable)
 
 
 def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:

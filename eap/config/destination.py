@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from ipaddress import IPv4Address
-
-from eap.codec.ethercat import EAP_PORT, MAX_ETHERNET_FRAME, MAX_UDP_FRAME, EtherCatHeader
+from eap.codec.ethercat import EAP_PORT
 from eap.config.index import Index
 from eap.config.structs import Port
 from eap.ids import (
@@ -13,21 +11,12 @@ from eap.ids import (
     Destination,
     DestinationKind,
     InterfaceUri,
-    MacAddr,
     NetId,
 )
+from eap.pd.rules import DESTINATIONS
 from eap.pd.spec import PortKind
 
 IP_BROADCAST = "255.255.255.255"
-MAX_STREAM_FRAME = EtherCatHeader.SIZE + 0x7FF
-"""What the 11 bits of Length allow where no wire does."""
-
-_ALLOWED = {
-    "udp": (DestinationKind.IP, DestinationKind.TCP),
-    "tcp": (DestinationKind.TCP,),
-    "ethernet": (DestinationKind.MAC,),
-    "loop": (DestinationKind.MAC,),
-}
 EXPECTED = {
     "udp": "an IPv4 address, tcp:// and one, STATION/PORT, a port's NetID, broadcast or requester",
     "tcp": "tcp:// and an IPv4 address, STATION/PORT, a port's NetID or requester",
@@ -60,7 +49,7 @@ def resolve(text: str, uri: InterfaceUri, index: Index) -> Destination:
     destination = Destination.parse(text)
     if destination.kind is DestinationKind.NET_ID:
         return _of_net_id(destination, uri, index)
-    if destination.kind not in _ALLOWED.get(uri.scheme, ()):
+    if destination.kind not in DESTINATIONS.get(uri.scheme, ()):
         raise ValueError(f"{text} cannot be reached from {uri}")
     if destination.kind is DestinationKind.TCP and destination.is_group:
         raise ValueError(f"{text} is a group, and TCP has none")
@@ -124,19 +113,6 @@ def takes_tcp(port: Port, uri: InterfaceUri) -> bool:
     return uri.scheme == "tcp" or (uri.scheme == "udp" and port.tcp)
 
 
-def frame_budget(destination: Destination | None, uri: InterfaceUri) -> int:
-    """Return the octets of the largest frame to *destination*, its EtherCAT header included.
-
-    Without a destination it goes to who asked, by any way that leads to a port on *uri*.
-    """
-    if destination is None:
-        budgets = {"udp": MAX_UDP_FRAME, "ethernet": MAX_ETHERNET_FRAME}
-        return budgets.get(uri.scheme, MAX_STREAM_FRAME)
-    if destination.kind is DestinationKind.TCP or uri.scheme == "loop":
-        return MAX_STREAM_FRAME
-    return MAX_UDP_FRAME if destination.kind is DestinationKind.IP else MAX_ETHERNET_FRAME
-
-
 def reaches(
     destination: Destination, sender: tuple[Port, InterfaceUri], receiver: tuple[Port, InterfaceUri]
 ) -> bool:
@@ -170,16 +146,6 @@ def group_of(destination: Destination) -> str | None:
         usual = {str(EAP_MULTICAST_MAC), str(BROADCAST_MAC)}
         return None if destination.host in usual else destination.host
     return destination.host
-
-
-def is_group(text: str, uri: InterfaceUri) -> bool:
-    """Tell whether *text* is a group that a port on *uri* can join."""
-    try:
-        if uri.scheme == "ethernet":
-            return MacAddr.parse(text).is_group
-        return uri.scheme == "udp" and IPv4Address(text).is_multicast
-    except ValueError:
-        return False
 
 
 def _vid(port: Port) -> int:

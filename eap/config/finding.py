@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from eap.config.document import Node
+    from eap.pd.rules import Breach
 
 _VARYING = re.compile(r"'[^']*'|\S*\d\S*|, did you mean [^?]*\?")
 """Parts of a message that differ from one use of an anchor to the next."""
@@ -67,6 +68,11 @@ class Report:
             self._further_uses.setdefault(first, set()).add(path)
         else:
             self._findings.setdefault((where, message, expected), finding)
+
+    def add_breaches(self, at: str, breaches: Iterable[Breach]) -> None:
+        """Report *breaches* of rules by the section at *at*."""
+        for breach in breaches:
+            self.add(f"{at}.{breach.key}", breach.message, breach.expected)
 
     def adopt(self, findings: Iterable[Finding]) -> None:
         """Take over what is wrong with another file."""

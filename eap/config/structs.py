@@ -12,7 +12,17 @@ from typing import Annotated, ClassVar, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from eap.pd.spec import BusTarget, OnChangeSpec, PortKind, Source, Substitute, Wake
+from eap.pd.spec import (
+    BusTarget,
+    OnChangeSpec,
+    PortKind,
+    Source,
+    Substitute,
+    TriggerSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    Wake,
+)
 
 U16 = Annotated[int, Meta(ge=0, le=0xFFFF)]
 Divider = Annotated[int, Meta(ge=1, le=0xFFFF)]
@@ -138,6 +148,21 @@ class Frame(Section, frozen=True):
     monitor_ip: str = ""
     changeable: bool = False
 
+    def spec(self, destination: str, pds: tuple[TxPdSpec, ...] = (), mac: str = "") -> TxFrameSpec:
+        """Return the specification of the frame to *destination*, with *pds* in it."""
+        return TxFrameSpec(
+            name=self.name,
+            port=self.port,
+            destination=destination,
+            pds=pds,
+            divider=self.divider or 0,
+            modulo=self.modulo or 0,
+            changeable=self.changeable,
+            mac=mac,
+            monitor_interval_ms=self.monitor_interval_ms,
+            monitor_ip=self.monitor_ip,
+        )
+
 
 class Publish(Section, frozen=True):
     """A PD to send in a frame."""
@@ -154,6 +179,25 @@ class Publish(Section, frozen=True):
     event: bool = False
     poll: str = ""
     changeable: bool = False
+
+    def spec(self) -> TxPdSpec:
+        """Return the specification of the PD."""
+        trigger = TriggerSpec(
+            cycle_us=self.cycle_us or 0,
+            divider=self.divider or 0,
+            modulo=self.modulo or 0,
+            on_change=self.on_change,
+            event=self.event,
+        )
+        return TxPdSpec(
+            name=self.name,
+            pd_id=self.id,
+            variables=self.variables,
+            version=self.version,
+            trigger=trigger,
+            poll_request=self.poll,
+            changeable=self.changeable,
+        )
 
 
 class From(Section, frozen=True):

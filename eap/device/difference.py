@@ -16,7 +16,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_mapping import Mapped
 from eap.device.stored import Configuration, configuration
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
+from eap.od.profiles.eap1000 import Frame, Rx, Tx, Var
 from eap.od.profiles.forms import Form, to_text
 from eap.od.profiles.table import ObjectRange
 

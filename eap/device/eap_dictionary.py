@@ -15,22 +15,22 @@ from contextlib import contextmanager
 
 from eap.codec import pdo
 from eap.device import eap_rules
-from eap.device.eap_content import STATUS, EapContent, Identity
-from eap.device.eap_mapping import check_mapped, data_budget, frame_budget, place
-from eap.device.eap_objects import DEFAULT_TYPE
-from eap.device.fault import DeviceFault
-from eap.device.live import LiveValues
+from eap.device.eap_mapping import check_mapped, place
+from eap.device.eap_objects import EapObjects, Identity, LiveValues
 from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary, check_value, take_bits
 from eap.od.model import Access, Entry, OdObject, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import Frame, Rx, Status, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, Status, Tx, Var
+from eap.od.profiles.maker import DEFAULT_TYPE
 from eap.od.profiles.table import CONFIG, ObjectRange
+from eap.pd.device import DeviceFault
+from eap.pd.rules import data_budget, frame_budget
 from eap.pd.spec import StationSpec
 
 
-class EapDictionary(EapContent):
+class EapDictionary(EapObjects):
     """What one EAP port of a station is and does, for clients to read and to write.
 
     Args:
@@ -53,7 +53,6 @@ class EapDictionary(EapContent):
         identity: Identity = Identity(),  # noqa: B008  immutable
     ) -> None:
         super().__init__(station, port, live, identity)
-        self.station = station
         self.on_request: Callable[[int], object] | None = None
         self.on_change: Callable[[int, int], None] | None = None
 
@@ -63,7 +62,7 @@ class EapDictionary(EapContent):
 
     def show_status(self, word: int, fault: DeviceFault | None) -> None:
         """Show the device's state, and why it is not another one, in 0xF100."""
-        entries = self[STATUS].entries
+        entries = self[profile.STATUS].entries
         entries[Status.STATE].value = word
         entries[Status.ERROR_CODE].value = fault.code if fault else 0
         text = fault.text if fault else ""
@@ -210,7 +209,7 @@ class EapDictionary(EapContent):
                 raise SdoAbortError(AbortCode.NO_SUBINDEX, index, count, detail)
             for subindex in range(1, count + 1):
                 check_mapped(self, item.entries[subindex].value, _right(row), index, subindex)
-            place(self, index, count, data_budget(self.uri))
+            place(self, index, count, data_budget(self.uri.scheme))
         elif count == 0 and row.dynamic:
             self._check_unused(index, 0)
             self.remove(index)
@@ -248,7 +247,7 @@ class EapDictionary(EapContent):
         }
         for frame, subindex in frames.items():
             self._check_budget(frame, index, subindex)
-        if index == eap_rules.CONTROL:
+        if index == profile.CONTROL:
             if self.on_request is not None:
                 self.on_request(self[index].entries[1].value)
         elif state is not OdState.PREOP and self.on_change is not None:
@@ -276,7 +275,8 @@ class EapDictionary(EapContent):
 
     def _check_budget(self, frame: int, index: int, subindex: int) -> None:
         length = self.frame_length(frame)
-        budget = frame_budget(self.uri.scheme, self[frame].entries[Frame.ADDRESS_MODE].value)
+        mode = AddressMode(self[frame].entries[Frame.ADDRESS_MODE].value)
+        budget = frame_budget(self.uri.scheme, mode.kind)
         if length > budget:
             detail = f"{self.name_of(frame)} would have {length} octets, at most {budget} go there"
             raise SdoAbortError(AbortCode.PDO_LENGTH, index, subindex, detail)

@@ -2,6 +2,9 @@
 
 Variables that the station has for itself are objects of its first EAP port; another port has those
 that it sends.  What is received is an object of the port that it comes to.
+
+Fields that are one entry each are converted as the table of the profile says; the functions here
+make what takes several objects or entries: references, mappings, lists and addresses.
 """
 
 from __future__ import annotations
@@ -10,30 +13,20 @@ from collections.abc import Iterable, Mapping
 from ipaddress import IPv4Address
 from typing import Any
 
+from msgspec import Struct
+
 from eap.codec import datatypes
-from eap.device.eap_content import COUNTED, PORT, bus_variables
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_mapping import encode_mapping
-from eap.device.eap_rules import GROUPS
-from eap.device.fault import DeviceFault, FaultCode
+from eap.device.pdlayout import bus_variables
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import (
-    AddressMode,
-    Configured,
-    Frame,
-    Port,
-    Rx,
-    RxFlag,
-    Substituted,
-    Tx,
-    Var,
-    Waking,
-    WrittenBy,
-)
+from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, RxFlag, Tx, Var
 from eap.od.profiles.table import ObjectRange
+from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import (
     REQUESTER,
+    OnChangeSpec,
     PortKind,
     RxPdSpec,
     TxFrameSpec,
@@ -41,12 +34,7 @@ from eap.pd.spec import (
     VariableSpec,
 )
 
-_MODES = {
-    DestinationKind.MAC: AddressMode.MAC,
-    DestinationKind.IP: AddressMode.IP,
-    DestinationKind.TCP: AddressMode.TCP,
-    DestinationKind.NET_ID: AddressMode.NETID,
-}
+_NO_CHANGE = OnChangeSpec()
 
 
 def fill(dictionary: EapDictionary, like: EapDictionary | None = None) -> None:
@@ -89,7 +77,8 @@ class _Filling:
             elsewhere = {name for pd in station.subscriptions for name in pd.variables}
             elsewhere |= bus_variables(station)
             wanted |= {each.name for each in station.variables} - elsewhere
-        return [each.name for each in station.variables if each.name in wanted - received]
+        wanted -= received
+        return [each.name for each in station.variables if each.name in wanted]
 
     def run(self) -> None:
         """Make all objects."""
@@ -151,33 +140,15 @@ class _Filling:
         return chosen
 
     def _fill_device(self) -> None:
-        station, port = self._station, self._dictionary.port
-        self._set(COUNTED, {
-            Configured.DEVICE_CYCLE_TIME: station.cycle_us,
-            Configured.PHASE: station.phase_us,
-        })  # fmt: skip
-        self._set(PORT, {
-            Port.VLAN_ID: port.vlan_id,
-            Port.VLAN_PRIORITY: port.vlan_priority,
-            Port.TCP: port.tcp,
-            Port.BROADCAST: port.broadcast,
-            Port.WAKE: Waking[port.wake.name],
-            Port.EAP_SM: port.eap_sm,
-        })  # fmt: skip
-        self._set_list(GROUPS, 1, port.join)
+        self._set_fields(profile.OBJECT_COUNTS, self._station)
+        self._set_fields(profile.PORT, self._dictionary.port)
+        self._set_list(profile.GROUPS, 1, self._dictionary.port.join)
 
     def _fill_variable(self, row: ObjectRange, index: int, variable: VariableSpec) -> None:
         kind = self._types[variable.name]
         self._dictionary.make(row, index)
-        values: dict[int, Any] = {
-            Var.TYPE_NAME: kind.text,
-            Var.NAME: variable.name,
-            Var.UNIT: variable.unit,
-            Var.COMMENT: variable.comment,
-        }
-        if row is profile.TX_VARIABLE:
-            values[Var.WRITER] = WrittenBy[variable.writer.name]
-        self._set(index, values)
+        self._set_fields(index, variable)
+        self._set(index, {Var.TYPE_NAME: kind.text})
         if variable.default is not None:
             default = kind.from_plain(variable.default)
             self._set(index, {Var.DEFAULT_GIVEN: True, Var.DEFAULT: default})
@@ -192,59 +163,38 @@ class _Filling:
         self._set_list(index, 1, words)
 
     def _fill_tx(self, index: int, pdo: int, pd: TxPdSpec, rx: Mapping[str, int]) -> None:
-        trigger = pd.trigger
-        values: dict[int, Any] = {
-            Tx.PDO_INDEX: pdo,
-            Tx.PD_ID: pd.pd_id,
-            Tx.VERSION: pd.version,
-            Tx.ENABLED: True,
-            Tx.CYCLE_TIME: trigger.cycle_us,
-            Tx.DIVIDER: trigger.divider,
-            Tx.MODULO: trigger.modulo,
-            Tx.POLL_REQUEST_RXPD: rx[pd.poll_request] if pd.poll_request else 0,
-            Tx.NAME: pd.name,
-            Tx.ON_CHANGE: trigger.on_change is not None,
-            Tx.EVENT: trigger.event,
-            Tx.CHANGEABLE: pd.changeable,
-        }
-        if trigger.on_change is not None:
-            values[Tx.ON_CHANGE_TIMEOUT] = trigger.on_change.timeout_ms
-            values[Tx.ON_CHANGE_INHIBIT] = trigger.on_change.inhibit_us
         self._dictionary.make(profile.TX_PD, index)
-        self._set(index, values)
+        self._set_fields(index, pd, rx)
+        is_on_change = pd.trigger.on_change is not None
+        self._set(index, {Tx.PDO_INDEX: pdo, Tx.ENABLED: True, Tx.ON_CHANGE: is_on_change})
 
     def _fill_rx(self, index: int, pdo: int, pd: RxPdSpec, tx: Mapping[str, int]) -> None:
-        flags = RxFlag.ENABLED | (RxFlag.IGNORE_VERSION if pd.ignore_version else 0)
         self._dictionary.make(profile.RX_PD, index)
-        self._set(index, {
-            Rx.PDO_INDEX: pdo,
-            Rx.PD_ID: pd.pd_id,
-            Rx.VERSION: pd.version,
-            Rx.FLAGS: flags,
-            Rx.PUBLISHER: NetId.parse(pd.publisher) if pd.publisher else bytes(6),
-            Rx.POLL_REQUEST_TXPD: tx[pd.poll_request] if pd.poll_request else 0,
-            Rx.NAME: pd.name,
-            Rx.TIME_OUT: pd.timeout_ms,
-            Rx.SUBSTITUTE: Substituted[pd.substitute.name],
-            Rx.SENDER_CYCLE: pd.sender_cycle_us,
-            Rx.STEP: pd.step,
-            Rx.CHANGEABLE: pd.changeable,
-            Rx.SOURCE: pd.source,
-        })  # fmt: skip
+        self._set_fields(index, pd, tx)
+        flags = RxFlag.ENABLED | (RxFlag.IGNORE_VERSION if pd.ignore_version else 0)
+        self._set(index, {Rx.PDO_INDEX: pdo, Rx.FLAGS: flags})
 
     def _fill_frame(self, index: int, frame: TxFrameSpec, tx: Mapping[str, int]) -> None:
-        values: dict[int, Any] = {
-            Frame.ENABLED: True,
-            Frame.NAME: frame.name,
-            Frame.DIVIDER: frame.divider,
-            Frame.MODULO: frame.modulo,
-            Frame.CHANGEABLE: frame.changeable,
-            Frame.MONITORING_INTERVAL: frame.monitor_interval_ms,
-            Frame.MONITOR_IP: IPv4Address(frame.monitor_ip or 0).packed,
-        }
         self._dictionary.make(profile.TX_FRAME, index)
-        self._set(index, values | _address(frame))
+        self._set_fields(index, frame)
+        self._set(index, {Frame.ENABLED: True, **_address(frame)})
         self._set_list(index, Frame.TXPD, [tx[pd.name] for pd in frame.pds])
+
+    def _set_fields(
+        self, index: int, record: Struct, references: Mapping[str, int] | None = None
+    ) -> None:
+        """Set the entries that are fields of *record*; *references* are those that it may name."""
+        values = {}
+        for each in profile.row_of(index).entries:
+            if each.field:
+                plain = _value(record, each.field)
+                if each.refers and references is not None:
+                    plain = references[plain] if plain else 0
+                else:
+                    plain = each.from_plain(plain)
+                if plain is not None:
+                    values[each.subindex] = plain
+        self._set(index, values)
 
     def _set_list(self, index: int, first: int, values: Iterable[Any]) -> None:
         numbered = dict(enumerate(values, first))
@@ -265,16 +215,23 @@ class _Filling:
             self._dictionary.put(index, subindex, octets.rstrip(b"\0") if entry.is_text else octets)
 
 
+def _value(record: Any, path: str) -> Any:
+    """Return the value at *path* of *record*; of what is not there its default."""
+    for name in path.split("."):
+        record = getattr(_NO_CHANGE if record is None else record, name)
+    return record
+
+
 def _address(frame: TxFrameSpec) -> dict[int, Any]:
     """Return the entries of a TxFrame that say where it goes."""
     if frame.destination == REQUESTER:
         return {Frame.ADDRESS_MODE: AddressMode.REQUESTER}
     destination = Destination.parse(frame.destination)
-    values: dict[int, Any] = {Frame.ADDRESS_MODE: _MODES[destination.kind]}
+    values: dict[int, Any] = {Frame.ADDRESS_MODE: AddressMode[destination.kind.name]}
     if destination.kind is DestinationKind.MAC:
-        values[Frame.DESTINATION_MAC] = bytes(MacAddr.parse(destination.host))
+        values[Frame.DESTINATION_MAC] = MacAddr.parse(destination.host)
     elif destination.kind is DestinationKind.NET_ID:
-        values[Frame.DESTINATION_NETID] = bytes(NetId.parse(destination.host))
+        values[Frame.DESTINATION_NETID] = NetId.parse(destination.host)
         values[Frame.DESTINATION_MAC] = MacAddr.parse(frame.mac) if frame.mac else bytes(6)
     else:
         values[Frame.DESTINATION_IP] = IPv4Address(destination.host).packed

@@ -11,34 +11,11 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from eap.codec.datatypes import DataType
-from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME, EtherCatHeader
-from eap.codec.pd import FIRST_PD, PdHeader
-from eap.ids import InterfaceUri, ObjectId
+from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Access, OdObject
 from eap.od.profiles.eap1000 import MAX_ENTRIES, WHOLE
-from eap.od.profiles.eap1000keys import AddressMode
-
-PD_OVERHEAD = FIRST_PD + PdHeader.SIZE
-"""Octets of a frame with one PD besides its data."""
-
-
-MAX_STREAM_FRAME = EtherCatHeader.SIZE + 0x7FF
-"""What the 11 bits of Length allow where no wire does."""
-
-
-def frame_budget(transport: str, mode: int) -> int:
-    """Return the octets of the largest frame that leaves by *transport* in an address mode."""
-    if mode == AddressMode.TCP or transport in {"loop", "tcp"}:
-        return MAX_STREAM_FRAME
-    return MAX_ETHERNET_FRAME if transport == "ethernet" else MAX_UDP_FRAME
-
-
-def data_budget(uri: InterfaceUri) -> int:
-    """Return the octets of data of the largest PD that a port on *uri* can carry."""
-    largest = MAX_ETHERNET_FRAME if uri.scheme == "ethernet" else MAX_STREAM_FRAME
-    return largest - PD_OVERHEAD
 
 
 class Mapped(NamedTuple):

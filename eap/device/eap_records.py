@@ -1,55 +1,125 @@
-"""The objects of one EAP port as the records of a specification."""
+"""From the objects of a station's EAP ports back to its specification: what the engine is to run.
+
+This is the check of PreOp to SafeOp (ETG.1005): all references are followed, and whatever cannot
+run is refused with the object that it is about.  Objects that are not enabled are left out.
+
+Fields that are one entry each are converted as the table of the profile says; the functions here
+read what takes several objects or entries: references, mappings, lists and addresses.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from ipaddress import IPv4Address
 from typing import Any
 
+import msgspec
 from msgspec.structs import replace
 
-from eap.device.eap_content import COUNTED, PORT
+from eap.device.eap_check import Found, check_station, fault_of
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_mapping import data_budget, frame_budget, place
-from eap.device.eap_rules import GROUPS, is_group
-from eap.device.fault import DeviceFault, FaultCode
+from eap.device.eap_mapping import place
+from eap.device.pdlayout import bus_variables, types_of
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import (
-    AddressMode,
-    Configured,
-    Frame,
-    Port,
-    Rx,
-    RxFlag,
-    Substituted,
-    Tx,
-    Var,
-    Waking,
-    WrittenBy,
-)
+from eap.od.profiles.eap1000 import AddressMode, Configured, Frame, Port, Rx, RxFlag, Tx, Var
+from eap.pd.device import DeviceFault, FaultCode
+from eap.pd.rules import DESTINATIONS, check_phase, data_budget, frame_budget, is_group
 from eap.pd.spec import (
     REQUESTER,
-    OnChangeSpec,
     PortSpec,
     RxPdSpec,
-    Substitute,
-    TriggerSpec,
+    StationSpec,
     TxFrameSpec,
     TxPdSpec,
     VariableSpec,
-    Wake,
     Writer,
 )
 
-_MODES = {
-    "udp": (AddressMode.IP, AddressMode.TCP, AddressMode.REQUESTER),
-    "tcp": (AddressMode.TCP, AddressMode.REQUESTER),
-    "ethernet": (AddressMode.MAC, AddressMode.NETID, AddressMode.REQUESTER),
-    "loop": (AddressMode.MAC, AddressMode.REQUESTER),
-}
-"""How a port of each kind of interface can address."""
+
+def read_back(station: StationSpec, dictionaries: Mapping[str, EapDictionary]) -> StationSpec:
+    """Return what *station* is with its EAP ports as *dictionaries* say.
+
+    What stood in *station* keeps its place, new things come behind; so what was filled from a
+    specification reads back as that specification.
+
+    Args:
+        station: Ports, buses, sources, links, and alternates of RxPDs, which are in no dictionary.
+        dictionaries: By name of the port; EAP ports that are missing here send and receive nothing.
+
+    Raises:
+        DeviceFault: it cannot run.
+    """
+    ports = [port for port in station.ports if port.name in dictionaries]
+    readers = [PortReader(dictionaries[port.name]) for port in ports]
+    found_ports = {reader.name: reader.port() for reader in readers}
+    cycle_us, phase_us = _times(station, readers)
+    variables = _variables(station, readers)
+    frames = [found for reader in readers for found in reader.frames()]
+    pds = [found for reader in readers for found in reader.sent]
+    subscriptions = [found for reader in readers for found in reader.subscriptions()]
+    spec = replace(
+        station,
+        cycle_us=cycle_us,
+        phase_us=phase_us,
+        ports=tuple(found_ports.get(port.name, port) for port in station.ports),
+        variables=_in_order(variables, station.variables),
+        frames=_in_order([each.record for each in frames], station.frames),
+        subscriptions=_in_order([each.record for each in subscriptions], station.subscriptions),
+    )
+    check_station(station, spec, frames, pds, subscriptions)
+    return _with_alternates(spec, station)
+
+
+def _with_alternates(spec: StationSpec, station: StationSpec) -> StationSpec:
+    """Return *spec* with the alternates of those RxPDs that are laid out as *station* has them."""
+    types = types_of(station)
+    known = {_expected(pd, types): pd.alternates for pd in station.subscriptions if pd.alternates}
+    if not known:
+        return spec
+    types = types_of(spec)
+    pds = (replace(pd, alternates=known.get(_expected(pd, types), ())) for pd in spec.subscriptions)
+    return replace(spec, subscriptions=tuple(pds))
+
+
+def _expected(pd: RxPdSpec, types: Mapping[str, str]) -> tuple[object, ...]:
+    variables = tuple((name, types[name]) for name in pd.variables)
+    return pd.name, pd.port, pd.publisher, pd.pd_id, pd.version, variables
+
+
+def _in_order(records: list[Any], before: tuple[Any, ...]) -> tuple[Any, ...]:
+    places = {each.name: place for place, each in enumerate(before)}
+    return tuple(sorted(records, key=lambda each: places.get(each.name, len(places))))
+
+
+def _times(station: StationSpec, readers: list[PortReader]) -> tuple[int, int]:
+    """Return device cycle and phase, which all ports have to agree on."""
+    found = [reader.times() for reader in readers] or [(station.cycle_us, station.phase_us)]
+    for reader, times in zip(readers, found, strict=False):
+        if times != found[0]:
+            detail = f"{times[0]} us at {times[1]}, but {found[0][0]} at {found[0][1]} on another"
+            index, subindex = profile.OBJECT_COUNTS, Configured.DEVICE_CYCLE_TIME
+            raise reader.fault(FaultCode.CYCLE_TIME, f"{detail} port", index, subindex)
+        for breach in check_phase(*times):
+            raise fault_of(breach, profile.OBJECT_COUNTS, reader.name)
+    return found[0]
+
+
+def _variables(station: StationSpec, readers: list[PortReader]) -> list[VariableSpec]:
+    """Return the variables of all ports and of the buses; equal ones of several ports are one."""
+    on_bus = bus_variables(station)
+    merged = {each.name: each for each in station.variables if each.name in on_bus}
+    for reader in readers:
+        own: set[str] = set()
+        for index, variable in reader.variables():
+            if variable.name in own or merged.get(variable.name, variable) != variable:
+                elsewhere = "" if variable.name in own else ", and differs there"
+                detail = f"{variable.name} exists in the station{elsewhere}"
+                raise reader.fault(FaultCode.NAME_TWICE, detail, index, Var.NAME)
+            own.add(variable.name)
+            merged[variable.name] = variable
+    return list(merged.values())
 
 
 class PortReader:
@@ -57,14 +127,14 @@ class PortReader:
 
     Attributes:
         name: Of the port.
-        sent: Index, PD and frame of all TxPDs that :meth:`frames` has yielded.
+        sent: All TxPDs that :meth:`frames` has yielded, each with its frame.
     """
 
     def __init__(self, dictionary: EapDictionary) -> None:
         self._dictionary = dictionary
         self.name = dictionary.port.name
         self._scheme = dictionary.uri.scheme
-        self.sent: list[tuple[int, TxPdSpec, TxFrameSpec]] = []
+        self.sent: list[Found] = []
 
     def fault(self, code: FaultCode, detail: str, index: int, subindex: int = 0) -> DeviceFault:
         """Make a fault about an object of this port."""
@@ -74,67 +144,69 @@ class PortReader:
         entries = self._dictionary[index].entries
         return lambda subindex: entries[subindex].value
 
+    def _fields(self, index: int) -> dict[str, Any]:
+        """Return the fields that are entries of the object at *index*, records within as dicts."""
+        entries = self._dictionary[index].entries
+        fields: dict[str, Any] = {}
+        for each in profile.row_of(index).entries:
+            if each.field:
+                value = entries[each.subindex].value
+                if each.refers:
+                    plain = self._name_at(value, index, each.subindex)
+                else:
+                    plain = each.to_plain(value)
+                part, (*outer, name) = fields, each.field.split(".")
+                for record in outer:
+                    part = part.setdefault(record, {})
+                part[name] = plain
+        return fields
+
+    def _name_at(self, target: int, index: int, subindex: int) -> str:
+        """Return the name of the PD that a poll request refers to, empty if it is 0."""
+        if not target:
+            return ""
+        if target not in self._dictionary:
+            raise self.fault(FaultCode.MISSING_OBJECT, f"PD 0x{target:04X}", index, subindex)
+        return self._dictionary.name_of(target)
+
     def times(self) -> tuple[int, int]:
         """Return device cycle and phase in microseconds."""
-        value = self._values(COUNTED)
-        return value(Configured.DEVICE_CYCLE_TIME), value(Configured.PHASE)
+        fields = self._fields(profile.OBJECT_COUNTS)
+        return fields["cycle_us"], fields["phase_us"]
 
     def port(self) -> PortSpec:
         """Return the port as it is to be."""
-        value, scheme = self._values(PORT), self._scheme
-        for subindex, schemes in (
-            (Port.VLAN_ID, {"ethernet"}),
-            (Port.VLAN_PRIORITY, {"ethernet"}),
-            (Port.TCP, {"udp", "tcp"}),
-            (Port.BROADCAST, {"udp"}),
-        ):
-            if value(subindex) and scheme not in schemes:
-                detail = f"only on {' and '.join(sorted(schemes))}, this is {scheme}"
-                raise self.fault(FaultCode.PORT, detail, PORT, subindex)
+        value = self._values(profile.PORT)
+        for each in profile.row_of(profile.PORT).entries:
+            if each.schemes and value(each.subindex) and self._scheme not in each.schemes:
+                detail = f"only on {' and '.join(each.schemes)}, this is {self._scheme}"
+                raise self.fault(FaultCode.PORT, detail, profile.PORT, each.subindex)
         if value(Port.VLAN_PRIORITY) and not value(Port.VLAN_ID):
-            raise self.fault(FaultCode.PORT, "a priority needs a VLAN", PORT, Port.VLAN_PRIORITY)
-        return replace(
-            self._dictionary.port,
-            vlan_id=value(Port.VLAN_ID),
-            vlan_priority=value(Port.VLAN_PRIORITY),
-            join=tuple(self._groups()),
-            broadcast=value(Port.BROADCAST),
-            tcp=value(Port.TCP),
-            wake=Wake[Waking(value(Port.WAKE)).name],
-            eap_sm=value(Port.EAP_SM),
-        )
+            detail = "a priority needs a VLAN"
+            raise self.fault(FaultCode.PORT, detail, profile.PORT, Port.VLAN_PRIORITY)
+        fields = {**msgspec.to_builtins(self._dictionary.port), **self._fields(profile.PORT)}
+        return msgspec.convert({**fields, "join": list(self._groups())}, PortSpec)
 
     def _groups(self) -> Iterator[str]:
-        for subindex, entry in self._dictionary[GROUPS].entries.items():
+        for subindex, entry in self._dictionary[profile.GROUPS].entries.items():
             if subindex and entry.value:
-                kinds = {"ethernet": True, "udp": False}
-                if not is_group(entry.value, ethernet=kinds.get(self._scheme)):
+                if not is_group(entry.value, self._scheme):
                     detail = f"{entry.value} cannot be joined on {self._scheme}"
-                    raise self.fault(FaultCode.PORT, detail, GROUPS, subindex)
+                    raise self.fault(FaultCode.PORT, detail, profile.GROUPS, subindex)
                 yield entry.value
 
     def variables(self) -> Iterator[tuple[int, VariableSpec]]:
         """Yield index and record of each variable."""
         for index in self._dictionary.members(*profile.VARIABLES):
-            value = self._values(index)
-            is_sent = index <= profile.TX_VARIABLE.last
-            kind = self._dictionary[index].entries[Var.DEFAULT].kind
-            given = value(Var.DEFAULT_GIVEN)
-            default: Any = kind.to_plain(value(Var.DEFAULT)) if given else None
-            yield (
-                index,
-                VariableSpec(
-                    name=value(Var.NAME),
-                    type=kind.text,
-                    writer=Writer[WrittenBy(value(Var.WRITER)).name] if is_sent else Writer.ENGINE,
-                    default=default,
-                    unit=value(Var.UNIT),
-                    comment=value(Var.COMMENT),
-                ),
-            )
+            value, fields = self._values(index), self._fields(index)
+            if value(Var.DEFAULT_GIVEN):
+                kind = self._dictionary[index].entries[Var.DEFAULT].kind
+                fields["default"] = kind.to_plain(value(Var.DEFAULT))
+            fields.setdefault("writer", Writer.ENGINE)
+            yield index, msgspec.convert(fields, VariableSpec)
 
-    def frames(self) -> Iterator[tuple[int, TxFrameSpec]]:
-        """Yield index and record of each frame that is enabled, with the PDs that are."""
+    def frames(self) -> Iterator[Found]:
+        """Yield each frame that is enabled, with the PDs that are."""
         seen: dict[int, int] = {}
         for index in self._dictionary.members(profile.TX_FRAME):
             listed = list(self._dictionary.listed_pds(index))
@@ -147,109 +219,75 @@ class PortReader:
                     raise self.fault(FaultCode.MISSING_OBJECT, detail, index, subindex)
                 seen[pd] = index
             if self._values(index)(Frame.ENABLED):
-                yield index, self._frame(index, [pd for _, pd in listed])
+                yield self._frame(index, [pd for _, pd in listed])
         for pd in self._dictionary.members(profile.TX_PD):
             if pd not in seen and self._values(pd)(Tx.ENABLED):
                 raise self.fault(FaultCode.PD_WITHOUT_FRAME, self._dictionary.name_of(pd), pd)
 
-    def _frame(self, index: int, listed: list[int]) -> TxFrameSpec:
+    def _frame(self, index: int, listed: list[int]) -> Found:
         value = self._values(index)
         enabled = [pd for pd in listed if self._values(pd)(Tx.ENABLED)]
         pds = tuple(self._tx(pd) for pd in enabled)
         if not pds:
             raise self.fault(FaultCode.EMPTY_FRAME, value(Frame.NAME), index, Frame.TXPD)
-        mode = value(Frame.ADDRESS_MODE)
-        length, budget = self._dictionary.frame_length(index), frame_budget(self._scheme, mode)
+        mode = AddressMode(value(Frame.ADDRESS_MODE))
+        length = self._dictionary.frame_length(index)
+        budget = frame_budget(self._scheme, mode.kind)
         if length > budget:
             detail = f"{length} octets, at most {budget} go there"
             raise self.fault(FaultCode.FRAME_TOO_LONG, detail, index, Frame.FRAME_LENGTH)
-        frame = TxFrameSpec(
-            name=value(Frame.NAME),
+        record = TxFrameSpec(
+            **self._fields(index),
             port=self.name,
-            destination=self._destination(index, AddressMode(mode)),
+            destination=self._destination(index, mode),
             pds=pds,
-            divider=value(Frame.DIVIDER),
-            modulo=value(Frame.MODULO),
-            changeable=value(Frame.CHANGEABLE),
-            mac=_known_mac(value(Frame.DESTINATION_MAC)) if mode == AddressMode.NETID else "",
-            monitor_interval_ms=value(Frame.MONITORING_INTERVAL),
-            monitor_ip=_text_of_ip(value(Frame.MONITOR_IP)),
+            mac=_known_mac(value(Frame.DESTINATION_MAC)) if mode is AddressMode.NET_ID else "",
         )
-        self.sent += [(at, pd, frame) for at, pd in zip(enabled, pds, strict=True)]
+        frame = Found(self.name, index, record)
+        self.sent += [Found(self.name, at, pd, frame) for at, pd in zip(enabled, pds, strict=True)]
         return frame
 
     def _destination(self, index: int, mode: AddressMode) -> str:
         value = self._values(index)
-        if mode not in _MODES[self._scheme]:
+        if (kind := mode.kind) is None:
+            return REQUESTER
+        if kind not in DESTINATIONS[self._scheme]:
             detail = f"{mode.name} is no way to address from {self._scheme}"
             raise self.fault(FaultCode.NO_DESTINATION, detail, index, Frame.ADDRESS_MODE)
-        if mode is AddressMode.REQUESTER:
-            return REQUESTER
-        if mode is AddressMode.MAC:
-            address: bytes = MacAddr(value(Frame.DESTINATION_MAC))
-            subindex = Frame.DESTINATION_MAC
-            destination = Destination(DestinationKind.MAC, str(address))
-        elif mode is AddressMode.NETID:
-            address = NetId(value(Frame.DESTINATION_NETID))
-            subindex = Frame.DESTINATION_NETID
-            destination = Destination(DestinationKind.NET_ID, str(address))
+        number = 0
+        if kind is DestinationKind.MAC:
+            subindex, host = Frame.DESTINATION_MAC, str(MacAddr(value(Frame.DESTINATION_MAC)))
+        elif kind is DestinationKind.NET_ID:
+            subindex, host = Frame.DESTINATION_NETID, str(NetId(value(Frame.DESTINATION_NETID)))
         else:
-            address = value(Frame.DESTINATION_IP)
-            subindex = Frame.DESTINATION_IP
-            kind = DestinationKind[mode.name]
-            host = str(IPv4Address(address))
-            destination = Destination(kind, host, value(Frame.PORT_NUMBER))
-        if not any(address) or (mode is AddressMode.TCP and destination.is_group):
+            subindex, host = Frame.DESTINATION_IP, str(IPv4Address(value(Frame.DESTINATION_IP)))
+            number = value(Frame.PORT_NUMBER)
+        destination = Destination(kind, host, number)
+        is_tcp_group = kind is DestinationKind.TCP and destination.is_group
+        if not any(value(subindex)) or is_tcp_group:
             raise self.fault(FaultCode.NO_DESTINATION, str(destination), index, subindex)
         return str(destination)
 
     def _tx(self, index: int) -> TxPdSpec:
-        value = self._values(index)
-        given = value(Tx.ON_CHANGE_TIMEOUT), value(Tx.ON_CHANGE_INHIBIT)
-        trigger = TriggerSpec(
-            cycle_us=value(Tx.CYCLE_TIME),
-            divider=value(Tx.DIVIDER),
-            modulo=value(Tx.MODULO),
-            on_change=OnChangeSpec(*given) if value(Tx.ON_CHANGE) or any(given) else None,
-            event=value(Tx.EVENT),
-        )
-        return TxPdSpec(
-            name=value(Tx.NAME),
-            pd_id=value(Tx.PD_ID),
-            variables=self._mapped(index),
-            version=value(Tx.VERSION),
-            trigger=trigger,
-            poll_request=self._asked(index, Tx.POLL_REQUEST_RXPD),
-            changeable=value(Tx.CHANGEABLE),
-        )
+        fields = self._fields(index)
+        trigger = fields["trigger"]
+        # Its times switch sending on change on, as they do without such an entry.
+        if not (self._values(index)(Tx.ON_CHANGE) or any(trigger["on_change"].values())):
+            trigger["on_change"] = None
+        return msgspec.convert({**fields, "variables": self._mapped(index)}, TxPdSpec)
 
-    def subscriptions(self) -> Iterator[tuple[int, RxPdSpec]]:
-        """Yield index and record of each RxPD that is enabled."""
+    def subscriptions(self) -> Iterator[Found]:
+        """Yield each RxPD that is enabled."""
         for index in self._dictionary.members(profile.RX_PD):
-            value = self._values(index)
-            flags, publisher = value(Rx.FLAGS), NetId(value(Rx.PUBLISHER))
+            flags = self._values(index)(Rx.FLAGS)
             if not flags & RxFlag.ENABLED:
                 continue
-            is_any = flags & RxFlag.IGNORE_NETID or not any(publisher)
-            yield (
-                index,
-                RxPdSpec(
-                    name=value(Rx.NAME),
-                    port=self.name,
-                    pd_id=value(Rx.PD_ID),
-                    variables=self._mapped(index),
-                    publisher="" if is_any else str(publisher),
-                    version=value(Rx.VERSION),
-                    ignore_version=bool(flags & RxFlag.IGNORE_VERSION),
-                    timeout_ms=value(Rx.TIME_OUT),
-                    substitute=Substitute[Substituted(value(Rx.SUBSTITUTE)).name],
-                    sender_cycle_us=value(Rx.SENDER_CYCLE),
-                    step=value(Rx.STEP),
-                    poll_request=self._asked(index, Rx.POLL_REQUEST_TXPD),
-                    changeable=value(Rx.CHANGEABLE),
-                    source=value(Rx.SOURCE),
-                ),
-            )
+            fields = self._fields(index)
+            if flags & RxFlag.IGNORE_NETID:
+                fields["publisher"] = ""
+            fields["ignore_version"] = bool(flags & RxFlag.IGNORE_VERSION)
+            mapped = {"port": self.name, "variables": self._mapped(index)}
+            yield Found(self.name, index, msgspec.convert({**fields, **mapped}, RxPdSpec))
 
     def _mapped(self, index: int) -> tuple[str, ...]:
         """Return the names of a PD's variables; its PDO has to be there and whole."""
@@ -261,9 +299,8 @@ class PortReader:
             detail = f"PDO 0x{pdo:04X} of {name}"
             raise self.fault(FaultCode.MISSING_OBJECT, detail, index, Tx.PDO_INDEX)
         try:
-            placed = place(
-                dictionary, pdo, dictionary[pdo].max_subindex, data_budget(dictionary.uri)
-            )
+            count = dictionary[pdo].max_subindex
+            placed = place(dictionary, pdo, count, data_budget(self._scheme))
         except SdoAbortError as exc:
             is_long = exc.code == AbortCode.PDO_LENGTH
             code = FaultCode.FRAME_TOO_LONG if is_long else FaultCode.BAD_MAPPING
@@ -272,21 +309,8 @@ class PortReader:
             raise self.fault(FaultCode.EMPTY_PDO, f"PDO of {name}", pdo)
         return tuple(dictionary.name_of(each) for each in placed.indexes)
 
-    def _asked(self, index: int, subindex: int) -> str:
-        """Return the name of the PD that a poll request refers to, empty if it is 0."""
-        asked = self._values(index)(subindex)
-        if not asked:
-            return ""
-        if asked not in self._dictionary:
-            raise self.fault(FaultCode.MISSING_OBJECT, f"PD 0x{asked:04X}", index, subindex)
-        return self._dictionary.name_of(asked)
-
 
 def _known_mac(octets: bytes) -> str:
     """Return the address behind a NetID; empty if it is to be learned, as a group is nobody's."""
     address = MacAddr(octets)
     return str(address) if any(address) and not address.is_group else ""
-
-
-def _text_of_ip(octets: bytes) -> str:
-    return str(IPv4Address(octets)) if any(octets) else ""

@@ -12,9 +12,8 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.fault import DeviceFault, FaultCode
 from eap.od.model import OdState
-from eap.pd.device import Device, DeviceState, Request
+from eap.pd.device import Device, DeviceFault, DeviceState, FaultCode, Request
 from eap.pd.spec import StationSpec
 
 ERROR_BIT = 0x10

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
-from eap.device.eap_content import Identity
-from eap.device.live_objects import make_object
+from eap.device.eap_objects import Identity
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject, OdState
 from eap.od.profiles import master1100 as profile
+from eap.od.profiles.maker import live_source, make_object
 from eap.od.profiles.master1100 import Live
 from eap.od.profiles.table import ObjectRange
 
@@ -74,7 +74,7 @@ class MasterDictionary(ObjectDictionary):
         self._full = full
         self._padded = padded
         for row in profile.FIXED:
-            self.add(make_object(row, row.first, self._read, write=self._write))
+            self.add(make_object(row, row.first, live_source(self._read), write=self._write))
         for (index, subindex), value in identity.entries().items():
             self[index].entries[subindex].value = value
 
@@ -137,7 +137,7 @@ class MasterDictionary(ObjectDictionary):
         if number >= len(stations):
             raise SdoAbortError(AbortCode.NO_OBJECT, index, 0)
         station = stations[number]
-        extent = 0 if self._full else profile.USUAL_EXTENT[row.first]
+        extent = row.last_subindex if self._full else profile.USUAL_EXTENT[row.first]
         read = {
             profile.CONFIGURED.first: self._values.of_configured,
             profile.DETECTED.first: self._values.of_detected,
@@ -147,16 +147,15 @@ class MasterDictionary(ObjectDictionary):
         def write(key: str, data: bytes) -> None:
             self._values.write_slave(station, Live(key), int.from_bytes(data, "little"))
 
-        return make_object(
-            row, index, lambda key: read(station, Live(key)), write=write, extent=extent
-        )
+        source = live_source(lambda key: read(station, Live(key)))
+        return make_object(row, index, source, write=write, extent=extent)
 
     def _make_list(self, row: ObjectRange, index: int, stations: Sequence[int]) -> OdObject:
         start = (index - row.first) * profile.PER_LIST
         part = stations[start : start + profile.PER_LIST]
         if start and not part:
             raise SdoAbortError(AbortCode.NO_OBJECT, index, 0)
-        item = make_object(row, index, self._read, count=len(part))
+        item = make_object(row, index, live_source(self._read), last=len(part))
         for subindex, station in enumerate(part, 1):
             item.entries[subindex].value = station
         return item

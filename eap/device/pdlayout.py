@@ -1,4 +1,4 @@
-"""What the PDs of a station look like to those who receive them."""
+"""Layouts of a station's PDs, and their versions, by which a receiver tells them apart."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from eap.codec import datatypes, pdo
-from eap.pd.spec import StationSpec, TxPdSpec
+from eap.pd.spec import PortKind, StationSpec, TxPdSpec
 
 
 class PdKey(NamedTuple):
@@ -57,3 +57,49 @@ def sent_pds(spec: StationSpec) -> Iterator[tuple[PdKey, TxPdSpec, PdLayout]]:
 def types_of(spec: StationSpec) -> dict[str, str]:
     """Return the type of every variable of *spec* by name."""
     return {variable.name: variable.type for variable in spec.variables}
+
+
+def bus_variables(station: StationSpec) -> set[str]:
+    """Return the names of the variables that *station* has because of its buses.
+
+    They are not configured here; a Tx variable of the same name is one of them.
+    """
+    prefixes = tuple(f"{port.name}." for port in station.ports if port.kind is PortKind.BUS)
+    return {each.name for each in station.variables if each.name.startswith(prefixes)}
+
+
+def kept_versions(old: StationSpec, new: StationSpec) -> list[str]:
+    """Return a line for people on every PD whose layout changes while its version does not.
+
+    A subscriber that is not changed too then discards the PD for its length or, worse, reads other
+    variables out of it than were sent.
+    """
+    before = {key: layout for key, _, layout in sent_pds(old)}
+    lines = []
+    for key, pd, layout in sent_pds(new):
+        harm = _harm(before[key], layout) if key in before else ""
+        if harm:
+            lines.append(
+                f"PD {pd.name!r} (id {pd.pd_id}) {harm}, but its version stays {pd.version}: "
+                f"expected another version, so that every subscriber can tell"
+            )
+    return lines
+
+
+def _harm(old: PdLayout, new: PdLayout) -> str:
+    """Return what happens to who takes *new* for *old*, empty for nothing."""
+    if old.version != new.version:
+        return ""
+    if old.size != new.size:
+        return (
+            f"changes from {old.size} to {new.size} octets, for which subscribers outside this "
+            f"change discard it"
+        )
+    places = {each.name: (each.type, each.bit_offset) for each in old.variables}
+    moved = any(
+        places.get(each.name, (each.type, each.bit_offset)) != (each.type, each.bit_offset)
+        for each in new.variables
+    )
+    if moved or [each[1:] for each in old.variables] != [each[1:] for each in new.variables]:
+        return "keeps its size with other variables in it, which subscribers misread"
+    return ""

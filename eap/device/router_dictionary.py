@@ -13,13 +13,13 @@ from ipaddress import IPv4Address
 from itertools import starmap
 from typing import Any, Protocol
 
-from eap.device.eap_content import Identity
-from eap.device.live_objects import make_object
+from eap.device.eap_objects import Identity
 from eap.ids import InterfaceUri, NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject
 from eap.od.profiles import eap1000
 from eap.od.profiles import router9000 as profile
+from eap.od.profiles.maker import live_source, make_object
 from eap.od.profiles.router9000 import Live
 from eap.od.profiles.table import ObjectRange
 from eap.pd.spec import PortKind, PortSpec, StationSpec
@@ -63,7 +63,7 @@ class RouterDictionary(ObjectDictionary):
             profile.DEVICE.first + number: port.name for number, port in enumerate(station.ports)
         }
         for row in profile.STATIC:
-            self.add(_make(row, row.first, self._read, count=len(station.ports)))
+            self.add(_make(row, row.first, self._read, last=len(station.ports)))
         for number, port in enumerate(station.ports):
             index = profile.DEVICE.first + number
             self.add(_make(profile.DEVICE, index, partial(self._read_device, port.name)))
@@ -131,8 +131,8 @@ class RouterDictionary(ObjectDictionary):
 _PROFILES = {PortKind.EAP: eap1000.MODULE_PROFILE, PortKind.BUS: profile.MASTER_PROFILE}
 
 
-def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, count: int = 0) -> OdObject:
-    return make_object(row, index, lambda key: read(Live(key)), count=count)
+def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, last: int = 0) -> OdObject:
+    return make_object(row, index, live_source(lambda key: read(Live(key))), last=last)
 
 
 def _is_route(index: int) -> bool:

@@ -22,10 +22,10 @@ from msgspec.structs import replace
 
 from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.store import effective, settle
-from eap.device.eap_read import read_back
+from eap.device.eap_records import read_back
 from eap.errors import EngineGoneError, EngineRefusedError
 from eap.od.abort import SdoAbortError
-from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
+from eap.od.profiles.eap1000 import Frame, Rx, Tx, Var
 from eap.pd.device import DeviceState
 from eap.pd.spec import (
     CounterSource,

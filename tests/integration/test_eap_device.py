@@ -23,7 +23,7 @@ from scapy.layers.l2 import Ether
 from eap.appliance.store import Store
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
-from eap.od.profiles.eap1000keys import Tx, Var
+from eap.od.profiles.eap1000 import Tx, Var
 from tests.support import aoe
 from tests.support.aoe import UdpClient
 from tests.support.appliance import Appliance, Plants, SharedAppliance, wait_until

@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from eap.od.profiles.eap1000keys import AddressMode, Frame, Rx, RxFlag, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, RxFlag, Tx, Var
 from tests.integration.test_eap_device import (
     BLANK,
     LEFT,

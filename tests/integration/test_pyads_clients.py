@@ -12,7 +12,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.od.profiles.eap1000keys import Tx
+from eap.od.profiles.eap1000 import Tx
 from tests.support.appliance import Appliance, Plants
 
 pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")

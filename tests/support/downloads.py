@@ -8,8 +8,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import adopt
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import row_of
-from eap.od.profiles.eap1000keys import AddressMode, Frame, Rx, RxFlag, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, RxFlag, Tx, Var, row_of
 
 PREOP, SAFEOP, OP = OdState.PREOP, OdState.SAFEOP, OdState.OP
 

@@ -24,7 +24,7 @@ from eap.codec.mailbox import (
     encode_message,
 )
 from eap.codec.soe import SoeAttribute
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.master_dictionary import MasterDictionary
 from eap.gateway.refusal import Reason, refuse
 from eap.od.dictionary import ObjectDictionary

@@ -7,8 +7,7 @@ import asyncio
 from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.services.device.station_keeper import StationKeeper
 from eap.appliance.store import Store
-from eap.device.eap_content import Identity
-from eap.device.live import NothingRuns
+from eap.device.eap_objects import Identity, NothingRuns
 from eap.errors import EapError, EngineGoneError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec

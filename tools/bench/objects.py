@@ -12,14 +12,13 @@ from eap.appliance.services.device.image_values import ImageValues
 from eap.appliance.station_image import StationImage
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
-from eap.device.eap_read import read_back
+from eap.device.eap_records import read_back
 from eap.ids import InterfaceUri
 from eap.net.image_file import create_image
 from eap.net.loopback import LoopbackLines
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Entry, OdState, record
-from eap.od.profiles.eap1000 import TX_VARIABLE
-from eap.od.profiles.eap1000keys import Var
+from eap.od.profiles.eap1000 import TX_VARIABLE, Var
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec, VariableSpec
 from eap.pd.station import Station

@@ -11,9 +11,9 @@ from eap.appliance.commands.client import Client
 from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
 from eap.appliance.control import ErrorCode
 from eap.codec import datatypes
-from eap.device.eap_rules import CONTROL
 from eap.errors import ControlError
 from eap.od.abort import AbortCode, SdoAbortError
+from eap.od.profiles.eap1000 import CONTROL
 
 
 class StationOd:

@@ -13,8 +13,8 @@ from eap.config.finding import Finding
 from eap.config.load import LoadResult
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
-from eap.device.fault import DeviceFault
 from eap.ids import InterfaceUri
+from eap.pd.device import DeviceFault
 from eap.pd.spec import BusSlaveSpec, PortKind, StationSpec
 
 

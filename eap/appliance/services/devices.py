@@ -23,7 +23,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.startup import Step, no_step
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import Store
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.errors import ImageError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec

@@ -3,15 +3,19 @@
 The ranges, the meaning of the objects and the sub-indexes 3, 4 and 6 of process data come from
 descriptions of the profile; the rest of the sub-index tables is ours, as no public document has
 them.  Clients find everything by name through SDO information.
+
+A field of the plant file is added here: its row says which key it has there, where the
+specification has it, and what it may hold; dictionaries, checks and docs/objects.md follow.
 """
 
 from __future__ import annotations
 
+from enum import IntEnum, StrEnum, auto
+
+from eap.ids import DestinationKind
 from eap.od.model import RO, RW, Access, ObjectCode
-from eap.od.profiles.eap1000keys import Derived, Live
-from eap.od.profiles.forms import Form
+from eap.od.profiles.forms import Form, Rule
 from eap.od.profiles.table import (
-    CONFIG,
     OWN_TYPE,
     EntryRow,
     ObjectRange,
@@ -19,11 +23,244 @@ from eap.od.profiles.table import (
     derived,
     fixed,
     live,
+    setting,
+    single,
 )
 
 PROFILE = 5001
 """Of modular devices; the vendor's description of its own EAP device says 5002."""
 MODULE_PROFILE = 1000
+
+
+class Live(StrEnum):
+    """What the running device is asked for; the object's name says of which one."""
+
+    VALUE = auto()
+    """Of the variable, as it lies in the process image."""
+    FRAME_STATE = auto()
+    FRAME_CTRL = auto()
+    FRAME_WHOLE = auto()
+    FRAME_PARTIAL = auto()
+    FRAME_SKIPPED = auto()
+    TX_VAR_STATE = auto()
+    TX_VAR_CTRL = auto()
+    TX_LAST_REASON = auto()
+    TX_SKIPPED = auto()
+    TX_SENT_CYCLE = auto()
+    TX_SENT_DIVIDER = auto()
+    TX_SENT_CHANGE = auto()
+    TX_SENT_CHANGE_TIMEOUT = auto()
+    TX_SENT_EVENT = auto()
+    TX_SENT_POLL = auto()
+    RX_QUALITY = auto()
+    RX_CYCLE_INDEX = auto()
+    RX_VAR_STATE = auto()
+    RX_STATE = auto()
+    RX_RECEIVED = auto()
+    RX_LOST = auto()
+    RX_DUPLICATED = auto()
+    RX_REORDERED = auto()
+    RX_LATE = auto()
+    RX_TIMEOUTS = auto()
+    RX_JITTER_MAX = auto()
+    RX_DISCARDED_VERSION = auto()
+    RX_DISCARDED_LENGTH = auto()
+    RX_DISCARDED_SUPPRESSED = auto()
+    RX_DISCARDED_STALE = auto()
+    RX_DISCARDED_WRONG_SOURCE = auto()
+    STATION_CYCLE = auto()
+    STATION_OVERRUNS = auto()
+    STATION_RESTARTS = auto()
+    STATION_TORN = auto()
+    STATION_LATENESS_MAX = auto()
+    STATION_LINKS_HELD = auto()
+    STATION_DISCARDED_WRONG_PUBLISHER = auto()
+    STATION_DISCARDED_UNKNOWN_ID = auto()
+    STATION_DISCARDED_TRUNCATED = auto()
+    STATION_DISCARDED_COUNT_TOO_LARGE = auto()
+    STATION_DISCARDED_WRONG_TYPE = auto()
+    STATION_DISCARDED_TOO_MANY_REQUESTS = auto()
+    STATION_DISCARDED_NO_SENDER = auto()
+
+
+class Derived(StrEnum):
+    """What the dictionary computes from other entries."""
+
+    BIT_LENGTH = auto()
+    TYPE_CODE = auto()
+    PDO_LENGTH = auto()
+    FRAME_LENGTH = auto()
+    COUNT = auto()
+    """Objects of the kind that the sub-index stands for, see COUNTED."""
+    NEXT_FREE = auto()
+    """First free index of that kind, 0 if all are taken."""
+
+
+class Var(IntEnum):
+    """0x6000 and 0x7000: a variable."""
+
+    VALUE = 1
+    BIT_LENGTH = 2
+    DATA_TYPE = 3
+    TYPE_NAME = 4
+    NAME = 5
+    UNIT = 6
+    COMMENT = 7
+    DEFAULT_GIVEN = 8
+    DEFAULT = 9
+    WRITER = 10
+
+
+class Frame(IntEnum):
+    """0x8000: a TxFrame."""
+
+    ENABLED = 1
+    ADDRESS_MODE = 2
+    DESTINATION_MAC = 3
+    DESTINATION_NETID = 4
+    DESTINATION_IP = 5
+    PORT_NUMBER = 6
+    MONITORING_INTERVAL = 7
+    FRAME_STATE = 8
+    NAME = 9
+    DIVIDER = 10
+    MODULO = 11
+    MONITOR_IP = 12
+    CHANGEABLE = 13
+    FRAME_CONTROL = 14
+    FRAME_LENGTH = 15
+    TXPD = 16
+
+
+class Tx(IntEnum):
+    """0xD000: a TxPD."""
+
+    PDO_INDEX = 1
+    PDO_LENGTH = 2
+    PD_ID = 3
+    VERSION = 4
+    ENABLED = 5
+    PUBLISHER = 6
+    CYCLE_TIME = 7
+    DIVIDER = 8
+    MODULO = 9
+    POLL_REQUEST_RXPD = 10
+    ON_CHANGE_TIMEOUT = 11
+    ON_CHANGE_INHIBIT = 12
+    VARSTATE = 13
+    NAME = 14
+    ON_CHANGE = 15
+    EVENT = 16
+    CHANGEABLE = 17
+    VARCTRL = 18
+
+
+class Rx(IntEnum):
+    """0xE000: an RxPD."""
+
+    PDO_INDEX = 1
+    PDO_LENGTH = 2
+    PD_ID = 3
+    VERSION = 4
+    FLAGS = 5
+    PUBLISHER = 6
+    POLL_REQUEST_TXPD = 7
+    QUALITY = 8
+    CYCLE_INDEX = 9
+    VARSTATE = 10
+    NAME = 11
+    TIME_OUT = 12
+    SUBSTITUTE = 13
+    SENDER_CYCLE = 14
+    STEP = 15
+    CHANGEABLE = 16
+    STATE = 17
+    SOURCE = 18
+
+
+class Status(IntEnum):
+    """0xF100: where the device stands."""
+
+    STATE = 1
+    ERROR_CODE = 2
+    ERROR_TEXT = 3
+    ERROR_OBJECT = 4
+
+
+class Configured(IntEnum):
+    """0xF800: how many objects there are, and the device's times."""
+
+    TXFRAMES = 1
+    TXPDS = 2
+    RXPDS = 3
+    TXPDOS = 4
+    RXPDOS = 5
+    TX_VARIABLES = 6
+    RX_VARIABLES = 7
+    DEVICE_CYCLE_TIME = 8
+    PHASE = 9
+
+
+class Port(IntEnum):
+    """0xF810: the port itself."""
+
+    NAME = 1
+    TRANSPORT = 2
+    INTERFACE = 3
+    PORT_NUMBER = 4
+    VLAN_ID = 5
+    VLAN_PRIORITY = 6
+    TCP = 7
+    BROADCAST = 8
+    WAKE = 9
+    EAP_SM = 10
+
+
+class AddressMode(IntEnum):
+    """How a TxFrame names its destination."""
+
+    MAC = 0
+    NET_ID = 1
+    IP = 2
+    TCP = 3
+    REQUESTER = 4
+
+    @property
+    def kind(self) -> DestinationKind | None:
+        """Kind of the address; None of the requester's."""
+        return None if self is AddressMode.REQUESTER else DestinationKind[self.name]
+
+
+class RxFlag(IntEnum):
+    """Bits of an RxPD's flags."""
+
+    IGNORE_NETID = 0x01
+    IGNORE_VERSION = 0x04
+    ENABLED = 0x80
+
+
+class WrittenBy(IntEnum):
+    """Who writes a Tx variable."""
+
+    APPLICATION = 0
+    ENGINE = 1
+    SERVICES = 2
+
+
+class Substituted(IntEnum):
+    """What the variables of an RxPD hold after its time-out."""
+
+    HOLD = 0
+    ZERO = 1
+    DEFAULT = 2
+
+
+class Waking(IntEnum):
+    """When a port takes frames."""
+
+    CYCLE = 0
+    ARRIVAL = 1
+
 
 NAME = "STRING(255)"
 TEXT = "STRING(1000)"
@@ -35,15 +272,18 @@ WHOLE = 0xFF
 _RECORD, _ARRAY, _VAR = ObjectCode.RECORD, ObjectCode.ARRAY, ObjectCode.VAR
 
 _VARIABLE = (
-    derived(2, "Bit length", "UDINT", Derived.BIT_LENGTH, "Bits that travel."),
-    derived(3, "Data type", "UINT", Derived.TYPE_CODE, "Index of the base type."),
-    config(4, "Type name", "STRING(40)", "Such as UINT, REAL[4] or BLOCK(600).", default="UINT"),
-    config(5, "Name", NAME, "Unique in the station."),
-    config(6, "Unit", NAME, "Text for people."),
-    config(7, "Comment", TEXT, "Text for people."),
-    config(8, "Default given", "BOOL", "Whether the next entry counts; else it starts as zero."),
-    config(9, "Default", OWN_TYPE, "Value at the start, and as a substitute."),
-)
+    derived(Var.BIT_LENGTH, "Bit length", "UDINT", Derived.BIT_LENGTH, "Bits that travel."),
+    derived(Var.DATA_TYPE, "Data type", "UINT", Derived.TYPE_CODE, "Index of the base type."),
+    setting(Var.TYPE_NAME, "Type name", "STRING(40)", "Such as UINT, REAL[4] or BLOCK(600).",
+            default="UINT", key="type", rule=Rule.TYPE),
+    config(Var.NAME, "Name", NAME, "Unique in the station.", field="name", rule=Rule.NAME),
+    setting(Var.UNIT, "Unit", NAME, "Text for people.", key="unit"),
+    setting(Var.COMMENT, "Comment", TEXT, "Text for people.", key="comment"),
+    config(Var.DEFAULT_GIVEN, "Default given", "BOOL",
+           "Whether the next entry counts; else it starts as zero."),
+    config(Var.DEFAULT, "Default", OWN_TYPE, "Value at the start, and as a substitute.",
+           key="default", rule=Rule.DEFAULT),
+)  # fmt: skip
 _VALUE = EntryRow(
     1, "Value", OWN_TYPE, RO, "As it lies in the process image.", live=Live.VALUE.value
 )
@@ -52,31 +292,33 @@ TX_VARIABLE = ObjectRange(
     (
         _VALUE._replace(access=RO | Access.TX_MAPPABLE),
         *_VARIABLE,
-        config(10, "Writer", "USINT", "0 user programs, 1 the cycle, 2 measurements and files.",
-               maximum=2),
+        config(Var.WRITER, "Writer", "USINT",
+               "0 user programs, 1 the cycle, 2 measurements and files.", maximum=2,
+               field="writer", words=WrittenBy),
     ),
     "A variable that can be sent; its value travels, in the order of the PDO. One that another "
     "port or a bus of the station has by the same name is that one, and described alike.",
-    dynamic=True,
+    dynamic=True, section="variables",
 )  # fmt: skip
 RX_VARIABLE = ObjectRange(
     0x7000, 0x7FFF, "Rx variable {n}", _RECORD,
     (_VALUE._replace(access=RO | Access.TX_MAPPABLE | Access.RX_MAPPABLE), *_VARIABLE),
     "A variable that is received; it may be sent on.", dynamic=True,
+    section="subscribe.variables",
 )  # fmt: skip
 
 _MAPPED = (
     config(1, "Mapping {n}", "UDINT", "Index, sub-index and bit length (16, 8, 8 bits); index 0 "
            "is padding, bit length 255 the whole of a longer variable.", last=MAX_ENTRIES,
-           form=Form.MAPPING),
+           form=Form.MAPPING, key="variables"),
 )  # fmt: skip
 RX_PDO = ObjectRange(
     0x1600, 0x17FF, "RxPDO mapping {n}", _ARRAY, _MAPPED,
-    "Variables of a received PD in their order.", dynamic=True, mapping=True,
+    "Variables of a received PD in their order.", dynamic=True, mapping=True, section="subscribe",
 )  # fmt: skip
 TX_PDO = ObjectRange(
     0x1A00, 0x1BFF, "TxPDO mapping {n}", _ARRAY, _MAPPED,
-    "Variables of a sent PD in their order.", dynamic=True, mapping=True,
+    "Variables of a sent PD in their order.", dynamic=True, mapping=True, section="publish",
 )  # fmt: skip
 MORE_RX_PDO = RX_PDO._replace(
     first=0x2000, last=0x2DFF, name="Further RxPDO mapping {n}",
@@ -90,35 +332,45 @@ MORE_TX_PDO = TX_PDO._replace(
 TX_FRAME = ObjectRange(
     0x8000, 0x8FFF, "TxFrame {n}", _RECORD,
     (
-        config(1, "Enabled", "BOOL", "A frame that is not is left alone altogether."),
-        config(2, "Address mode", "USINT", "0 MAC, 1 NetID, 2 IP by UDP, 3 IP by TCP, 4 whoever "
-               "asked for its PDs.", maximum=4, changeable=True),
-        config(3, "Destination MAC", "BLOCK(6)", "Address mode 0; in mode 1 that of the NetID, and "
-               "all zero or a group if it is to be learned.",
-               default=bytes.fromhex("010105040000"), form=Form.MAC, changeable=True),
-        config(4, "Destination NetID", "BLOCK(6)", "Address mode 1.", form=Form.NET_ID,
-               changeable=True),
-        config(5, "Destination IP", "BLOCK(4)", "Address modes 2 and 3, first octet first.",
-               form=Form.IP, changeable=True),
-        config(6, "Port number", "UINT", "UDP or TCP; 0 is 34980.", changeable=True),
-        config(7, "Monitoring interval", "UDINT", "How often to look whether the subscriber is "
-               "there; 0 never.", unit="ms"),
-        live(8, "Frame state", "UINT", Live.FRAME_STATE,
+        config(Frame.ENABLED, "Enabled", "BOOL", "A frame that is not is left alone altogether."),
+        config(Frame.ADDRESS_MODE, "Address mode", "USINT",
+               "0 MAC, 1 NetID, 2 IP by UDP, 3 IP by TCP, 4 whoever asked for its PDs.",
+               maximum=4, changeable=True, key="to"),
+        config(Frame.DESTINATION_MAC, "Destination MAC", "BLOCK(6)",
+               "Address mode 0; in mode 1 that of the NetID, and all zero or a group if it is to "
+               "be learned.", default=bytes.fromhex("010105040000"), form=Form.MAC,
+               changeable=True, key="to"),
+        config(Frame.DESTINATION_NETID, "Destination NetID", "BLOCK(6)", "Address mode 1.",
+               form=Form.NET_ID, changeable=True, key="to"),
+        config(Frame.DESTINATION_IP, "Destination IP", "BLOCK(4)",
+               "Address modes 2 and 3, first octet first.", form=Form.IP, changeable=True,
+               key="to"),
+        config(Frame.PORT_NUMBER, "Port number", "UINT", "UDP or TCP; 0 is 34980.",
+               changeable=True, key="to"),
+        setting(Frame.MONITORING_INTERVAL, "Monitoring interval", "UDINT",
+                "How often to look whether the subscriber is there; 0 never.", unit="ms",
+                key="monitor_interval_ms"),
+        live(Frame.FRAME_STATE, "Frame state", "UINT", Live.FRAME_STATE,
              "Bit 0 not sent, bit 1 too long, bit 2 subscriber missing."),
-        config(9, "Name", NAME, "Unique among the station's frames."),
-        config(10, "Divider", "UINT", "Leaves only in cycles whose number, divided by this, leaves "
-               "the modulo; 0 off."),
-        config(11, "Modulo", "UINT", "Less than the divider."),
-        config(12, "Monitor IP", "BLOCK(4)", "Whom to probe for on Ethernet; all "
-               "zero nobody.", form=Form.IP),
-        config(13, "Changeable", "BOOL", "Whether the destination may be written in SafeOp and "
-               "Op."),
-        live(14, "Frame control", "UINT", Live.FRAME_CTRL, "Bit 0 suppresses the frame."),
-        derived(15, "Frame length", "UINT", Derived.FRAME_LENGTH, "Octets with all its PDs."),
-        config(16, "TxPD {n}", "UINT", "Index of a PD that it carries; 0 none.",
-               last=MAX_ENTRIES, form=Form.INDEX),
+        setting(Frame.NAME, "Name", NAME, "Unique among the station's frames.", key="name",
+                rule=Rule.NAME),
+        setting(Frame.DIVIDER, "Divider", "UINT",
+                "Leaves only in cycles whose number, divided by this, leaves the modulo; 0 off.",
+                key="divider"),
+        setting(Frame.MODULO, "Modulo", "UINT", "Less than the divider.", key="modulo"),
+        setting(Frame.MONITOR_IP, "Monitor IP", "BLOCK(4)",
+                "Whom to probe for on Ethernet; all zero nobody.", form=Form.IP, key="monitor_ip"),
+        setting(Frame.CHANGEABLE, "Changeable", "BOOL",
+                "Whether the destination may be written in SafeOp and Op.", key="changeable"),
+        live(Frame.FRAME_CONTROL, "Frame control", "UINT", Live.FRAME_CTRL,
+             "Bit 0 suppresses the frame."),
+        derived(Frame.FRAME_LENGTH, "Frame length", "UINT", Derived.FRAME_LENGTH,
+                "Octets with all its PDs."),
+        config(Frame.TXPD, "TxPD {n}", "UINT", "Index of a PD that it carries; 0 none.",
+               last=MAX_ENTRIES, form=Form.INDEX, refers=(0xD000,)),
     ),
     "One frame to send: where it goes and what is in it.", dynamic=True, companion=0xA000,
+    section="frames",
 )  # fmt: skip
 FRAME_DIAGNOSIS = ObjectRange(
     0xA000, 0xAFFF, "TxFrame diagnosis {n}", _RECORD,
@@ -132,32 +384,49 @@ FRAME_DIAGNOSIS = ObjectRange(
 TX_PD = ObjectRange(
     0xD000, 0xDFFF, "TxPD {n}", _RECORD,
     (
-        config(1, "PDO index", "UINT", "Mapping that it carries (0x1A00 or 0x3000 on); 0 none.",
-               form=Form.INDEX),
-        derived(2, "PDO length", "UINT", Derived.PDO_LENGTH, "Octets of data."),
-        config(3, "PD ID", "UINT", "Unique per publisher.", changeable=True),
-        config(4, "Version", "UINT", "Of the layout; subscribers discard others."),
-        config(5, "Enabled", "BOOL", "A PD that is not is left out of its frame."),
-        fixed(6, "Publisher", "BLOCK(6)", "NetID of this port.", form=Form.NET_ID),
-        config(7, "Cycle time", "UDINT", "Whole multiple of the device cycle; 0 off.", unit="us"),
-        config(8, "Divider", "UINT", "Sent in cycles whose number, divided by this, leaves the "
-               "modulo; 0 off."),
-        config(9, "Modulo", "UINT", "Less than the divider."),
-        config(10, "Poll request RxPD", "UINT", "Sent as the answer to this RxPD; 0 none.",
-               form=Form.INDEX, changeable=True),
-        config(11, "On change timeout", "UDINT", "Sent again though unchanged; 0 never. Other "
-               "than 0 it switches sending on change on.", unit="ms"),
-        config(12, "On change inhibit", "UDINT", "Shortest gap between two changes; 0 none. Other "
-               "than 0 it switches sending on change on.", unit="us"),
-        live(13, "VarState", "UINT", Live.TX_VAR_STATE, "Bit 0 not sent."),
-        config(14, "Name", NAME, "Unique among the station's sent PDs."),
-        config(15, "On change", "BOOL", "Sent when the data differs from what was sent last."),
-        config(16, "Event", "BOOL", "Sent when bit 1 of its VarCtrl rises."),
-        config(17, "Changeable", "BOOL", "Whether PD ID and poll request may be written in "
-               "SafeOp and Op."),
-        live(18, "VarCtrl", "UINT", Live.TX_VAR_CTRL, "Bit 0 suppresses the PD, bit 1 sends it."),
+        config(Tx.PDO_INDEX, "PDO index", "UINT",
+               "Mapping that it carries (0x1A00 or 0x3000 on); 0 none.", form=Form.INDEX,
+               refers=(0x1A00, 0x3000)),
+        derived(Tx.PDO_LENGTH, "PDO length", "UINT", Derived.PDO_LENGTH, "Octets of data."),
+        setting(Tx.PD_ID, "PD ID", "UINT", "Unique per publisher.", changeable=True, key="id",
+                field="pd_id"),
+        setting(Tx.VERSION, "Version", "UINT", "Of the layout; subscribers discard others.",
+                key="version"),
+        config(Tx.ENABLED, "Enabled", "BOOL", "A PD that is not is left out of its frame."),
+        fixed(Tx.PUBLISHER, "Publisher", "BLOCK(6)", "NetID of this port.", form=Form.NET_ID),
+        setting(Tx.CYCLE_TIME, "Cycle time", "UDINT",
+                "Whole multiple of the device cycle; 0 off.", unit="us", key="cycle_us",
+                field="trigger.cycle_us"),
+        setting(Tx.DIVIDER, "Divider", "UINT",
+                "Sent in cycles whose number, divided by this, leaves the modulo; 0 off.",
+                key="divider", field="trigger.divider"),
+        setting(Tx.MODULO, "Modulo", "UINT", "Less than the divider.", key="modulo",
+                field="trigger.modulo"),
+        setting(Tx.POLL_REQUEST_RXPD, "Poll request RxPD", "UINT",
+                "Sent as the answer to this RxPD; 0 none.", form=Form.INDEX, changeable=True,
+                key="poll", field="poll_request", refers=(0xE000,)),
+        setting(Tx.ON_CHANGE_TIMEOUT, "On change timeout", "UDINT",
+                "Sent again though unchanged; 0 never. Other than 0 it switches sending on change "
+                "on.", unit="ms", key="on_change.timeout_ms",
+                field="trigger.on_change.timeout_ms"),
+        setting(Tx.ON_CHANGE_INHIBIT, "On change inhibit", "UDINT",
+                "Shortest gap between two changes; 0 none. Other than 0 it switches sending on "
+                "change on.", unit="us", key="on_change.inhibit_us",
+                field="trigger.on_change.inhibit_us"),
+        live(Tx.VARSTATE, "VarState", "UINT", Live.TX_VAR_STATE, "Bit 0 not sent."),
+        setting(Tx.NAME, "Name", NAME, "Unique among the station's sent PDs.", key="name",
+                rule=Rule.NAME),
+        config(Tx.ON_CHANGE, "On change", "BOOL",
+               "Sent when the data differs from what was sent last.", key="on_change"),
+        setting(Tx.EVENT, "Event", "BOOL", "Sent when bit 1 of its VarCtrl rises.", key="event",
+                field="trigger.event"),
+        setting(Tx.CHANGEABLE, "Changeable", "BOOL",
+                "Whether PD ID and poll request may be written in SafeOp and Op.",
+                key="changeable"),
+        live(Tx.VARCTRL, "VarCtrl", "UINT", Live.TX_VAR_CTRL,
+             "Bit 0 suppresses the PD, bit 1 sends it."),
     ),
-    "One PD to send: which PDO, and when.", dynamic=True, companion=0xB000,
+    "One PD to send: which PDO, and when.", dynamic=True, companion=0xB000, section="publish",
 )  # fmt: skip
 TX_DIAGNOSIS = ObjectRange(
     0xB000, 0xBFFF, "TxPD diagnosis {n}", _RECORD,
@@ -176,35 +445,50 @@ TX_DIAGNOSIS = ObjectRange(
 RX_PD = ObjectRange(
     0xE000, 0xEFFF, "RxPD {n}", _RECORD,
     (
-        config(1, "PDO index", "UINT", "Mapping that takes it (0x1600 or 0x2000 on); 0 none.",
-               form=Form.INDEX),
-        derived(2, "PDO length", "UINT", Derived.PDO_LENGTH, "Octets of data."),
-        config(3, "PD ID", "UINT", "Expected ID.", changeable=True),
-        config(4, "Version", "UINT", "Expected version of the layout."),
-        config(5, "Flags", "USINT", "Bit 7 enabled; bit 0: the NetID is ignored, bit 2: the "
-               "version is. ID and length never are: bits 1 and 3 are 0.", form=Form.HEX),
-        config(6, "Publisher", "BLOCK(6)", "NetID of the sender; all zero is any.",
-               form=Form.NET_ID, changeable=True),
-        config(7, "Poll request TxPD", "UINT", "The TxPD that this one answers; 0 none.",
-               form=Form.INDEX, changeable=True),
-        live(8, "Quality", "UINT", Live.RX_QUALITY, "Age of the data.", unit="100 us"),
-        live(9, "Cycle index", "UINT", Live.RX_CYCLE_INDEX, "Cycle counter of the sender."),
-        live(10, "VarState", "UINT", Live.RX_VAR_STATE, "Last one refused for: bit 0 version, "
-             "bit 1 length."),
-        config(11, "Name", NAME, "Unique among the station's received PDs."),
-        config(12, "Time-out", "UDINT", "Age at which the substitute applies; 0 never.", unit="ms"),
-        config(13, "Substitute", "USINT", "0 hold the last values, 1 zero, 2 the defaults.",
-               maximum=2),
-        config(14, "Sender cycle", "UDINT", "Device cycle of the sender; 0 unknown.", unit="us"),
-        config(15, "Step", "UDINT", "Sender cycles between two of this PD; 0 no fixed step."),
-        config(16, "Changeable", "BOOL", "Whether PD ID, NetID and poll request may be written in "
-               "SafeOp and Op."),
-        live(17, "State", "USINT", Live.RX_STATE, "0 waiting, 1 running, 2 stale."),
-        config(18, "Source", "STRING(40)", "Address that its frames must come from: MAC on "
-               "Ethernet, else IPv4; empty any. Writing another publisher empties it.",
-               changeable=True),
+        config(Rx.PDO_INDEX, "PDO index", "UINT",
+               "Mapping that takes it (0x1600 or 0x2000 on); 0 none.", form=Form.INDEX,
+               refers=(0x1600, 0x2000)),
+        derived(Rx.PDO_LENGTH, "PDO length", "UINT", Derived.PDO_LENGTH, "Octets of data."),
+        setting(Rx.PD_ID, "PD ID", "UINT", "Expected ID.", changeable=True, key="from.id",
+                field="pd_id"),
+        setting(Rx.VERSION, "Version", "UINT", "Expected version of the layout.", key="version"),
+        config(Rx.FLAGS, "Flags", "USINT", "Bit 7 enabled; bit 0: the NetID is ignored, bit 2: the "
+               "version is. ID and length never are: bits 1 and 3 are 0.", form=Form.HEX,
+               key="ignore_version", rule=Rule.FLAGS),
+        setting(Rx.PUBLISHER, "Publisher", "BLOCK(6)", "NetID of the sender; all zero is any.",
+                form=Form.NET_ID, changeable=True, key="from.publisher", field="publisher"),
+        setting(Rx.POLL_REQUEST_TXPD, "Poll request TxPD", "UINT",
+                "The TxPD that this one answers; 0 none.", form=Form.INDEX, changeable=True,
+                key="poll", field="poll_request", refers=(0xD000,)),
+        live(Rx.QUALITY, "Quality", "UINT", Live.RX_QUALITY, "Age of the data.", unit="100 us"),
+        live(Rx.CYCLE_INDEX, "Cycle index", "UINT", Live.RX_CYCLE_INDEX,
+             "Cycle counter of the sender."),
+        live(Rx.VARSTATE, "VarState", "UINT", Live.RX_VAR_STATE,
+             "Last one refused for: bit 0 version, bit 1 length."),
+        setting(Rx.NAME, "Name", NAME, "Unique among the station's received PDs.", key="name",
+                rule=Rule.NAME),
+        setting(Rx.TIME_OUT, "Time-out", "UDINT", "Age at which the substitute applies; 0 never.",
+                unit="ms", key="timeout_ms"),
+        setting(Rx.SUBSTITUTE, "Substitute", "USINT",
+                "0 hold the last values, 1 zero, 2 the defaults.", maximum=2, key="substitute",
+                words=Substituted),
+        setting(Rx.SENDER_CYCLE, "Sender cycle", "UDINT",
+                "Device cycle of the sender; 0 unknown.", unit="us", key="from.cycle_us",
+                field="sender_cycle_us"),
+        setting(Rx.STEP, "Step", "UDINT",
+                "Sender cycles between two of this PD; 0 no fixed step.", key="from.step",
+                field="step"),
+        setting(Rx.CHANGEABLE, "Changeable", "BOOL",
+                "Whether PD ID, NetID and poll request may be written in SafeOp and Op.",
+                key="changeable"),
+        live(Rx.STATE, "State", "USINT", Live.RX_STATE, "0 waiting, 1 running, 2 stale."),
+        setting(Rx.SOURCE, "Source", "STRING(40)",
+                "Address that its frames must come from: MAC on Ethernet, else IPv4; empty any. "
+                "Writing another publisher empties it.", changeable=True, key="source",
+                rule=Rule.SOURCE),
     ),
     "One PD to receive: from whom, and into which PDO.", dynamic=True, companion=0xC000,
+    section="subscribe",
 )  # fmt: skip
 RX_DIAGNOSIS = ObjectRange(
     0xC000, 0xCFFF, "RxPD diagnosis {n}", _RECORD,
@@ -232,88 +516,100 @@ COUNTED = ((TX_FRAME,), (TX_PD,), (RX_PD,), (TX_PDO, MORE_TX_PDO), (RX_PDO, MORE
 """The ranges behind sub-indexes 1 to 7 of 0xF800 and 0xF801."""
 
 
-def _single(index: int, name: str, description: str, *entries: EntryRow) -> ObjectRange:
-    code = _VAR if entries[0].subindex == 0 else _ARRAY if entries[0].last else _RECORD
-    described = tuple(
-        each._replace(description=each.description or description) for each in entries
-    )
-    return ObjectRange(index, index, name, code, described, description)
+def identity(module_profile: int) -> tuple[ObjectRange, ...]:
+    """Return the objects that name a device of *module_profile*."""
+    return (
+        single(0x1000, "Device type", "Profile in the low word, module profile in the high one.",
+               fixed(0, "Device type", "UDINT", "", default=module_profile << 16 | PROFILE,
+                     form=Form.HEX)),
+        single(0x1008, "Device name", "Of the product.", fixed(0, "Device name", NAME, "")),
+        single(0x1009, "Hardware version", "Of the host.",
+               fixed(0, "Hardware version", NAME, "")),
+        single(0x100A, "Software version", "Of the product.",
+               fixed(0, "Software version", NAME, "")),
+        single(0x1018, "Identity", "Who made what.",
+               fixed(1, "Vendor ID", "UDINT", "0: not a member of the ETG."),
+               fixed(2, "Product code", "UDINT", "Of the product."),
+               fixed(3, "Revision", "UDINT", "Of the product."),
+               fixed(4, "Serial number", "UDINT", "Of the device; 0 none.")),
+    )  # fmt: skip
 
 
-IDENTITY = (
-    _single(0x1000, "Device type", "Profile in the low word, module profile in the high one.",
-            fixed(0, "Device type", "UDINT", "", default=MODULE_PROFILE << 16 | PROFILE,
-                  form=Form.HEX)),
-    _single(0x1008, "Device name", "Of the product.", fixed(0, "Device name", NAME, "")),
-    _single(0x1009, "Hardware version", "Of the host.", fixed(0, "Hardware version", NAME, "")),
-    _single(0x100A, "Software version", "Of the product.", fixed(0, "Software version", NAME, "")),
-    _single(0x1018, "Identity", "Who made what.",
-            fixed(1, "Vendor ID", "UDINT", "0: not a member of the ETG."),
-            fixed(2, "Product code", "UDINT", "Of the product."),
-            fixed(3, "Revision", "UDINT", "Of the product."),
-            fixed(4, "Serial number", "UDINT", "Of the device; 0 none.")),
-)  # fmt: skip
 DEVICE = (
-    _single(0xF000, "Modular device profile", "How the objects are numbered.",
-            fixed(1, "Index distance", "UINT", "Between two objects of a range.", default=1),
-            fixed(2, "Maximum number", "UINT", "Of objects of a kind.", default=0x1000)),
-    _single(0xF100, "EAP status", "Where the device stands.",
-            fixed(1, "State", "UINT", "1 Init, 2 PreOp, 4 SafeOp, 8 Op; bit 4: an error."),
-            fixed(2, "Error code", "UINT", "Why the last request was refused; 0 it was not."),
-            fixed(3, "Error text", TEXT, "The same in words."),
-            fixed(4, "Error object", "UDINT", "Index and sub-index (16, 8 bits, then zero) that "
-                  "the error is about; 0 none.", form=Form.HEX)),
-    _single(0xF110, "Device diagnosis", "Counters of the whole station.",
-            live(1, "Cycle", "ULINT", Live.STATION_CYCLE, "Device cycles run."),
-            live(2, "Overruns", "ULINT", Live.STATION_OVERRUNS, "Cycles left out, being too late."),
-            live(3, "Restarts", "ULINT", Live.STATION_RESTARTS, "Of the engine."),
-            live(4, "Torn", "ULINT", Live.STATION_TORN, "Cycles with half-written variables."),
-            live(5, "Largest lateness", "ULINT", Live.STATION_LATENESS_MAX, "In nanoseconds."),
-            live(6, "Links held", "ULINT", Live.STATION_LINKS_HELD, "Values no link could pass."),
-            live(7, "Wrong publisher", "ULINT", Live.STATION_DISCARDED_WRONG_PUBLISHER,
+    single(0xF000, "Modular device profile", "How the objects are numbered.",
+           fixed(1, "Index distance", "UINT", "Between two objects of a range.", default=1),
+           fixed(2, "Maximum number", "UINT", "Of objects of a kind.", default=0x1000)),
+    single(0xF100, "EAP status", "Where the device stands.",
+           fixed(1, "State", "UINT", "1 Init, 2 PreOp, 4 SafeOp, 8 Op; bit 4: an error."),
+           fixed(2, "Error code", "UINT", "Why the last request was refused; 0 it was not."),
+           fixed(3, "Error text", TEXT, "The same in words."),
+           fixed(4, "Error object", "UDINT", "Index and sub-index (16, 8 bits, then zero) that "
+                 "the error is about; 0 none.", form=Form.HEX)),
+    single(0xF110, "Device diagnosis", "Counters of the whole station.",
+           live(1, "Cycle", "ULINT", Live.STATION_CYCLE, "Device cycles run."),
+           live(2, "Overruns", "ULINT", Live.STATION_OVERRUNS, "Cycles left out, being too late."),
+           live(3, "Restarts", "ULINT", Live.STATION_RESTARTS, "Of the engine."),
+           live(4, "Torn", "ULINT", Live.STATION_TORN, "Cycles with half-written variables."),
+           live(5, "Largest lateness", "ULINT", Live.STATION_LATENESS_MAX, "In nanoseconds."),
+           live(6, "Links held", "ULINT", Live.STATION_LINKS_HELD, "Values no link could pass."),
+           live(7, "Wrong publisher", "ULINT", Live.STATION_DISCARDED_WRONG_PUBLISHER,
                  "PDs discarded for it."),
-            live(8, "Unknown ID", "ULINT", Live.STATION_DISCARDED_UNKNOWN_ID,
+           live(8, "Unknown ID", "ULINT", Live.STATION_DISCARDED_UNKNOWN_ID,
                  "PDs discarded for it."),
-            live(9, "Truncated", "ULINT", Live.STATION_DISCARDED_TRUNCATED,
+           live(9, "Truncated", "ULINT", Live.STATION_DISCARDED_TRUNCATED,
                  "Frames discarded for it."),
-            live(10, "Count too large", "ULINT", Live.STATION_DISCARDED_COUNT_TOO_LARGE,
+           live(10, "Count too large", "ULINT", Live.STATION_DISCARDED_COUNT_TOO_LARGE,
                  "Frames discarded for it."),
-            live(11, "Wrong type", "ULINT", Live.STATION_DISCARDED_WRONG_TYPE,
+           live(11, "Wrong type", "ULINT", Live.STATION_DISCARDED_WRONG_TYPE,
                  "Frames discarded for it."),
-            live(12, "Too many requests", "ULINT", Live.STATION_DISCARDED_TOO_MANY_REQUESTS,
+           live(12, "Too many requests", "ULINT", Live.STATION_DISCARDED_TOO_MANY_REQUESTS,
                  "Requests left without an answer."),
-            live(13, "No sender", "ULINT", Live.STATION_DISCARDED_NO_SENDER,
+           live(13, "No sender", "ULINT", Live.STATION_DISCARDED_NO_SENDER,
                  "Requests that do not tell whom to answer.")),
-    _single(0xF200, "EAP control", "What the device is asked to do.",
-            EntryRow(1, "Requested state", "UINT", RW, "2 PreOp, 4 SafeOp, 8 Op; the status says "
-                     "what came of it.")),
-    _single(0xF800, "Configured objects", "How many there are; counted by the device.",
-            *(derived(sub, name, "UINT", Derived.COUNT, "How many exist.")
-              for sub, name in enumerate(_KINDS, 1)),
-            config(8, "Device cycle time", "UDINT", "Of the station, all its ports alike.",
-                   default=10_000, minimum=100, maximum=60_000_000, unit="us"),
-            config(9, "Phase", "UDINT", "Where in the cycle the station runs.", unit="us")),
-    _single(0xF801, "Free objects", "First free index of each kind; found by the device.",
-            *(derived(sub, name, "UINT", Derived.NEXT_FREE, "First free index; 0 none is left.",
-                      form=Form.INDEX)
-              for sub, name in enumerate(_KINDS, 1))),
-    _single(0xF810, "EAP port", "How the port reaches others.",
-            fixed(1, "Name", NAME, "In the plant file."),
-            fixed(2, "Transport", "USINT", "0 UDP, 1 Ethernet, 2 TCP, 3 loop within the process."),
-            fixed(3, "Interface", TEXT, "Such as udp://10.0.0.1 or ethernet://eth0."),
-            fixed(4, "Port number", "UINT", "UDP or TCP; 0 is 34980, or there is none."),
-            config(5, "VLAN ID", "UINT", "Ethernet: tag of its frames; 0 untagged.", maximum=4094),
-            config(6, "VLAN priority", "USINT", "Of the tag.", maximum=7),
-            config(7, "TCP", "BOOL", "Whether process data is taken from TCP connections too."),
-            config(8, "Broadcast", "BOOL", "UDP: whether broadcasts are listened to."),
-            config(9, "Wake", "USINT", "Frames are taken 0 in each cycle, 1 as they arrive.",
-                   maximum=1),
-            config(10, "EAP SM", "BOOL", "Whether the frames it sends carry the device's state.")),
-    _single(0xF811, "Multicast groups", "Groups to listen to besides the EAP default.",
-            EntryRow(1, "Group {n}", "STRING(17)", CONFIG, "MAC address on Ethernet, IPv4 on UDP; "
-                     "empty none.", last=MAX_ENTRIES)),
-    _single(0xF920, "AoE NetID", "Of this port.",
-            fixed(1, "NetID", "BLOCK(6)", "", form=Form.NET_ID)),
+    single(0xF200, "EAP control", "What the device is asked to do.",
+           EntryRow(1, "Requested state", "UINT", RW, "2 PreOp, 4 SafeOp, 8 Op; the status says "
+                    "what came of it.", rule=Rule.STATE)),
+    single(0xF800, "Configured objects", "How many there are; counted by the device.",
+           *(derived(sub, name, "UINT", Derived.COUNT, "How many exist.")
+             for sub, name in enumerate(_KINDS, 1)),
+           setting(Configured.DEVICE_CYCLE_TIME, "Device cycle time", "UDINT",
+                   "Of the station, all its ports alike.", default=10_000, minimum=100,
+                   maximum=60_000_000, unit="us", key="cycle_us"),
+           setting(Configured.PHASE, "Phase", "UDINT", "Where in the cycle the station runs.",
+                   unit="us", key="phase_us"),
+           section="stations"),
+    single(0xF801, "Free objects", "First free index of each kind; found by the device.",
+           *(derived(sub, name, "UINT", Derived.NEXT_FREE, "First free index; 0 none is left.",
+                     form=Form.INDEX)
+             for sub, name in enumerate(_KINDS, 1))),
+    single(0xF810, "EAP port", "How the port reaches others.",
+           fixed(Port.NAME, "Name", NAME, "In the plant file.", key="name"),
+           fixed(Port.TRANSPORT, "Transport", "USINT",
+                 "0 UDP, 1 Ethernet, 2 TCP, 3 loop within the process.", key="interface"),
+           fixed(Port.INTERFACE, "Interface", TEXT, "Such as udp://10.0.0.1 or ethernet://eth0.",
+                 key="interface"),
+           fixed(Port.PORT_NUMBER, "Port number", "UINT",
+                 "UDP or TCP; 0 is 34980, or there is none.", key="interface"),
+           setting(Port.VLAN_ID, "VLAN ID", "UINT", "Ethernet: tag of its frames; 0 untagged.",
+                   maximum=4094, key="vlan.id", field="vlan_id", schemes=("ethernet",)),
+           setting(Port.VLAN_PRIORITY, "VLAN priority", "USINT", "Of the tag.", maximum=7,
+                   key="vlan.priority", field="vlan_priority", schemes=("ethernet",)),
+           setting(Port.TCP, "TCP", "BOOL",
+                   "Whether process data is taken from TCP connections too.", key="tcp",
+                   schemes=("tcp", "udp")),
+           setting(Port.BROADCAST, "Broadcast", "BOOL",
+                   "UDP: whether broadcasts are listened to.", key="broadcast", schemes=("udp",)),
+           setting(Port.WAKE, "Wake", "USINT",
+                   "Frames are taken 0 in each cycle, 1 as they arrive.", maximum=1, key="wake",
+                   words=Waking),
+           setting(Port.EAP_SM, "EAP SM", "BOOL",
+                   "Whether the frames it sends carry the device's state.", key="eap_sm"),
+           section="ports"),
+    single(0xF811, "Multicast groups", "Groups to listen to besides the EAP default.",
+           config(1, "Group {n}", "STRING(17)", "MAC address on Ethernet, IPv4 on UDP; empty "
+                  "none.", last=MAX_ENTRIES, key="join", rule=Rule.GROUP), section="ports"),
+    single(0xF920, "AoE NetID", "Of this port.",
+           fixed(1, "NetID", "BLOCK(6)", "", form=Form.NET_ID, key="net_id"), section="ports"),
 )  # fmt: skip
 
 DYNAMIC = (RX_PDO, TX_PDO, MORE_RX_PDO, MORE_TX_PDO, TX_VARIABLE, RX_VARIABLE,
@@ -321,8 +617,16 @@ DYNAMIC = (RX_PDO, TX_PDO, MORE_RX_PDO, MORE_TX_PDO, TX_VARIABLE, RX_VARIABLE,
 VARIABLES = (TX_VARIABLE, RX_VARIABLE)
 MAPPINGS = (RX_PDO, TX_PDO, MORE_RX_PDO, MORE_TX_PDO)
 COMPANIONS = (FRAME_DIAGNOSIS, TX_DIAGNOSIS, RX_DIAGNOSIS)
-STATIC = (*IDENTITY, *DEVICE)
+STATIC = (*identity(MODULE_PROFILE), *DEVICE)
 ALL = tuple(sorted((*STATIC, *DYNAMIC, *COMPANIONS), key=lambda row: row.first))
+
+STATUS = 0xF100
+CONTROL = 0xF200
+OBJECT_COUNTS = 0xF800
+FREE_INDEXES = 0xF801
+PORT = 0xF810
+GROUPS = 0xF811
+NET_ID = 0xF920
 
 _BY_PAGE = {
     page: [row for row in ALL if row.first >> 8 <= page <= row.last >> 8] for page in range(0x100)

@@ -1,4 +1,4 @@
-"""How people read and write the entries of a profile: addresses, references, numbers, texts."""
+"""Forms of a profile's entries: texts for people, and rules for content."""
 
 from __future__ import annotations
 
@@ -9,6 +9,26 @@ from ipaddress import IPv4Address
 
 from eap.codec.datatypes import DataType
 from eap.ids import MacAddr, NetId, ObjectId
+
+
+class Rule(StrEnum):
+    """Rules for the content of an entry, beyond its type and limits."""
+
+    NONE = ""
+    NAME = "name"
+    """A name of a station's parts: no spaces, no slashes."""
+    TYPE = "type"
+    """A data type."""
+    DEFAULT = "default"
+    """A value of the variable's type; numbers are finite."""
+    FLAGS = "flags"
+    """Known flags of an RxPD."""
+    GROUP = "group"
+    """A multicast address, MAC or IPv4, or empty."""
+    SOURCE = "source"
+    """A MAC or IPv4 address, or empty."""
+    STATE = "state"
+    """A state that can be requested."""
 
 
 class Form(StrEnum):
@@ -25,11 +45,24 @@ class Form(StrEnum):
     NET_ID = "net_id"
     IP = "ip"
 
+    @property
+    def is_address(self) -> bool:
+        """Whether it is a block of octets that has a text of its own."""
+        return self in _BLOCKS
+
+    def text_of(self, octets: bytes) -> str:
+        """Return an address as people write it."""
+        return _BLOCKS[self][0](octets)
+
+    def octets_of(self, text: str) -> bytes:
+        """Return the octets of an address; raise ValueError if *text* is none."""
+        return _BLOCKS[self][1](text)
+
 
 def to_text(form: Form, kind: DataType, octets: bytes) -> str:
     """Return the *octets* of an entry as people write them; :func:`from_text` reads it again."""
-    if form in _BLOCKS:
-        return _BLOCKS[form][0](octets)
+    if form.is_address:
+        return form.text_of(octets)
     value = kind.decode(octets.ljust(kind.size, b"\0"), 0)
     if form is Form.MAPPING and isinstance(value, int):
         return f"{ObjectId(value >> 16, value >> 8 & 0xFF)}/{value & 0xFF}"
@@ -48,8 +81,8 @@ def from_text(form: Form, kind: DataType, text: str) -> bytes:
     Raises:
         ValueError: it is nothing of the form, or no value of the type.
     """
-    if form in _BLOCKS:
-        return _BLOCKS[form][1](text)
+    if form.is_address:
+        return form.octets_of(text)
     if form is Form.MAPPING and "/" in text:
         entry, _, bits = text.strip().partition("/")
         if ":" not in entry or not _BITS.fullmatch(bits):

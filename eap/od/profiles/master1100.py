@@ -10,9 +10,8 @@ from __future__ import annotations
 from enum import StrEnum, auto
 
 from eap.od.model import RW, ObjectCode
-from eap.od.profiles import eap1000
-from eap.od.profiles.eap1000 import PROFILE
-from eap.od.profiles.table import EntryRow, ObjectRange, fixed, live
+from eap.od.profiles.eap1000 import identity
+from eap.od.profiles.table import EntryRow, ObjectRange, fixed, live, single
 
 MODULE_PROFILE = 1100
 MAX_SLAVES = 4080
@@ -150,43 +149,31 @@ DIAGNOSIS = ObjectRange(
 )  # fmt: skip
 USUAL_EXTENT = {CONFIGURED.first: 37, DETECTED.first: 32, DIAGNOSIS.first: 17}
 """Last sub-index by first index of the range, as TwinCAT has it."""
-
-
-def _single(index: int, name: str, description: str, *entries: EntryRow) -> ObjectRange:
-    return ObjectRange(index, index, name, _RECORD, entries, description)
-
-
-IDENTITY = tuple(
-    row
-    if row.first != 0x1000
-    else row._replace(entries=(row.entries[0]._replace(default=MODULE_PROFILE << 16 | PROFILE),))
-    for row in eap1000.IDENTITY
-)
 FIXED = (
-    *IDENTITY,
-    _single(0xF000, "Modular device profile", "How the objects are numbered.",
-            fixed(1, "Module index distance", "UINT", "Between two slaves.", default=1),
-            fixed(2, "Maximum number of modules", "UINT", "Slaves.", default=MAX_SLAVES),
-            fixed(3, "Available entries in 0x8nnn", "UDINT", "One bit for each of the first.",
-                  default=0xFF),
-            fixed(4, "Available entries in 0x9nnn", "UDINT", "One bit for each of the first.",
-                  default=0xF1)),
-    _single(0xF002, "Detect modules command", "Scans the bus.",
-            _writable(live(1, "Command request", "BLOCK(2)", Live.DETECT_REQUEST, "Writing it "
-                           "starts a scan.")),
-            live(2, "Command status", "USINT", Live.DETECT_STATUS, "0 none yet, 1 done, 3 failed, "
-                 "255 busy."),
-            live(3, "Command response", "BLOCK(6)", Live.DETECT_RESPONSE, "Status, 0, vendor's "
-                 "error, number of slaves.")),
-    _single(0xF120, "Master diag data", "Frames of the whole bus.",
-            live(1, "Cyclic lost frames", "UDINT", Live.LOST_CYCLIC, "Since the last reset."),
-            live(2, "Acyclic lost frames", "UDINT", Live.LOST_ACYCLIC, "Since the last reset."),
-            live(3, "Cyclic frames per second", "UDINT", Live.RATE_CYCLIC, "Now."),
-            live(4, "Acyclic frames per second", "UDINT", Live.RATE_ACYCLIC, "Now."),
-            live(16, "Master state", "UINT", Live.STATE, "1 Init, 2 PreOp, 4 SafeOp, 8 Op.")),
-    _single(0xF200, "Diag interface control", "Resets counters.",
-            _writable(live(16, "Reset diag info", "BOOL", Live.RESET, "A rising edge sets the "
-                           "counters of 0xAnnn and 0xF120 to 0."))),
+    *identity(MODULE_PROFILE),
+    single(0xF000, "Modular device profile", "How the objects are numbered.",
+           fixed(1, "Module index distance", "UINT", "Between two slaves.", default=1),
+           fixed(2, "Maximum number of modules", "UINT", "Slaves.", default=MAX_SLAVES),
+           fixed(3, "Available entries in 0x8nnn", "UDINT", "One bit for each of the first.",
+                 default=0xFF),
+           fixed(4, "Available entries in 0x9nnn", "UDINT", "One bit for each of the first.",
+                 default=0xF1)),
+    single(0xF002, "Detect modules command", "Scans the bus.",
+           _writable(live(1, "Command request", "BLOCK(2)", Live.DETECT_REQUEST, "Writing it "
+                          "starts a scan.")),
+           live(2, "Command status", "USINT", Live.DETECT_STATUS, "0 none yet, 1 done, 3 failed, "
+                "255 busy."),
+           live(3, "Command response", "BLOCK(6)", Live.DETECT_RESPONSE, "Status, 0, vendor's "
+                "error, number of slaves.")),
+    single(0xF120, "Master diag data", "Frames of the whole bus.",
+           live(1, "Cyclic lost frames", "UDINT", Live.LOST_CYCLIC, "Since the last reset."),
+           live(2, "Acyclic lost frames", "UDINT", Live.LOST_ACYCLIC, "Since the last reset."),
+           live(3, "Cyclic frames per second", "UDINT", Live.RATE_CYCLIC, "Now."),
+           live(4, "Acyclic frames per second", "UDINT", Live.RATE_ACYCLIC, "Now."),
+           live(16, "Master state", "UINT", Live.STATE, "1 Init, 2 PreOp, 4 SafeOp, 8 Op.")),
+    single(0xF200, "Diag interface control", "Resets counters.",
+           _writable(live(16, "Reset diag info", "BOOL", Live.RESET, "A rising edge sets the "
+                          "counters of 0xAnnn and 0xF120 to 0."))),
 )  # fmt: skip
 CONFIGURED_LIST = ObjectRange(
     0xF020, 0xF02F, "Configured address list {n}", _ARRAY,

@@ -10,10 +10,9 @@ from __future__ import annotations
 from enum import StrEnum, auto
 
 from eap.od.model import ObjectCode
-from eap.od.profiles import eap1000
-from eap.od.profiles.eap1000 import MAX_ENTRIES, NAME, PROFILE, TEXT
+from eap.od.profiles.eap1000 import MAX_ENTRIES, NAME, TEXT, identity
 from eap.od.profiles.forms import Form
-from eap.od.profiles.table import EntryRow, ObjectRange, fixed, live
+from eap.od.profiles.table import ObjectRange, fixed, live, single
 
 MODULE_PROFILE = 9000
 ROUTER = "router"
@@ -90,25 +89,12 @@ ROUTE = ObjectRange(
     ),
     "A route, of the first 1024 in the order of the table: objects come and go with the routes.",
 )  # fmt: skip
-
-
-def _single(index: int, name: str, description: str, *entries: EntryRow) -> ObjectRange:
-    code = _ARRAY if entries[0].last else _RECORD
-    return ObjectRange(index, index, name, code, entries, description)
-
-
-IDENTITY = tuple(
-    row
-    if row.first != 0x1000
-    else row._replace(entries=(row.entries[0]._replace(default=MODULE_PROFILE << 16 | PROFILE),))
-    for row in eap1000.IDENTITY
-)
-MODULES = _single(
+MODULES = single(
     0xF010, "Module list", "Which kind of device each AoE device is.",
     fixed(1, "Module {n}", "UDINT", "Sub-profile of the AoE device of that number.",
           last=MAX_ENTRIES),
 )  # fmt: skip
-DIAGNOSIS = _single(
+DIAGNOSIS = single(
     0xF110, "Router diagnosis", "Packets by what became of them, and what there is now.",
     live(1, "Answered", "ULINT", Live.ANSWERED, "Requests that were answered by their target."),
     live(2, "Failed", "ULINT", Live.FAILED, "Requests that the router answered with an error."),
@@ -122,16 +108,16 @@ DIAGNOSIS = _single(
     live(10, "Notifications", "UDINT", Live.SUBSCRIPTIONS, "That pass on their way to clients."),
 )  # fmt: skip
 STATIC = (
-    *IDENTITY,
-    _single(0xF000, "Modular device profile", "How the objects are numbered.",
-            fixed(1, "Index distance", "UINT", "Between two objects of a range.", default=1),
-            fixed(2, "Maximum number", "UINT", "Of AoE devices.", default=MAX_ENTRIES)),
+    *identity(MODULE_PROFILE),
+    single(0xF000, "Modular device profile", "How the objects are numbered.",
+           fixed(1, "Index distance", "UINT", "Between two objects of a range.", default=1),
+           fixed(2, "Maximum number", "UINT", "Of AoE devices.", default=MAX_ENTRIES)),
     MODULES,
-    _single(0xF100, "Router status", "Where the station stands.",
-            live(1, "State", "UINT", Live.STATE, "1 Init, 2 PreOp, 4 SafeOp, 8 Op.")),
+    single(0xF100, "Router status", "Where the station stands.",
+           live(1, "State", "UINT", Live.STATE, "1 Init, 2 PreOp, 4 SafeOp, 8 Op.")),
     DIAGNOSIS,
-    _single(0xF920, "AoE NetID", "Of the router.",
-            fixed(1, "NetID", "BLOCK(6)", "By which all of the station is reached.",
-                  form=Form.NET_ID)),
+    single(0xF920, "AoE NetID", "Of the router.",
+           fixed(1, "NetID", "BLOCK(6)", "By which all of the station is reached.",
+                 form=Form.NET_ID)),
 )  # fmt: skip
 ALL = tuple(sorted((*STATIC, DEVICE, ROUTE), key=lambda row: row.first))

@@ -1,17 +1,20 @@
-"""The records of which a profile's table consists, and short ways to write them.
+"""Records of which a profile's table consists, and short forms to write them.
 
-Every entry gets its content from one of four places, and its row says from which: it is *config*
-(written in PreOp, kept), *fixed* (given at the start, read only), *live* (what the running device
-is asked for under a key) or *derived* (computed from other entries of the dictionary).
+The row of an entry names the source of its content: *config* (written in PreOp, kept), *fixed*
+(given at the start, read only), *live* (read from the running device under a key) or *derived*
+(computed from other entries of the dictionary).
+
+A row of configuration is the one description of a field of a station: its key in the plant file,
+its path in the specification, its sub-index, type, limits and rule, and its text in the docs.
 """
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import Enum, IntEnum
 from typing import Any, NamedTuple
 
 from eap.od.model import RO, RW_PREOP, Access, ObjectCode
-from eap.od.profiles.forms import Form
+from eap.od.profiles.forms import Form, Rule
 
 CONFIG = RW_PREOP | Access.BACKUP
 """Rights of configuration: read always, written in PreOp, listed among what is to be saved."""
@@ -48,6 +51,34 @@ class EntryRow(NamedTuple):
     """How people read and write it."""
     changeable: bool = False
     """Whether it can be written in SafeOp and Op too once its object says so."""
+    key: str = ""
+    """Key of the plant file, below the section of the object."""
+    field: str = ""
+    """Path of the same in the specification, for what is converted entry by entry."""
+    words: type[IntEnum] | None = None
+    """Numbers of an entry for which the specification has the names, in lower case."""
+    rule: Rule = Rule.NONE
+    """Content that is allowed beyond type and limits."""
+    refers: tuple[int, ...] = ()
+    """First indexes of the ranges to which an index in this entry may refer."""
+    schemes: tuple[str, ...] = ()
+    """Interfaces on which it may be other than 0; empty for all."""
+
+    def to_plain(self, value: Any) -> Any:
+        """Return the *value* of an entry as the specification has it."""
+        if self.words is not None:
+            return self.words(value).name.lower()
+        if isinstance(value, bytes):
+            return self.form.text_of(value) if any(value) else ""
+        return value
+
+    def from_plain(self, plain: Any) -> Any:
+        """Return the value of an entry for which the specification has *plain*."""
+        if self.words is not None:
+            return self.words[plain.upper()]
+        if self.form.is_address:
+            return self.form.octets_of(plain) if plain else None
+        return plain
 
     def numbered(self, subindex: int) -> str:
         """Return the name of the entry at *subindex*."""
@@ -72,6 +103,8 @@ class ObjectRange(NamedTuple):
     """Whether it lists the variables of a PDO."""
     companion: int = 0
     """First index of the range whose objects come and go with these."""
+    section: str = ""
+    """Section of the plant file that an object stands for."""
 
     @property
     def list_row(self) -> EntryRow | None:
@@ -86,6 +119,12 @@ class ObjectRange(NamedTuple):
         return row.subindex - 1 if row.last else row.subindex
 
     @property
+    def count_access(self) -> Access:
+        """Access of sub-index 0: written where it deletes the object or cuts its list."""
+        is_kept = self.list_row is not None and self.list_row.access & CONFIG == CONFIG
+        return CONFIG if self.dynamic or is_kept else RO
+
+    @property
     def last_subindex(self) -> int:
         """Highest sub-index of an object that is as long as it can be."""
         row = self.entries[-1]
@@ -98,28 +137,56 @@ class ObjectRange(NamedTuple):
                 return row
         return None
 
+    def subindex_of(self, key: str) -> int:
+        """Return the sub-index of the entry that has *key* in the plant file."""
+        return next(row.subindex for row in self.entries if row.key == key)
+
     def title(self, index: int) -> str:
         """Return the name of the object at *index*."""
         return self.name.format(n=index - self.first)
 
 
-def config(subindex: int, name: str, kind: str, description: str, **more: Any) -> EntryRow:
+def single(
+    index: int, name: str, description: str, *entries: EntryRow, section: str = ""
+) -> ObjectRange:
+    """Write the row of one object; an entry without a description has that of the object."""
+    first = entries[0]
+    code = ObjectCode.ARRAY if first.last else ObjectCode.RECORD
+    described = tuple(
+        each._replace(description=each.description or description) for each in entries
+    )
+    return ObjectRange(
+        index, index, name, code if first.subindex else ObjectCode.VAR, described, description,
+        section=section,
+    )  # fmt: skip
+
+
+def config(
+    subindex: int, name: str, kind: str, description: str, *, key: str = "", **more: Any
+) -> EntryRow:
     """Write a row of configuration; *more* as :class:`EntryRow` has it."""
-    return EntryRow(subindex, name, kind, CONFIG, description, **more)
+    return EntryRow(int(subindex), name, kind, CONFIG, description, key=key, **more)
+
+
+def setting(
+    subindex: int, name: str, kind: str, description: str, *, key: str, field: str = "", **more: Any
+) -> EntryRow:
+    """Write a row of configuration that the specification has as one field, *key* by default."""
+    return config(subindex, name, kind, description, key=key, field=field or key, **more)
 
 
 def fixed(subindex: int, name: str, kind: str, description: str, **more: Any) -> EntryRow:
     """Write a row that is given at the start."""
-    return EntryRow(subindex, name, kind, RO, description, **more)
+    return EntryRow(int(subindex), name, kind, RO, description, **more)
 
 
 def live(subindex: int, name: str, kind: str, key: Enum, description: str, **more: Any) -> EntryRow:
     """Write a row that shows what *key* stands for while the device runs."""
-    return EntryRow(subindex, name, kind, RO, description, live=key.value, **more)
+    return EntryRow(int(subindex), name, kind, RO, description, live=key.value, **more)
 
 
 def derived(
     subindex: int, name: str, kind: str, key: Enum, description: str, **more: Any
 ) -> EntryRow:
     """Write a row that is computed from other entries."""
-    return EntryRow(subindex, name, kind, RO, description, derived=key.value, **more)
+    return EntryRow(int(subindex), name, kind, RO, description, derived=key.value, **more)

@@ -13,7 +13,7 @@ from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.services.routes.whereabouts import Whereabouts
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.station_image import StationImage
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.pd.spec import StationSpec

@@ -15,7 +15,7 @@ from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.errors import ImageError
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import Live
+from eap.od.profiles.eap1000 import Live
 from eap.pd import outcome
 from eap.pd.frame_status import frame_state
 from eap.pd.image import Image

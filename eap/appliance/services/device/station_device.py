@@ -20,15 +20,13 @@ from eap.appliance.device_plan import find_refusals
 from eap.appliance.services.device.station_keeper import StationKeeper
 from eap.appliance.services.jobs import Jobs
 from eap.device import stored
-from eap.device.eap_content import Identity
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_read import read_back
+from eap.device.eap_objects import Identity, LiveValues
+from eap.device.eap_records import read_back
 from eap.device.eap_state import EapStateMachine, StateResult
-from eap.device.fault import DeviceFault, FaultCode
-from eap.device.live import LiveValues
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
-from eap.pd.device import DeviceState
+from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import StationSpec
 
 _CONTROL = 0xF200

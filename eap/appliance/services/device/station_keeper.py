@@ -18,10 +18,9 @@ from msgspec.structs import replace
 
 from eap.appliance.configuration import Configuration, Stored, digest_of, new_cause
 from eap.appliance.store import Store
-from eap.device.fault import DeviceFault, FaultCode
 from eap.device.rollout import without_alternates
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
-from eap.pd.device import DeviceState
+from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import StationSpec
 
 logger = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ import os
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.master.master_values import MasterView
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.master_dictionary import MasterDictionary
 from eap.od.profiles.master1100 import CONFIGURED
 

@@ -6,9 +6,8 @@ from eap.appliance import control_device as words
 from eap.appliance.device_change import Plan
 from eap.device.difference import Change, ChangeKind
 from eap.device.eap_state import StateResult
-from eap.device.fault import DeviceFault, FaultCode
 from eap.od.model import WO, Entry, record
-from eap.pd.device import DeviceState
+from eap.pd.device import DeviceFault, DeviceState, FaultCode
 
 
 def test_rows_of_objects_and_entries():

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.config.destination import frame_budget, group_of, is_group, reaches, resolve
+from eap.config.destination import group_of, reaches, resolve
 from eap.config.structs import Port, Vlan
 from eap.ids import Destination, InterfaceUri
 from eap.pd.spec import PortKind
@@ -122,20 +122,6 @@ def test_a_frame_arrives_where_its_address_is(destination, sender, receiver, arr
 
 
 @pytest.mark.parametrize(
-    ("destination", "interface", "octets"),
-    [
-        ("10.0.0.2", "udp://10.0.0.1", 1472),
-        ("tcp://10.0.0.2", "udp://10.0.0.1", 2049),
-        ("01:01:05:04:00:00", "ethernet://eth0", 1500),
-        ("01:01:05:04:00:00", "loop://line", 2049),
-    ],
-)
-def test_the_budget_is_that_of_the_wire(destination, interface, octets):
-    uri = InterfaceUri.parse(interface)
-    assert frame_budget(Destination.parse(destination), uri) == octets
-
-
-@pytest.mark.parametrize(
     ("destination", "group"),
     [
         ("10.0.0.2", None),
@@ -149,21 +135,3 @@ def test_the_budget_is_that_of_the_wire(destination, interface, octets):
 )
 def test_groups_are_what_one_has_to_join(destination, group):
     assert group_of(Destination.parse(destination)) == group
-
-
-def test_a_group_is_of_the_kind_of_its_interface():
-    udp, ethernet = InterfaceUri.parse("udp://10.0.0.1"), InterfaceUri.parse("ethernet://eth0")
-    assert is_group("239.1.1.1", udp)
-    assert not is_group("10.1.1.1", udp)
-    assert is_group("01:01:05:04:00:07", ethernet)
-    assert not is_group("02:01:05:04:00:07", ethernet)
-    assert not is_group("239.1.1.1", ethernet)
-
-
-@pytest.mark.parametrize(
-    ("interface", "size"),
-    [("udp://10.0.0.1", 1472), ("ethernet://eth0", 1500), ("tcp://10.0.0.1", 2049),
-     ("loop://line", 2049)],
-)  # fmt: skip
-def test_an_answer_fits_every_way_back(interface, size):
-    assert frame_budget(None, InterfaceUri.parse(interface)) == size

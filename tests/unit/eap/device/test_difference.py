@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from eap.device.difference import compare
 from eap.device.stored import configuration
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import RX_PD, TX_PD
-from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
+from eap.od.profiles.eap1000 import RX_PD, TX_PD, Frame, Rx, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import copy, mapping, receiver, sender, tx_pd, variable, write
 from tests.support.stations import empty, filled, stations

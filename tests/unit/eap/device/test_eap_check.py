@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from eap.device.eap_read import read_back
-from eap.device.fault import DeviceFault, FaultCode
-from eap.od.profiles.eap1000keys import AddressMode, Frame, Rx, RxFlag, Tx, Var
+from eap.device.eap_records import read_back
+from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, RxFlag, Tx, Var
+from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import CounterSource, HostSource, LinkSpec, Measure, VariableSpec, Writer
 from tests.support.downloads import frame, mapping, receiver, rx_pd, sender, tx_pd, variable, write
 from tests.support.stations import BLANK, empty, filled

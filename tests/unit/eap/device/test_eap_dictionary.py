@@ -5,12 +5,12 @@ import struct
 import pytest
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.fault import DeviceFault, FaultCode
 from eap.device.stored import configuration
 from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000keys import AddressMode, Frame, Rx, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, Tx, Var
+from eap.pd.device import DeviceFault, FaultCode
 from tests.support.downloads import (
     OP,
     PREOP,

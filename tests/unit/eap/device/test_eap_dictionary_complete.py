@@ -8,7 +8,7 @@ import pytest
 
 from eap.device.stored import configuration
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.profiles.eap1000keys import AddressMode, Frame, Var
+from eap.od.profiles.eap1000 import AddressMode, Frame, Var
 from tests.support.downloads import (
     OP,
     PREOP,

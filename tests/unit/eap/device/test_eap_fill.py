@@ -6,10 +6,9 @@ from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
-from eap.device.fault import DeviceFault, FaultCode
 from eap.device.stored import configuration
-from eap.od.profiles.eap1000 import RX_PD, RX_VARIABLE, TX_FRAME, TX_PD, TX_VARIABLE
-from eap.od.profiles.eap1000keys import Tx, Var
+from eap.od.profiles.eap1000 import RX_PD, RX_VARIABLE, TX_FRAME, TX_PD, TX_VARIABLE, Tx, Var
+from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import (
     PortKind,
     PortSpec,

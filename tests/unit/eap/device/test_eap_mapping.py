@@ -5,21 +5,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.codec import datatypes, pdo
-from eap.device.eap_content import EapContent
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_mapping import (
     Mapped,
     check_mapped,
-    data_budget,
     encode_mapping,
-    frame_budget,
     mapped_bits,
     place,
 )
-from eap.ids import InterfaceUri
+from eap.device.eap_objects import EapObjects
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access
-from eap.od.profiles.eap1000keys import AddressMode
 from tests.support.downloads import variable, write
 from tests.support.stations import BLANK, TYPES
 
@@ -87,7 +83,7 @@ def test_a_received_variable_is_sent_on_but_a_sent_one_is_not_received(udp):
         check_mapped(udp, 0x6000_0110, Access.RX_MAPPABLE, 0x1600, 1)
 
 
-def test_a_mapping_that_no_longer_holds_counts_what_is_left(udp: EapContent):
+def test_a_mapping_that_no_longer_holds_counts_what_is_left(udp: EapObjects):
     variable(udp, 0x6000, "level")
     write(udp, 0x1A00, 1, 0x6000_0110)
     write(udp, 0x1A00, 0, 1)
@@ -96,14 +92,3 @@ def test_a_mapping_that_no_longer_holds_counts_what_is_left(udp: EapContent):
     with pytest.raises(SdoAbortError) as caught:
         place(udp, 0x1A00, 1, 100)
     assert caught.value.code == AbortCode.NO_OBJECT
-
-
-def test_budgets_are_those_of_the_way():
-    assert frame_budget("udp", AddressMode.IP) == 1472
-    assert frame_budget("udp", AddressMode.TCP) == 2049
-    assert frame_budget("udp", AddressMode.REQUESTER) == 1472
-    assert frame_budget("ethernet", AddressMode.MAC) == 1500
-    assert frame_budget("tcp", AddressMode.TCP) == 2049
-    assert frame_budget("loop", AddressMode.MAC) == 2049
-    assert data_budget(InterfaceUri.parse("ethernet://eth0")) == 1478
-    assert data_budget(InterfaceUri.parse("tcp://127.0.0.1")) == 2027

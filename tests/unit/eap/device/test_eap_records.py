@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given, settings
 from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_records import PortReader
-from eap.device.fault import DeviceFault, FaultCode
+from eap.device.eap_records import PortReader, read_back
 from eap.od.abort import SdoAbortError
-from eap.od.profiles.eap1000keys import AddressMode, Frame, Port, Rx, RxFlag, Tx
-from eap.pd.spec import OnChangeSpec, PortKind, PortSpec, TriggerSpec
+from eap.od.profiles.eap1000 import AddressMode, Configured, Frame, Port, Rx, RxFlag, Tx, Var
+from eap.pd.device import DeviceFault, FaultCode
+from eap.pd.spec import (
+    OnChangeSpec,
+    PortKind,
+    PortSpec,
+    RxAlternateSpec,
+    RxPdSpec,
+    StationSpec,
+    TakenVariableSpec,
+    TriggerSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
 from tests.support.downloads import (
     frame,
     mapping,
@@ -21,7 +35,7 @@ from tests.support.downloads import (
     variable,
     write,
 )
-from tests.support.stations import BLANK
+from tests.support.stations import BLANK, empty, filled, stations
 
 
 def _fault(dictionary: EapDictionary) -> tuple[FaultCode, int, int]:
@@ -86,7 +100,7 @@ def test_each_fault_names_its_object(udp, writes, fault):
         for interface, modes in {
             "udp://10.0.0.1": {AddressMode.IP, AddressMode.TCP, AddressMode.REQUESTER},
             "tcp://10.0.0.1": {AddressMode.TCP, AddressMode.REQUESTER},
-            "ethernet://eth0": {AddressMode.MAC, AddressMode.NETID, AddressMode.REQUESTER},
+            "ethernet://eth0": {AddressMode.MAC, AddressMode.NET_ID, AddressMode.REQUESTER},
             "loop://line": {AddressMode.MAC, AddressMode.REQUESTER},
         }.items()
         for mode in AddressMode
@@ -97,14 +111,14 @@ def test_a_port_addresses_as_its_interface_can(interface, mode, is_way):
     write(dictionary, 0x8000, Frame.ADDRESS_MODE, mode)
     write(dictionary, 0x8000, Frame.DESTINATION_NETID, bytes(range(1, 7)))
     if is_way:
-        ((_, read),) = PortReader(dictionary).frames()
+        (read,) = (found.record for found in PortReader(dictionary).frames())
         assert (
             read.destination
             == {
                 AddressMode.IP: "10.0.0.2",
                 AddressMode.TCP: "tcp://10.0.0.2",
                 AddressMode.MAC: "01:01:05:04:00:00",
-                AddressMode.NETID: "1.2.3.4.5.6",
+                AddressMode.NET_ID: "1.2.3.4.5.6",
                 AddressMode.REQUESTER: "requester",
             }[mode]
         )
@@ -157,8 +171,8 @@ def test_what_is_not_enabled_is_left_out(udp):
     write(udp, 0x8001, Frame.NAME, "later")
     write(udp, 0xE000, Rx.FLAGS, 0)
     reader = PortReader(udp)
-    assert [index for index, _ in reader.frames()] == [0x8000]
-    assert [index for index, _, _ in reader.sent] == [0xD000]
+    assert [found.at for found in reader.frames()] == [0x8000]
+    assert [found.at for found in reader.sent] == [0xD000]
     assert list(reader.subscriptions()) == []
 
 
@@ -169,7 +183,7 @@ def test_any_publisher_is_a_flag_or_no_netid(udp):
     for publisher, flags in ((bytes(6), 0), (b"\1\2\3\4\5\6", 0), (b"\1\2\3\4\5\6", 1)):
         write(udp, 0xE000, Rx.PUBLISHER, publisher)
         write(udp, 0xE000, Rx.FLAGS, RxFlag.ENABLED | flags)
-        read += [pd.publisher for _, pd in PortReader(udp).subscriptions()]
+        read += [found.record.publisher for found in PortReader(udp).subscriptions()]
     assert read == ["", "1.2.3.4.5.6", ""]
 
 
@@ -178,11 +192,11 @@ def test_writing_another_publisher_empties_the_source(udp):
     rx_pd(udp, 0xE000, 0x1600, 1)
     write(udp, 0xE000, Rx.PUBLISHER, b"\1\2\3\4\5\6")
     write(udp, 0xE000, Rx.SOURCE, "10.0.0.7")
-    read = [next(PortReader(udp).subscriptions())[1].source]
+    read = [next(PortReader(udp).subscriptions()).record.source]
     write(udp, 0xE000, Rx.PUBLISHER, b"\1\2\3\4\5\6")
-    read.append(next(PortReader(udp).subscriptions())[1].source)
+    read.append(next(PortReader(udp).subscriptions()).record.source)
     write(udp, 0xE000, Rx.PUBLISHER, b"\1\2\3\4\5\7")
-    read.append(next(PortReader(udp).subscriptions())[1].source)
+    read.append(next(PortReader(udp).subscriptions()).record.source)
     assert read == ["10.0.0.7", "10.0.0.7", ""]
 
 
@@ -201,14 +215,14 @@ def test_times_of_on_change_switch_it_on(udp):
         (Tx.ON_CHANGE, OnChangeSpec()),
     ):
         write(udp, 0xD000, subindex, 1)
-        ((_, read),) = PortReader(udp).frames()
+        (read,) = (found.record for found in PortReader(udp).frames())
         assert read.pds[0].trigger == TriggerSpec(on_change=spec)
         write(udp, 0xD000, subindex, 0)
 
 
 def test_a_net_id_may_come_with_its_mac_address():
     dictionary = _on("ethernet://eth0")
-    write(dictionary, 0x8000, Frame.ADDRESS_MODE, AddressMode.NETID)
+    write(dictionary, 0x8000, Frame.ADDRESS_MODE, AddressMode.NET_ID)
     assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, Frame.DESTINATION_NETID)
     write(dictionary, 0x8000, Frame.DESTINATION_NETID, b"\5\5\5\5\2\1")
     for octets, mac in (
@@ -217,7 +231,7 @@ def test_a_net_id_may_come_with_its_mac_address():
         (b"\x01\0\0\0\0\x09", ""),
     ):
         write(dictionary, 0x8000, Frame.DESTINATION_MAC, octets)
-        ((_, read),) = PortReader(dictionary).frames()
+        (read,) = (found.record for found in PortReader(dictionary).frames())
         assert (read.destination, read.mac) == ("5.5.5.5.2.1", mac)
 
 
@@ -226,5 +240,115 @@ def test_subscribers_are_monitored_as_the_object_says():
     write(dictionary, 0x8000, Frame.ADDRESS_MODE, AddressMode.MAC)
     write(dictionary, 0x8000, Frame.MONITORING_INTERVAL, 2500)
     write(dictionary, 0x8000, Frame.MONITOR_IP, b"\x0a\0\0\x09")
-    ((_, read),) = PortReader(dictionary).frames()
+    (read,) = (found.record for found in PortReader(dictionary).frames())
     assert (read.monitor_interval_ms, read.monitor_ip) == (2500, "10.0.0.9")
+
+
+@settings(max_examples=30)
+@given(stations())
+def test_what_was_filled_from_a_station_reads_back_as_that_station(station: StationSpec):
+    assert read_back(station, filled(station)) == station
+
+
+@settings(max_examples=30)
+@given(stations())
+def test_what_was_filled_reads_back_alike_into_a_blank_station(station: StationSpec):
+    bare = replace(station, variables=(), frames=(), subscriptions=(), sources=(), links=())
+    spec = read_back(bare, filled(station))
+    assert sorted(each.name for each in spec.variables) == sorted(
+        each.name for each in station.variables
+    )
+    assert {each.name: each for each in spec.frames} == {e.name: e for e in station.frames}
+    again = filled(replace(spec, sources=station.sources, links=station.links))
+    assert read_back(bare, again) == spec
+
+
+def test_alternates_stay_with_what_is_laid_out_as_before():
+    alternates = (RxAlternateSpec(7, (TakenVariableSpec("limit", "UINT"),)),)
+    ports = empty()
+    receiver(ports["eap0"])
+    spec = read_back(BLANK, ports)
+    tolerant = replace(spec, subscriptions=(replace(spec.subscriptions[0], alternates=alternates),))
+    assert read_back(tolerant, ports) == tolerant
+    assert read_back(tolerant, filled(tolerant)) == tolerant
+    write(ports["eap0"], 0xE000, Rx.TIME_OUT, 50)
+    assert read_back(tolerant, ports).subscriptions[0].alternates == alternates
+    write(ports["eap0"], 0xE000, Rx.VERSION, 7)
+    assert read_back(tolerant, ports).subscriptions[0].alternates == ()
+
+
+def test_a_blank_station_is_a_whole_one(udp):
+    assert read_back(BLANK, empty()) == BLANK
+    assert read_back(BLANK, {}) == BLANK
+
+
+def test_downloads_make_a_station():
+    ports = empty()
+    sender(ports["eap0"])
+    receiver(ports["eap0"])
+    assert read_back(BLANK, ports) == replace(
+        BLANK,
+        variables=(VariableSpec("level", "UINT"), VariableSpec("limit", "UINT", Writer.ENGINE)),
+        frames=(TxFrameSpec("frame0", "eap0", "10.0.0.2", (TxPdSpec("txpd0", 1, ("level",)),)),),
+        subscriptions=(RxPdSpec("rxpd0", "eap0", 1, ("limit",)),),
+    )
+
+
+def test_what_stood_in_the_station_keeps_its_place_and_new_things_come_behind():
+    before = replace(BLANK, variables=(VariableSpec("zebra", "UINT"), VariableSpec("ape", "UINT")))
+    ports = filled(before)
+    variable(ports["eap0"], 0x6002, "cat")
+    variable(ports["eap1"], 0x6000, "ant")
+    names = [each.name for each in read_back(before, ports).variables]
+    assert names == ["zebra", "ape", "cat", "ant"]
+
+
+def test_a_variable_of_two_ports_is_one_if_both_say_the_same():
+    ports = empty()
+    for each in ports.values():
+        variable(each, 0x6000, "shared", "REAL")
+    assert read_back(BLANK, ports).variables == (VariableSpec("shared", "REAL"),)
+    write(ports["eap1"], 0x6000, Var.UNIT, "degC")
+    with pytest.raises(DeviceFault) as caught:
+        read_back(BLANK, ports)
+    assert caught.value.code == FaultCode.NAME_TWICE
+    assert (caught.value.port, caught.value.index) == ("eap1", 0x6000)
+
+
+def test_a_name_is_given_once_in_a_port():
+    ports = empty()
+    variable(ports["eap0"], 0x6000, "same")
+    variable(ports["eap0"], 0x7000, "same")
+    with pytest.raises(DeviceFault) as caught:
+        read_back(BLANK, ports)
+    assert (caught.value.code, caught.value.index) == (FaultCode.NAME_TWICE, 0x7000)
+
+
+def test_variables_of_a_bus_stay_and_are_described_as_they_are():
+    state = VariableSpec("bus0.state", "BYTE", Writer.ENGINE)
+    bus = PortSpec("bus0", PortKind.BUS, "sim:///b.yaml", "127.0.9.1.4.1")
+    station = replace(BLANK, ports=(*BLANK.ports, bus), variables=(state,))
+    ports = empty(station)
+    assert read_back(station, ports).variables == (state,)
+    variable(ports["eap0"], 0x6000, "bus0.state", "BYTE")
+    with pytest.raises(DeviceFault, match=r"bus0.state exists in the station, and differs"):
+        read_back(station, ports)
+    write(ports["eap0"], 0x6000, Var.WRITER, 1)
+    assert read_back(station, ports).variables == (state,)
+
+
+def test_cycle_and_phase_are_those_of_all_ports():
+    ports = empty()
+    for each in ports.values():
+        write(each, 0xF800, Configured.DEVICE_CYCLE_TIME, 2000)
+        write(each, 0xF800, Configured.PHASE, 1999)
+    spec = read_back(BLANK, ports)
+    assert (spec.cycle_us, spec.phase_us) == (2000, 1999)
+    write(ports["eap1"], 0xF800, Configured.PHASE, 7)
+    with pytest.raises(DeviceFault, match="on another port") as caught:
+        read_back(BLANK, ports)
+    assert (caught.value.code, caught.value.port) == (FaultCode.CYCLE_TIME, "eap1")
+    write(ports["eap0"], 0xF800, Configured.PHASE, 2000)
+    with pytest.raises(DeviceFault, match="not within the cycle") as caught:
+        read_back(BLANK, ports)
+    assert caught.value.subindex == Configured.PHASE

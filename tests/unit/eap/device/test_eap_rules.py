@@ -5,9 +5,9 @@ import struct
 import pytest
 
 from eap.codec import datatypes
-from eap.device.eap_rules import check_name, checked, is_group
+from eap.device.eap_rules import checked
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
+from eap.od.profiles.eap1000 import Frame, Rx, Tx, Var
 
 
 def _checked(dictionary, row, subindex, data):
@@ -81,14 +81,7 @@ def test_a_default_is_a_finite_number_and_nothing_beside_its_bits(udp):
             default(text, data)
 
 
-def test_control_variables_are_the_appliances_own():
-    for name in ("state.VarCtrl", "frame.FrameCtrl"):
+def test_control_variables_are_the_appliances_own(udp):
+    for name in (b"state.VarCtrl", b"frame.FrameCtrl"):
         with pytest.raises(ValueError, match="made by the appliance"):
-            check_name(name)
-
-
-def test_groups_are_told_by_the_kind_of_interface():
-    assert is_group("239.1.1.1", ethernet=False)
-    assert not is_group("239.1.1.1", ethernet=True)
-    assert is_group("01:01:05:04:00:00", ethernet=True)
-    assert not is_group("239.1.1.1", ethernet=None)
+            _checked(udp, profile.TX_VARIABLE, Var.NAME, name)

@@ -8,14 +8,13 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from eap.device.difference import compare
-from eap.device.eap_read import read_back
+from eap.device.eap_records import read_back
 from eap.device.eap_state import EapStateMachine
-from eap.device.fault import DeviceFault, FaultCode
 from eap.device.stored import configuration, dump, load
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000keys import Frame, Rx, Tx, Var
-from eap.pd.device import DeviceState
+from eap.od.profiles.eap1000 import Frame, Rx, Tx, Var
+from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import StationSpec
 from tests.support.downloads import PREOP, receiver, sender, write
 from tests.support.stations import BLANK, empty, filled

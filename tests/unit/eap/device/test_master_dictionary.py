@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.master_dictionary import MasterDictionary
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, object_list

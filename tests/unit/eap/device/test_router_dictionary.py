@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.od import info

@@ -15,7 +15,7 @@ from eap.device.stored import (
 )
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000keys import Frame, Tx, Var
+from eap.od.profiles.eap1000 import Frame, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import OP, copy, receiver, sender, variable, write
 from tests.support.stations import BLANK, empty, filled, stations

@@ -11,7 +11,7 @@ from eap.appliance.plantfile import load_plant
 from eap.config.blank import blank
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
-from eap.device.eap_read import read_back
+from eap.device.eap_records import read_back
 from eap.errors import ControlError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, Entry, OdState, record

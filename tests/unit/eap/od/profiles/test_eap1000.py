@@ -7,8 +7,10 @@ import pytest
 from eap.codec import datatypes
 from eap.od.model import Access, ObjectCode
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import Derived, Live
+from eap.od.profiles.eap1000 import Derived, Live
 from eap.od.profiles.table import CONFIG, OWN_TYPE, UNITS
+from eap.pd.device import DeviceState
+from eap.pd.spec import Substitute, Wake, Writer
 
 ENTRIES = [(row, entry) for row in profile.ALL for entry in row.entries]
 
@@ -80,3 +82,55 @@ def test_what_the_profile_says_of_process_data_is_where_it_says():
 
 def test_device_type_is_profile_and_module_profile():
     assert profile.row_of(0x1000).row(0).default == 0x03E81389
+
+
+@pytest.mark.parametrize(
+    ("index", "names"),
+    [
+        (0x6000, profile.Var),
+        (0x8000, profile.Frame),
+        (0xD000, profile.Tx),
+        (0xE000, profile.Rx),
+        (0xF100, profile.Status),
+        (0xF800, profile.Configured),
+        (0xF810, profile.Port),
+    ],
+)
+def test_each_name_is_that_of_its_entry_and_none_is_missing(index, names):
+    row = profile.row_of(index)
+    table = {
+        entry.name.removesuffix(" {n}").upper().replace(" ", "_").replace("-", "_"): entry.subindex
+        for entry in row.entries
+    }
+    assert {each.name: each.value for each in names} == table
+
+
+def test_received_variables_have_what_sent_ones_have_but_a_writer():
+    sent, received = profile.TX_VARIABLE, profile.RX_VARIABLE
+    assert [e.name for e in sent.entries if e.subindex != profile.Var.WRITER] == [
+        e.name for e in received.entries
+    ]
+
+
+def test_every_key_is_shown_by_an_entry():
+    entries = [entry for row in profile.ALL for entry in row.entries]
+    assert {entry.live for entry in entries} - {""} == set(Live)
+    assert {entry.derived for entry in entries} - {""} == set(Derived)
+
+
+def test_numbers_stand_for_the_words_of_specifications():
+    assert {each.name for each in profile.WrittenBy} == {each.name for each in Writer}
+    assert {each.name for each in profile.Substituted} == {each.name for each in Substitute}
+    assert {each.name for each in profile.Waking} == {each.name for each in Wake}
+    assert (
+        profile.row_of(0xF100)
+        .row(1)
+        .description.startswith(
+            ", ".join(
+                f"{state.value} {name}" for state, name in zip(DeviceState, _STATES, strict=True)
+            )
+        )
+    )
+
+
+_STATES = ("Init", "PreOp", "SafeOp", "Op")

@@ -41,5 +41,5 @@ def test_everything_live_is_shown():
 
 
 def test_device_type_is_that_of_a_master():
-    (entry,) = profile.IDENTITY[0].entries
+    (entry,) = next(row.entries for row in profile.ALL if row.first == 0x1000)
     assert entry.default == 1100 << 16 | 5001

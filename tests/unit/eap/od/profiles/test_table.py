@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from eap.od.model import RO, RW, ObjectCode
-from eap.od.profiles.eap1000keys import Derived, Live
+from eap.od.profiles.eap1000 import Derived, Live
 from eap.od.profiles.table import CONFIG, EntryRow, ObjectRange, config, derived, fixed, live
 
 PLAIN = ObjectRange(

@@ -17,11 +17,10 @@ from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader
-from eap.device.fault import FaultCode
 from eap.errors import EngineRefusedError
 from eap.ids import NetId
-from eap.od.profiles.eap1000keys import Tx
-from eap.pd.device import DeviceState
+from eap.od.profiles.eap1000 import Tx
+from eap.pd.device import DeviceState, FaultCode
 from eap.pd.words import StationWord
 from tests.support import aoe
 from tests.support.stationengine import make_device

@@ -18,7 +18,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import AmsCommand, AmsHeader
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.pd.device import DeviceState

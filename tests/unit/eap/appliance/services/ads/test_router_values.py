@@ -11,7 +11,7 @@ from eap.aoe.routes import Origin, Route
 from eap.aoe.way import Door, Way
 from eap.appliance.services.ads.router_values import LiveRouter
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.net.image_file import create_image

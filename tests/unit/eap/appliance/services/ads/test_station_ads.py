@@ -14,7 +14,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode, decode_notification
 from eap.codec.ams import AmsCommand
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.ids import NetId
 from eap.pd.inputs import Inputs
 from eap.pd.samples import Sampler

@@ -14,11 +14,11 @@ from eap.appliance.configuration import digest_of
 from eap.appliance.control import ErrorCode
 from eap.appliance.services.device.device_methods import DeviceMethods
 from eap.appliance.store import Store
-from eap.device.eap_content import Identity
+from eap.device.eap_objects import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.errors import ControlError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.profiles.eap1000keys import Frame, Tx
+from eap.od.profiles.eap1000 import Frame, Tx
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from tests.support.routervalues import Values
 from tests.support.stationengine import make_device

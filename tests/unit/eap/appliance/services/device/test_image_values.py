@@ -12,7 +12,7 @@ from eap.device.eap_fill import fill
 from eap.net.image_file import create_image
 from eap.od.model import OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000keys import Live
+from eap.od.profiles.eap1000 import Live
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import (

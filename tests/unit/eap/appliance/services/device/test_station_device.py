@@ -9,12 +9,11 @@ import pytest
 from msgspec.structs import replace
 
 from eap.appliance.store import Store, effective
-from eap.device.fault import FaultCode
 from eap.device.stored import dump
 from eap.errors import EngineGoneError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.profiles.eap1000keys import Tx
-from eap.pd.device import DeviceState
+from eap.od.profiles.eap1000 import Tx
+from eap.pd.device import DeviceState, FaultCode
 from eap.pd.spec import TriggerSpec, TxFrameSpec, TxPdSpec, VariableSpec
 from tests.support.stationengine import make_device
 

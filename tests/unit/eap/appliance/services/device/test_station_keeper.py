@@ -11,9 +11,8 @@ from msgspec.structs import replace
 from eap.appliance.configuration import Configuration, digest_of
 from eap.appliance.services.device.station_keeper import StationKeeper
 from eap.appliance.store import Store, effective, state_root
-from eap.device.fault import DeviceFault, FaultCode
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
-from eap.pd.device import DeviceState
+from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import RxAlternateSpec, StationSpec, TakenVariableSpec
 from tests.support.stationengine import StationEngine
 from tests.unit.eap.appliance.conftest import right

@@ -1,17 +1,17 @@
-"""Objects of a profile's rows."""
+"""Objects made of a profile's rows."""
 
 from __future__ import annotations
 
 from eap.codec import datatypes
-from eap.device.live_objects import make_object, octets_of
 from eap.od.model import RW, ObjectCode
+from eap.od.profiles.maker import live_octets, live_source, make_object
 from eap.od.profiles.master1100 import CONFIGURED_LIST, DIAGNOSIS, Live
 
 
 def test_live_entries_are_asked_for_and_written() -> None:
     written = []
     item = make_object(
-        DIAGNOSIS, 0xA003, lambda key: 7 if key == Live.AL_STATUS else 0,
+        DIAGNOSIS, 0xA003, live_source(lambda key: 7 if key == Live.AL_STATUS else 0),
         write=lambda key, data: written.append((key, data)), extent=17,
     )  # fmt: skip
     assert (item.name, item.code) == ("Diagnosis data slave 3", ObjectCode.RECORD)
@@ -24,14 +24,14 @@ def test_live_entries_are_asked_for_and_written() -> None:
 
 
 def test_lists_are_as_long_as_they_are_said_to_be() -> None:
-    item = make_object(CONFIGURED_LIST, 0xF020, lambda key: 0, count=3)
+    item = make_object(CONFIGURED_LIST, 0xF020, live_source(lambda key: 0), last=3)
     assert list(item.entries) == [0, 1, 2, 3]
     assert item.max_subindex == 3
     assert item.data_type == datatypes.parse("UINT").code
-    assert make_object(CONFIGURED_LIST, 0xF020, lambda key: 0).max_subindex == 0
+    assert make_object(CONFIGURED_LIST, 0xF020, live_source(lambda key: 0)).max_subindex == 0
 
 
 def test_values_beyond_their_type_are_its_largest() -> None:
-    assert octets_of(datatypes.parse("USINT"), 300) == b"\xff"
-    assert octets_of(datatypes.parse("STRING(3)"), "abcd") == b"abc"
-    assert octets_of(datatypes.parse("BLOCK(2)"), b"ab") == b"ab"
+    assert live_octets(datatypes.parse("USINT"), 300) == b"\xff"
+    assert live_octets(datatypes.parse("STRING(3)"), "abcd") == b"abc"
+    assert live_octets(datatypes.parse("BLOCK(2)"), b"ab") == b"ab"
