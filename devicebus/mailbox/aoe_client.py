@@ -6,8 +6,15 @@ back.  Those of an answer are, if the slave wants it.
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from devicebus.errors import MailboxProtocolError, MailboxSizeError
-from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Ask, Conversation, reading
+from devicebus.mailbox.conversation import (
+    RESPONSE_TIMEOUT_NS,
+    Conversation,
+    MailboxRequest,
+    reading,
+)
 from devicebus.mailbox.match import answers, is_aoe_fragment
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.fragment import Assembler, iter_fragments
@@ -36,13 +43,15 @@ def exchange(
     what = f"AoE answer of {header.target}:{header.target_port}"
     packet = encode_packet(header, data)
     if len(packet) <= sizes.to_slave - MailboxHeader.SIZE:
-        ask = Ask(MailboxType.AOE, packet, timeout_ns=timeout_ns)
+        ask = MailboxRequest(MailboxType.AOE, packet, timeout_ns=timeout_ns)
     else:
         yield from _send_fragments(packet, header.invoke_id, sizes)
-        ask = Ask(MailboxType.AOE, packet[: AmsHeader.SIZE], listen=True, timeout_ns=timeout_ns)
+        ask = MailboxRequest(
+            MailboxType.AOE, packet[: AmsHeader.SIZE], listen=True, timeout_ns=timeout_ns
+        )
     whole = (yield ask).data
     if is_aoe_fragment(whole):
-        whole = yield from _gather(what, whole, ask._replace(listen=True))
+        whole = yield from _gather(what, whole, replace(ask, listen=True))
     with reading(what):
         answer, body = decode_packet(whole)
     return answer, bytes(body)
@@ -52,7 +61,7 @@ def send(header: AmsHeader, data: bytes, sizes: MailboxSizes) -> Conversation[No
     """Send a request that wants no answer; raises MailboxSizeError as exchange() does."""
     packet = encode_packet(header, data)
     if len(packet) <= sizes.to_slave - MailboxHeader.SIZE:
-        yield Ask(MailboxType.AOE, packet, expects_reply=False)
+        yield MailboxRequest(MailboxType.AOE, packet, expects_reply=False)
     else:
         yield from _send_fragments(packet, header.invoke_id, sizes)
 
@@ -65,10 +74,10 @@ def _send_fragments(packet: bytes, number: int, sizes: MailboxSizes) -> Conversa
             " fragment of it"
         )
     for fragment in iter_fragments(packet, number, room):
-        yield Ask(MailboxType.AOE, fragment, expects_reply=False)
+        yield MailboxRequest(MailboxType.AOE, fragment, expects_reply=False)
 
 
-def _gather(what: str, first: bytes, more: Ask) -> Conversation[bytes]:
+def _gather(what: str, first: bytes, more: MailboxRequest) -> Conversation[bytes]:
     """Put the answer together that begins with *first*; *more* listens for what follows."""
     assembler = Assembler()
     message = first
@@ -90,7 +99,7 @@ def _gather(what: str, first: bytes, more: Ask) -> Conversation[bytes]:
                 is_begun = False
                 late += 1
             elif acknowledgement is not None:
-                ask = more._replace(request=acknowledgement, listen=False)
+                ask = replace(more, request=acknowledgement, listen=False)
         message = (yield ask).data
         if not is_aoe_fragment(message):
             return message

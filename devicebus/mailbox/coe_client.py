@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from devicebus.errors import MailboxProtocolError
-from devicebus.mailbox.conversation import Ask, Conversation, Progress, reading
+from devicebus.mailbox.conversation import Conversation, MailboxRequest, Progress, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.coe import CoeHeader, CoeService, encode_message
 from eap.codec.mailbox import MailboxType
@@ -149,7 +149,7 @@ class _Sdo:
     def ask(self, body: bytes) -> Conversation[tuple[SdoHeader, bytes]]:
         """Send the first message of a transfer; return the head of the answer and the rest."""
         request = encode_message(CoeService.SDO_REQUEST, body)
-        data = (yield Ask(MailboxType.COE, request)).data
+        data = (yield MailboxRequest(MailboxType.COE, request)).data
         with reading(f"answer to {self}"):
             head = SdoHeader.decode(data, CoeHeader.SIZE)
         if head.specifier == SdoResponse.ABORT:
@@ -159,7 +159,7 @@ class _Sdo:
     def ask_segment(self, body: bytes) -> Conversation[bytes]:
         """Send a segment or ask for one; return the answer behind its CoE header."""
         request = encode_message(CoeService.SDO_REQUEST, body)
-        data = (yield Ask(MailboxType.COE, request)).data
+        data = (yield MailboxRequest(MailboxType.COE, request)).data
         with reading(f"segment of {self}"):
             head = SdoSegmentHeader.decode(data, CoeHeader.SIZE)
             if head.specifier == SdoResponse.ABORT:
@@ -170,5 +170,5 @@ class _Sdo:
     def give_up(self, code: AbortCode, reason: str) -> Conversation[NoReturn]:
         """Abort the transfer and raise."""
         abort = encode_abort(self.index, self.subindex, code)
-        yield Ask(MailboxType.COE, abort, expects_reply=False)
+        yield MailboxRequest(MailboxType.COE, abort, expects_reply=False)
         raise MailboxProtocolError(f"{self}: {reason}")

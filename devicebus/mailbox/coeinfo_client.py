@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from devicebus.errors import MailboxProtocolError
-from devicebus.mailbox.conversation import Ask, Conversation, reading
+from devicebus.mailbox.conversation import Conversation, MailboxRequest, reading
 from devicebus.mailbox.match import INFO_START
 from eap.codec.coe import CoeHeader, CoeService, encode_message
 from eap.codec.mailbox import MailboxType
@@ -95,14 +95,14 @@ def read_pdo(service: CoeService, number: int) -> Conversation[bytes]:
         CoeService.RX_PDO: CoeService.RX_PDO_REMOTE_REQUEST,
     }[service]
     request = encode_message(remote, b"", number=number)
-    message = yield Ask(MailboxType.COE, request)
+    message = yield MailboxRequest(MailboxType.COE, request)
     return message.data[CoeHeader.SIZE :]
 
 
 def write_rx_pdo(number: int, data: bytes) -> Conversation[None]:
     """Send an RxPDO through the mailbox; nothing confirms it."""
     request = encode_message(CoeService.RX_PDO, data, number=number)
-    yield Ask(MailboxType.COE, request, expects_reply=False)
+    yield MailboxRequest(MailboxType.COE, request, expects_reply=False)
 
 
 def _ask(
@@ -120,9 +120,9 @@ def _ask(
     late = 0
     while left != 0:
         if left is None:
-            message = yield Ask(MailboxType.COE, sent)
+            message = yield MailboxRequest(MailboxType.COE, sent)
         else:
-            message = yield Ask(MailboxType.COE, sent[:INFO_START], listen=True)
+            message = yield MailboxRequest(MailboxType.COE, sent[:INFO_START], listen=True)
         with reading(what):
             header = SdoInfoHeader.decode(message.data, CoeHeader.SIZE)
             if header.opcode is SdoInfoOpcode.ERROR:

@@ -1,13 +1,15 @@
-"""A client's side of a mailbox protocol, written as a generator.
+"""Conversation: a client's side of a mailbox protocol, written as a generator.
 
     def read_twice() -> Conversation[bytes]:
-        first = yield Ask(MailboxType.COE, request)
-        more = yield Ask(MailboxType.COE, request, listen=True)  # another message, nothing is sent
+        first = yield MailboxRequest(MailboxType.COE, request)
+        more = yield MailboxRequest(MailboxType.COE, request, listen=True)  # nothing is sent
         return first.data + more.data
 
-The runner sends the request, waits, and resumes the generator with the reply.  It throws
-MailboxTimeoutError into it when none comes, MailboxRefusedError when the slave answers with a
-mailbox error, and closes it to cancel.
+Its driver (:mod:`devicebus.drive`, or a master's mailbox) sends the request, waits, and resumes the
+generator with the reply.  It throws MailboxTimeoutError into it when none comes,
+MailboxRefusedError when the slave answers with a mailbox error, and closes it to cancel.
+
+The records travel as they are, in MessagePack, between the processes that share a master.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
+
+import msgspec
 
 from devicebus.errors import MailboxProtocolError
 from eap.codec.mailbox import MailboxType
@@ -27,33 +31,36 @@ RESPONSE_TIMEOUT_NS = 2_000_000_000
 """How long a slave may take to answer, unless a protocol says otherwise (ESI default)."""
 
 
-class Ask(NamedTuple):
-    """What a conversation wants next; :func:`devicebus.mailbox.match.answers` knows its reply."""
+class MailboxRequest(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """One step of a conversation; :func:`devicebus.mailbox.match.answers` knows its reply."""
 
     type: MailboxType
     request: bytes
-    """What to send behind the mailbox header."""
+    """Message to send, without the mailbox header."""
     listen: bool = False
-    """Whether to send nothing, and only wait for one more message that answers *request*."""
+    """Send nothing; wait for one more message that answers *request*."""
     timeout_ns: int = RESPONSE_TIMEOUT_NS
     delay_ns: int = 0
-    """Wait this long before sending, as after a busy reply."""
+    """Pause before sending, as after a busy reply."""
     expects_reply: bool = True
     """If not, the conversation goes on as soon as this is sent, with a message without data."""
 
 
-class Message(NamedTuple):
+class MailboxMessage(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """A mailbox message without its header."""
 
     type: MailboxType
     data: bytes
     at_ns: int = 0
-    """When it came; 0 where nobody has a clock, and a number of messages is the only limit."""
+    """Time of arrival; 0 where no clock is at hand, and a number of messages is the only limit."""
     counter: int = 0
-    """Of its mailbox header: the slave's own, which says nothing of the request."""
+    """Counter of its mailbox header: the slave's own, which says nothing about the request."""
 
 
-Conversation: TypeAlias = Generator[Ask, Message, T]
+Ask = MailboxRequest
+Message = MailboxMessage
+
+Conversation: TypeAlias = Generator[MailboxRequest, MailboxMessage, T]
 
 
 RATE_WINDOW_NS = 2_000_000_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from devicebus.errors import EoeError
-from devicebus.mailbox.conversation import Ask, Conversation, reading
+from devicebus.mailbox.conversation import Conversation, MailboxRequest, reading
 from eap.codec.eoe import (
     EoeResult,
     EoeType,
@@ -36,7 +36,7 @@ def get_ip(*, port: int = 0) -> Conversation[IpSettings]:
 
 
 def _ask(what: str, request: bytes) -> Conversation[bytes]:
-    message = yield Ask(MailboxType.EOE, request)
+    message = yield MailboxRequest(MailboxType.EOE, request)
     with reading(what):
         _, result, body = decode_message(message.data)
     if result != EoeResult.OK:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msgspec.structs import replace
+
 from devicebus.errors import FoeError, MailboxProtocolError, MailboxSizeError, MailboxTimeoutError
-from devicebus.mailbox.conversation import Ask, Conversation, Progress, reading
+from devicebus.mailbox.conversation import Conversation, MailboxRequest, Progress, reading
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import (
     DATA_OVERHEAD,
@@ -75,7 +77,7 @@ def read(
         progress.done += len(data)
         sent = encode_message(FoeOpcode.ACK, expected)
         if len(data) < room:
-            yield Ask(MailboxType.FOE, sent, expects_reply=False)
+            yield MailboxRequest(MailboxType.FOE, sent, expects_reply=False)
             return progress.done
         expected += 1
 
@@ -156,7 +158,7 @@ class _Transfer:
 
     def ask(self, sent: bytes) -> Conversation[tuple[FoeHeader, bytes]]:
         """Send a message, again while the slave is busy; return header and body of the answer."""
-        ask = Ask(MailboxType.FOE, sent, timeout_ns=STEP_TIMEOUT_NS)
+        ask = MailboxRequest(MailboxType.FOE, sent, timeout_ns=STEP_TIMEOUT_NS)
         since_ns: int | None = None
         times = 0
         while times < BUSY_LIMIT:
@@ -171,13 +173,15 @@ class _Transfer:
             since_ns = message.at_ns if since_ns is None else since_ns
             if message.at_ns - since_ns > BUSY_TIMEOUT_NS:
                 break
-            ask = ask._replace(delay_ns=BUSY_DELAY_NS)
+            ask = replace(ask, delay_ns=BUSY_DELAY_NS)
         yield from self.tell(FoeErrorCode.NOT_DEFINED)
         raise MailboxTimeoutError(f"{self.what}: still busy after {times} answers")
 
     def tell(self, code: FoeErrorCode) -> Conversation[None]:
         """Tell the slave that the transfer is over."""
-        yield Ask(MailboxType.FOE, encode_message(FoeOpcode.ERROR, code), expects_reply=False)
+        yield MailboxRequest(
+            MailboxType.FOE, encode_message(FoeOpcode.ERROR, code), expects_reply=False
+        )
 
     def give_up(self, code: FoeErrorCode, reason: str) -> Conversation[None]:
         """Tell the slave and raise."""

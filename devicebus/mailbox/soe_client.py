@@ -7,7 +7,13 @@ that end in another IDN were late, and are dropped.
 from __future__ import annotations
 
 from devicebus.errors import BusError, MailboxProtocolError, MailboxTimeoutError, SoeError
-from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress, reading
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+    Progress,
+    reading,
+)
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_procedure import CLEAR, START
 from eap.codec.mailbox import MailboxType
@@ -55,7 +61,7 @@ def read(
 
 def _read(
     idn: Idn, elements: int, drive: int, progress: Progress | None, delay_ns: int
-) -> Conversation[tuple[Message, bytes]]:
+) -> Conversation[tuple[MailboxMessage, bytes]]:
     """As read(); return the last message as well."""
     what = f"SoE read of {idn} at drive {drive}"
     progress = progress or Progress()
@@ -66,10 +72,10 @@ def _read(
     late = 0
     while True:
         if left is None and not late:
-            message = yield Ask(MailboxType.SOE, request, delay_ns=delay_ns)
+            message = yield MailboxRequest(MailboxType.SOE, request, delay_ns=delay_ns)
         else:
             named = request if left is None else request[:_NAMELESS]
-            message = yield Ask(MailboxType.SOE, named, listen=True)
+            message = yield MailboxRequest(MailboxType.SOE, named, listen=True)
         with reading(what):
             header, body = decode_message(message.data)
         is_foreign = not header.incomplete and header.idn != number
@@ -117,9 +123,9 @@ def write(
     header = SoeHeader(SoeOpcode.WRITE_REQUEST, 0, 0, drive, elements, idn.number)
     *fragments, last = encode_fragments(header, data, room)
     for fragment in fragments:
-        yield Ask(MailboxType.SOE, fragment, expects_reply=False)
+        yield MailboxRequest(MailboxType.SOE, fragment, expects_reply=False)
         progress.done += room
-    message = yield Ask(MailboxType.SOE, last)
+    message = yield MailboxRequest(MailboxType.SOE, last)
     with reading(what):
         answer, body = decode_message(message.data)
     if answer.error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Ask, Conversation
+from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Conversation, MailboxRequest
 from eap.codec.mailbox import MailboxType
 from eap.codec.voe import VoeHeader
 
@@ -12,11 +12,11 @@ def exchange(
 ) -> Conversation[bytes]:
     """Send data to a slave; return the data of its answer of the same vendor and type."""
     head = VoeHeader(vendor_id, vendor_type).encode()
-    message = yield Ask(MailboxType.VOE, head + data, timeout_ns=timeout_ns)
+    message = yield MailboxRequest(MailboxType.VOE, head + data, timeout_ns=timeout_ns)
     return message.data[VoeHeader.SIZE :]
 
 
 def send(vendor_id: int, vendor_type: int, data: bytes) -> Conversation[None]:
     """Send data to a slave that does not answer."""
     head = VoeHeader(vendor_id, vendor_type).encode()
-    yield Ask(MailboxType.VOE, head + data, expects_reply=False)
+    yield MailboxRequest(MailboxType.VOE, head + data, expects_reply=False)

@@ -10,7 +10,7 @@ slaves are in use that take one for a request which they never finish, and are d
 from __future__ import annotations
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.mailbox.conversation import Conversation, MailboxRequest
 from devicebus.master.bring import bring, wait_for
 from devicebus.master.bus import Bus, Unit
 from devicebus.master.mailboxes import Mailbox
@@ -81,12 +81,12 @@ def _greet(protocols: SiiProtocol, state: AlState | None) -> Conversation[None]:
     if protocols & SiiProtocol.COE and state is not AlState.BOOT:
         body = encode_plain(SdoRequest.UPLOAD, _DEVICE_TYPE, 0)
         request = encode_message(CoeService.SDO_REQUEST, body)
-        yield Ask(MailboxType.COE, request, expects_reply=False)
+        yield MailboxRequest(MailboxType.COE, request, expects_reply=False)
     elif protocols & SiiProtocol.FOE:
         over = foe.encode_message(foe.FoeOpcode.ERROR, foe.FoeErrorCode.NOT_DEFINED)
-        yield Ask(MailboxType.FOE, over, expects_reply=False)
+        yield MailboxRequest(MailboxType.FOE, over, expects_reply=False)
     elif protocols & SiiProtocol.SOE:
         note = soe.encode_message(soe.SoeOpcode.NOTIFICATION, 0)
-        yield Ask(MailboxType.SOE, note, expects_reply=False)
+        yield MailboxRequest(MailboxType.SOE, note, expects_reply=False)
     else:
-        yield Ask(MailboxType.VOE, VoeHeader(0, 0).encode(), expects_reply=False)
+        yield MailboxRequest(MailboxType.VOE, VoeHeader(0, 0).encode(), expects_reply=False)

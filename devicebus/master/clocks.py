@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 
 from devicebus.errors import WorkingCounterError
-from devicebus.master.access import Access, bwr, fprd, frmw
+from devicebus.master.access import DatagramRequest, bwr, fprd, frmw
 from devicebus.master.procedure import Procedure, read, write
 from devicebus.master.scan import FoundSlave
 from devicebus.master.topology import Joint
@@ -118,7 +118,7 @@ def find_delays(joints: Mapping[int, Joint], latched: Mapping[int, Latched]) -> 
     return delays
 
 
-def drift_access(reference: int) -> Access:
+def drift_access(reference: int) -> DatagramRequest:
     """Return the datagram that hands the reference's time to all; one belongs in every cycle."""
     return frmw(reference, Register.DC_SYSTEM_TIME, 8)
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import Access, Reply, logical
+from devicebus.master.access import DatagramReply, DatagramRequest, logical
 from devicebus.master.image import BusImage
 from devicebus.master.layout import Group, Place
 from devicebus.master.link import Exchange, Link
@@ -82,9 +82,9 @@ class Cycle:
         self._link = link
         self._image = image
         self._trouble = trouble
-        self.extra: Sequence[Access] = ()
+        self.extra: Sequence[DatagramRequest] = ()
         """More datagrams of each cycle; their replies go to *take_extra*."""
-        self.take_extra: Callable[[Sequence[Reply]], None] = lambda replies: None
+        self.take_extra: Callable[[Sequence[DatagramReply]], None] = lambda replies: None
         self._presence = dict.fromkeys(image.layout.places, Presence.AWAY)
         self._parts = tuple(
             part
@@ -140,7 +140,7 @@ class Cycle:
         self.is_good = False
         allowed = self._allowed
 
-        def done(outcome: list[Reply] | FrameLostError, done_ns: int) -> None:
+        def done(outcome: list[DatagramReply] | FrameLostError, done_ns: int) -> None:
             if isinstance(outcome, FrameLostError):
                 self._lost += 1
                 return
@@ -169,7 +169,7 @@ class Cycle:
             max_trip_ns=self._max_trip_ns,
         )
 
-    def _access(self, part: _Part) -> Access:
+    def _access(self, part: _Part) -> DatagramRequest:
         group = self._image.layout.groups[part.group]
         data = b""
         if part.command is not Command.LRD:
@@ -178,7 +178,7 @@ class Cycle:
             data += bytes(group.inputs_size)
         return logical(part.command, part.address, data)
 
-    def _take(self, replies: list[Reply], allowed: tuple[int, ...], now_ns: int) -> None:
+    def _take(self, replies: list[DatagramReply], allowed: tuple[int, ...], now_ns: int) -> None:
         is_good = True
         for part, reply, counts in zip(self._parts, replies, allowed, strict=False):
             if counts >> reply.wkc & 1:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import msgspec
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import Reply, fprd, fpwr
+from devicebus.master.access import DatagramReply, fprd, fpwr
 from devicebus.master.procedure import Procedure
 from devicebus.master.topology import find_joints
 from devicebus.wire.alstatus import ERROR, name_of, state_name
@@ -105,7 +105,7 @@ def clear_counters(stations: Sequence[int]) -> Procedure[None]:
         yield [fpwr(at, Register.RX_ERROR, bytes(COUNTERS)) for at in part]
 
 
-def _read(stations: Sequence[int]) -> Procedure[list[tuple[int, list[Reply]]]]:
+def _read(stations: Sequence[int]) -> Procedure[list[tuple[int, list[DatagramReply]]]]:
     found = []
     for station in stations:
         replies, _ = yield [
@@ -117,7 +117,7 @@ def _read(stations: Sequence[int]) -> Procedure[list[tuple[int, list[Reply]]]]:
     return found
 
 
-def _slave(station: int, replies: Sequence[Reply]) -> tuple[SlaveDiagnosis, DlStatus]:
+def _slave(station: int, replies: Sequence[DatagramReply]) -> tuple[SlaveDiagnosis, DlStatus]:
     al, dl, counters = replies
     if not (al.wkc and dl.wkc and counters.wkc):
         return SlaveDiagnosis(station, answers=False), DlStatus()

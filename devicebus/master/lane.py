@@ -12,7 +12,7 @@ from collections.abc import Hashable, Iterator
 from typing import Any
 
 from devicebus.errors import MailboxClosedError
-from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.mailbox.conversation import Conversation, MailboxRequest
 from devicebus.master.late import ReplyJudge
 from devicebus.master.task import Task
 from eap.codec.mailbox import MailboxType
@@ -29,7 +29,7 @@ class Job:
     __slots__ = ("ask", "conversation", "ready_ns", "requester", "task")
 
     def __init__(
-        self, conversation: Conversation[Any], ask: Ask, name: str, requester: Hashable
+        self, conversation: Conversation[Any], ask: MailboxRequest, name: str, requester: Hashable
     ) -> None:
         self.conversation = conversation
         self.ask = ask

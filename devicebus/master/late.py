@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.mailbox.match import answers, has_more, is_aoe_fragment
 from eap.codec.ams import AmsHeader, StateFlags
 from eap.codec.coe import CoeHeader, CoeService
@@ -39,7 +39,7 @@ class ReplyJudge:
         self._has_more = False
         self._tag = 0
         self._echoes = False
-        self._expired: list[Ask] = []
+        self._expired: list[MailboxRequest] = []
         self._suspected = False
 
     def next_address(self) -> int:
@@ -50,7 +50,7 @@ class ReplyJudge:
             self._tag = _TAG | (self._tag + 1 & _TAGS)
         return self._tag
 
-    def expire(self, ask: Ask) -> None:
+    def expire(self, ask: MailboxRequest) -> None:
         """The request that waited has timed out: its reply may still come."""
         if not self._suspected:
             self._expired.append(ask)
@@ -69,7 +69,7 @@ class ReplyJudge:
         self._has_more = has_more(self._kind, data)
         return True
 
-    def take_kept(self, ask: Ask) -> bytes | None:
+    def take_kept(self, ask: MailboxRequest) -> bytes | None:
         """Return the fragment that *ask* listens for, if it was kept."""
         while self._kept:
             data = self._kept.popleft()
@@ -77,7 +77,7 @@ class ReplyJudge:
                 return data
         return None
 
-    def answers(self, header: MailboxHeader, data: bytes, ask: Ask) -> bool:
+    def answers(self, header: MailboxHeader, data: bytes, ask: MailboxRequest) -> bool:
         """Whether a message is the reply that *ask* waits for."""
         if header.type == MailboxType.ERR or _fits(header, data, ask):
             return not self._is_late(header, data)
@@ -105,7 +105,7 @@ class ReplyJudge:
         return False
 
 
-def _fits(header: MailboxHeader, data: bytes, ask: Ask) -> bool:
+def _fits(header: MailboxHeader, data: bytes, ask: MailboxRequest) -> bool:
     return header.type == ask.type and answers(ask.type, ask.request, data)
 
 

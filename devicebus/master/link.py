@@ -23,7 +23,7 @@ from typing import TypeAlias
 import msgspec
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import Access, Reply
+from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.roundtrip import CEILING_NS, RoundTrip
 from devicebus.wire.datagram import OVERHEAD, Command, DatagramHeader
 from eap.codec.ethercat import EtherCatHeader, FrameType
@@ -47,7 +47,7 @@ MAX_RIDE = 256
 MAX_ACYCLIC_FRAMES = 8
 """Acyclic frames under way at once; more would only wait in somebody's buffer."""
 
-Done: TypeAlias = Callable[[list[Reply] | FrameLostError, int], None]
+Done: TypeAlias = Callable[[list[DatagramReply] | FrameLostError, int], None]
 
 _LAYOUT = DatagramHeader.LAYOUT
 _TYPE_WORD = FrameType.DATAGRAM << 12
@@ -96,7 +96,7 @@ class Exchange:
         self.done = done
         self.is_cyclic = is_cyclic
         self.missing = count
-        self.replies: list[Reply] = [Reply(b"", 0)] * count
+        self.replies: list[DatagramReply] = [DatagramReply(b"", 0)] * count
         self.cancelled = False
         self.is_overdue = False
 
@@ -116,7 +116,9 @@ class _Item:
 
     __slots__ = ("access", "exchange", "is_answered", "limit", "number", "tries")
 
-    def __init__(self, access: Access, exchange: Exchange, number: int, limit: int) -> None:
+    def __init__(
+        self, access: DatagramRequest, exchange: Exchange, number: int, limit: int
+    ) -> None:
         self.access = access
         self.exchange = exchange
         self.number = number
@@ -171,7 +173,9 @@ class Link:
         self._sent = self._received = self._late = self._lost = self._retried = 0
         self._unexpected = self._malformed = 0
 
-    def submit(self, accesses: Sequence[Access], done: Done, *, cyclic: bool = False) -> Exchange:
+    def submit(
+        self, accesses: Sequence[DatagramRequest], done: Done, *, cyclic: bool = False
+    ) -> Exchange:
         """Queue accesses; *done* is called once with all replies, or with what went wrong.
 
         They go out in order, as many as fit in one frame.  Acyclic ones are sent again when their
@@ -239,7 +243,7 @@ class Link:
                 continue
             item.is_answered = True
             exchange = item.exchange
-            exchange.replies[item.number] = Reply(reply, wkc, item.tries)
+            exchange.replies[item.number] = DatagramReply(reply, wkc, item.tries)
             exchange.missing -= 1
             if not exchange.missing:
                 exchange.done(exchange.replies, now_ns)
@@ -371,9 +375,14 @@ def _encode(items: list[_Item], index: int) -> bytes:
     length = 0
     last = len(items) - 1
     for number, item in enumerate(items):
-        command, adp, ado, data, _ = item.access
+        access = item.access
+        data = access.data
         word = len(data) | (_MORE if number < last else 0)
-        parts += (_LAYOUT.pack(command, index, adp, ado, word, 0), data, b"\0\0")
+        parts += (
+            _LAYOUT.pack(access.command, index, access.adp, access.ado, word, 0),
+            data,
+            b"\0\0",
+        )
         length += OVERHEAD + len(data)
     parts[0] = (length | _TYPE_WORD).to_bytes(2, "little")
     return b"".join(parts)
@@ -387,13 +396,14 @@ def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, in
     if len(data) < need or data[1] >> 4 != FrameType.DATAGRAM:
         return None
     for item in items:
-        command, adp, ado, sent, _ = item.access
+        access = item.access
+        command, size = access.command, len(access.data)
         there = _LAYOUT.unpack_from(data, offset)
-        same = (command, index, ado, len(sent)) == (*there[:2], there[3], there[4] & _LENGTH)
-        if not same or (command in _FIXED_ADP and adp != there[2]):
+        same = (command, index, access.ado, size) == (*there[:2], there[3], there[4] & _LENGTH)
+        if not same or (command in _FIXED_ADP and access.adp != there[2]):
             return None
         start = offset + DatagramHeader.SIZE
-        offset = start + len(sent)
+        offset = start + size
         wkc = data[offset] | data[offset + 1] << 8
         results.append((bytes(data[start:offset]), wkc))
         offset += 2
@@ -401,10 +411,11 @@ def _match(data: Buffer, index: int, items: list[_Item]) -> list[tuple[bytes, in
 
 
 def _lost(item: _Item) -> FrameLostError:
-    command, adp, ado, _, _ = item.access
+    access = item.access
     # A frame to one slave that is lost says nothing about the others; a broadcast goes to any.
-    advice = "; check the cable to the first slave and its power" if command in _BROADCAST else ""
+    is_broadcast = access.command in _BROADCAST
+    advice = "; check the cable to the first slave and its power" if is_broadcast else ""
     return FrameLostError(
-        f"{command.name} 0x{adp:04X}:0x{ado:04X}: no frame came back, sent {item.tries} times"
-        f"{advice}"
+        f"{access.command.name} 0x{access.adp:04X}:0x{access.ado:04X}: no frame came back, sent"
+        f" {item.tries} times{advice}"
     )

@@ -10,6 +10,8 @@ from collections.abc import Callable, Hashable
 from contextlib import suppress
 from typing import NamedTuple, TypeAlias, TypeVar
 
+from msgspec.structs import replace
+
 from devicebus.errors import (
     BusError,
     FrameLostError,
@@ -19,7 +21,7 @@ from devicebus.errors import (
     MailboxSizeError,
     MailboxTimeoutError,
 )
-from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.counter import CounterWatch, next_counter
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.lane import Job, Lanes
@@ -136,7 +138,7 @@ class Mailbox:
             repeats=self._port.repeats, duplicates=self._watch.repeated, gaps=self._watch.gaps
         )
 
-    def _refusal_of(self, ask: Ask, who: str) -> BusError | None:
+    def _refusal_of(self, ask: MailboxRequest, who: str) -> BusError | None:
         """Why a request cannot be sent."""
         if not self._is_open:
             return MailboxClosedError(f"{who}: the slave's mailbox is closed")
@@ -179,7 +181,7 @@ class Mailbox:
         ask = job.ask
         _, start_ns = yield Sleep(0)
         error: EapError | None = None
-        message = Message(ask.type, b"")
+        message = MailboxMessage(ask.type, b"")
         try:
             message = yield from self._exchange(ask, start_ns + ask.timeout_ns)
         except EapError as exc:
@@ -190,28 +192,28 @@ class Mailbox:
         _, now_ns = yield Sleep(0)
         if error is None:
             self._tally.answer(now_ns - start_ns)
-            answer = message._replace(at_ns=now_ns)
+            answer = replace(message, at_ns=now_ns)
             _resume(job, lambda: job.conversation.send(answer), now_ns)
         else:
             reason = error
             _resume(job, lambda: job.conversation.throw(reason), now_ns)
         return now_ns
 
-    def _exchange(self, ask: Ask, deadline_ns: int) -> Procedure[Message]:
+    def _exchange(self, ask: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage]:
         refusal = self._refusal_of(ask, f"slave {self.station}")
         if refusal is not None:
             raise refusal
         if ask.listen:
             kept = self._lanes.judge(ask.type).take_kept(ask)
             if kept is not None:
-                return Message(ask.type, kept)
+                return MailboxMessage(ask.type, kept)
         else:
             early = yield from self._send(ask, deadline_ns)
             if early is not None:
                 return early
             if not ask.expects_reply:
                 self._lanes.judge(ask.type).took(ask.request)
-                return Message(ask.type, b"")
+                return MailboxMessage(ask.type, b"")
         pause_ns = FIRST_PAUSE_NS
         is_full = True  # a quick slave has answered by now: look at once, and look only then
         while True:
@@ -227,7 +229,7 @@ class Mailbox:
             pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)
             is_full = yield from self._is_full(deadline_ns)
 
-    def _send(self, ask: Ask, deadline_ns: int) -> Procedure[Message | None]:
+    def _send(self, ask: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage | None]:
         """Write a request; return its reply if that came while it was written again."""
         self._counter = next_counter(self._counter)
         address = self._lanes.judge(ask.type).next_address()
@@ -275,7 +277,7 @@ class Mailbox:
                 if now_ns >= deadline_ns:
                     raise
 
-    def _receive(self, ask: Ask | None) -> Procedure[Message | None]:
+    def _receive(self, ask: MailboxRequest | None) -> Procedure[MailboxMessage | None]:
         """Read one message; return it if it is the reply to *ask*."""
         octets = yield from self._port.fetch()
         if octets is None:
@@ -293,7 +295,7 @@ class Mailbox:
             if header.type == MailboxType.ERR:
                 raise self._refusal(data)
             self._lanes.judge(ask.type).took(data)
-            return Message(header.type, data, counter=header.counter)
+            return MailboxMessage(header.type, data, counter=header.counter)
         if self._lanes.judge(header.type).keep(data):
             return None
         if is_unsolicited(header.type, data):
@@ -315,7 +317,7 @@ class Mailbox:
         )
 
 
-def _resume(job: Job, action: Callable[[], Ask], now_ns: int) -> None:
+def _resume(job: Job, action: Callable[[], MailboxRequest], now_ns: int) -> None:
     """Let a conversation go on, unless it was cancelled meanwhile."""
     if job.task.is_done:
         return

@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Generic, NamedTuple, TypeAlias, TypeVar
 
 from devicebus.errors import FrameLostError, WorkingCounterError
-from devicebus.master.access import AS_SET, Access, Reply, fprd, fpwr
+from devicebus.master.access import AS_SET, DatagramReply, DatagramRequest, fprd, fpwr
 from eap.errors import EapError
 
 T = TypeVar("T")
@@ -28,15 +28,16 @@ class Sleep(NamedTuple):
     duration_ns: int
 
 
-class Answer(NamedTuple):
-    """What a procedure is resumed with: one reply an access, and the time."""
+class StepResult(NamedTuple):
+    """Value that a procedure is resumed with: one reply for each access, and the time."""
 
-    replies: Sequence[Reply]
+    replies: Sequence[DatagramReply]
     now_ns: int
 
 
-Step: TypeAlias = Sequence[Access] | Sleep
-Procedure: TypeAlias = Generator[Step, Answer, T]
+Answer = StepResult
+Step: TypeAlias = Sequence[DatagramRequest] | Sleep
+Procedure: TypeAlias = Generator[Step, StepResult, T]
 
 
 def read(
@@ -83,7 +84,7 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
                 _, now_ns = yield Sleep(pause_ns)
             for child in running:
                 if not child.accesses and child.is_running and child.wake_ns <= now_ns:
-                    child.resume(Answer((), now_ns))
+                    child.resume(StepResult((), now_ns))
     finally:
         for child in children:
             child.procedure.close()
@@ -97,11 +98,11 @@ class _Child(Generic[T]):
         self.procedure = procedure
         self.is_running = True
         self.result: T | EapError
-        self.accesses: Sequence[Access] = ()
+        self.accesses: Sequence[DatagramRequest] = ()
         self.wake_ns = 0
         self._advance(lambda: next(procedure), now_ns)
 
-    def resume(self, answer: Answer) -> None:
+    def resume(self, answer: StepResult) -> None:
         self._advance(lambda: self.procedure.send(answer), answer.now_ns)
 
     def _advance(self, action: Callable[[], Step], now_ns: int) -> None:
@@ -128,6 +129,6 @@ def _ask_for(asking: Sequence[_Child[T]]) -> Procedure[int]:
     start = 0
     for child in asking:
         end = start + len(child.accesses)
-        child.resume(Answer(replies[start:end], now_ns))
+        child.resume(StepResult(replies[start:end], now_ns))
         start = end
     return now_ns

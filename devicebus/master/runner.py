@@ -8,9 +8,9 @@ from itertools import count
 from typing import Any, TypeVar
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import Reply
+from devicebus.master.access import DatagramReply
 from devicebus.master.link import Exchange, Link
-from devicebus.master.procedure import Answer, Procedure, Sleep, Step
+from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
 from devicebus.master.task import Task
 from eap.errors import EapError
 
@@ -43,7 +43,7 @@ class Runner:
         while self._sleeping and self._sleeping[0][0] <= now_ns:
             _, _, run = heapq.heappop(self._sleeping)
             if not run.task.is_done:
-                run.resume(Answer((), now_ns))
+                run.resume(StepResult((), now_ns))
 
     def take_step(self, run: _Run, step: Step, now_ns: int) -> None:
         """Queue what a procedure wants next."""
@@ -65,16 +65,16 @@ class _Run:
         self._procedure = procedure
         self._runner = runner
 
-    def take(self, outcome: list[Reply] | FrameLostError, now_ns: int) -> None:
+    def take(self, outcome: list[DatagramReply] | FrameLostError, now_ns: int) -> None:
         """The link has answered."""
         self.exchange = None
         if isinstance(outcome, FrameLostError):
             error = outcome
             self.advance(lambda: self._procedure.throw(error), now_ns)
         else:
-            self.resume(Answer(outcome, now_ns))
+            self.resume(StepResult(outcome, now_ns))
 
-    def resume(self, answer: Answer) -> None:
+    def resume(self, answer: StepResult) -> None:
         """Hand the procedure what it waited for."""
         self.advance(lambda: self._procedure.send(answer), answer.now_ns)
 
@@ -83,7 +83,7 @@ class _Run:
         try:
             step = action()
             while isinstance(step, Sleep) and step.duration_ns <= 0:
-                step = self._procedure.send(Answer((), now_ns))
+                step = self._procedure.send(StepResult((), now_ns))
         except StopIteration as end:
             self.task.finish(end.value)
         except EapError as error:

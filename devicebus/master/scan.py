@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from devicebus.errors import BusError, WorkingCounterError
-from devicebus.master.access import Access, Reply, aprd, apwr, brd, fprd
+from devicebus.master.access import DatagramReply, DatagramRequest, aprd, apwr, brd, fprd
 from devicebus.master.eeprom import read_image, read_words, take_over
 from devicebus.master.procedure import Procedure, together
 from devicebus.master.topology import Joint, find_joints
@@ -200,8 +200,8 @@ def _found(
     return FoundSlave(position, station, alias, esc, al_status, joint, identity, content, fault)
 
 
-def _in_pieces(accesses: Sequence[Access]) -> Procedure[list[Reply]]:
-    replies: list[Reply] = []
+def _in_pieces(accesses: Sequence[DatagramRequest]) -> Procedure[list[DatagramReply]]:
+    replies: list[DatagramReply] = []
     for start in range(0, len(accesses), _PER_STEP):
         answers, _ = yield accesses[start : start + _PER_STEP]
         replies += answers

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from devicebus.errors import FrameLostError, IdentityError, WorkingCounterError
-from devicebus.master.access import Reply, fprd, fpwr
+from devicebus.master.access import DatagramReply, fprd, fpwr
 from devicebus.master.bring import bring, set_clocks
 from devicebus.master.bus import Bus, Unit
 from devicebus.master.cycle import Presence
@@ -69,8 +69,8 @@ def _pause(bus: Bus) -> Procedure[int]:
     return now_ns
 
 
-def _read_states(stations: Sequence[int]) -> Procedure[list[Reply]]:
-    replies: list[Reply] = []
+def _read_states(stations: Sequence[int]) -> Procedure[list[DatagramReply]]:
+    replies: list[DatagramReply] = []
     for start in range(0, len(stations), _PER_STEP):
         part = stations[start : start + _PER_STEP]
         answers, _ = yield [fprd(at, Register.AL_STATUS, AlStatus.SIZE) for at in part]

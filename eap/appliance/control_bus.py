@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, Ask
-from devicebus.master.access import Access, Reply
+from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, MailboxRequest
+from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.wire.datagram import Command
 from eap.appliance.control import ErrorCode, Parameters
 from eap.codec.mailbox import MailboxType
@@ -127,7 +127,7 @@ def kind_of(protocol: str) -> MailboxType:
     return MailboxType[protocol.upper()]
 
 
-def ask_parameters(ask: Ask) -> dict[str, Any]:
+def ask_parameters(ask: MailboxRequest) -> dict[str, Any]:
     """Return a step of a conversation as parameters, without the conversation."""
     return {
         "request": ask.request.hex(),
@@ -138,9 +138,9 @@ def ask_parameters(ask: Ask) -> dict[str, Any]:
     }
 
 
-def to_ask(kind: MailboxType, wanted: BusAskParameters) -> Ask:
+def to_ask(kind: MailboxType, wanted: BusAskParameters) -> MailboxRequest:
     """Return the step that parameters tell of."""
-    return Ask(
+    return MailboxRequest(
         kind,
         to_octets(wanted.request),
         listen=wanted.listen,
@@ -150,30 +150,30 @@ def to_ask(kind: MailboxType, wanted: BusAskParameters) -> Ask:
     )
 
 
-def datagram_row(access: Access) -> DatagramRow:
+def datagram_row(access: DatagramRequest) -> DatagramRow:
     """Return a datagram as a row."""
     return access.command, access.adp, access.ado, access.data.hex(), access.tries
 
 
-def to_access(row: DatagramRow) -> Access:
+def to_access(row: DatagramRow) -> DatagramRequest:
     """Return the datagram of a row; raise ControlError if there is none like it."""
     command, adp, ado, octets, tries = row
     try:
-        return Access(Command(command), adp, ado, to_octets(octets), tries)
+        return DatagramRequest(Command(command), adp, ado, to_octets(octets), tries)
     except ValueError:
         reason = f"params: {command} is no command of a datagram"
         raise ControlError(reason, code=ErrorCode.BAD_REQUEST) from None
 
 
-def reply_row(reply: Reply) -> ReplyRow:
+def reply_row(reply: DatagramReply) -> ReplyRow:
     """Return what came back as a row."""
     return reply.wkc, reply.data.hex(), reply.tries
 
 
-def to_replies(rows: Sequence[ReplyRow]) -> list[Reply]:
+def to_replies(rows: Sequence[ReplyRow]) -> list[DatagramReply]:
     """Return what came back, from rows; raise BusError if they are none."""
     try:
-        return [Reply(bytes.fromhex(octets), wkc, tries) for wkc, octets, tries in rows]
+        return [DatagramReply(bytes.fromhex(octets), wkc, tries) for wkc, octets, tries in rows]
     except (TypeError, ValueError):
         raise BusError("what came back over the control socket is no reply") from None
 

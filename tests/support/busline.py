@@ -8,12 +8,12 @@ from typing import Protocol
 
 import devicebus.drive
 from devicebus.mailbox.server import MailboxServer
-from devicebus.master.access import Access, Reply
+from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.esm import change_state
 from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea, configure
-from devicebus.master.procedure import Answer, Procedure, Sleep, Step
+from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
 from devicebus.master.runner import Runner
 from devicebus.master.scan import scan
 from devicebus.master.task import Task
@@ -129,24 +129,26 @@ def answer(frame: bytes, *, wkc: int = 1, data: bytes | None = None) -> bytes:
     )
 
 
-def accesses_of(frame: bytes) -> list[Access]:
+def accesses_of(frame: bytes) -> list[DatagramRequest]:
     """What a frame asks for."""
     return [
-        Access(header.command, header.adp, header.ado, bytes(data))
+        DatagramRequest(header.command, header.adp, header.ado, bytes(data))
         for header, data, _ in iter_datagrams(frame)
     ]
 
 
-def drive(procedure: Procedure, respond: Callable[[Access], Reply], now_ns: int = 0):
+def drive(
+    procedure: Procedure, respond: Callable[[DatagramRequest], DatagramReply], now_ns: int = 0
+):
     """Run a procedure against *respond* alone; sleeps take as long as they say."""
 
-    def exchange(step: Step) -> Answer:
+    def exchange(step: Step) -> StepResult:
         nonlocal now_ns
         if isinstance(step, Sleep):
             now_ns += step.duration_ns
-            return Answer((), now_ns)
+            return StepResult((), now_ns)
         now_ns += TRIP_NS
-        return Answer([respond(access) for access in step], now_ns)
+        return StepResult([respond(access) for access in step], now_ns)
 
     return devicebus.drive.drive(procedure, exchange)
 

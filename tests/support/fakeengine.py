@@ -13,8 +13,8 @@ from typing import Any
 
 import msgspec
 
-from devicebus.mailbox.conversation import Ask, Conversation, Message
-from devicebus.master.access import Access
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.master.access import DatagramRequest
 from devicebus.master.bus import MasterSettings
 from devicebus.master.master import Master, why_closed
 from devicebus.master.procedure import Procedure
@@ -99,7 +99,8 @@ class FakeBus:
             return {"data": message.data, "counter": message.counter}
         if isinstance(request, Transfer):
             accesses = [
-                Access(Command(each[0]), *each[1:]) for each in map(_fields, request.datagrams)
+                DatagramRequest(Command(each[0]), *each[1:])
+                for each in map(_fields, request.datagrams)
             ]
             replies = self.finish(master.run(_transfer(accesses), now_ns))
             return {"outcomes": tuple(Outcome(r.wkc, r.data, r.tries) for r in replies)}
@@ -172,8 +173,8 @@ def _fields(record: Any) -> Sequence[Any]:
     return msgspec.structs.astuple(record)
 
 
-def _ask_of(request: AskMailbox) -> Ask:
-    return Ask(
+def _ask_of(request: AskMailbox) -> MailboxRequest:
+    return MailboxRequest(
         MailboxType(request.type),
         request.request,
         request.listen,
@@ -183,11 +184,11 @@ def _ask_of(request: AskMailbox) -> Ask:
     )
 
 
-def _one(ask: Ask) -> Conversation[Message]:
+def _one(ask: MailboxRequest) -> Conversation[MailboxMessage]:
     return (yield ask)
 
 
-def _transfer(accesses: Sequence[Access]) -> Procedure[Sequence[Any]]:
+def _transfer(accesses: Sequence[DatagramRequest]) -> Procedure[Sequence[Any]]:
     replies, _ = yield accesses
     return replies
 

@@ -15,7 +15,7 @@ import pytest
 
 from devicebus.drive import drive
 from devicebus.errors import MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.counter import CounterWatch, next_counter
 from devicebus.mailbox.match import answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
@@ -60,7 +60,7 @@ class Line:
         self.server = server
         self.choose = choose
         self.now_ns = 0
-        self.others: list[Message] = []
+        self.others: list[MailboxMessage] = []
         """Messages that no conversation waited for."""
         self.sent: list[bytes] = []
         self._counter = 0
@@ -83,19 +83,21 @@ class Line:
         if ask.expects_reply:
             self._receive(ask)
 
-    def fetch(self) -> list[Message]:
+    def fetch(self) -> list[MailboxMessage]:
         """Fetch what the slave sends unasked."""
         while (message := self._fetch()) is not None:
             self.others.append(message)
         return self.others
 
-    def _exchange(self, ask: Ask) -> Message:
+    def _exchange(self, ask: MailboxRequest) -> MailboxMessage:
         if not ask.listen:
             self.now_ns += ask.delay_ns
             self._send(ask)
-        return self._receive(ask) if ask.expects_reply else Message(ask.type, b"", self.now_ns)
+        return (
+            self._receive(ask) if ask.expects_reply else MailboxMessage(ask.type, b"", self.now_ns)
+        )
 
-    def _send(self, ask: Ask) -> None:
+    def _send(self, ask: MailboxRequest) -> None:
         if ask.listen:
             return
         self.sent.append(ask.request)
@@ -109,7 +111,7 @@ class Line:
             self.now_ns += STEP_NS
         self.server.receive_message(message, self.now_ns)
 
-    def _receive(self, ask: Ask) -> Message:
+    def _receive(self, ask: MailboxRequest) -> MailboxMessage:
         deadline_ns = self.now_ns + ask.timeout_ns
         while self.now_ns <= deadline_ns:
             message = self._fetch()
@@ -124,7 +126,7 @@ class Line:
                 self.others.append(message)
         raise MailboxTimeoutError("no answer")
 
-    def _fetch(self) -> Message | None:
+    def _fetch(self) -> MailboxMessage | None:
         fault = self.choose()
         if fault in {Fault.LOST, Fault.LATE}:
             self.now_ns += STEP_NS
@@ -142,7 +144,7 @@ class Line:
             self.server.handle_read()
             assert again == octets
             assert not self._watch.is_new(decode_message(again)[0].counter)
-        return Message(header.type, bytes(data), self.now_ns)
+        return MailboxMessage(header.type, bytes(data), self.now_ns)
 
 
 def open_line(

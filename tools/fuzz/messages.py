@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from devicebus.drive import drive
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.match import answers
 from eap.codec.mailbox import MailboxType
 
@@ -23,7 +23,7 @@ def cut(data: bytes) -> Iterator[bytes]:
         at += 1 + size
 
 
-def _next_answer(ask: Ask, rest: Iterator[bytes]) -> bytes | None:
+def _next_answer(ask: MailboxRequest, rest: Iterator[bytes]) -> bytes | None:
     for n, data in enumerate(rest):
         if n % 2 or answers(ask.type, ask.request, data):
             return data
@@ -37,12 +37,12 @@ def answer_with(talk: Conversation[T], kind: MailboxType, answers: Iterable[byte
     """
     rest = iter(answers)
 
-    def exchange(ask: Ask) -> Message:
+    def exchange(ask: MailboxRequest) -> MailboxMessage:
         if not ask.expects_reply:
-            return Message(kind, b"")
+            return MailboxMessage(kind, b"")
         found = _next_answer(ask, rest)
         if found is None:
             raise MailboxTimeoutError("no answer is left")
-        return Message(kind, found)
+        return MailboxMessage(kind, found)
 
     return drive(talk, exchange)

@@ -16,11 +16,11 @@ import msgspec
 
 from devicebus.drive import drive
 from devicebus.errors import FrameLostError
-from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.master.access import Reply, fprd
+from devicebus.master.access import DatagramReply, fprd
 from devicebus.master.findings import History
-from devicebus.master.procedure import Answer, Procedure, Sleep, Step
+from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
 from devicebus.master.topology import find_joints
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus, DlStatus, Register
@@ -166,13 +166,13 @@ class RunningBus:
         found = self._request(control_bus.PATIENCE_S, "bus_describe", wait=True)
         return msgspec.convert(found, BusReport)
 
-    def _do(self, step: Step) -> Answer:
+    def _do(self, step: Step) -> StepResult:
         if isinstance(step, Sleep):
             select.select([], [], [], max(0, step.duration_ns) / _S)
-            return Answer((), monotonic_ns())
+            return StepResult((), monotonic_ns())
         rows = [datagram_row(access) for access in step]
         answer = self._request(control_bus.TRANSFER_S, "bus_transfer", datagrams=rows)
-        return Answer(to_replies(answer["replies"]), monotonic_ns())
+        return StepResult(to_replies(answer["replies"]), monotonic_ns())
 
     def _lead(
         self, slave: Slave, conversation: Conversation[T], meanwhile: Callable[[], None] | None
@@ -180,14 +180,14 @@ class RunningBus:
         look_s = 0.0
         number: int | None = None
 
-        def exchange(ask: Ask) -> Message:
+        def exchange(ask: MailboxRequest) -> MailboxMessage:
             nonlocal look_s, number
             if number is None:
                 number = self._open(slave, ask)
             elif meanwhile is not None and monotonic() >= look_s:
                 meanwhile()
                 look_s = monotonic() + LOOK_S
-            return Message(ask.type, self._ask(number, ask), monotonic_ns())
+            return MailboxMessage(ask.type, self._ask(number, ask), monotonic_ns())
 
         try:
             return drive(conversation, exchange)
@@ -199,7 +199,7 @@ class RunningBus:
                 with suppress(ControlError):
                     self._client.request("bus_close", conversation=number)
 
-    def _open(self, slave: Slave, ask: Ask) -> int:
+    def _open(self, slave: Slave, ask: MailboxRequest) -> int:
         answer = self._request(
             control_bus.TURN_S,
             "bus_open",
@@ -208,7 +208,7 @@ class RunningBus:
         )
         return int(answer["conversation"])
 
-    def _ask(self, number: int, ask: Ask) -> bytes:
+    def _ask(self, number: int, ask: MailboxRequest) -> bytes:
         patience_s = (ask.timeout_ns + ask.delay_ns) / _S + control_bus.MARGIN_S + _MARGIN_S
         answer = self._client.request_within(
             patience_s, "bus_ask", conversation=number, **ask_parameters(ask)
@@ -232,7 +232,7 @@ def open_running(station: str, port: str, plant: str | None = None) -> Iterator[
 
 def _look(stations: Sequence[int]) -> Procedure[list[tuple[AlStatus, DlStatus]]]:
     """Read where slaves stand and what is wired to them; zeros for one that does not answer."""
-    replies: list[Reply] = []
+    replies: list[DatagramReply] = []
     for start in range(0, len(stations), _PER_STEP):
         answers, _ = yield [
             access

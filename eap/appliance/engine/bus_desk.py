@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import msgspec
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Message
-from devicebus.master.access import Reply
+from devicebus.mailbox.conversation import MailboxMessage
+from devicebus.master.access import DatagramReply
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
@@ -270,11 +270,11 @@ class BusDesk:
         return True
 
 
-def _message_answer(number: int, message: Message) -> Answer:
+def _message_answer(number: int, message: MailboxMessage) -> Answer:
     return Answer(id=number, data=message.data, counter=message.counter)
 
 
-def _outcomes_answer(number: int, replies: list[Reply]) -> Answer:
+def _outcomes_answer(number: int, replies: list[DatagramReply]) -> Answer:
     outcomes = tuple(Outcome(reply.wkc, reply.data, reply.tries) for reply in replies)
     return Answer(id=number, outcomes=outcomes)
 

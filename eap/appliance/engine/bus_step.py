@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import msgspec
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask, Conversation, Message
-from devicebus.master.access import AS_SET, Access, Reply
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.master.access import AS_SET, DatagramReply, DatagramRequest
 from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure
 from devicebus.wire.datagram import Command
@@ -27,13 +27,13 @@ _ALLOWED = frozenset(
 """What does not disturb the slaves that others talk to: no logical ones, none that write to all."""
 
 
-def to_ask(request: AskMailbox) -> Ask:
+def to_ask(request: AskMailbox) -> MailboxRequest:
     """Return what is asked of a mailbox; raise BusError if there is no such protocol."""
     try:
         kind = MailboxType(request.type)
     except ValueError:
         raise BusError(f"there is no mailbox protocol {request.type}") from None
-    return Ask(
+    return MailboxRequest(
         kind,
         request.request,
         listen=request.listen,
@@ -43,12 +43,12 @@ def to_ask(request: AskMailbox) -> Ask:
     )
 
 
-def one_ask(ask: Ask) -> Conversation[Message]:
+def one_ask(ask: MailboxRequest) -> Conversation[MailboxMessage]:
     """Ask once and return the reply."""
     return (yield ask)
 
 
-def to_accesses(request: Transfer) -> list[Access]:
+def to_accesses(request: Transfer) -> list[DatagramRequest]:
     """Return the datagrams to send.
 
     Raises:
@@ -59,13 +59,13 @@ def to_accesses(request: Transfer) -> list[Access]:
     return [_to_access(each) for each in request.datagrams]
 
 
-def one_step(accesses: Sequence[Access]) -> Procedure[list[Reply]]:
+def one_step(accesses: Sequence[DatagramRequest]) -> Procedure[list[DatagramReply]]:
     """Send datagrams together and return what came back."""
     replies, _ = yield accesses
     return list(replies)
 
 
-def _to_access(wanted: Datagram) -> Access:
+def _to_access(wanted: Datagram) -> DatagramRequest:
     command, adp, ado, data, tries = msgspec.structs.astuple(wanted)
     if command not in _ALLOWED:
         names = ", ".join(sorted(each.name for each in _ALLOWED))
@@ -78,4 +78,4 @@ def _to_access(wanted: Datagram) -> Access:
             f"datagram to 0x{adp:X}:0x{ado:X} with {len(data)} octets, expected addresses of 16"
             f" bits and 1 to {MAX_DATA} octets"
         )
-    return Access(Command(command), adp, ado, data, min(max(tries, AS_SET), MAX_TRIES))
+    return DatagramRequest(Command(command), adp, ado, data, min(max(tries, AS_SET), MAX_TRIES))

@@ -11,7 +11,7 @@ from typing import TypeVar, cast
 from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
 from devicebus.mailbox.coe_server import CoeServer
-from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
@@ -75,18 +75,18 @@ class _Talk:
     def __init__(self, box: MailboxServer) -> None:
         self._box = box
 
-    async def ask(self, ask: Ask) -> Message:
+    async def ask(self, ask: MailboxRequest) -> MailboxMessage:
         if not ask.listen:
             octets = encode_message(MailboxHeader(0, 0, type=ask.type), ask.request)
             self._box.receive_message(octets, 0)
         if not ask.expects_reply:
-            return Message(ask.type, b"")
+            return MailboxMessage(ask.type, b"")
         reply = self._box.next_message(0)
         if reply is None:
             raise MailboxTimeoutError("nothing comes")
         self._box.handle_read()
         header, body = decode_message(reply)
-        return Message(header.type, bytes(body), counter=header.counter)
+        return MailboxMessage(header.type, bytes(body), counter=header.counter)
 
     def abandon(self) -> None:
         """Nobody is told."""

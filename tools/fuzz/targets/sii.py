@@ -8,10 +8,10 @@ from contextlib import suppress
 from devicebus.drive import drive
 from devicebus.errors import BusError
 from devicebus.master import eeprom
-from devicebus.master.access import Access, Reply
+from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.layout import SlaveShape, lay_out
 from devicebus.master.pdo import channels_from_sii
-from devicebus.master.procedure import Answer, Sleep, Step
+from devicebus.master.procedure import Sleep, Step, StepResult
 from devicebus.wire import sii
 from devicebus.wire.register import Register
 from devicebus.wire.sii import CategoryHeader, SiiCategory
@@ -62,7 +62,7 @@ def _read(image: bytes) -> bytes:
     """Read *image* as a master does, from a controller that gives four octets at a time."""
     word = 0
 
-    def exchange(step: Step) -> Answer:
+    def exchange(step: Step) -> StepResult:
         nonlocal word
         replies = []
         if not isinstance(step, Sleep):
@@ -70,12 +70,12 @@ def _read(image: bytes) -> bytes:
                 if access.ado == Register.EEPROM_CONTROL and len(access.data) == 6:
                     word = int.from_bytes(access.data[2:6], "little")
                 replies.append(_reply(access, image, word))
-        return Answer(replies, 0)
+        return StepResult(replies, 0)
 
     return drive(eeprom.read_image(1001), exchange)
 
 
-def _reply(access: Access, image: bytes, word: int) -> Reply:
+def _reply(access: DatagramRequest, image: bytes, word: int) -> DatagramReply:
     here = image[2 * word : 2 * word + 4].ljust(4, b"\xff")
     octets = bytes(2) + word.to_bytes(4, "little") + here
-    return Reply(octets[: len(access.data)].ljust(len(access.data), b"\0"), 1)
+    return DatagramReply(octets[: len(access.data)].ljust(len(access.data), b"\0"), 1)

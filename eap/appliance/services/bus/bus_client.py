@@ -11,11 +11,13 @@ from collections.abc import Callable, Hashable, Sequence
 from time import monotonic_ns
 from typing import TypeVar
 
+from msgspec.structs import astuple
+
 from devicebus.drive import drive_async
 from devicebus.errors import BusError, MailboxBusyError
-from devicebus.mailbox.conversation import Ask, Conversation, Message
-from devicebus.master.access import Access, Reply
-from devicebus.master.procedure import Answer, Procedure, Sleep, Step
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.master.access import DatagramReply, DatagramRequest
+from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import (
     Bring,
@@ -152,7 +154,7 @@ class BusClient:
         """
         talk: Talk | None = None
 
-        async def exchange(ask: Ask) -> Message:
+        async def exchange(ask: MailboxRequest) -> MailboxMessage:
             nonlocal talk
             if talk is None:
                 talk = await self.open_talk(port, station, ask.type, requester, turn_s)
@@ -172,15 +174,17 @@ class BusClient:
         """Run a procedure to its end; return its result or raise what went wrong."""
         await self._be_up(port)
 
-        async def exchange(step: Step) -> Answer:
+        async def exchange(step: Step) -> StepResult:
             if isinstance(step, Sleep):
                 await asyncio.sleep(step.duration_ns / _S)
-                return Answer((), monotonic_ns())
-            return Answer(await self.transfer(port, step), monotonic_ns())
+                return StepResult((), monotonic_ns())
+            return StepResult(await self.transfer(port, step), monotonic_ns())
 
         return await drive_async(procedure, exchange)
 
-    async def transfer(self, port: PortName, accesses: Sequence[Access]) -> list[Reply]:
+    async def transfer(
+        self, port: PortName, accesses: Sequence[DatagramRequest]
+    ) -> list[DatagramReply]:
         """Send datagrams, none of them logical, and return what came back for each.
 
         Raises:
@@ -189,11 +193,11 @@ class BusClient:
         """
         await self._be_up(port)
         bus = self._numbers[port]
-        datagrams = tuple(Datagram(*access) for access in accesses)
+        datagrams = tuple(Datagram(*astuple(access)) for access in accesses)
         answer = await self._link.ask(
             lambda number: Transfer(id=number, bus=bus, datagrams=datagrams), TRANSFER_S
         )
-        return [Reply(each.data, each.wkc, each.tries) for each in answer.outcomes]
+        return [DatagramReply(each.data, each.wkc, each.tries) for each in answer.outcomes]
 
     async def bring(self, port: PortName, station: int, target: AlState) -> None:
         """Bring a slave, or with station 0 all of them, to a state where they are kept then.

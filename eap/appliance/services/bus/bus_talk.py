@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from time import monotonic_ns
 
-from devicebus.mailbox.conversation import Ask, Message
+from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
 from devicebus.mailbox.farewell import FAREWELLS
 from eap.appliance.bus_request import AskMailbox
 from eap.appliance.control_bus import MARGIN_S
@@ -36,7 +36,7 @@ class Talk:
         self._is_open = True
         self._is_silent = True
 
-    async def ask(self, ask: Ask) -> Message:
+    async def ask(self, ask: MailboxRequest) -> MailboxMessage:
         """Do one step.
 
         Raises:
@@ -48,7 +48,7 @@ class Talk:
             lambda number: self._request(ask, number),
             (ask.delay_ns + ask.timeout_ns) / _S + MARGIN_S,
         )
-        return Message(self._kind, answer.data, monotonic_ns(), answer.counter)
+        return MailboxMessage(self._kind, answer.data, monotonic_ns(), answer.counter)
 
     def abandon(self) -> None:
         """Close it in the middle: the slave is told that what it has begun will not go on."""
@@ -64,7 +64,7 @@ class Talk:
             self._is_open = False
             self._give_back()
 
-    def _request(self, ask: Ask, number: int) -> AskMailbox:
+    def _request(self, ask: MailboxRequest, number: int) -> AskMailbox:
         return AskMailbox(
             id=number,
             bus=self._bus,

@@ -196,7 +196,7 @@ class SlaveSession:
 
     async def _step(self, talk: Talk, ask: Ask, deadline_s: float) -> Message:
         rest_s = deadline_s - asyncio.get_running_loop().time()
-        asked = ask._replace(timeout_ns=max(1, int(rest_s * _S)))
+        asked = replace(ask, timeout_ns=max(1, int(rest_s * _S)))
         try:
             # The engine's time counts from when the mailbox is free.
             async with asyncio.timeout_at(deadline_s + _GRACE_S):

@@ -3,13 +3,19 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import MailboxProtocolError
-from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress, reading
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+    Progress,
+    reading,
+)
 from eap.codec.mailbox import MailboxHeader, MailboxType
 
 
 def twice() -> Conversation[bytes]:
-    first = yield Ask(MailboxType.COE, b"a")
-    second = yield Ask(MailboxType.COE, b"a", listen=True)
+    first = yield MailboxRequest(MailboxType.COE, b"a")
+    second = yield MailboxRequest(MailboxType.COE, b"a", listen=True)
     return first.data + second.data
 
 
@@ -17,10 +23,10 @@ def test_a_conversation_is_resumed_with_each_reply() -> None:
     talk = twice()
     ask = next(talk)
     assert (ask.request, ask.listen) == (b"a", False)
-    ask = talk.send(Message(MailboxType.COE, b"1"))
+    ask = talk.send(MailboxMessage(MailboxType.COE, b"1"))
     assert (ask.request, ask.listen) == (b"a", True)
     with pytest.raises(StopIteration) as end:
-        talk.send(Message(MailboxType.COE, b"2"))
+        talk.send(MailboxMessage(MailboxType.COE, b"2"))
     assert end.value.value == b"12"
 
 

@@ -20,7 +20,7 @@ from devicebus.errors import (
     MailboxTimeoutError,
 )
 from devicebus.mailbox import foe_client
-from devicebus.mailbox.conversation import Message, Progress
+from devicebus.mailbox.conversation import MailboxMessage, Progress
 from devicebus.mailbox.foe_server import FoeServer
 from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
@@ -94,7 +94,7 @@ def test_busy_slave_is_asked_again_after_a_while() -> None:
     assert asked == ["02 00 00 00 00 00 66"] * 2 + ["03 00 01 00 00 00 61 62"] * 3
     talk = foe_client.write(NAME, io.BytesIO(b"ab").read, SIZES)
     assert next(talk).delay_ns == 0
-    busy = Message(FOE, bytes.fromhex(BUSY))
+    busy = MailboxMessage(FOE, bytes.fromhex(BUSY))
     assert talk.send(busy).delay_ns == foe_client.BUSY_DELAY_NS
 
 
@@ -108,7 +108,7 @@ def test_endless_busy_ends_in_a_timeout() -> None:
 def test_slave_that_takes_its_time_to_be_busy_ends_in_a_timeout_too() -> None:
     talk = foe_client.write(NAME, io.BytesIO(b"ab").read, SIZES)
     next(talk)
-    slow = (Message(FOE, bytes.fromhex(BUSY), n * 2_900_000_000) for n in itertools.count())
+    slow = (MailboxMessage(FOE, bytes.fromhex(BUSY), n * 2_900_000_000) for n in itertools.count())
     with pytest.raises(MailboxTimeoutError, match="still busy after 43 answers"):
         list(map(talk.send, slow))
 

@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from devicebus.errors import BusError, MailboxProtocolError, MailboxTimeoutError, SoeError
 from devicebus.mailbox import soe_client
-from devicebus.mailbox.conversation import Message, Progress
+from devicebus.mailbox.conversation import MailboxMessage, Progress
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_parameter import SoeParameter
 from devicebus.mailbox.soe_procedure import Procedure
@@ -169,10 +169,12 @@ def test_procedure_command_that_fails_is_cleared_too(
 def test_procedure_command_that_takes_its_time_to_be_busy_ends_too() -> None:
     talk = soe_client.execute(RESET, SIZES, timeout_ns=30_000_000_000)
     next(talk)
-    ask = talk.send(Message(SOE, bytes.fromhex("04 40 6300")))
+    ask = talk.send(MailboxMessage(SOE, bytes.fromhex("04 40 6300")))
     polls = 0
     while ask.request[0] == 1:
-        ask = talk.send(Message(SOE, bytes.fromhex("02 01 6300 0700"), polls * 1_900_000_000))
+        ask = talk.send(
+            MailboxMessage(SOE, bytes.fromhex("02 01 6300 0700"), polls * 1_900_000_000)
+        )
         polls += 1
     assert polls == 17
     assert ask.request == bytes.fromhex("03 40 6300 0000")

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master.access import frmw
 from devicebus.master.bus import MAX_EVENTS, Bus, MasterSettings, Unit
 from devicebus.master.cycle import Presence
@@ -44,7 +44,7 @@ def test_a_mailbox_that_closes_tells_who_waits():
 
 
 def talk():
-    yield Ask(MailboxType.COE, b"")
+    yield MailboxRequest(MailboxType.COE, b"")
 
 
 def test_forgetting_ends_what_runs():

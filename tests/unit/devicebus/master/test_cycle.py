@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.master.access import frmw
+from devicebus.master.access import DatagramRequest, frmw
 from devicebus.master.cycle import MAX_UNDER_WAY, Cycle, Presence
 from devicebus.master.image import BusImage
 from devicebus.master.layout import BASE, lay_out
@@ -36,7 +36,7 @@ def test_one_datagram_takes_outputs_and_brings_inputs():
     f = Fixture()
     f.image.outputs[:] = b"abc"
     (access,) = f.round(7, b"...WXYZ")
-    assert access == (Command.LRW, BASE & 0xFFFF, BASE >> 16, b"abc\0\0\0\0", 0)
+    assert access == DatagramRequest(Command.LRW, BASE & 0xFFFF, BASE >> 16, b"abc\0\0\0\0", 0)
     assert f.image.inputs == b"WXYZ"
     stats = f.cycle.stats()
     assert (stats.cycles, stats.good, stats.expected_wkc, stats.received_wkc) == (1, 1, 7, 7)

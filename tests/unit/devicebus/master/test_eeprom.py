@@ -4,7 +4,7 @@ import pytest
 
 from devicebus.errors import SiiError, WorkingCounterError
 from devicebus.master import eeprom
-from devicebus.master.access import Reply
+from devicebus.master.access import DatagramReply
 from devicebus.master.procedure import Sleep
 from devicebus.master.scan import assign_stations
 from devicebus.sim.eeprom import Eeprom
@@ -39,16 +39,16 @@ class Chip:
             if access.ado == Register.EEPROM_CONTROL:
                 self.commands.append(access.data)
                 self.pending = self.busy
-            return Reply(access.data, self.wkc)
+            return DatagramReply(access.data, self.wkc)
         failed = int(self.refuse > 0)
         if self.pending:
             self.pending -= 1
-            return Reply(EepromControl(busy=1).encode() + bytes(12), self.wkc)
+            return DatagramReply(EepromControl(busy=1).encode() + bytes(12), self.wkc)
         self.refuse -= failed
         at = 2 * int.from_bytes(self.commands[-1][2:6], "little")
         data = self.image[at : at + 4].ljust(8, b"\xff")
         control = EepromControl(command_error=failed).encode()
-        return Reply(control + self.commands[-1][2:6] + data, self.wkc)
+        return DatagramReply(control + self.commands[-1][2:6] + data, self.wkc)
 
 
 def test_an_image_is_read_up_to_its_end(line):

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import AlStatusError, BusError, StateTimeoutError, WorkingCounterError
-from devicebus.master.access import Reply
+from devicebus.master.access import DatagramReply
 from devicebus.master.esm import TIMEOUT_NS, acknowledge, change_state, path, read_status
 from devicebus.master.scan import assign_stations
 from devicebus.sim.smcheck import ALLOWED
@@ -91,7 +91,9 @@ def test_a_slave_that_does_not_answer(line):
 
 def stuck(state, *, error=0, code=0):
     octets = AlStatus(state, error=error, code=code).encode()
-    return lambda access: Reply(octets if access.command is Command.FPRD else access.data, 1)
+    return lambda access: DatagramReply(
+        octets if access.command is Command.FPRD else access.data, 1
+    )
 
 
 @pytest.mark.parametrize(
@@ -129,7 +131,9 @@ def test_a_controller_that_emulates_a_device_mirrors_the_acknowledge_bit():
     def emulate(access):
         if access.command is Command.FPWR:
             written.append(access.data)
-        return Reply(written[-1].ljust(6, b"\0") if access.command is Command.FPRD else b"", 1)
+        return DatagramReply(
+            written[-1].ljust(6, b"\0") if access.command is Command.FPRD else b"", 1
+        )
 
     assert drive(acknowledge(7), emulate) is INIT
     assert written[-1] == b"\1\0"

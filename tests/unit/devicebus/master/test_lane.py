@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master.lane import Job, Lanes
 from eap.codec.mailbox import MailboxType
 
@@ -11,7 +11,7 @@ COE, FOE = MailboxType.COE, MailboxType.FOE
 
 
 def talk(kind, *, listen):
-    yield Ask(kind, b"", listen=listen)
+    yield MailboxRequest(kind, b"", listen=listen)
 
 
 def job(name, requester="r", kind=COE, listen=False, ready_ns=0):

@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import pytest
 
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master.late import ReplyJudge, is_unsolicited
 from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxHeader, MailboxType
 
 COE, FOE, ERR = MailboxType.COE, MailboxType.FOE, MailboxType.ERR
 YES, NO = (bytes.fromhex(f"0030 43 1810 0{n} 00000000") for n in (1, 2))
-ASK, ASK_OTHER = (Ask(COE, bytes.fromhex(f"0020 40 1810 0{n} 00000000")) for n in (1, 3))
+ASK, ASK_OTHER = (MailboxRequest(COE, bytes.fromhex(f"0020 40 1810 0{n} 00000000")) for n in (1, 3))
 
 
 @pytest.fixture
@@ -108,11 +108,11 @@ def test_what_slaves_send_unasked(kind, data, expected):
     assert is_unsolicited(kind, data) is expected
 
 
-LISTED = Ask(COE, bytes.fromhex("0080 01 00 0000 0100"))
+LISTED = MailboxRequest(COE, bytes.fromhex("0080 01 00 0000 0100"))
 PARTS = [bytes.fromhex(f"0080 {head} 00{n:02x}10") for n, head in
          enumerate(("82 00 0200 0100", "82 00 0100", "02 00 0000"))]  # fmt: skip
 EMERGENCY = encode_message(CoeService.EMERGENCY, bytes(8))
-REST = Ask(COE, LISTED.request[:6], listen=True)
+REST = MailboxRequest(COE, LISTED.request[:6], listen=True)
 
 
 def test_fragments_that_come_before_somebody_listens_are_kept(judge):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from devicebus.errors import FrameLostError
-from devicebus.master.access import Reply, brd, fprd, fpwr, logical
+from devicebus.master.access import DatagramReply, brd, fprd, fpwr, logical
 from devicebus.master.link import (
     INDEXES,
     LINGER_NS,
@@ -61,8 +62,8 @@ def test_accesses_of_several_share_a_frame_and_each_gets_its_own_answer(link):
     assert accesses_of(frame) == [READ, fpwr(1001, 0x120, b"\2\0"), READ]
     assert link.frames_to_send(1) == []
     link.receive_frame(answer(frame, data=b"abcdef"), 50)
-    assert one.outcomes == [([Reply(b"abcdef", 1), Reply(b"ab", 1)], 50)]
-    assert two.outcomes == [([Reply(b"abcdef", 1)], 50)]
+    assert one.outcomes == [([DatagramReply(b"abcdef", 1), DatagramReply(b"ab", 1)], 50)]
+    assert two.outcomes == [([DatagramReply(b"abcdef", 1)], 50)]
     assert (link.stats().sent, link.stats().received) == (1, 1)
     assert not link.is_waiting
 
@@ -121,7 +122,7 @@ def test_link_sends_as_often_as_it_is_told():
     link = Link(retries=1, ceiling_ns=5 * MS)
     client = Client(link)
     client.ask(READ)
-    client.ask(READ._replace(tries=1))
+    client.ask(replace(READ, tries=1))
     for number in range(2):
         assert len(link.frames_to_send(5 * MS * number)) == 1
         link.handle_timeout(5 * MS * (number + 1))
@@ -136,7 +137,7 @@ def test_an_answer_says_how_often_it_was_asked_for(quick):
     quick.handle_timeout(2 * MS)
     (frame,) = quick.frames_to_send(2 * MS)
     quick.receive_frame(answer(frame, data=b"abcdef"), 2 * MS)
-    assert client.outcomes == [([Reply(b"abcdef", 1, 2)], 2 * MS)]
+    assert client.outcomes == [([DatagramReply(b"abcdef", 1, 2)], 2 * MS)]
 
 
 def test_link_takes_the_answer_of_a_late_frame_and_drops_the_second_one(quick):
@@ -146,7 +147,7 @@ def test_link_takes_the_answer_of_a_late_frame_and_drops_the_second_one(quick):
     quick.handle_timeout(2 * MS)
     (again,) = quick.frames_to_send(2 * MS)
     quick.receive_frame(answer(late, data=b"abcdef"), 3 * MS)
-    assert client.outcomes == [([Reply(b"abcdef", 1, 2)], 3 * MS)]
+    assert client.outcomes == [([DatagramReply(b"abcdef", 1, 2)], 3 * MS)]
     quick.receive_frame(answer(again, data=b"second"), 3 * MS)
     quick.receive_frame(answer(again, data=b"third!"), 3 * MS)
     assert len(client.outcomes) == 1
@@ -167,7 +168,7 @@ def test_link_does_not_send_again_what_a_late_frame_has_answered(quick):
 
 def test_link_keeps_the_index_of_a_frame_that_may_still_come(quick):
     client = Client(quick)
-    client.ask(READ._replace(tries=1))
+    client.ask(replace(READ, tries=1))
     (late,) = quick.frames_to_send(0)
     quick.handle_timeout(2 * MS)
     for _ in range(300):
@@ -184,7 +185,7 @@ def test_link_counts_the_oldest_as_lost_when_all_indexes_are_taken():
     link = Link(ceiling_ns=2 * MS)
     client = Client(link)
     for number in range(INDEXES + 8):
-        client.ask(READ._replace(tries=1))
+        client.ask(replace(READ, tries=1))
         link.frames_to_send(number)
         link.handle_timeout(3 * MS)
     assert (len(client.outcomes), link.stats().lost) == (INDEXES + 8, 8)
@@ -227,7 +228,7 @@ def test_a_frame_with_the_right_index_but_of_something_else_answers_nothing(link
 
 def test_positions_change_on_the_way_and_still_match(link):
     client = Client(link)
-    client.ask(READ._replace(command=Command.APRD, adp=0xFFFF))
+    client.ask(replace(READ, command=Command.APRD, adp=0xFFFF))
     frame = bytearray(link.frames_to_send(0)[0])
     frame[4:6] = b"\2\0"
     link.receive_frame(bytes(frame), 1)
@@ -256,7 +257,7 @@ def test_what_is_cancelled_is_not_sent_and_not_answered(link):
     (frame,) = link.frames_to_send(0)
     under_way.cancel()
     link.receive_frame(answer(frame), 1)
-    lost = client.ask(READ._replace(tries=1))
+    lost = client.ask(replace(READ, tries=1))
     link.frames_to_send(1)
     lost.cancel()
     link.handle_timeout(9 * MS)
@@ -292,10 +293,10 @@ def test_cyclic_frames_go_first_and_take_a_little_along():
     long = fprd(1001, 0x1000, MAX_RIDE)
     client.ask(READ, READ, long, READ)
     link.start_cycle()
-    cyclic = logical(Command.LRW, 0x10000, bytes(20))._replace(tries=1)
+    cyclic = replace(logical(Command.LRW, 0x10000, bytes(20)), tries=1)
     client.ask(cyclic, cyclic=True)
     first, second = link.frames_to_send(0)
-    assert accesses_of(first) == [cyclic._replace(tries=0), READ, READ]
+    assert accesses_of(first) == [replace(cyclic, tries=0), READ, READ]
     assert accesses_of(second) == [long, READ]
 
 
@@ -337,7 +338,7 @@ def test_a_cycle_sends_no_more_acyclic_octets_than_its_budget_and_one_datagram()
     for cycle in range(20):
         link.start_cycle()
         frames = link.frames_to_send(cycle)
-        sent.append(sum(len(data) for frame in frames for *_, data, _ in accesses_of(frame)))
+        sent.append(sum(len(each.data) for frame in frames for each in accesses_of(frame)))
         for frame in frames:
             link.receive_frame(answer(frame), cycle)
     assert len(client.outcomes) == 10

@@ -15,7 +15,7 @@ from devicebus.errors import (
     WorkingCounterError,
 )
 from devicebus.mailbox import coe_client, foe_client
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.sim.spec import EntrySpec, FileSpec, MailboxSpec, ObjectSpec
 from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxHeader, MailboxType
@@ -79,7 +79,7 @@ def test_refusals_reach_who_asked(line, box):
         line.wait(start(line, box, coe_client.upload(0x2000, 0)))
 
     def soe():
-        yield Ask(MailboxType.SOE, b"\1\x40\x20\0")
+        yield MailboxRequest(MailboxType.SOE, b"\1\x40\x20\0")
 
     with pytest.raises(MailboxRefusedError, match="slave 1001: mailbox error UNSUPPORTED_PROTOCOL"):
         line.wait(start(line, box, soe()))
@@ -90,7 +90,7 @@ def test_a_message_that_does_not_fit_is_refused_before_it_is_sent(line, box):
     frames = line.frames
 
     def large():
-        yield Ask(MailboxType.COE, bytes(251))
+        yield MailboxRequest(MailboxType.COE, bytes(251))
 
     def grows():
         yield from vendor()
@@ -284,7 +284,7 @@ def test_requests_that_come_while_it_looks_are_served_too(line, box):
 
 def echo(data=b"abc", **options):
     def talk():
-        reply = yield Ask(MailboxType.VOE, data, **options)
+        reply = yield MailboxRequest(MailboxType.VOE, data, **options)
         return reply.data
 
     return talk()
@@ -294,9 +294,9 @@ def test_a_conversation_may_wait_send_without_reply_and_listen(line, box):
     server(line).protocols[MailboxType.VOE] = Talker()
 
     def talk():
-        sent = yield Ask(MailboxType.VOE, b"one", expects_reply=False)
-        first = yield Ask(MailboxType.VOE, b"one", listen=True)
-        late = yield Ask(MailboxType.VOE, b"two", delay_ns=50 * MS)
+        sent = yield MailboxRequest(MailboxType.VOE, b"one", expects_reply=False)
+        first = yield MailboxRequest(MailboxType.VOE, b"one", listen=True)
+        late = yield MailboxRequest(MailboxType.VOE, b"two", delay_ns=50 * MS)
         return sent.data, first.data, late.data
 
     begun = line.now_ns
@@ -312,7 +312,7 @@ def test_fragments_wait_for_who_comes_back_for_them(line, box):
     """Who asks from another process listens a while after the slave has sent the rest."""
 
     def ask(request, **options):
-        return (yield Ask(MailboxType.COE, request, **options)).data
+        return (yield MailboxRequest(MailboxType.COE, request, **options)).data
 
     request = encode_message(CoeService.SDO_INFORMATION, bytes.fromhex("01 00 0000 0100"))
     server(line).sizes.set(128, 16)
@@ -331,7 +331,7 @@ def test_errors_of_files_end_the_conversation_only(line, box):
     server(line).protocols[MailboxType.VOE] = Talker()
 
     def broken():
-        yield Ask(MailboxType.VOE, b"x")
+        yield MailboxRequest(MailboxType.VOE, b"x")
         raise OSError("no space left")
 
     with pytest.raises(BusError, match="slave 1001: saving: no space left"):

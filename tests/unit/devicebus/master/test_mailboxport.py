@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError, FrameLostError, WorkingCounterError
-from devicebus.master.access import Reply
+from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted, configure
 from devicebus.master.scan import assign_stations
 from devicebus.wire.datagram import Command
@@ -60,16 +60,16 @@ class Wire:
         if access.ado == 0x080E:
             self.repeat = access.data[0] & 2
         if access.ado == 0x080F:
-            return Reply(bytes((self.repeat * self.acknowledges,)), 1)
+            return DatagramReply(bytes((self.repeat * self.acknowledges,)), 1)
         if access.ado == 0x080D:
-            return Reply(b"\x08" if self.reply else b"\0", 1)
-        return Reply(self.reply, self.wkc, self.tries)
+            return DatagramReply(b"\x08" if self.reply else b"\0", 1)
+        return DatagramReply(self.reply, self.wkc, self.tries)
 
 
 def test_a_message_fills_its_mailbox():
     wire = Wire()
     assert drive(MailboxPort(7, AREA).post(b"abc"), wire) == Posted(True, False)
-    assert wire.accesses == [(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 0)]
+    assert wire.accesses == [DatagramRequest(Command.FPWR, 7, 0x1000, b"abc".ljust(32, b"\0"), 0)]
 
 
 def test_a_full_mailbox_takes_nothing():
@@ -82,7 +82,7 @@ def test_messages_are_fetched_whole_and_never_read_twice():
     port = MailboxPort(7, AREA)
     assert drive(port.is_full(), wire)
     assert drive(port.fetch(), wire) == b"x" * 48
-    assert wire.accesses[-1] == (Command.FPRD, 7, 0x1080, bytes(48), 1)
+    assert wire.accesses[-1] == DatagramRequest(Command.FPRD, 7, 0x1080, bytes(48), 1)
     assert drive(port.fetch(), Wire(wkc=0)) is None
     assert not drive(port.is_full(), Wire())
 
@@ -99,12 +99,12 @@ def test_a_lost_reply_is_asked_for_again():
     port, wire = MailboxPort(7, AREA), Wire(reply=b"x")
     lose_read(port)
     assert drive(port.is_full(), wire)
-    assert wire.accesses[0] == (Command.FPWR, 7, 0x080E, b"\x03", 0)
+    assert wire.accesses[0] == DatagramRequest(Command.FPWR, 7, 0x080E, b"\x03", 0)
     assert drive(port.fetch(), wire) == b"x"
     assert len(wire.accesses) == 4
     lose_read(port)
     assert drive(port.is_full(), wire)
-    assert wire.accesses[4][3] == b"\x01"
+    assert wire.accesses[4].data == b"\x01"
     assert port.repeats == 2
 
 
@@ -116,7 +116,7 @@ def test_mailbox_port_without_any_frame_back_asks_again_with_the_same_bit():
     with pytest.raises(FrameLostError):
         asking.throw(FrameLostError("gone"))
     assert drive(port.is_full(), wire)
-    assert wire.accesses[0][3] == b"\x03"
+    assert wire.accesses[0].data == b"\x03"
     assert port.repeats == 1
 
 

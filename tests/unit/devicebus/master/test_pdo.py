@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import MailboxProtocolError
-from devicebus.mailbox.conversation import Message
+from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.pdo import (
     Channel,
@@ -107,13 +107,13 @@ def test_a_mapping_is_written_as_index_subindex_and_bits():
     first = next(writing)
     assert first.request[3:6] == b"\x00\x16\x00"
     answer = encode_message(CoeService.SDO_RESPONSE, b"\x60\x00\x16\x00" + bytes(4))
-    second = writing.send(Message(MailboxType.COE, answer))
+    second = writing.send(MailboxMessage(MailboxType.COE, answer))
     assert second.request[5:] == b"\x01\x10\x02\x10\x70"
 
 
 def response(index, subindex, octets):
     body = encode_initiate(SdoResponse.UPLOAD, index, subindex, octets, complete=False, room=100)
-    return Message(MailboxType.COE, encode_message(CoeService.SDO_RESPONSE, body))
+    return MailboxMessage(MailboxType.COE, encode_message(CoeService.SDO_RESPONSE, body))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError, FrameLostError, WorkingCounterError
-from devicebus.master.access import Reply
+from devicebus.master.access import DatagramReply
 from devicebus.master.scan import (
     Identity,
     assign_stations,
@@ -53,12 +53,12 @@ def test_an_empty_bus_and_no_bus_at_all():
     line.segment.cut(0)
     with pytest.raises(FrameLostError):
         run(line, scan())
-    assert drive(scan(), lambda _: Reply(b"\0", 0)) == ()
+    assert drive(scan(), lambda _: DatagramReply(b"\0", 0)) == ()
 
 
 def test_more_slaves_than_can_be_are_refused():
     with pytest.raises(BusError, match="65000 slaves answered"):
-        drive(scan(), lambda _: Reply(b"\0", 65000))
+        drive(scan(), lambda _: DatagramReply(b"\0", 65000))
 
 
 def test_a_scan_survives_lost_frames():

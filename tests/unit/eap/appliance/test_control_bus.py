@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask
-from devicebus.master.access import Access, Reply, fprd
+from devicebus.mailbox.conversation import MailboxRequest
+from devicebus.master.access import DatagramReply, DatagramRequest, fprd
 from devicebus.wire.datagram import Command
 from eap.appliance.control import parameters
 from eap.appliance.control_bus import (
@@ -28,9 +28,11 @@ from eap.errors import ControlError
 @pytest.mark.parametrize(
     "ask",
     [
-        Ask(MailboxType.COE, b"\x01\xff"),
-        Ask(MailboxType.FOE, b"", listen=True, timeout_ns=3_000_000_000, delay_ns=10_000_000),
-        Ask(MailboxType.VOE, b"x", expects_reply=False),
+        MailboxRequest(MailboxType.COE, b"\x01\xff"),
+        MailboxRequest(
+            MailboxType.FOE, b"", listen=True, timeout_ns=3_000_000_000, delay_ns=10_000_000
+        ),
+        MailboxRequest(MailboxType.VOE, b"x", expects_reply=False),
     ],
 )
 def test_step(ask):
@@ -39,7 +41,7 @@ def test_step(ask):
 
 
 def test_times_are_rounded_up():
-    assert ask_parameters(Ask(MailboxType.COE, b"", timeout_ns=1))["timeout_ms"] == 1
+    assert ask_parameters(MailboxRequest(MailboxType.COE, b"", timeout_ns=1))["timeout_ms"] == 1
 
 
 def test_protocols():
@@ -51,8 +53,8 @@ def test_datagrams_and_replies():
     access = fprd(1001, 0x130, 6)
     assert to_access(datagram_row(access)) == access
     row = (Command.FPWR, 1, 2, "ff", 0)
-    assert to_access(row) == Access(Command.FPWR, 1, 2, b"\xff")
-    replies = [Reply(b"\1\2", 1, 2), Reply(b"", 0)]
+    assert to_access(row) == DatagramRequest(Command.FPWR, 1, 2, b"\xff")
+    replies = [DatagramReply(b"\1\2", 1, 2), DatagramReply(b"", 0)]
     assert to_replies([reply_row(each) for each in replies]) == replies
 
 

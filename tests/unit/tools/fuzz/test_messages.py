@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Ask, Conversation
+from devicebus.mailbox.conversation import Conversation, MailboxRequest
 from eap.codec.mailbox import MailboxType
 from tools.fuzz.messages import answer_with, cut
 
@@ -17,9 +17,9 @@ def test_octets_are_cut_by_the_lengths_in_them() -> None:
 
 
 def talk() -> Conversation[bytes]:
-    yield Ask(VOE, b"", expects_reply=False)
-    first = yield Ask(VOE, b"aaaaaa")
-    second = yield Ask(VOE, b"")
+    yield MailboxRequest(VOE, b"", expects_reply=False)
+    first = yield MailboxRequest(VOE, b"aaaaaa")
+    second = yield MailboxRequest(VOE, b"")
     return first.data + second.data
 
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from devicebus.errors import FoeError, MailboxClosedError
-from devicebus.mailbox.conversation import Message
+from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.commands import bus_foe, bus_session
 from eap.appliance.commands.bus_foe import exchange, get_file, put_file
@@ -199,7 +199,9 @@ class BrokenBus:
         conversation = begin(MailboxSizes(64, 64))
         next(conversation)
         for number in range(2):
-            conversation.send(Message(MailboxType.FOE, encode_message(FoeOpcode.ACK, number)))
+            conversation.send(
+                MailboxMessage(MailboxType.FOE, encode_message(FoeOpcode.ACK, number))
+            )
         self.faults += 1
         raise MailboxClosedError("the slave's mailbox was closed")
 

@@ -8,7 +8,7 @@ import pytest
 
 from devicebus.errors import AlStatusError, BusError, FrameLostError, MailboxTimeoutError
 from devicebus.mailbox import coe_client
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master.procedure import Sleep, read
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
@@ -75,7 +75,7 @@ def test_errors_reach_the_conversation(bus, works):
     def careful(sizes):
         assert sizes.to_slave > 16
         try:
-            yield Ask(MailboxType.COE, bytes(10), timeout_ns=5_000_000)
+            yield MailboxRequest(MailboxType.COE, bytes(10), timeout_ns=5_000_000)
         except MailboxTimeoutError:
             return "late"
 
@@ -141,7 +141,7 @@ def test_who_leaves_gives_the_turn_back(bus, works):
 
     def stuck(sizes):
         del sizes
-        yield Ask(MailboxType.COE, bytes.fromhex("00204018100100000000"))
+        yield MailboxRequest(MailboxType.COE, bytes.fromhex("00204018100100000000"))
         raise KeyboardInterrupt
 
     with (

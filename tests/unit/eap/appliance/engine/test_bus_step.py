@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import BusError
-from devicebus.mailbox.conversation import Ask, Message
-from devicebus.master.access import AS_SET, Access, Reply
-from devicebus.master.procedure import Answer
+from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
+from devicebus.master.access import AS_SET, DatagramReply, DatagramRequest
+from devicebus.master.procedure import StepResult
 from devicebus.wire.datagram import Command
 from eap.appliance.bus_request import AskMailbox, Datagram, Transfer
 from eap.appliance.engine.bus_step import MAX_TRIES, one_ask, one_step, to_accesses, to_ask
@@ -22,12 +22,12 @@ def test_a_message_keeps_all_that_was_asked():
         expects_reply=False,
     )  # fmt: skip
     ask = to_ask(request)
-    assert ask == Ask(MailboxType.FOE, b"x", True, 5, 6, False)
+    assert ask == MailboxRequest(MailboxType.FOE, b"x", True, 5, 6, False)
     conversation = one_ask(ask)
     assert next(conversation) == ask
     with pytest.raises(StopIteration) as end:
-        conversation.send(Message(MailboxType.FOE, b"reply"))
-    assert end.value.value == Message(MailboxType.FOE, b"reply")
+        conversation.send(MailboxMessage(MailboxType.FOE, b"reply"))
+    assert end.value.value == MailboxMessage(MailboxType.FOE, b"reply")
 
 
 def test_a_protocol_that_is_none_is_named():
@@ -37,12 +37,12 @@ def test_a_protocol_that_is_none_is_named():
 
 def test_datagrams_go_out_and_come_back_in_one_step():
     accesses = to_accesses(transfer(Datagram(4, 1001, 0x130, bytes(2), 0)))
-    assert accesses == [Access(Command.FPRD, 1001, 0x130, bytes(2))]
+    assert accesses == [DatagramRequest(Command.FPRD, 1001, 0x130, bytes(2))]
     procedure = one_step(accesses)
     assert next(procedure) == accesses
     with pytest.raises(StopIteration) as end:
-        procedure.send(Answer((Reply(b"\x08\0", 1, 2),), 0))
-    assert end.value.value == [Reply(b"\x08\0", 1, 2)]
+        procedure.send(StepResult((DatagramReply(b"\x08\0", 1, 2),), 0))
+    assert end.value.value == [DatagramReply(b"\x08\0", 1, 2)]
 
 
 @pytest.mark.parametrize(("wanted", "made"), [(-1, AS_SET), (0, AS_SET), (5, 5), (1000, MAX_TRIES)])

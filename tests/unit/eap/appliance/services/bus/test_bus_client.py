@@ -9,7 +9,7 @@ import pytest
 
 from devicebus.errors import AlStatusError, BusError, FrameLostError, MailboxTimeoutError
 from devicebus.mailbox import coe_client, foe_client
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.diagnosis import diagnose
 from devicebus.master.procedure import Sleep, read
@@ -97,7 +97,7 @@ def test_errors_reach_the_conversation_as_what_they_are():
 
         def stubborn():
             try:
-                yield Ask(MailboxType.COE, bytes(10), timeout_ns=5_000_000)
+                yield MailboxRequest(MailboxType.COE, bytes(10), timeout_ns=5_000_000)
             except MailboxTimeoutError as exc:
                 seen.append(exc)
             return "done"

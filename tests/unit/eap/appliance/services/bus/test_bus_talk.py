@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from msgspec.structs import replace
 
 from devicebus.drive import drive_async
 from devicebus.errors import MailboxTimeoutError
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from eap.appliance.bus_request import AskMailbox
 from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.engine_link import EngineLink
@@ -16,7 +17,7 @@ from eap.codec.mailbox import MailboxType
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
-VENDOR = Ask(MailboxType.COE, bytes.fromhex("00204018100100000000"))
+VENDOR = MailboxRequest(MailboxType.COE, bytes.fromhex("00204018100100000000"))
 
 
 def play(scene, kind=MailboxType.COE):
@@ -37,7 +38,7 @@ def play(scene, kind=MailboxType.COE):
 
 def test_step_as_it_was_asked_for():
     async def scene(talk, engine, given):
-        message = await talk.ask(VENDOR._replace(delay_ns=5, timeout_ns=10**9))
+        message = await talk.ask(replace(VENDOR, delay_ns=5, timeout_ns=10**9))
         assert message.type is MailboxType.COE
         assert message.data[6:] == b"\x5a\x0e\0\0"
         assert message.counter in range(1, 8)
@@ -54,7 +55,7 @@ def test_step_as_it_was_asked_for():
 def test_errors_are_thrown_into_the_conversation():
     def careful():
         try:
-            yield VENDOR._replace(timeout_ns=10**6)
+            yield replace(VENDOR, timeout_ns=10**6)
         except MailboxTimeoutError:
             return "late"
         raise AssertionError("it answered")
@@ -69,7 +70,7 @@ def test_errors_are_thrown_into_the_conversation():
 @pytest.mark.parametrize(("kind", "farewells"), [(MailboxType.COE, 1), (MailboxType.VOE, 0)])
 def test_abandoned(kind, farewells):
     async def scene(talk, engine, given):
-        asked = VENDOR._replace(expects_reply=False)
+        asked = replace(VENDOR, expects_reply=False)
         await talk.ask(asked)
         talk.abandon()
         talk.abandon()

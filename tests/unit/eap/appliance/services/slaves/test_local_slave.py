@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from devicebus.errors import MailboxBusyError, NoMailboxError, SoeError
-from devicebus.mailbox.conversation import Ask
+from devicebus.mailbox.conversation import MailboxRequest
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.slaves.access import SlaveAccess
@@ -99,7 +99,7 @@ def test_local_slave_without_turn_is_busy() -> None:
         other = await slave.bus.open_talk(1001, MailboxType.COE, "other")
         with pytest.raises(MailboxBusyError):
             await slave.read_object(0x1018, 1)
-        await other.ask(Ask(MailboxType.COE, bytes.fromhex("0020 40 1810 01 00000000")))
+        await other.ask(MailboxRequest(MailboxType.COE, bytes.fromhex("0020 40 1810 01 00000000")))
         other.close()
         assert await slave.read_object(0x1018, 1)
 
