@@ -388,6 +388,10 @@ def test_clients_are_served_while_three_hosts_attack_every_listener(
         # Nothing is broken: an error would name a wrong cause.
         assert [each for each in findings if each["severity"] == "error"] == []
         failures = [failure for each in readers for failure in each.failures]
+        if LOAD:  # a busy machine may be late, and must say so
+            late = [failure for failure in failures if "timed out" in failure]
+            assert len(late) < sum(len(each.took_s) for each in readers) / 200
+            failures = [failure for failure in failures if failure not in late]
         assert failures == []
         assert min(len(each.took_s) for each in readers) > SECONDS / (4 if LOAD else 2) - 2
         assert during["processes"] == before["processes"]
