@@ -17,7 +17,7 @@ from eap.aoe.ads_operation import (
     WriteControl,
 )
 from eap.appliance.bus_request import AskMailbox
-from eap.appliance.services.bus_ads import files, idns, service
+from eap.appliance.services.bus_ads import service, slave_ads, slave_files
 from eap.appliance.services.master.master_desk import MasterDesk
 from eap.codec.ads import (
     AdsDeviceInfo,
@@ -260,8 +260,8 @@ def test_answer_has_to_fit(length):
 
 
 def test_whatever_is_asked_is_answered(monkeypatch):
-    monkeypatch.setattr(files, "ANSWER_S", 0.01)
-    monkeypatch.setattr(idns, "ANSWER_S", 0.01)
+    monkeypatch.setattr(slave_files, "ANSWER_S", 0.01)
+    monkeypatch.setattr(slave_ads, "COMMAND_ANSWER_S", 0.01)
     pick = random.Random(7)
     groups = [*IndexGroup, 0, 0x8000_0000]
     offsets = [0, 1, 0x1018_0001, 0x1018_0100, 0x0040_0020, 0x0800_0063, 0xFFFF_FFFF]

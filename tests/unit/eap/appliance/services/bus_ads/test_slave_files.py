@@ -8,7 +8,7 @@ import pytest
 
 from eap.aoe.ads_operation import Read, ReadWrite, Write
 from eap.appliance.bus_request import AskMailbox
-from eap.appliance.services.bus_ads import files, transfer
+from eap.appliance.services.bus_ads import slave_files, transfer
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import NetId
 from tests.support.busads import Client, play
@@ -131,7 +131,7 @@ def test_handle_belongs_to_a_net_id_through_any_connection():
 
 
 def test_one_file_of_a_slave_at_a_time(monkeypatch):
-    monkeypatch.setattr(files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -148,7 +148,7 @@ def test_one_file_of_a_slave_at_a_time(monkeypatch):
 
 
 def test_file_that_nobody_asks_for_is_closed(monkeypatch):
-    monkeypatch.setattr(files, "IDLE_S", 0.02)
+    monkeypatch.setattr(slave_files, "IDLE_S", 0.02)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -176,7 +176,7 @@ def test_close_with_data_closes_the_file(data):
 
 
 def test_file_left_open_gives_way_to_the_next_one_of_its_owner(monkeypatch):
-    monkeypatch.setattr(files, "LEFT_S", 0.02)
+    monkeypatch.setattr(slave_files, "LEFT_S", 0.02)
 
     async def scene(client, engine):
         left = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -190,8 +190,8 @@ def test_file_left_open_gives_way_to_the_next_one_of_its_owner(monkeypatch):
 
 
 def test_file_left_open_does_not_count_when_its_owner_opens_the_next_one(monkeypatch):
-    monkeypatch.setattr(files, "LEFT_S", 0)
-    monkeypatch.setattr(files, "MAX_OF_CLIENT", 1)
+    monkeypatch.setattr(slave_files, "LEFT_S", 0)
+    monkeypatch.setattr(slave_files, "MAX_OF_CLIENT", 1)
 
     async def scene(client, engine):
         await client.open_file(DISK, OPEN_READ, b"a.bin")
@@ -202,8 +202,8 @@ def test_file_left_open_does_not_count_when_its_owner_opens_the_next_one(monkeyp
 
 
 def test_file_left_open_does_not_give_way_to_other_clients(monkeypatch):
-    monkeypatch.setattr(files, "LEFT_S", 0)
-    monkeypatch.setattr(files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "LEFT_S", 0)
+    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -216,8 +216,8 @@ def test_file_left_open_does_not_give_way_to_other_clients(monkeypatch):
 
 
 def test_file_in_use_does_not_give_way_to_the_next_one_of_its_owner(monkeypatch):
-    monkeypatch.setattr(files, "LEFT_S", 0.05)
-    monkeypatch.setattr(files, "ANSWER_S", 0.1)
+    monkeypatch.setattr(slave_files, "LEFT_S", 0.05)
+    monkeypatch.setattr(slave_files, "ANSWER_S", 0.1)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -248,7 +248,7 @@ def test_file_that_is_given_up_keeps_its_content():
 
 
 def test_slow_slave_is_waited_for_by_asking_again(monkeypatch):
-    monkeypatch.setattr(files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
@@ -271,7 +271,7 @@ def test_slow_slave_is_waited_for_by_asking_again(monkeypatch):
 
 
 def test_slave_that_says_yes_late(monkeypatch):
-    monkeypatch.setattr(files, "ANSWER_S", 0.05)
+    monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
         hold_mailboxes(engine)
@@ -293,14 +293,14 @@ def hold_mailboxes(engine):
 
 
 def test_limits(monkeypatch):
-    monkeypatch.setattr(files, "MAX_OF_CLIENT", 1)
+    monkeypatch.setattr(slave_files, "MAX_OF_CLIENT", 1)
 
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_READ, b"a.bin")
         full = await client.do(DISK, ReadWrite(OPEN_READ, 0, 4, b"a.bin"))
         assert full.result == AdsError.NO_MORE_HANDLES
         for operation, result in (
-            (ReadWrite(READ, handle, files.MAX_BLOCK + 1, b""), AdsError.SIZE),
+            (ReadWrite(READ, handle, slave_files.MAX_BLOCK + 1, b""), AdsError.SIZE),
             (ReadWrite(READ, handle, 4, b"data"), AdsError.SIZE),
             (ReadWrite(OPEN_READ, 0, 3, b"a.bin"), AdsError.SIZE),
             (ReadWrite(WRITE, handle, 0, b"data"), AdsError.ACCESS),

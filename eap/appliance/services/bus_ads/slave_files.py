@@ -1,12 +1,12 @@
-"""The files of slaves behind index groups, by FoE (Ads.h of the TwinCAT SDK; ETG.1000.6).
+"""ADS services of the files of slaves, by FoE (Ads.h of the TwinCAT SDK; ETG.1000.6).
 
 A file is opened by its name, read or written in blocks by a handle, and closed; Read and Write do
-as well as the ReadWrite that TwinCAT's clients send.  Own format: what cannot be answered in time
-is answered BUSY, has done nothing, and is to be asked again; what FOE_PROGRESS answers; and that a
-ReadWrite of it with any data gives the file up, where closing it would make it complete.  Data of
-a close means nothing: some clients cannot write none.  Handles belong to the NetID that opened
-them, through whichever connection it comes; a file that it has left open gives way to its next one
-at that slave, which takes one at a time.
+as well as the ReadWrite that TwinCAT's clients send.  Own format: a request that cannot be answered
+in time is answered BUSY, has done nothing, and is to be sent again; the answer to FOE_PROGRESS; and
+that a ReadWrite of it with any data gives the file up, where closing it would make it complete.
+Data of a close means nothing: some clients cannot write none.  Handles belong to the NetID that
+opened them, through whichever connection it comes; a file that it has left open gives way to its
+next one at that slave, which takes one at a time.
 """
 
 from __future__ import annotations
@@ -17,14 +17,11 @@ import secrets
 from collections.abc import Awaitable, Collection
 from typing import TypeVar
 
-from devicebus.wire.sii import SiiProtocol
-from eap.aoe.ads_operation import AdsRefusedError
-from eap.appliance.handover import PortName
-from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.bus_ads.slave_space import Asked, SlaveSpace
+from eap.aoe.ads_notifications import Client
+from eap.aoe.ads_operation import AdsRefusedError, Read, ReadWrite, Write
 from eap.appliance.services.bus_ads.transfer import Transfer
+from eap.appliance.services.slaves.local_slave import LocalSlave
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
 from eap.ids import NetId
 
@@ -33,12 +30,12 @@ T = TypeVar("T")
 ANSWER_S = 3.0
 """How long one request may take."""
 IDLE_S = 30.0
-"""A file for which nothing is asked for so long is closed: others may wait for the slave."""
+"""A file without requests for so long is closed: other clients may wait for the slave."""
 LEFT_S = 2.0
-"""A file for which nothing is asked for so long gives way to the next one of its owner.
+"""A file without requests for so long gives way to the next one of its owner.
 
-Shorter than ANSWER_S, so that the next one has its turn when it asks for the first time; longer
-than the pauses between the blocks of a transfer, since several programs may share one NetID.
+Shorter than ANSWER_S, so that the next one has its turn at its first request; longer than the
+pauses between the blocks of a transfer, since several programs may share one NetID.
 """
 MAX_OF_CLIENT = 8
 """Files that a NetID may have open."""
@@ -46,26 +43,27 @@ MAX_OPEN = 64
 MAX_BLOCK = 1 << 19
 """Octets of the longest block."""
 _HANDLE_SIZE = 4
+_OPENED = frozenset((IndexGroup.FOE_OPEN_READ, IndexGroup.FOE_OPEN_WRITE))
+_WRITTEN = frozenset((IndexGroup.FOE_WRITE, IndexGroup.FOE_CLOSE))
 
 logger = logging.getLogger(__name__)
 
 
-class _Open:
-    """A file that somebody has open."""
+class _OpenFile:
+    """A file with a handle."""
 
-    def __init__(self, owner: NetId, station: int, what: str, transfer: Transfer) -> None:
+    def __init__(self, owner: NetId, station: int, name: str, stream: Transfer) -> None:
         self.owner = owner
         self.station = station
-        self.what = what
-        self.transfer = transfer
-        self.task: asyncio.Task[None] | None = None
+        self.name = name
+        self.stream = stream
         self.idle: asyncio.TimerHandle | None = None
         self.idle_since_s: float | None = None
         """None while something is being done with it."""
 
 
-class SlaveFiles(SlaveSpace):
-    """Files that are open, and those that may be opened."""
+class SlaveFiles:
+    """Files of the slaves on one bus that clients have open."""
 
     groups: Collection[int] = frozenset(
         (
@@ -77,36 +75,33 @@ class SlaveFiles(SlaveSpace):
             IndexGroup.FOE_PROGRESS,
         )
     )
-    protocol = SiiProtocol.FOE
 
-    def __init__(self, bus: BusClient, port: PortName) -> None:
-        super().__init__(bus, port)
-        self._open: dict[int, _Open] = {}
+    def __init__(self) -> None:
+        self._open: dict[int, _OpenFile] = {}
 
-    async def read(self, asked: Asked, group: int, offset: int, length: int) -> bytes:
-        """Return a block or how far a transfer is."""
-        return await self.read_write(asked, group, offset, length, b"")
-
-    async def write(self, asked: Asked, group: int, offset: int, data: bytes) -> None:
-        """Take a block, or close a file."""
-        if group not in {IndexGroup.FOE_WRITE, IndexGroup.FOE_CLOSE}:
-            raise AdsRefusedError(AdsError.SERVICE, "a file is opened by ReadWrite")
-        await self.read_write(asked, group, offset, 0, data)
-
-    async def read_write(
-        self, asked: Asked, group: int, offset: int, length: int, data: bytes
+    async def perform(
+        self,
+        access: LocalSlave,
+        station: int,
+        client: Client,
+        operation: Read | Write | ReadWrite,
     ) -> bytes:
-        """Open a file, or do something with the one that the handle *offset* names."""
-        if group in {IndexGroup.FOE_OPEN_READ, IndexGroup.FOE_OPEN_WRITE}:
+        """Open a file, or do something with the one that the operation's offset names."""
+        group, offset = operation.group, operation.offset
+        length = 0 if isinstance(operation, Write) else operation.length
+        data = b"" if isinstance(operation, Read) else operation.data
+        if isinstance(operation, Write) and group not in _WRITTEN:
+            raise AdsRefusedError(AdsError.SERVICE, "a file is opened by ReadWrite")
+        if group in _OPENED:
             if length < _HANDLE_SIZE:
                 raise AdsRefusedError(AdsError.SIZE, "a handle has four octets")
             is_write = group == IndexGroup.FOE_OPEN_WRITE
-            return await self._begin(asked, data, offset, is_write=is_write)
+            return await self._begin(access, station, client, data, offset, is_write=is_write)
         if max(len(data), length) > MAX_BLOCK:
             raise AdsRefusedError(AdsError.SIZE, f"a block has at most {MAX_BLOCK} octets")
         if data and group == IndexGroup.FOE_READ:
             raise AdsRefusedError(AdsError.SIZE, "nothing is written here")
-        item = self._find(asked, offset)
+        item = self._find(station, client, offset)
         self._end_idle(item)
         try:
             return await self._do(item, offset, group, length, data)
@@ -114,23 +109,27 @@ class SlaveFiles(SlaveSpace):
             if offset in self._open:
                 self._begin_idle(offset)
 
-    async def _begin(self, asked: Asked, name: bytes, password: int, *, is_write: bool) -> bytes:
-        owner, station = asked.client.net_id, asked.slave.station
+    async def _begin(
+        self,
+        access: LocalSlave,
+        station: int,
+        client: Client,
+        name: bytes,
+        password: int,
+        *,
+        is_write: bool,
+    ) -> bytes:
+        owner = client.net_id
         self._replace_left(owner, station)
         self._check_room(owner)
-        what = _text(name)
-        transfer = Transfer(what, password, asked.sizes, is_write=is_write)
-        item = _Open(owner, station, f"file {what!r} of slave {station}", transfer)
+        text = _text(name)
+        stream = access.open_file(text, password, is_write=is_write)
         handle = self._new_handle()
-        self._open[handle] = item
-        # By the handle, not by the client: two of its files are two that want a turn.
-        talk = self.bus.open_talk
-        opening = transfer.run(lambda: talk(self.port, station, MailboxType.FOE, handle))
-        item.task = asyncio.get_running_loop().create_task(opening)
+        self._open[handle] = _OpenFile(owner, station, f"file {text!r} of slave {station}", stream)
         try:
-            await _in_time(transfer.wait_open(), "")
+            await _in_time(stream.wait_open(), "")
         except AdsRefusedError:
-            if not transfer.has_turn:
+            if not stream.has_turn:
                 self._drop(handle)
                 why = f"another file goes to slave {station} or comes from it"
                 raise AdsRefusedError(AdsError.BUSY, why) from None
@@ -141,31 +140,33 @@ class SlaveFiles(SlaveSpace):
         self._begin_idle(handle)
         return handle.to_bytes(_HANDLE_SIZE, "little")
 
-    async def _do(self, item: _Open, handle: int, group: int, length: int, data: bytes) -> bytes:
-        transfer = item.transfer
+    async def _do(
+        self, item: _OpenFile, handle: int, group: int, length: int, data: bytes
+    ) -> bytes:
+        stream = item.stream
         match group:
             case IndexGroup.FOE_PROGRESS if data:
                 self._drop(handle)
             case IndexGroup.FOE_PROGRESS:
-                return _progress(transfer)[:length]
+                return _progress(stream)[:length]
             case IndexGroup.FOE_READ | IndexGroup.FOE_WRITE:
-                if transfer.is_write is not (group == IndexGroup.FOE_WRITE):
-                    done = "written" if transfer.is_write else "read"
-                    raise AdsRefusedError(AdsError.ACCESS, f"{item.what} is being {done}")
-                if not transfer.is_write:
-                    return await _in_time(transfer.read(length), item.what)
-                if transfer.is_whole:
-                    raise AdsRefusedError(AdsError.STATE, f"{item.what} is being closed")
-                await _in_time(transfer.write(data), item.what)
+                if stream.is_write is not (group == IndexGroup.FOE_WRITE):
+                    done = "written" if stream.is_write else "read"
+                    raise AdsRefusedError(AdsError.ACCESS, f"{item.name} is being {done}")
+                if not stream.is_write:
+                    return await _in_time(stream.read(length), item.name)
+                if stream.is_whole:
+                    raise AdsRefusedError(AdsError.STATE, f"{item.name} is being closed")
+                await _in_time(stream.write(data), item.name)
             case _:
                 await self._finish(item, handle)
         return b""
 
-    async def _finish(self, item: _Open, handle: int) -> None:
+    async def _finish(self, item: _OpenFile, handle: int) -> None:
         """Close a file; one that is being written is complete only now."""
-        if item.transfer.is_write:
+        if item.stream.is_write:
             try:
-                await _in_time(item.transfer.finish(), item.what)
+                await _in_time(item.stream.finish(), item.name)
             except EapError:
                 self._drop(handle)
                 raise
@@ -180,14 +181,14 @@ class SlaveFiles(SlaveSpace):
             left_at_s = item.idle_since_s + LEFT_S
             if left_at_s <= loop.time():
                 self._give_up_left(handle, item.idle_since_s)
-            elif item.transfer.has_turn:
+            elif item.stream.has_turn:
                 loop.call_at(left_at_s, self._give_up_left, handle, item.idle_since_s)
 
     def _give_up_left(self, handle: int, since_s: float) -> None:
         """Give a file up if nothing has been asked for it since then."""
         item = self._open.get(handle)
         if item is not None and item.idle_since_s == since_s:
-            logger.info("%s given up: %s left it open and opens another one", item.what, item.owner)
+            logger.info("%s given up: %s left it open and opens another one", item.name, item.owner)
             self._drop(handle)
 
     def _check_room(self, owner: NetId) -> None:
@@ -202,11 +203,10 @@ class SlaveFiles(SlaveSpace):
             handle = secrets.randbits(8 * _HANDLE_SIZE)
         return handle
 
-    def _find(self, asked: Asked, handle: int) -> _Open:
+    def _find(self, station: int, client: Client, handle: int) -> _OpenFile:
         item = self._open.get(handle)
-        place = asked.client.net_id, asked.slave.station
-        if item is None or (item.owner, item.station) != place:
-            why = f"slave {place[1]}: {place[0]} has no file open by the handle 0x{handle:X}"
+        if item is None or (item.owner, item.station) != (client.net_id, station):
+            why = f"slave {station}: {client.net_id} has no file open by the handle 0x{handle:X}"
             raise AdsRefusedError(AdsError.INDEX_OFFSET, why)
         return item
 
@@ -217,14 +217,14 @@ class SlaveFiles(SlaveSpace):
         item.idle_since_s = loop.time()
         item.idle = loop.call_later(IDLE_S, self._expire, handle)
 
-    def _end_idle(self, item: _Open) -> None:
+    def _end_idle(self, item: _OpenFile) -> None:
         item.idle_since_s = None
         if item.idle is not None:
             item.idle.cancel()
 
     def _expire(self, handle: int) -> None:
         item = self._open[handle]
-        logger.info("%s closed: %s has asked for nothing for %g s", item.what, item.owner, IDLE_S)
+        logger.info("%s closed: %s has asked for nothing for %g s", item.name, item.owner, IDLE_S)
         self._drop(handle)
 
     def _drop(self, handle: int) -> None:
@@ -232,8 +232,7 @@ class SlaveFiles(SlaveSpace):
         if item is None:
             return
         self._end_idle(item)
-        if item.task is not None:
-            item.task.cancel()
+        item.stream.close()
 
 
 async def _in_time(work: Awaitable[T], what: str) -> T:
@@ -251,7 +250,7 @@ def _text(name: bytes) -> str:
         raise AdsRefusedError(AdsError.VALUE, "a file name that is no UTF-8") from None
 
 
-def _progress(transfer: Transfer) -> bytes:
+def _progress(stream: Transfer) -> bytes:
     """Octets so far, and 1 if these are all and there was no error, of 32 bits each."""
-    done = min(transfer.progress.done, 0xFFFF_FFFF)
-    return done.to_bytes(4, "little") + transfer.is_complete.to_bytes(4, "little")
+    done = min(stream.progress.done, 0xFFFF_FFFF)
+    return done.to_bytes(4, "little") + stream.is_complete.to_bytes(4, "little")
