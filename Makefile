@@ -13,10 +13,10 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo valve test check bench clean
+.PHONY: help setup demo valve test test-tools check structure bench clean
 
 help:  ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-6s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
 
 setup: .venv/.stamp-dev  ## prepare .venv for tests and checks (once, and when pyproject.toml changes)
 
@@ -38,9 +38,14 @@ valve: .venv/.stamp-run  ## a limit switch on one station's bus opens a valve on
 	@$(BIN)/python tools/valve_demo.py
 
 # Each worker has a network of its own, as an ordinary user in a user namespace where these are allowed; tests marked quiet run alone: see tests/conftest.py.
-test: setup  ## run all tests; as root, first install the programs they use
+PYTEST := sh tools/isolated.sh $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+test: setup  ## run all tests of the product; as root, first install the programs they use
 	@sh tools/install_peers.sh test || echo 'make test: going on; what needs them is skipped and listed'
-	@sh tools/isolated.sh $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
+	@$(PYTEST) $(ARGS)
+
+test-tools: setup  ## run the tests of tools/: fuzz targets, page of faults, benchmarks
+	@$(PYTEST) tests/tools $(ARGS)
 
 check: setup  ## format, lint, types, import contracts, tree
 	$(BIN)/ruff format --check .
@@ -48,6 +53,9 @@ check: setup  ## format, lint, types, import contracts, tree
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python tools/check_tree.py
+
+structure: setup  ## count modules, code lines, names, tests, and modules that a request passes
+	@sh tools/isolated.sh $(BIN)/python -m tools.structure --paths $(ARGS)
 
 bench: .venv/.stamp-bench  ## measure speed and memory (as root for everything; takes minutes)
 	@sh tools/install_peers.sh bench || echo 'make bench: going on without; what needs them is left out'

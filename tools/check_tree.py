@@ -1,7 +1,7 @@
 """Check the shape of the tree: what no linter of single files sees.
 
 Rules: the top level holds only what ``docs/architecture.md`` allows; modules stay under 700 lines;
-``tests/unit`` holds test files, in folders named after the packages that they test;
+``tests/unit`` and ``tests/tools`` hold test files, in folders named after what they test;
 nothing that is true of one machine only is committed; unfinished work names its issue; the files
 that pages in ``docs/`` name exist.
 
@@ -39,7 +39,11 @@ TOP_LEVEL = frozenset(
 )
 PACKAGES = ("eap", "devicebus")
 MAX_LINES = 700
-UNIT = PurePosixPath("tests/unit")
+MIRRORS = (
+    (PurePosixPath("tests/unit"), PurePosixPath("tests/unit")),
+    (PurePosixPath("tests/tools"), PurePosixPath("tests")),
+)
+"""Folders of test files, and the part of their path that stands for the top level."""
 
 # Written so that no pattern matches its own line.
 FORBIDDEN = (
@@ -129,15 +133,16 @@ def check_top_level(files: list[PurePosixPath]) -> Iterator[Violation]:
 
 
 def check_unit_tests(files: list[PurePosixPath]) -> Iterator[Violation]:
-    """Yield files under ``tests/unit`` that are no tests, or whose folder mirrors no package."""
+    """Yield files in the mirrors that are no tests, or whose folder mirrors no package."""
     folders = {name.parent for name in files if not name.is_relative_to("tests")}
-    for name in files:
-        if not name.is_relative_to(UNIT) or name.suffix != ".py" or name.name == "conftest.py":
-            continue
-        if not name.name.startswith("test_"):
-            yield Violation(name, 1, "no test file", "helpers of tests in tests/support")
-        elif name.parent != UNIT and name.parent.relative_to(UNIT) not in folders:
-            yield Violation(name, 1, "a unit test of no package", "its package's folder")
+    for mirror, top in MIRRORS:
+        for name in files:
+            if not name.is_relative_to(mirror) or name.suffix != ".py" or name.stem == "conftest":
+                continue
+            if not name.name.startswith("test_"):
+                yield Violation(name, 1, "no test file", "helpers of tests in tests/support")
+            elif name.parent != mirror and name.parent.relative_to(top) not in folders:
+                yield Violation(name, 1, "a unit test of no package", "its package's folder")
 
 
 def check_text(name: PurePosixPath, text: str) -> Iterator[Violation]:

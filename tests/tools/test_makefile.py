@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
     ("target", "installed"),
-    [("demo", "run"), ("valve", "run"), ("setup", "dev"), ("test", "dev"), ("check", "dev")],
+    [("demo", "run"), ("valve", "run"), ("test", "dev"), ("test-tools", "dev"), ("check", "dev")],
 )
 def test_make_installs_only_what_the_target_needs(target: str, installed: str) -> None:
     done = subprocess.run(

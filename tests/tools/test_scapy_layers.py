@@ -64,7 +64,7 @@ def test_stream_waits_for_a_whole_frame() -> None:
 
 def test_referee_knows_nothing_of_our_codec() -> None:
     code = "import sys, tools.scapy_layers; print([m for m in sys.modules if m[:3] == 'eap'])"
-    root = Path(__file__).parents[3]
+    root = Path(__file__).parents[2]
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
     )

@@ -67,6 +67,13 @@ def test_unit_test_in_a_folder_of_no_package_is_reported(tmp_path):
     ]
 
 
+def test_test_of_tools_in_a_folder_of_no_tool_is_reported(tmp_path):
+    grow(tmp_path, "tools/bench/a.py", "tests/tools/bench/test_a.py", "tests/tools/gone/test_a.py")
+    assert found(tmp_path) == [
+        "tests/tools/gone/test_a.py:1: a unit test of no package, expected its package's folder"
+    ]
+
+
 def test_helper_in_the_mirror(tmp_path):
     grow(tmp_path, "eap/ids.py", "tests/unit/eap/helper.py")
     assert found(tmp_path) == [

@@ -69,7 +69,7 @@ def test_unknown_target_is_named(capsys: pytest.CaptureFixture[str]) -> None:
 def test_runs_as_a_program() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tools.fuzz", "ams", "mailbox", "--seconds", "0.1"],
-        cwd=Path(__file__).parents[4],
+        cwd=Path(__file__).parents[3],
         capture_output=True,
         text=True,
         check=True,
