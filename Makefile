@@ -13,7 +13,7 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo valve test test-tools check structure bench clean
+.PHONY: help setup demo valve test test-tools properties check structure bench clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -46,6 +46,9 @@ test: setup  ## run all tests of the product; as root, first install the program
 
 test-tools: setup  ## run the tests of tools/: fuzz targets, page of faults, benchmarks
 	@$(PYTEST) tests/tools $(ARGS)
+
+properties: setup  ## run the property tests with all their examples; make test takes a quarter
+	@$(PYTEST) -m hypothesis --hypothesis-profile=full tests $(ARGS)
 
 check: setup  ## format, lint, types, import contracts, tree
 	$(BIN)/ruff format --check .

@@ -24,13 +24,15 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
-    "ci",
+    "full",
     derandomize=True,
     deadline=None,
     database=None,
+    max_examples=100,
     suppress_health_check=[HealthCheck.too_slow],
 )
-settings.load_profile("ci")
+settings.register_profile("quick", settings.get_profile("full"), max_examples=25)
+settings.load_profile("quick")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts what it puts into the background that way, and programs inherit it: those of
@@ -121,10 +123,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what this machine cannot do, and begin with the files that take longest.
-
-    A worker that has the last long file would keep the others waiting.
-    """
+    """Skip tests for which this machine lacks something, and put tests with sockets last."""
     missing = {
         "root": _lacks_root(),
         "host_root": _lacks_host_root(),
@@ -136,7 +135,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for marker, reason in missing.items():
             if reason is not None and item.get_closest_marker(marker) is not None:
                 item.add_marker(pytest.mark.skip(reason=reason))
-    items.sort(key=lambda item: (_is_net(item), "tools" not in item.path.parts))
+    items.sort(key=_is_net)
 
 
 def pytest_collection_finish() -> None:

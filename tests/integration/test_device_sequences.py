@@ -15,7 +15,6 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from msgspec.structs import replace
@@ -38,6 +37,7 @@ from eap.pd.spec import (
     VariableSpec,
     Writer,
 )
+from tests.support.examples import examples
 from tests.support.stationengine import StationEngine, make_device
 
 PORT = PortSpec("eap0", PortKind.EAP, "udp://127.9.2.1", "1.2.3.4.5.1")
@@ -219,4 +219,4 @@ class Sequences(RuleBasedStateMachine):
 
 
 TestSequences = Sequences.TestCase
-TestSequences.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
+TestSequences.settings = examples(60, stateful_step_count=25)

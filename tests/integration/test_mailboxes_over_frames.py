@@ -10,7 +10,6 @@ from ipaddress import IPv4Address
 from itertools import count
 from random import Random
 
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
@@ -34,6 +33,7 @@ from eap.codec.eoe import IpSettings
 from eap.codec.soe import Idn, encode_list
 from eap.ids import NetId
 from tests.support.busline import MS, POLL_NS, TRIP_NS, Bench, Line, open_mailbox, segment, slave
+from tests.support.examples import examples
 
 LONGEST_TRIP_NS = 800_000
 """Of a frame on its way to the slaves, and on its way back; less than a master waits for both."""
@@ -214,4 +214,4 @@ class MailboxMachine(RuleBasedStateMachine):
 
 
 TestMailboxMachine = MailboxMachine.TestCase
-TestMailboxMachine.settings = settings(max_examples=20, stateful_step_count=20)
+TestMailboxMachine.settings = examples(20, stateful_step_count=20)

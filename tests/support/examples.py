@@ -1,13 +1,18 @@
-"""How many examples a property takes where few are as good as many."""
+"""Number of examples of a property that needs more or fewer of them than others."""
 
 from __future__ import annotations
 
-import os
+from typing import Any
 
 from hypothesis import settings
 
-FEW = settings(max_examples=100 if os.environ.get("EAP_LONG") else 25)
-"""For costly properties whose first examples reach every branch that 100 of them reach.
+_FEWEST = 8
 
-``EAP_LONG=1`` takes the 100.
-"""
+
+def examples(number: int, **others: Any) -> settings:
+    """Return settings with *number* examples of a full run, where other properties take 100.
+
+    In a quick run they are fewer in the same proportion: ``tests/conftest.py`` has both profiles.
+    """
+    share = settings().max_examples / 100
+    return settings(max_examples=max(round(number * share), min(number, _FEWEST)), **others)

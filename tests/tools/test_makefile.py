@@ -11,7 +11,14 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.parametrize(
     ("target", "installed"),
-    [("demo", "run"), ("valve", "run"), ("test", "dev"), ("test-tools", "dev"), ("check", "dev")],
+    [
+        ("demo", "run"),
+        ("valve", "run"),
+        ("test", "dev"),
+        ("test-tools", "dev"),
+        ("properties", "dev"),
+        ("check", "dev"),
+    ],
 )
 def test_make_installs_only_what_the_target_needs(target: str, installed: str) -> None:
     done = subprocess.run(

@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from tools.structure.paths import Calls, read_calls, find_passed
+from tools.structure.paths import Calls, find_passed, read_calls
 
 TRACER = Path(__file__).parents[3] / "tools" / "structure" / "tracer"
 

@@ -4,7 +4,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from devicebus.errors import BusError, MailboxProtocolError, MailboxSizeError
@@ -15,6 +15,7 @@ from eap.aoe.answer import AmsAnswer
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.ids import NetId
+from tests.support.examples import examples
 from tests.support.mailbox import Fault, Line, open_line, run_with, talk_to
 
 AOE = MailboxType.AOE
@@ -52,7 +53,7 @@ def serve(sizes: MailboxSizes, seed: int | None = None) -> Line:
     return open_line(AOE, server, sizes, lambda: dice.choice(bad) if seed else Fault.NONE)
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(st.binary(max_size=400), st.integers(39, 128), st.integers(39, 128), st.integers(0, 1 << 30))
 def test_exchange_with_our_slave_whatever_its_mailboxes_hold(
     data: bytes, to_slave: int, to_master: int, seed: int

@@ -7,7 +7,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
@@ -20,6 +20,7 @@ from eap.codec.mailbox import MailboxType
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, Entry, ObjectCode, OdObject, OdState, array, variable
+from tests.support.examples import examples
 from tests.support.mailbox import Fault, Line, open_line, run_with, talk_to
 
 COE = MailboxType.COE
@@ -234,7 +235,7 @@ def faults(dice: Random | None) -> object:
     return lambda: dice.choice([Fault.NONE] * 6 + list(Fault))
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.binary(max_size=1500).map(lambda data: data.replace(b"\0", b"x")),
     st.integers(16, 256),
@@ -250,7 +251,7 @@ def test_what_was_written_is_read_over_a_bad_line(
     assert line.run(coe_client.upload(0x2000, 0)) == data
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(st.lists(st.integers(0, 0xFFFF), max_size=8), st.integers(16, 64), st.integers(0, 1 << 30))
 def test_whole_objects_over_a_bad_line(numbers: list[int], size: int, seed: int) -> None:
     sizes = MailboxSizes(size, size)
@@ -321,4 +322,4 @@ class CoeMachine(RuleBasedStateMachine):
 
 
 TestCoeMachine = CoeMachine.TestCase
-TestCoeMachine.settings = settings(max_examples=25, stateful_step_count=25)
+TestCoeMachine.settings = examples(25, stateful_step_count=25)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
@@ -26,6 +26,7 @@ from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxType
+from tests.support.examples import examples
 from tests.support.mailbox import Fault, Line, open_line, run_with
 
 FOE = MailboxType.FOE
@@ -232,7 +233,7 @@ def get(line: Line, name: str, password: int = 0) -> bytes:
     return sink.getvalue()
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.binary(max_size=600),
     st.integers(16, 128),
@@ -303,4 +304,4 @@ class FoeMachine(RuleBasedStateMachine):
 
 
 TestFoeMachine = FoeMachine.TestCase
-TestFoeMachine.settings = settings(max_examples=25, stateful_step_count=25)
+TestFoeMachine.settings = examples(25, stateful_step_count=25)

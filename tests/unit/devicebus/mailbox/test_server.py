@@ -6,7 +6,7 @@ import io
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
@@ -29,6 +29,7 @@ from eap.codec.mailbox import (
 )
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
+from tests.support.examples import examples
 from tests.support.mailbox import Fault, Line
 
 
@@ -309,4 +310,4 @@ class MailboxMachine(RuleBasedStateMachine):
 
 
 TestMailboxMachine = MailboxMachine.TestCase
-TestMailboxMachine.settings = settings(max_examples=25, stateful_step_count=30)
+TestMailboxMachine.settings = examples(25, stateful_step_count=30)

@@ -7,7 +7,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
@@ -22,6 +22,7 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Display, Element, Idn, SoeAttribute, encode_list
 from eap.codec.soeerror import SoeErrorCode
 from eap.od.model import OdState
+from tests.support.examples import examples
 from tests.support.mailbox import Fault, Line, open_line, run_with, talk_to
 
 SOE = MailboxType.SOE
@@ -216,7 +217,7 @@ def serve(sizes: MailboxSizes, dice: Random | None) -> Line:
     return open_line(SOE, server, sizes, lambda: dice.choice(bad) if dice else Fault.NONE)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.binary(max_size=1200),
     st.integers(16, 128),
@@ -286,4 +287,4 @@ class SoeMachine(RuleBasedStateMachine):
 
 
 TestSoeMachine = SoeMachine.TestCase
-TestSoeMachine.settings = settings(max_examples=25, stateful_step_count=25)
+TestSoeMachine.settings = examples(25, stateful_step_count=25)

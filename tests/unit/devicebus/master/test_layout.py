@@ -8,7 +8,6 @@ from devicebus.errors import BusError
 from devicebus.master.layout import BASE, Group, SlaveShape, lay_out
 from devicebus.master.link import MAX_DATA
 from devicebus.master.pdo import Channel, Pdo, PdoEntry
-from tests.support.examples import FEW
 
 
 def channel(number, *bits, is_output, start=0x1100, name=""):
@@ -60,7 +59,6 @@ def test_more_than_a_frame_holds_goes_in_several():
     assert layout.places[3].fmmus[1].logical_start == BASE + 0x800 + 400
 
 
-@FEW
 @given(st.lists(st.tuples(st.integers(0, 700), st.integers(0, 700)), max_size=12))
 def test_no_octet_is_used_twice_and_no_slave_is_split(sizes):
     slaves = [shape(n, (8,) * out, (8,) * into) for n, (out, into) in enumerate(sizes)]

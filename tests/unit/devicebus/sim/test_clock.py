@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from devicebus.sim.clock import Clock
 from devicebus.wire.register import Register
-from tests.support.examples import FEW
 
 
 @pytest.fixture
@@ -61,7 +60,6 @@ def test_difference_is_sign_and_magnitude(memory):
     assert get(memory, Register.DC_SYSTEM_TIME_DIFFERENCE, 4) == 2000
 
 
-@FEW
 @given(st.integers(-200, 200))
 def test_loop_takes_out_drift(drift_ppm):
     memory = bytearray(0x1000)

@@ -8,7 +8,6 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from devicebus.sim.syncmanager import SyncChannel
 from devicebus.wire.register import Register, SyncManager
-from tests.support.examples import FEW
 
 START, SIZE = 0x1000, 16
 
@@ -168,4 +167,3 @@ class MailboxMachine(RuleBasedStateMachine):
 
 
 TestMailboxMachine = MailboxMachine.TestCase
-TestMailboxMachine.settings = FEW

@@ -14,7 +14,6 @@ from devicebus.wire.datagram import (
 )
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.examples import FEW
 from tests.support.records import records
 
 datagrams = st.lists(
@@ -38,7 +37,6 @@ def test_logical_commands_are_the_three_of_the_standard() -> None:
     assert [c.name for c in Command if c.is_logical] == ["LRD", "LWR", "LRW"]
 
 
-@FEW
 @given(datagrams)
 def test_round_trip(items: list[Datagram]) -> None:
     frame = encode_frame(items)

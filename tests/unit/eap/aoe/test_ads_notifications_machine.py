@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, rule
 
@@ -14,6 +13,7 @@ from eap.codec.adsnotification import (
     AddNotification,
     decode_notification,
 )
+from tests.support.examples import examples
 from tests.unit.eap.aoe.test_ads_notifications import (
     CHANGE,
     CYCLE,
@@ -131,4 +131,4 @@ class Watched(RuleBasedStateMachine):
 
 TestWatched = Watched.TestCase
 
-TestWatched.settings = settings(max_examples=60, stateful_step_count=40)
+TestWatched.settings = examples(60, stateful_step_count=40)

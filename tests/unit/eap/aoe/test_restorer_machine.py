@@ -19,7 +19,6 @@ from eap.codec.adsnotification import (
 )
 from tests.support.ams import ADD_NOTIFICATION, DELETE_NOTIFICATION, NOTIFICATION, Ams, parse
 from tests.support.aoerouter import CLIENT, FAR, FAR_DEVICE, LINK, Station, route
-from tests.support.examples import FEW
 
 SECOND = 1_000_000_000
 STEP_NS = SECOND // 2
@@ -241,4 +240,3 @@ class RestorerMachine(RuleBasedStateMachine):
 
 
 TestRestorer = RestorerMachine.TestCase
-TestRestorer.settings = FEW

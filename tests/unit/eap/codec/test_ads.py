@@ -21,7 +21,6 @@ from eap.codec.ads import (
     encode_result,
 )
 from eap.errors import TruncatedError
-from tests.support.examples import FEW
 from tests.support.records import records
 
 RECORDS = (AdsRange, AdsReadWrite, AdsDeviceInfo, AdsStates, AdsWriteControl, AdsSystemState,
@@ -77,7 +76,6 @@ def test_codes_are_told_in_words() -> None:
     assert AdsError.words_of(0) == "no error"
 
 
-@FEW
 @given(st.data())
 def test_records_round_trip_and_truncate(data: st.DataObject) -> None:
     record = data.draw(st.sampled_from(RECORDS))

@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 
 from eap.codec.coe import CoeHeader, CoeService, Emergency, decode_message, encode_message
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.examples import FEW
 from tests.support.records import records
 
 
@@ -24,7 +23,6 @@ def test_emergency_lies_as_on_the_wire() -> None:
 
 
 @pytest.mark.parametrize("record", [CoeHeader, Emergency])
-@FEW
 @given(data=st.data())
 def test_round_trip_and_every_prefix_is_truncated(record: type, data: st.DataObject) -> None:
     value = data.draw(records(record))

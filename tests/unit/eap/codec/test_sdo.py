@@ -20,7 +20,6 @@ from eap.codec.sdo import (
     encode_segment_answer,
 )
 from eap.errors import TruncatedError
-from tests.support.examples import FEW
 from tests.support.records import records
 from tests.support.vectors import Vector, load, load_message
 
@@ -127,7 +126,6 @@ def test_empty_segment_is_truncated() -> None:
 
 
 @pytest.mark.parametrize("record", [SdoHeader, SdoSegmentHeader])
-@FEW
 @given(data=st.data())
 def test_round_trip_and_every_prefix_is_truncated(record: type, data: st.DataObject) -> None:
     value = data.draw(records(record))

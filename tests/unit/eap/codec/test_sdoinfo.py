@@ -15,7 +15,6 @@ from eap.codec.sdoinfo import (
     SdoInfoOpcode,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.examples import FEW
 from tests.support.records import records
 
 ENTRY = bytes.fromhex("1810 01 7f 0700 2000 0701 01000000 02000000 00000000 ffffff00") + b"Vendor"
@@ -51,7 +50,6 @@ def test_entry_description_that_lacks_what_it_flags_is_truncated(cut: int) -> No
 @pytest.mark.parametrize(
     "record", [SdoInfoHeader, ListRequest, ObjectRequest, EntryRequest, InfoError]
 )
-@FEW
 @given(data=st.data())
 def test_round_trip_and_every_prefix_is_truncated(record: type, data: st.DataObject) -> None:
     value = data.draw(records(record))

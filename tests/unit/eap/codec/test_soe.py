@@ -20,7 +20,6 @@ from eap.codec.soe import (
     error_code_of,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.examples import FEW
 from tests.support.records import records
 from tests.support.vectors import load_message
 
@@ -102,7 +101,6 @@ def test_list_that_contradicts_its_head_is_refused() -> None:
 
 
 @pytest.mark.parametrize("record", [SoeHeader, SoeAttribute, ListHead])
-@FEW
 @given(data=st.data())
 def test_round_trip_and_every_prefix_is_truncated(record: type, data: st.DataObject) -> None:
     value = data.draw(records(record))

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 
 from eap.device.difference import compare
 from eap.device.stored import configuration
@@ -8,6 +8,7 @@ from eap.od.model import OdState
 from eap.od.profiles.eap1000 import RX_PD, TX_PD, Frame, Rx, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import copy, mapping, receiver, sender, tx_pd, variable, write
+from tests.support.examples import examples
 from tests.support.stations import empty, filled, stations
 
 
@@ -19,7 +20,7 @@ def _kept(dictionary):
     }
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(stations(), stations())
 def test_changes_written_in_their_order_make_the_new_dictionary(
     before: StationSpec, after: StationSpec
@@ -33,7 +34,7 @@ def test_changes_written_in_their_order_make_the_new_dictionary(
             assert compare(old, new[name]) == []
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(stations())
 def test_a_blank_station_is_filled_by_downloads_alone(station: StationSpec):
     for name, new in filled(station).items():
@@ -44,7 +45,7 @@ def test_a_blank_station_is_filled_by_downloads_alone(station: StationSpec):
         assert configuration(old) == configuration(new)
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(stations())
 def test_a_copy_does_not_differ(station: StationSpec):
     for each in filled(station).values():

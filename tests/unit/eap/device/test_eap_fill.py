@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
@@ -19,6 +19,7 @@ from eap.pd.spec import (
     VariableSpec,
     Writer,
 )
+from tests.support.examples import examples
 from tests.support.stations import BLANK, filled, stations
 
 
@@ -75,7 +76,7 @@ def test_what_has_the_same_name_keeps_its_index(forwarding):
     assert ports["eap1"][0xD001].entries[Tx.PDO_INDEX].value == 0x1A01
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(stations())
 def test_filling_like_itself_changes_nothing(station: StationSpec):
     before = filled(station)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from msgspec.structs import replace
 
 from eap.device.eap_dictionary import EapDictionary
@@ -35,6 +35,7 @@ from tests.support.downloads import (
     variable,
     write,
 )
+from tests.support.examples import examples
 from tests.support.stations import BLANK, empty, filled, stations
 
 
@@ -244,13 +245,13 @@ def test_subscribers_are_monitored_as_the_object_says():
     assert (read.monitor_interval_ms, read.monitor_ip) == (2500, "10.0.0.9")
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(stations())
 def test_what_was_filled_from_a_station_reads_back_as_that_station(station: StationSpec):
     assert read_back(station, filled(station)) == station
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(stations())
 def test_what_was_filled_reads_back_alike_into_a_blank_station(station: StationSpec):
     bare = replace(station, variables=(), frames=(), subscriptions=(), sources=(), links=())

@@ -3,7 +3,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
@@ -17,6 +17,7 @@ from eap.od.profiles.eap1000 import Frame, Rx, Tx, Var
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import StationSpec
 from tests.support.downloads import PREOP, receiver, sender, write
+from tests.support.examples import examples
 from tests.support.stations import BLANK, empty, filled
 
 INIT, PRE, SAFE, OPER = DeviceState.INIT, DeviceState.PREOP, DeviceState.SAFEOP, DeviceState.OP
@@ -282,4 +283,4 @@ class DeviceMachine(RuleBasedStateMachine):
 
 
 TestDevice = DeviceMachine.TestCase
-TestDevice.settings = settings(max_examples=8, stateful_step_count=25)
+TestDevice.settings = examples(8, stateful_step_count=25)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import (
@@ -18,10 +18,11 @@ from eap.od.model import OdState
 from eap.od.profiles.eap1000 import Frame, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import OP, copy, receiver, sender, variable, write
+from tests.support.examples import examples
 from tests.support.stations import BLANK, empty, filled, stations
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(stations())
 def test_what_is_dumped_comes_back_whole(station: StationSpec):
     for name, each in filled(station).items():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
@@ -22,6 +21,7 @@ from eap.net.connections import (
     Listener,
     host_of,
 )
+from tests.support.examples import examples
 
 S = 1_000_000_000
 A, B, C, D = "10.0.0.1", "10.0.0.2", "10.0.0.3", "10.0.0.4"
@@ -308,4 +308,4 @@ class Use(RuleBasedStateMachine):
 
 
 TestUse = Use.TestCase
-TestUse.settings = settings(max_examples=40, stateful_step_count=60, deadline=None)
+TestUse.settings = examples(40, stateful_step_count=60)

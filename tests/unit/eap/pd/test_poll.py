@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ids import InterfaceUri
@@ -29,6 +29,7 @@ from eap.pd.spec import (
 from eap.pd.station import Station
 from eap.pd.words import FrameWord, TxWord
 from tests.support.cyclic import MS, eap_port, image_of, received, station, written
+from tests.support.examples import examples
 
 CLIENT, MILL, LATHE = "5.0.0.1.1.1", "5.0.0.2.1.1", "5.0.0.3.1.1"
 
@@ -298,7 +299,7 @@ def test_what_nobody_asks_for_again_does_not_time_out():
     assert row["quality"] >= 4000
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(
     loss=st.sampled_from([0.0, 0.2]),
     duplicate=st.sampled_from([0.0, 0.3]),

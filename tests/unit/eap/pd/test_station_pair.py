@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
@@ -35,6 +34,7 @@ from tests.support.cyclic import (
     station,
     written,
 )
+from tests.support.examples import examples
 from tests.support.runstations import (
     assemble,
 )
@@ -238,6 +238,6 @@ class PairMachine(RuleBasedStateMachine):
             assert row["sent"] == sum(row["reason"].values())
 
 
-PairMachine.TestCase.settings = settings(max_examples=50, stateful_step_count=30)
+PairMachine.TestCase.settings = examples(50, stateful_step_count=30)
 
 TestPairMachine = PairMachine.TestCase

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from eap.pd.spec import RxPdSpec
 from eap.pd.words import RxWord
 from tests.support.cyclic import MS, PEER, Receiver, octets, received
+from tests.support.examples import examples
 
 
 class Naive:
@@ -43,7 +43,7 @@ class Naive:
 NAMES = ("p0", "p1", "p2", "p3")
 
 
-@settings(max_examples=60, stateful_step_count=40)
+@examples(60, stateful_step_count=40)
 class PartingAccounts(RuleBasedStateMachine):
     """PDs that share an account, part and are restarted count as if each had its own."""
 

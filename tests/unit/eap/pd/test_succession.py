@@ -6,7 +6,7 @@ import random
 from typing import Any
 
 import msgspec
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.pd.image import Image
@@ -38,6 +38,7 @@ from tests.support.cyclic import (
     received,
     station,
 )
+from tests.support.examples import examples
 from tests.support.runstations import (
     addressed,
     assemble,
@@ -139,7 +140,7 @@ def shared(image: Image) -> dict[str, int]:
     return {rx.name: account_word(image, rx) for rx in image.layout.rx}
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(specs(), specs(), st.integers(0, 1 << 30))
 def test_what_has_the_same_name_goes_on(before, after, seed):
     old, new = image_of(before), image_of(after)
