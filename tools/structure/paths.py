@@ -185,6 +185,7 @@ def _command_line(pid: int) -> bytes:
 
 
 def read_calls(path: Path) -> Calls:
+    """Return what the tracer of one process wrote."""
     return Counter({(file, name): count for file, name, count in json.loads(path.read_bytes())})
 
 
