@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from eap.appliance.configuration import Configuration
 from eap.appliance.control import Parameters
 from eap.appliance.device_change import Plan
+from eap.appliance.store import Configuration
 from eap.device.difference import Change
 from eap.device.eap_state import StateResult
 from eap.device.rollout import without_alternates

@@ -5,20 +5,21 @@ Nothing here runs anything: a plan holds dictionaries as they would be, for whic
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from eap.appliance.configuration import Configuration
-from eap.appliance.device_plan import describe_rest, find_refusals
+from eap.appliance.store import Configuration
 from eap.device import stored
 from eap.device.difference import Change, compare
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
 from eap.device.eap_records import read_back
+from eap.device.pdlayout import bus_variables, kept_versions
 from eap.device.rollout import without_alternates
 from eap.device.stored import StoredError
 from eap.pd.device import DeviceFault
-from eap.pd.spec import PortKind, StationSpec
+from eap.pd.spec import LinkSpec, PortKind, Source, StationSpec, VariableSpec
+from eap.pd.succession import needs_new_start
 
 
 class Plan(NamedTuple):
@@ -119,3 +120,63 @@ def plan_rollback(
     if wanted is not None and without_alternates(wanted) != without_alternates(previous.spec):
         return Plan(now, [], [], ["meanwhile it would go back to something else"], {})
     return make_plan(now, dictionaries, wanted or previous.spec, previous.objects)
+
+
+def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
+    """Return what cannot change while the station runs; nothing else may be done then."""
+    before = {port.name: port.net_id for port in old.ports}
+    net_ids = [("the station's router", old.net_id, new.net_id)]
+    net_ids += [
+        (f"port {port.name}", before[port.name], port.net_id)
+        for port in new.ports
+        if port.name in before
+    ]
+    return needs_new_start(old, new) + [
+        f"{what}: net_id {was} -> {becomes}: this needs a new start of the appliance"
+        for what, was, becomes in net_ids
+        if was != becomes
+    ]
+
+
+def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
+    """Return what changes beside the objects of the dictionaries, a line for each thing."""
+    on_bus = bus_variables(old) | bus_variables(new)
+    return [
+        *kept_versions(old, new),
+        *_differences("source of", _source_name, old.sources, new.sources),
+        *_differences("link", _link_name, old.links, new.links),
+        *_differences("variable", _variable_name, _chosen(old, on_bus), _chosen(new, on_bus)),
+    ]
+
+
+def _chosen(spec: StationSpec, names: set[str]) -> tuple[VariableSpec, ...]:
+    return tuple(each for each in spec.variables if each.name in names)
+
+
+def _source_name(source: Source) -> str:
+    return source.variable
+
+
+def _link_name(link: LinkSpec) -> str:
+    bits = f" bit {link.source_bit}" if link.source_bit else ""
+    target_bits = f" bit {link.target_bit}" if link.target_bit else ""
+    return f"{link.source}{bits} to {link.target}{target_bits}"
+
+
+def _variable_name(variable: VariableSpec) -> str:
+    return variable.name
+
+
+def _differences(
+    what: str, name_of: Callable[[Any], str], old: tuple[Any, ...], new: tuple[Any, ...]
+) -> Iterator[str]:
+    before = {name_of(each): each for each in old}
+    after = {name_of(each): each for each in new}
+    for name in before:
+        if name not in after:
+            yield f"{what} {name}: removed"
+    for name, each in after.items():
+        if name not in before:
+            yield f"{what} {name}: added"
+        elif before[name] != each:
+            yield f"{what} {name}: changed"

@@ -1,6 +1,6 @@
-"""Configurations that outlive the appliance: one file per station, replaced in one step.
+"""What is kept of a station that was changed while it ran: records, and one file for each.
 
-Rule 1: a station that was never configured while it ran has no file.
+Rule 1: a station that was never changed while it ran has no files.
 Rule 2: a file is written beside the old one, synced and renamed, so that whatever happens one of
 the two is there, and whole.
 Rule 3: who edits the plant file has the last word: what was stored before that does not run, and
@@ -12,31 +12,76 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import time
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
+import msgspec
 from msgspec.structs import replace
 
-from eap.appliance.configuration import (
-    Configuration,
-    Stored,
-    decode_stored,
-    digest_of,
-    encode_stored,
-    new_cause,
-)
-from eap.appliance.durable import put_aside, replace_file
+from eap.aoe.spec import Record as AoeRecord
+from eap.aoe.spec import RouteSpec, RoutingSpec
+from eap.appliance.durable import digest, put_aside, replace_file, seal, unseal
 from eap.appliance.runtime import folder_name
 from eap.device.rollout import without_alternates
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.device import DeviceState
-from eap.pd.spec import StationSpec
+from eap.pd.spec import Record, StationSpec
 
 VARIABLE = "EAP_STATE_DIR"
+VERSION = 1
 _FULL = frozenset((errno.ENOSPC, errno.EDQUOT))
+T = TypeVar("T")
 
 logger = logging.getLogger(__name__)
+
+
+class Configuration(Record, frozen=True, kw_only=True):
+    """One whole configuration of a station."""
+
+    base: str
+    """``digest_of`` the station in the plant file that was in force then."""
+    spec: StationSpec
+    """What the engine runs."""
+    objects: dict[str, Any] = msgspec.field(default_factory=dict)
+    """Content of the dictionary of each EAP port, by its name; a port that is missing here has
+    what follows from *spec*."""
+
+
+class Stored(Configuration, frozen=True, kw_only=True):
+    """The configuration in force and the one before it."""
+
+    state: DeviceState = DeviceState.OP
+    """Asked for last."""
+    applied: str = ""
+    """``digest_of`` the station in the appliance's own plant file, if that was applied while it ran
+    (and edited before); empty if it was not."""
+    previous: Configuration | None = None
+    """For a rollback."""
+    cause: str = ""
+    """Which change brought it; the same at all stations that one ``apply`` changed."""
+    undone: bool = False
+    """Whether *cause* was rolled back: *previous* is what it had brought."""
+
+
+class AppliedRouting(AoeRecord, frozen=True, kw_only=True):
+    """Routes and access rules that a station was given while it ran.
+
+    Attributes:
+        base: Digest of what the plant file said that the appliance was started with.
+        spec: What is in force.
+        previous: What was before, for a rollback.
+        cause: Which change brought it, see ``Stored.cause``.
+        undone: Whether that change was rolled back: *previous* is what it had brought.
+    """
+
+    base: str
+    spec: RoutingSpec
+    previous: RoutingSpec
+    cause: str = ""
+    undone: bool = False
 
 
 class Effective(NamedTuple):
@@ -61,59 +106,56 @@ def state_root() -> Path:
     return Path.home() / ".local/state/eap"
 
 
-class Store:
-    """The configurations of the stations of one plant."""
+def plant_folder(plant: str) -> Path:
+    """Return the folder of everything that is kept of the stations of *plant*."""
+    return state_root() / folder_name(plant)
 
-    def __init__(self, plant: str) -> None:
-        self.path = state_root() / folder_name(plant)
 
-    def file(self, station: str) -> Path:
-        """Return the file of one station."""
-        return self.path / f"{folder_name(station)}.json"
+class StationFile(Generic[T]):
+    """A file with one value of a station, replaced in one step.
 
-    def load(self, station: str) -> Stored | None:
-        """Return what is stored of *station*, None if nothing is that can be used.
+    Args:
+        folder: Of all files of its kind.
+        station: Name of the station.
+        kind: Type of the value, as msgspec takes it.
+        what: Words for the value.
+    """
+
+    def __init__(self, folder: Path, station: str, kind: Any, what: str) -> None:
+        self.path = folder / f"{folder_name(station)}.json"
+        self._station = station
+        self._kind = kind
+        self._what = what
+
+    def read(self) -> T | None:
+        """Return the value, None if there is none that can be used.
 
         A damaged file is put aside under its name with ``.damaged``, and a warning says so.
         """
-        path = self.file(station)
         try:
-            data = path.read_bytes()
+            data = self.path.read_bytes()
         except FileNotFoundError:
             return None
         except OSError as exc:
-            logger.warning(
-                "station %s: its configuration in %s cannot be read (%s); the plant file runs",
-                station,
-                path,
-                exc.strerror,
-            )
+            self._warn(f"cannot be read ({exc.strerror}); the plant file runs")
             return None
         try:
-            return decode_stored(data)
+            return self.decode(data)
         except ConfigError as exc:
-            aside = path.with_suffix(".damaged")
-            logger.warning(
-                "station %s: its configuration in %s cannot be used: %s; it is kept as %s, and the"
-                " plant file runs",
-                station,
-                path,
-                exc,
-                aside.name,
-            )
-            put_aside(path, aside)
+            aside = self.path.with_suffix(".damaged")
+            self._warn(f"cannot be used: {exc}; it is kept as {aside.name}, the plant file runs")
+            put_aside(self.path, aside)
             return None
 
-    def save(self, station: str, stored: Stored) -> None:
-        """Keep *stored*, in the place of what there was.
+    def save(self, value: T) -> None:
+        """Keep *value*, in the place of what there was.
 
         Raises:
             EnvironmentalError: it cannot be written; what there was is still there.
         """
-        path = self.file(station)
         try:
-            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            replace_file(path, encode_stored(stored))
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            replace_file(self.path, self.encode(value))
         except OSError as exc:
             remedy = (
                 "make room there"
@@ -121,29 +163,41 @@ class Store:
                 else f"set {VARIABLE} to a directory that you may write"
             )
             raise EnvironmentalError(
-                f"station {station}: its configuration cannot be kept in {path}: {exc.strerror};"
-                f" {remedy}"
+                f"station {self._station}: {self._what} cannot be kept in {self.path}:"
+                f" {exc.strerror}; {remedy}"
             ) from None
 
-    def set_aside(self, station: str) -> bool:
-        """Let *station* start as if it had never been configured; tell whether it had been.
+    def encode(self, value: T) -> bytes:
+        """Return the octets of the file."""
+        return seal(msgspec.json.encode(value), VERSION)
+
+    def decode(self, data: bytes) -> T:
+        """Read the octets of the file; raise ConfigError that says what is wrong with them."""
+        try:
+            value: T = msgspec.json.decode(unseal(data, VERSION), type=self._kind)
+        except msgspec.MsgspecError as exc:
+            raise ConfigError(f"it holds no {self._what}: {exc}") from None
+        return value
+
+    def set_aside(self) -> bool:
+        """Let the station start as if nothing had been kept; tell whether anything was.
 
         Raises:
             EnvironmentalError: the file cannot be renamed.
         """
-        return self._rename(self.file(station), self._aside(station))
+        return self._rename(self.path, self._aside)
 
-    def bring_back(self, station: str) -> bool:
-        """Undo ``set_aside``, unless *station* was configured again; tell whether that was done.
+    def bring_back(self) -> bool:
+        """Undo ``set_aside``, unless something was kept since; tell whether that was done.
 
         Raises:
             EnvironmentalError: the file cannot be renamed.
         """
-        path = self.file(station)
-        return not path.exists() and self._rename(self._aside(station), path)
+        return not self.path.exists() and self._rename(self._aside, self.path)
 
-    def _aside(self, station: str) -> Path:
-        return self.file(station).with_suffix(".before")
+    @property
+    def _aside(self) -> Path:
+        return self.path.with_suffix(".before")
 
     def _rename(self, path: Path, target: Path) -> bool:
         try:
@@ -154,6 +208,63 @@ class Store:
             raise EnvironmentalError(f"{path} cannot be renamed: {exc.strerror}") from None
         return True
 
+    def _warn(self, text: str) -> None:
+        logger.warning("station %s: %s in %s %s", self._station, self._what, self.path, text)
+
+
+class StationStore:
+    """Everything that is kept of one station.
+
+    Attributes:
+        configuration: What its devices were told.
+        routes: Routes that were added to those of its router.
+        routing: Routes and access rules that were applied.
+    """
+
+    def __init__(self, plant: str, station: str) -> None:
+        folder = plant_folder(plant)
+        self.configuration: StationFile[Stored] = StationFile(
+            folder, station, Stored, "configuration"
+        )
+        self.routes: StationFile[tuple[RouteSpec, ...]] = StationFile(
+            folder / "routes", station, tuple[RouteSpec, ...], "added routes"
+        )
+        self.routing: StationFile[AppliedRouting] = StationFile(
+            folder / "routing", station, AppliedRouting, "routes and access rules"
+        )
+
+    def set_aside(self) -> bool:
+        """Let the station start from the plant file alone; tell whether it was configured.
+
+        Raises:
+            EnvironmentalError: a file cannot be renamed.
+        """
+        self.routes.set_aside()
+        self.routing.set_aside()
+        return self.configuration.set_aside()
+
+    def bring_back(self) -> None:
+        """Undo ``set_aside`` for what was not kept anew since.
+
+        Raises:
+            EnvironmentalError: a file cannot be renamed.
+        """
+        for file in (self.configuration, self.routes, self.routing):
+            file.bring_back()
+
+
+def new_cause() -> str:
+    """Return a name for a change; those of later changes sort behind it."""
+    return f"{time.time_ns():020d}"
+
+
+def digest_of(spec: StationSpec | RoutingSpec) -> str:
+    """Return what tells *spec* from any other.
+
+    Fields that hold their defaults do not count: a release that adds one does not change it.
+    """
+    return digest(msgspec.json.encode(_lean(spec)))
+
 
 def settle(
     plant: str, stations: Iterable[StationSpec], state: DeviceState = DeviceState.OP
@@ -163,9 +274,10 @@ def settle(
     While it runs, what counts is the file that it was started with, and what was applied on top;
     now what was applied last is that file, or there is another one.  Arguments as for *effective*.
     """
-    store, cause = Store(plant), new_cause()
+    cause = new_cause()
     for spec in stations:
-        stored = store.load(spec.name)
+        file = StationStore(plant, spec.name).configuration
+        stored = file.read()
         if stored is None or not stored.applied:
             continue
         base = digest_of(spec)
@@ -174,7 +286,7 @@ def settle(
         else:
             made_up = _settled(stored, Stored(base=base, spec=spec, state=state, cause=cause))
         if made_up != stored:
-            _keep(store, spec.name, made_up)
+            _keep(file, made_up)
 
 
 def effective(
@@ -187,25 +299,26 @@ def effective(
         stations: As the plant file has them.
         state: Of stations that were never asked for another.
     """
-    store, cause = Store(plant), new_cause()
-    return tuple(_effective(store, spec, state, cause) for spec in stations)
+    cause = new_cause()
+    return tuple(_effective(plant, spec, state, cause) for spec in stations)
 
 
-def _effective(store: Store, spec: StationSpec, state: DeviceState, cause: str) -> Effective:
-    stored = store.load(spec.name)
+def _effective(plant: str, spec: StationSpec, state: DeviceState, cause: str) -> Effective:
+    file = StationStore(plant, spec.name).configuration
+    stored = file.read()
     if stored is None:
         return Effective(spec, state)
     base = digest_of(spec)
     if stored.base == base:
         return Effective(stored.spec, stored.state)
     settled = _settled(stored, Stored(base=base, spec=spec, state=state, cause=cause))
-    _keep(store, spec.name, settled)
+    _keep(file, settled)
     return Effective(settled.spec, settled.state)
 
 
-def _keep(store: Store, station: str, stored: Stored) -> None:
+def _keep(file: StationFile[Stored], stored: Stored) -> None:
     try:
-        store.save(station, stored)
+        file.save(stored)
     except EnvironmentalError as exc:
         logger.warning("%s", exc)
 
@@ -224,3 +337,25 @@ def _settled(stored: Stored, file: Stored) -> Stored:
         return replace(file, previous=stored.previous, cause=stored.cause)
     previous = Configuration(base=stored.base, spec=bare, objects=stored.objects)
     return replace(file, previous=previous)
+
+
+def _lean(value: Any) -> Any:
+    """Return *value* for JSON, records without the fields that hold their defaults."""
+    if isinstance(value, msgspec.Struct):
+        tag, defaults = _outline(type(value))
+        lean = {"kind": tag} if tag is not None else {}
+        for name, default in defaults:
+            held = getattr(value, name)
+            if held != default:
+                lean[name] = _lean(held)
+        return lean
+    if isinstance(value, tuple):
+        return [_lean(each) for each in value]
+    return value
+
+
+@cache
+def _outline(kind: type[msgspec.Struct]) -> tuple[Any, tuple[tuple[str, Any], ...]]:
+    """Return the tag of records of *kind*, and their fields with their defaults."""
+    fields = msgspec.structs.fields(kind)
+    return kind.__struct_config__.tag, tuple((field.name, field.default) for field in fields)

@@ -11,8 +11,10 @@ Rule 3: everything is planned beside running cycles; when the moment comes, only
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
+
+from msgspec.structs import asdict
 
 from eap.codec import datatypes
 from eap.codec.pd import PdHeader
@@ -20,7 +22,7 @@ from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxPlace
 from eap.pd.presence import Presence
-from eap.pd.spec import Writer
+from eap.pd.spec import PortSpec, StationSpec, Writer
 from eap.pd.words import (
     ACCOUNT_START,
     REASON_INDEX,
@@ -31,6 +33,10 @@ from eap.pd.words import (
     TxWord,
 )
 
+_IN_FRAMES = {"net_id", "eap_sm"}
+"""Fields of a port that only say what its frames carry."""
+_WHOLE = {"bus", "gateway"}
+"""Fields that are too much for a line."""
 _OWN_WORDS = {
     StationWord.FUTEX,
     StationWord.ENGINE_SEQUENCE,
@@ -287,3 +293,27 @@ def _joined(runs: Iterable[_Run]) -> list[_Run]:
 def _copy(runs: Iterable[_Run], old: memoryview, new: memoryview) -> None:
     for source, target, size in runs:
         new[target : target + size] = old[source : source + size]
+
+
+def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
+    """Return what differs between the two and cannot be changed by the engine, one line each."""
+    found = []
+    if old.name != new.name:
+        found.append(f"station {old.name} cannot become {new.name}")
+    before = {port.name: port for port in old.ports}
+    after = {port.name: port for port in new.ports}
+    found += [f"port {name} is new" for name in after if name not in before]
+    found += [f"port {name} is gone" for name in before if name not in after]
+    for name, port in after.items():
+        if name in before:
+            found += [f"port {name}: {what}" for what in _port_differences(before[name], port)]
+    return [f"{line}: this needs a new start of the appliance" for line in found]
+
+
+def _port_differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
+    was = asdict(old)
+    for field, value in asdict(new).items():
+        if field not in _IN_FRAMES and value != was[field]:
+            yield (
+                f"{field} is another one" if field in _WHOLE else f"{field} {was[field]} -> {value}"
+            )

@@ -20,7 +20,7 @@ import pytest
 from scapy.layers.inet import IP, UDP
 from scapy.layers.l2 import Ether
 
-from eap.appliance.store import Store
+from eap.appliance.store import StationStore
 from eap.codec.ethercat import EAP_PORT
 from eap.errors import ControlError
 from eap.od.profiles.eap1000 import Tx, Var
@@ -267,7 +267,7 @@ def test_damaged_configuration_is_put_aside_and_the_plant_file_runs(
     spec = appliance.request("export", station="left")["spec"]
     assert appliance.request("apply", station="left", spec=with_version(spec, 3))["ok"]
     assert appliance.stop()[0] == 0
-    path = Store("devices").file("left")
+    path = StationStore("devices", "left").configuration.path
     octets = bytearray(path.read_bytes())
     octets[len(octets) // 2] ^= 1
     path.write_bytes(octets)
@@ -371,7 +371,7 @@ def _settled(appliance: Appliance) -> dict:
             (row,) = appliance.request("pd_list", station="left")
         except (ControlError, ValueError):
             return False
-        stored = Store("devices").load("left")
+        stored = StationStore("devices", "left").configuration.read()
         kept = exported if stored is None else json.loads(msgspec.json.encode(stored.spec))
         version = exported["frames"][0]["pds"][0]["version"]
         found.update(exported)

@@ -13,11 +13,11 @@ from eap.aoe.spec import (
     RoutingSpec,
 )
 from eap.aoe.way import Door, Way
-from eap.appliance.route_store import RouteStore
 from eap.appliance.services.routes.route_rows import RouterView
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.routing.station_router import StationRouter
+from eap.appliance.store import StationStore
 from eap.codec.ams import SYSTEM_PORT
 from eap.ids import NetId
 from tests.support.routing import KeepingCarrier, StubService
@@ -57,7 +57,7 @@ class Left:
         self.carrier = KeepingCarrier()
         self.router.add_door(Door("udp:eap0", is_hub=True), self.carrier)
         self.routes = StationRoutes(
-            self.router, RoutingSpec(routes=(RIGHT,)), RouteStore("hall", "left"),
+            self.router, RoutingSpec(routes=(RIGHT,)), StationStore("hall", "left").routes,
             open_hop=self._open,
         )  # fmt: skip
         self.routes.start()

@@ -18,9 +18,9 @@ from typing import TypeAlias
 import msgspec
 
 from eap.appliance.commands.plant_link import Outcome, PlantLink, StationPlan
-from eap.appliance.configuration import new_cause
 from eap.appliance.control_routing import RoutingDifference
 from eap.appliance.plantfile import load_plant
+from eap.appliance.store import new_cause
 from eap.config.load import Plant
 from eap.device.rollout import Step, steps, without_alternates
 from eap.errors import ConfigError

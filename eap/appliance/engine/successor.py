@@ -6,7 +6,6 @@ reads.  It belongs to nobody until it takes over, which copies numbers and littl
 
 from __future__ import annotations
 
-from eap.appliance.change import needs_new_start
 from eap.appliance.engine import tcp_ports
 from eap.appliance.engine.bus_ties import BusTies
 from eap.appliance.engine.engine_bus import EngineBus
@@ -17,7 +16,7 @@ from eap.pd.engine import Engine
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec
 from eap.pd.station import Station
-from eap.pd.succession import ImageSuccession
+from eap.pd.succession import ImageSuccession, needs_new_start
 
 
 class EngineStation:

@@ -10,7 +10,6 @@ from functools import partial
 from time import monotonic_ns
 
 from eap.aoe.spec import RoutingSpec
-from eap.appliance.route_store import RouteStore, RoutingStore
 from eap.appliance.services.ads.station_ads import StationAds
 from eap.appliance.services.device.image_values import ImageValues
 from eap.appliance.services.device.sources import SourcePlayer
@@ -22,7 +21,7 @@ from eap.appliance.services.routing.planned import access_of, make_router
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.startup import Step, no_step
 from eap.appliance.station_image import StationImage
-from eap.appliance.store import Store
+from eap.appliance.store import StationStore
 from eap.device.eap_objects import Identity
 from eap.errors import ImageError
 from eap.pd.device import DeviceState
@@ -64,21 +63,20 @@ class Devices:
         *,
         step: Step = no_step,
     ) -> None:
-        store = Store(plant)
         self.by_station: dict[str, StationDevice] = {}
         self.routers: dict[str, StationRouter] = {}
         self.routing: dict[str, StationRouting] = {}
         self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
-        self._plant = plant
         self._release = release
         self._images = images
         self._has_restarted = asyncio.Event()
         for station in stations:
             step(f"building station {station.name}")
             state = states.get(station.name, DeviceState.OP)
-            keeper = StationKeeper(station, state, store, engine)
-            self._add(station, keeper, routing.get(station.name, RoutingSpec()))
+            store = StationStore(plant, station.name)
+            keeper = StationKeeper(station, state, store.configuration, engine)
+            self._add(station, keeper, store, routing.get(station.name, RoutingSpec()))
 
     async def serve(self) -> None:
         """Serve all of them until cancelled.
@@ -99,7 +97,13 @@ class Devices:
         """Tell the new engine, soon, what it may have missed."""
         self._has_restarted.set()
 
-    def _add(self, station: StationSpec, keeper: StationKeeper, told: RoutingSpec) -> None:
+    def _add(
+        self,
+        station: StationSpec,
+        keeper: StationKeeper,
+        store: StationStore,
+        routing: RoutingSpec,
+    ) -> None:
         name, image = station.name, self._images[station.name]
         if _runs(image):
             self._has_restarted.set()  # services before this one, in the middle of a change
@@ -113,11 +117,11 @@ class Devices:
         )
         device = StationDevice(keeper, ImageValues(image), identity)
         self.by_station[name] = device
-        self.routers[name] = router = make_router(station, told)
+        self.routers[name] = router = make_router(station, routing)
         self.routing[name] = StationRouting(
             name,
-            StationRoutes(router, told, RouteStore(self._plant, name)),
-            RoutingStore(self._plant, name),
+            StationRoutes(router, routing, store.routes),
+            store.routing,
             partial(_set_access, station, router),
         )
         self.routing[name].start()

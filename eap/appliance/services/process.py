@@ -59,7 +59,7 @@ from eap.appliance.services.status import (
 )
 from eap.appliance.startup import Startup
 from eap.appliance.station_image import StationImage
-from eap.appliance.store import Store
+from eap.appliance.store import plant_folder
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.ids import NetId
 from eap.net import realtime
@@ -254,7 +254,7 @@ class Services:
     def _audit(
         self, routers: Mapping[str, StationRouter], gateways: Mapping[PortName, MailboxGateway]
     ) -> Audit:
-        file = AuditFile(Store(self._handover.plant).path / "audit.jsonl")
+        file = AuditFile(plant_folder(self._handover.plant) / "audit.jsonl")
         is_required = self._handover.audit_required
         audit = Audit(file, self._directory, is_required=is_required)
         for name, router in routers.items():

@@ -21,10 +21,9 @@ from msgspec.structs import replace
 from eap.aoe.spec import RoutingSpec
 from eap.appliance.handover import EngineOptions, Handover, SegmentHandover
 from eap.appliance.plantfile import load_plant, require_own_buses
-from eap.appliance.route_store import bring_routes_back, set_routes_aside
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.appliance.signals import catch_end_signals
-from eap.appliance.store import Store, effective, settle
+from eap.appliance.store import StationStore, effective, settle
 from eap.appliance.supervisor.bus_sockets import segments
 from eap.appliance.supervisor.child import Child, describe_end
 from eap.appliance.supervisor.output import OutputHandler
@@ -78,14 +77,11 @@ def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> 
     """
     info = make_info(plant.name, "", plant.stations)
     with _claim(folder_name(plant.name)) as folder:
-        store = Store(plant.name)
         for station in plant.stations:
+            store = StationStore(plant.name, station.name)
             if resume:
-                store.bring_back(station.name)
-                bring_routes_back(plant.name, station.name)
-                continue
-            set_routes_aside(plant.name, station.name)
-            if store.set_aside(station.name):
+                store.bring_back()
+            elif store.set_aside():
                 logger.warning(
                     "station %s starts blank; --resume goes on with what it was configured to be",
                     station.name,

@@ -1,4 +1,4 @@
-"""What a process of the appliance is to run when it is started: as configured last."""
+"""Specifications that a process of the appliance runs when it starts: as configured last."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import logging
 
 from msgspec.structs import replace
 
-from eap.appliance.change import needs_new_start
 from eap.appliance.handover import Handover
 from eap.appliance.store import effective
-from eap.appliance.trial import why_not_built
+from eap.ids import InterfaceUri
+from eap.net.loopback import LoopbackLines
+from eap.pd.image import format_image
+from eap.pd.layout import plan_layout
+from eap.pd.spec import PortKind, StationSpec
+from eap.pd.station import Station
+from eap.pd.succession import needs_new_start
 
 logger = logging.getLogger(__name__)
 
@@ -32,3 +37,22 @@ def what_runs_now(handover: Handover) -> Handover:
         specs.append(given if reasons else found.spec)
         states[given.name] = found.state
     return replace(handover, stations=tuple(specs), states=states)
+
+
+def why_not_built(spec: StationSpec) -> list[str]:
+    """Return what keeps a station from being built, nothing if it can be.
+
+    A configuration may have been kept that no engine ever ran: whoever kept it was killed before
+    the engine refused it.  Started with it, the engine would fail again and again.
+    """
+    try:
+        layout = plan_layout(spec)
+        image = format_image(memoryview(bytearray(layout.size)), layout, 1)
+        station = Station(spec, image, lambda: None)
+        lines = LoopbackLines()
+        for port in spec.ports:
+            if port.kind is PortKind.EAP:
+                station.connect(port.name, lines.open(InterfaceUri("loop", "trial")))
+    except Exception as exc:  # noqa: BLE001  whatever it is, an engine would fail with it too
+        return [f"it cannot be built: {type(exc).__name__}: {exc}"]
+    return []

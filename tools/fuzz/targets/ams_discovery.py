@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from eap.aoe.judged import AuditEntry
@@ -13,11 +13,11 @@ from eap.aoe.routes import Route, RouteTable
 from eap.aoe.spec import AmsUser, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.appliance.discards import Refusal
-from eap.appliance.route_store import RouteStore
 from eap.appliance.services.ams.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.routes.ams_questions import AmsQuestions
 from eap.appliance.services.routes.route_desk import RouteDesk
 from eap.appliance.services.routes.station_routes import StationRoutes
+from eap.appliance.store import StationFile
 from eap.codec.amsdiscovery import (
     decode_discovery,
     decode_text,
@@ -35,17 +35,17 @@ _PASSWORD = "/dev/null"  # noqa: S105  a file: nobody's password is right
 logging.getLogger("eap").addHandler(logging.NullHandler())
 
 
-class _Store(RouteStore):
+class _Store(StationFile[tuple[RouteSpec, ...]]):
     """Keeps nothing."""
 
     def __init__(self) -> None:
         self.path = Path()
 
-    def load(self) -> tuple[RouteSpec, ...]:
+    def read(self) -> tuple[RouteSpec, ...]:
         return ()
 
-    def save(self, routes: Sequence[RouteSpec]) -> None:
-        del routes
+    def save(self, value: tuple[RouteSpec, ...]) -> None:
+        del value
 
 
 class _Router:

@@ -13,12 +13,18 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from eap.appliance.configuration import Configuration
-from eap.appliance.device_change import Plan, dump_all, eap_ports, fill_all, make_plan
+from eap.appliance.device_change import (
+    Plan,
+    dump_all,
+    eap_ports,
+    fill_all,
+    find_refusals,
+    make_plan,
+)
 from eap.appliance.device_change import plan_rollback as make_rollback
-from eap.appliance.device_plan import find_refusals
 from eap.appliance.services.device.station_keeper import StationKeeper
 from eap.appliance.services.jobs import Jobs
+from eap.appliance.store import Configuration
 from eap.device import stored
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_objects import Identity, LiveValues

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 from msgspec.structs import replace
 
-from eap.appliance.configuration import Configuration, Stored, digest_of, new_cause
-from eap.appliance.store import Store
+from eap.appliance.store import Configuration, StationFile, Stored, digest_of, new_cause
 from eap.device.rollout import without_alternates
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
@@ -67,7 +66,11 @@ class StationKeeper:
     """
 
     def __init__(
-        self, spec: StationSpec, state: DeviceState, store: Store, engine: StationEngine
+        self,
+        spec: StationSpec,
+        state: DeviceState,
+        store: StationFile[Stored],
+        engine: StationEngine,
     ) -> None:
         self.spec = spec
         self.state = state
@@ -82,7 +85,7 @@ class StationKeeper:
         self._base = digest_of(spec)
         self._applied = ""
         self._is_unsure = False
-        stored = store.load(spec.name)
+        stored = store.read()
         if stored is not None:
             self._base, self._applied = stored.base, stored.applied
             self.previous, self.cause = stored.previous, stored.cause
@@ -197,7 +200,7 @@ class StationKeeper:
 
     async def _save(self, record: Stored) -> None:
         # Other clients do not wait for the disk.
-        await asyncio.to_thread(self._store.save, self.spec.name, record)
+        await asyncio.to_thread(self._store.save, record)
         self._kept = record
         self.unkept = None
 

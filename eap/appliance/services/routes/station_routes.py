@@ -20,10 +20,10 @@ from eap.aoe.judged import AuditEntry
 from eap.aoe.routes import Origin, Route, RouteTable
 from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
-from eap.appliance.route_store import RouteStore
 from eap.appliance.services.jobs import Jobs
 from eap.appliance.services.routes.neighbours import Scanner
 from eap.appliance.services.routing.planned import to_route, to_way
+from eap.appliance.store import StationFile
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.errors import ControlError
 from eap.ids import STATION_OCTETS, NetId, prefix_text
@@ -83,7 +83,7 @@ class StationRoutes:
         self,
         router: RoutedStation,
         spec: RoutingSpec,
-        store: RouteStore,
+        store: StationFile[tuple[RouteSpec, ...]],
         *,
         open_hop: Callable[[HopSpec], Way] = to_way,
     ) -> None:
@@ -111,7 +111,7 @@ class StationRoutes:
         """Take the routes of the plant file, or of *spec*, then those that were added before."""
         self._spec = spec or self._spec
         self._take_spec()
-        for added in self._store.load():
+        for added in self._store.read() or ():
             self._take(added)
             self._added[added] = True  # what cannot be today may be one after the next start
 

@@ -16,11 +16,10 @@ from msgspec.structs import replace
 
 from eap.aoe.routing_change import describe_routing, routing_needs_new_start
 from eap.aoe.spec import RoutingSpec
-from eap.appliance.configuration import digest_of
-from eap.appliance.route_store import AppliedRouting, RoutingStore
 from eap.appliance.services.jobs import Jobs
 from eap.appliance.services.routes.station_routes import StationRoutes
-from eap.errors import ControlError
+from eap.appliance.store import AppliedRouting, StationFile, digest_of
+from eap.errors import ControlError, EnvironmentalError
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +45,7 @@ class StationRouting:
         self,
         name: str,
         routes: StationRoutes,
-        store: RoutingStore,
+        store: StationFile[AppliedRouting],
         set_access: Callable[[RoutingSpec], None],
     ) -> None:
         self.routes = routes
@@ -132,7 +131,10 @@ class StationRouting:
                 " the file counts",
                 self._name,
             )
-        self._store.set_aside()
+        try:
+            self._store.set_aside()
+        except EnvironmentalError as exc:
+            logger.warning("%s", exc)
         return None
 
     async def _change(self, applied: AppliedRouting) -> None:

@@ -5,22 +5,28 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from eap.appliance.configuration import Configuration
 from eap.appliance.device_change import (
+    describe_rest,
     dump_all,
     eap_ports,
     fill_all,
+    find_refusals,
     make_plan,
     plan_rollback,
 )
+from eap.appliance.store import Configuration
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import dump
 from eap.pd.spec import (
+    BusPortSpec,
     CounterSource,
+    LinkSpec,
     PortKind,
     PortSpec,
     RxAlternateSpec,
     TakenVariableSpec,
+    VariableSpec,
+    Writer,
 )
 
 
@@ -103,4 +109,82 @@ def test_rollback_with_alternates(stations):
     other = replace(right, cycle_us=20_000)
     assert plan_rollback(right, dictionaries, previous, other).refused == [
         "meanwhile it would go back to something else"
+    ]
+
+
+BUS = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.9.1", bus=BusPortSpec())
+
+
+@pytest.fixture
+def plain(stations):
+    return stations[0]
+
+
+def with_port(spec, **changes):
+    return replace(spec, ports=(replace(spec.ports[0], **changes),))
+
+
+def test_same_specification(plain):
+    assert find_refusals(plain, plain) == []
+    assert describe_rest(plain, plain) == []
+
+
+def test_what_the_dictionaries_hold_is_not_told_here(plain):
+    variables = (*plain.variables, VariableSpec("more", "UINT"))
+    changed = replace(plain, cycle_us=20_000, variables=variables, frames=())
+    assert find_refusals(plain, changed) == []
+    assert describe_rest(plain, changed) == []
+
+
+def test_layout_that_changes_under_its_version_is_told(plain):
+    frame = plain.frames[0]
+    shorter = replace(frame.pds[0], variables=frame.pds[0].variables[1:])
+    changed = replace(plain, frames=(replace(frame, pds=(shorter,)),))
+    (line,) = describe_rest(plain, changed)
+    assert "PD 'state' (id 7) changes from 19 to 17 octets" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: replace(s, name="middle"), "station left cannot become middle"),
+        (
+            lambda s: replace(s, net_id="9.9.9.9.9.9"),
+            "the station's router: net_id 1.1.1.1.1.1 -> 9.9.9.9.9.9",
+        ),
+        (
+            lambda s: with_port(s, net_id="9.9.9.9.9.9"),
+            "port eap0: net_id 1.2.3.4.5.1 -> 9.9.9.9.9.9",
+        ),
+        (lambda s: replace(s, ports=()), "port eap0 is gone"),
+        (lambda s: replace(s, ports=(*s.ports, BUS)), "port bus0 is new"),
+        (lambda s: with_port(s, tcp=True), "port eap0: tcp False -> True"),
+    ],
+)
+def test_what_needs_a_new_start(plain, change, words):
+    (reason,) = find_refusals(plain, change(plain))
+    assert reason.startswith(words)
+    assert reason.endswith("needs a new start of the appliance")
+
+
+def test_sources_links_and_variables_of_buses_are_told(plain):
+    on_bus = VariableSpec("bus0.valve.valve", "BOOL", Writer.ENGINE)
+    before = replace(
+        plain,
+        ports=(*plain.ports, BUS),
+        links=(LinkSpec("running", "a"), LinkSpec("ticks", "b", source_bit=3, target_bit=1)),
+        variables=(*plain.variables, on_bus),
+    )
+    after = replace(
+        before,
+        sources=(CounterSource("ticks", 2), CounterSource("more")),
+        links=(LinkSpec("running", "a", swap=True),),
+        variables=(*plain.variables, replace(on_bus, writer=Writer.APPLICATION)),
+    )
+    assert describe_rest(before, after) == [
+        "source of ticks: changed",
+        "source of more: added",
+        "link ticks bit 3 to b bit 1: removed",
+        "link running to a: changed",
+        "variable bus0.valve.valve: changed",
     ]

@@ -13,10 +13,10 @@ from msgspec.structs import replace
 from eap.aoe.spec import RoutingSpec
 from eap.appliance.discards import DiscardCounters
 from eap.appliance.handover import Handover
-from eap.appliance.route_store import RouteStore
 from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.sockets import open_doors
+from eap.appliance.store import StationStore
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EAP_PORT
 from tests.support import aoe
@@ -48,7 +48,7 @@ def script_on(tmp_path):
                 resources.enter_context(ours)
                 resources.enter_context(theirs)
                 routes = {
-                    name: StationRoutes(router, RoutingSpec(), RouteStore("plant", name))
+                    name: StationRoutes(router, RoutingSpec(), StationStore("plant", name).routes)
                     for name, router in routers.items()
                 }
                 doors = open_doors(

@@ -4,11 +4,11 @@ import logging
 
 from msgspec.structs import replace
 
-from eap.appliance.configuration import Stored, digest_of
 from eap.appliance.handover import Handover
-from eap.appliance.store import Store
-from eap.appliance.supervisor.what_runs import what_runs_now
+from eap.appliance.store import StationStore, Stored, digest_of
+from eap.appliance.supervisor.what_runs import what_runs_now, why_not_built
 from eap.pd.device import DeviceState
+from eap.pd.spec import PortKind, PortSpec, RxPdSpec, TxFrameSpec, TxPdSpec
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
 
@@ -17,7 +17,9 @@ def handover():
 
 
 def store(spec, state=DeviceState.OP):
-    Store("demo").save("left", Stored(base=digest_of(left()), spec=spec, state=state))
+    StationStore("demo", "left").configuration.save(
+        Stored(base=digest_of(left()), spec=spec, state=state)
+    )
 
 
 def test_without_any_configuration_the_plant_file_runs():
@@ -53,3 +55,21 @@ def test_what_no_engine_can_run_does_not_run(caplog):
         found = what_runs_now(handover())
     assert found.stations == (left(), right())
     assert "station left: the plant file runs: it cannot be built: KeyError" in caplog.text
+
+
+BUS = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.2.3.4.6.1")
+
+
+def test_whatever_a_plant_file_says_can_be_built():
+    for interface in ("udp://127.9.2.1", "ethernet://eth7", "tcp://127.9.2.1"):
+        spec = left(eap_port(1, interface))
+        assert why_not_built(replace(spec, ports=(*spec.ports, BUS))) == []
+    assert why_not_built(right()) == []
+
+
+def test_what_does_not_fit_together_is_told():
+    unknown = replace(right(), subscriptions=(RxPdSpec("a", "eap0", 1, ("nothing",)),))
+    assert why_not_built(unknown) == ["it cannot be built: KeyError: 'nothing'"]
+    many = tuple(TxPdSpec(f"p{n}", n, ("name",)) for n in range(200))
+    (reason,) = why_not_built(replace(left(), frames=(TxFrameSpec("f", "eap0", "10.0.0.1", many),)))
+    assert reason.startswith("it cannot be built: ")

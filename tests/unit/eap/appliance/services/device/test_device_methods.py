@@ -10,10 +10,9 @@ import pytest
 from msgspec.structs import replace
 
 from eap.appliance import control_device
-from eap.appliance.configuration import digest_of
 from eap.appliance.control import ErrorCode
 from eap.appliance.services.device.device_methods import DeviceMethods
-from eap.appliance.store import Store
+from eap.appliance.store import StationStore, digest_of
 from eap.device.eap_objects import Identity
 from eap.device.router_dictionary import RouterDictionary
 from eap.errors import ControlError, EngineRefusedError
@@ -207,7 +206,7 @@ def test_export_plan_apply_and_rollback(call, stations, device):
 def test_apply_of_the_own_plant_file_is_noted(call, stations, file, is_own):
     spec = replace(stations[0], cycle_us=20_000)
     assert call("apply", station="left", spec=msgspec.to_builtins(spec), file=file)["ok"]
-    stored = Store("demo").load("left")
+    stored = StationStore("demo", "left").configuration.read()
     assert stored is not None
     assert stored.applied == (digest_of(spec) if is_own else "")
 

@@ -8,7 +8,7 @@ import errno
 import pytest
 from msgspec.structs import replace
 
-from eap.appliance.store import Store, effective
+from eap.appliance.store import StationStore, effective
 from eap.device.stored import dump
 from eap.errors import EngineGoneError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
@@ -52,7 +52,7 @@ def test_it_begins_as_the_engine_does(spec, state):
     assert word(device, STATUS, 1) == state
     assert device.spec == spec
     assert engine.calls == []
-    assert Store("demo").load("left") is None
+    assert StationStore("demo", "left").configuration.read() is None
 
 
 def test_walk_through_the_states(spec):
@@ -235,7 +235,7 @@ def test_apply_of_what_cannot_be_is_refused_whole(spec):
     asyncio.run(script())
     assert engine.calls == []
     assert device.spec == spec
-    assert Store("demo").load("left") is None
+    assert StationStore("demo", "left").configuration.read() is None
 
 
 def test_apply_that_the_engine_refuses_changes_nothing(spec):

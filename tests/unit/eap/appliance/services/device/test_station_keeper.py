@@ -8,9 +8,15 @@ import errno
 import pytest
 from msgspec.structs import replace
 
-from eap.appliance.configuration import Configuration, digest_of
 from eap.appliance.services.device.station_keeper import StationKeeper
-from eap.appliance.store import Store, effective, state_root
+from eap.appliance.store import (
+    Configuration,
+    StationFile,
+    StationStore,
+    digest_of,
+    effective,
+    state_root,
+)
 from eap.errors import EngineGoneError, EngineRefusedError, EnvironmentalError
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import RxAlternateSpec, StationSpec, TakenVariableSpec
@@ -18,6 +24,11 @@ from tests.support.stationengine import StationEngine
 from tests.unit.eap.appliance.conftest import right
 
 OLD, NEW = {"eap0": "old"}, {"eap0": "new"}
+
+
+def make_keeper(spec: StationSpec, engine: StationEngine) -> StationKeeper:
+    file = StationStore("demo", spec.name).configuration
+    return StationKeeper(spec, DeviceState.OP, file, engine)
 
 
 @pytest.fixture
@@ -37,11 +48,13 @@ def engine(spec):
 
 @pytest.fixture
 def keeper(spec, engine):
-    return StationKeeper(spec, DeviceState.OP, Store("demo"), engine)
+    return StationKeeper(
+        spec, DeviceState.OP, StationStore("demo", spec.name).configuration, engine
+    )
 
 
 def kept():
-    return Store("demo").load("left")
+    return StationStore("demo", "left").configuration.read()
 
 
 def test_nothing_is_kept_of_what_never_changed(keeper, spec):
@@ -68,7 +81,9 @@ def test_change_is_kept_and_runs(keeper, engine, spec, changed):
 
 def test_next_keeper_goes_on_from_there(keeper, engine, spec, changed):
     asyncio.run(keeper.change(changed, NEW))
-    again = StationKeeper(changed, DeviceState.OP, Store("demo"), engine)
+    again = StationKeeper(
+        changed, DeviceState.OP, StationStore("demo", changed.name).configuration, engine
+    )
     assert (again.objects, again.previous.spec) == (NEW, spec)
     asyncio.run(again.change(spec, OLD))
     assert kept().base == digest_of(spec)
@@ -77,7 +92,12 @@ def test_next_keeper_goes_on_from_there(keeper, engine, spec, changed):
 
 def test_what_was_kept_of_something_else_is_not_taken(keeper, engine, spec, changed):
     asyncio.run(keeper.change(changed, NEW))
-    assert StationKeeper(spec, DeviceState.OP, Store("demo"), engine).objects == {}
+    assert (
+        StationKeeper(
+            spec, DeviceState.OP, StationStore("demo", spec.name).configuration, engine
+        ).objects
+        == {}
+    )
 
 
 def test_it_is_kept_before_the_engine_is_asked(keeper, engine, changed):
@@ -104,10 +124,10 @@ def test_what_the_engine_does_not_take_is_not_kept(keeper, engine, spec, changed
 
 
 def test_what_cannot_be_kept_does_not_run(keeper, engine, changed, monkeypatch):
-    def full(self, station, stored):
+    def full(self, stored):
         raise EnvironmentalError("disk full")
 
-    monkeypatch.setattr(Store, "save", full)
+    monkeypatch.setattr(StationFile, "save", full)
     with pytest.raises(DeviceFault, match="disk full"):
         asyncio.run(keeper.change(changed, NEW))
     assert engine.calls == []
@@ -159,10 +179,10 @@ def test_way_up_can_fail_and_way_down_cannot(keeper, engine, caplog):
 
 
 def test_state_that_cannot_be_kept_is_told(keeper, engine, monkeypatch, caplog):
-    def full(self, station, stored):
+    def full(self, stored):
         raise EnvironmentalError("disk full")
 
-    monkeypatch.setattr(Store, "save", full)
+    monkeypatch.setattr(StationFile, "save", full)
     asyncio.run(keeper.change_state(DeviceState.SAFEOP))
     assert engine.state is keeper.state is DeviceState.SAFEOP
     assert "disk full; after a start it will be as it was before" in caplog.text
@@ -184,7 +204,7 @@ def tolerant(spec: StationSpec) -> StationSpec:
 
 
 def going(old: StationSpec, engine: StationEngine) -> StationKeeper:
-    return StationKeeper(old, DeviceState.OP, Store("demo"), engine)
+    return make_keeper(old, engine)
 
 
 def test_steps_of_one_change_have_one_way_back(engine):
@@ -195,7 +215,7 @@ def test_steps_of_one_change_have_one_way_back(engine):
         asyncio.run(keeper.change(spec, objects, cause="1", applied=True))
         assert keeper.previous == Configuration(base=digest_of(old), spec=old)
         assert (keeper.cause, keeper.undone) == ("1", False)
-        applied.append(Store("demo").load("right").applied)
+        applied.append(StationStore("demo", "right").configuration.read().applied)
     assert applied == ["", digest_of(new), digest_of(new)]
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from eap.aoe.routes import Origin
 from eap.aoe.spec import AmsUser, DoorKind, HopSpec, RouteSpec, RoutingSpec
-from eap.appliance.route_store import RouteStore
 from eap.appliance.services.routes.route_desk import RATES, RouteDesk
 from eap.appliance.services.routes.station_routes import StationRoutes
+from eap.appliance.store import StationStore
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import (
     TEMPORARY,
@@ -44,7 +44,7 @@ def state(tmp_path, monkeypatch):
 
 def routes(name="left", **told) -> StationRoutes:
     router = station(OWN, name=name)
-    found = StationRoutes(router, RoutingSpec(**told), RouteStore("demo", name))
+    found = StationRoutes(router, RoutingSpec(**told), StationStore("demo", name).routes)
     found.start()
     return found
 

@@ -8,10 +8,10 @@ import pytest
 
 from eap.aoe.spec import DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
 from eap.appliance.control_routing import RoutingDifference, RunningRouting
-from eap.appliance.route_store import RouteStore, RoutingStore
 from eap.appliance.services.routes.routing_methods import RoutingMethods
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routes.station_routing import StationRouting
+from eap.appliance.store import StationStore
 from eap.errors import ControlError
 from tests.support.routing import station
 
@@ -23,8 +23,8 @@ NEW = RoutingSpec(routes=(RouteSpec(name="mill", net_id="10.0.0.2.1.1", hop=HOP)
 @pytest.fixture
 def ask(tmp_path, monkeypatch):
     monkeypatch.setenv("EAP_STATE_DIR", str(tmp_path))
-    routes = StationRoutes(station("10.0.0.1.2.1"), OLD, RouteStore("p", "left"))
-    routing = StationRouting("left", routes, RoutingStore("p", "left"), lambda told: None)
+    routes = StationRoutes(station("10.0.0.1.2.1"), OLD, StationStore("p", "left").routes)
+    routing = StationRouting("left", routes, StationStore("p", "left").routing, lambda told: None)
     routing.start()
     methods = RoutingMethods({"left": routing}).table()
 

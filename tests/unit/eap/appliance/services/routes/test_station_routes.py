@@ -9,8 +9,8 @@ from msgspec.structs import replace
 from eap.aoe.routes import Origin, Route, RouteTable
 from eap.aoe.spec import DoorKind, HopSpec, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
-from eap.appliance.route_store import RouteStore
 from eap.appliance.services.routes.station_routes import LEARNED_NS, MAX_ADDED, StationRoutes
+from eap.appliance.store import StationFile, StationStore
 from eap.errors import ControlError
 from eap.ids import NetId
 
@@ -40,7 +40,7 @@ class House:
 
     def __init__(self, spec=WITH_STATIC):
         self.router = Router()
-        self.store = RouteStore("demo", "left")
+        self.store = StationStore("demo", "left").routes
         self.routes = StationRoutes(self.router, spec, self.store, open_hop=self.open)
         self.routes.start()
 
@@ -247,11 +247,12 @@ def test_a_default_route_is_no_reason_not_to_learn():
     assert house.router.table.find(NetId.parse("8.1.1.1.5.5"))[0].name == "10.0.0.9"
 
 
-class SlowStore(RouteStore):
+class SlowStore(StationFile):
     """A disk that takes its time; *written* is what came there, in that order."""
 
     def __init__(self):
-        super().__init__("demo", "left")
+        file = StationStore("demo", "left").routes
+        super().__init__(file.path.parent, "left", tuple[RouteSpec, ...], "added routes")
         self.go_on = threading.Event()
         self.written = []
 

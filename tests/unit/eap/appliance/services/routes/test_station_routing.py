@@ -6,9 +6,9 @@ import pytest
 from msgspec.structs import replace
 
 from eap.aoe.spec import AccessRule, DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
-from eap.appliance.route_store import RouteStore, RoutingStore
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routes.station_routing import StationRouting
+from eap.appliance.store import StationStore
 from eap.errors import ControlError, EnvironmentalError
 from tests.support.routing import station
 
@@ -30,8 +30,8 @@ class House:
     def __init__(self, told=FILE):
         self.access = []
         self.router = station("10.0.0.1.2.1")
-        routes = StationRoutes(self.router, told, RouteStore("p", "left"))
-        store = RoutingStore("p", "left")
+        routes = StationRoutes(self.router, told, StationStore("p", "left").routes)
+        store = StationStore("p", "left").routing
         self.routing = StationRouting("left", routes, store, self.access.append)
         self.routing.start()
 

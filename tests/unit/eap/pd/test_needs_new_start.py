@@ -2,9 +2,9 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from eap.appliance.change import needs_new_start
 from eap.pd.gateway import GatewaySpec
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec
+from eap.pd.succession import needs_new_start
 from tests.unit.eap.appliance.conftest import eap_port, left
 
 END = ": this needs a new start of the appliance"
