@@ -138,12 +138,17 @@ slaves:
 """Buses of these tests; others are those of ``config``."""
 
 
-def play(scene: Callable[[Client, FakeEngine], Awaitable[Any]], name: str = "drive") -> Any:
+def play(
+    scene: Callable[[Client, FakeEngine], Awaitable[Any]],
+    name: str = "drive",
+    *,
+    look_s: float = 0.05,
+) -> Any:
     """Run *scene* with a client and the engine behind the service that it asks."""
 
     async def run() -> Any:
         engine = FakeEngine(FakeBus(_line(name)))
-        link = EngineLink(engine.services, look_s=0.05)
+        link = EngineLink(engine.services, look_s=look_s)
         bus = BusClient(link, [PORT])
         told: list[tuple[Way, bytes]] = []
         desk = MasterDesk(bus, PORT, "1.2.3")

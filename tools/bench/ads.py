@@ -14,15 +14,21 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from tools.bench import machine
+from tools.bench import buses, machine
+from tools.bench.ads_roles import DEVICE
 from tools.bench.appliance import running, status
 from tools.bench.figures import Figure, at_least, at_most, median_ratio, report, skipped
+from tools.bench.gateway_roles import PORT as GATEWAY_PORT
 from tools.bench.network import Worker
+from tools.bench.pacing import wait
 from tools.bench.settings import Settings
 
 TITLE = "ADS by AMS/TCP: 4 octets of a dictionary, read by pyads and by plain sockets over loopback"
 NEAR, FAR, SERVER = "127.0.9.31", "127.0.9.32", "127.0.9.33"
 CLIENTS = 100
+SLAVES = list(range(1001, 1017))
+_GATEWAY: dict[str, Any] = {"address": NEAR, "port": GATEWAY_PORT}
+_UP_WITHIN_S = 30
 OURS, THEIRS = "ads_roles.pyads_reads", "ads_roles.pyads_server"
 HOPS = {"type 5 over UDP": "", "AMS/TCP": "ams_tcp: far/eap0"}
 """What the route to the far station says."""
@@ -37,6 +43,7 @@ def run(settings: Settings) -> list[Figure]:
             _reads(settings, folder),
             *(figure for how in HOPS for figure in _hop(settings, folder, how)),
             _crowd(settings, folder),
+            *_slaves(settings, folder),
         ]
 
 
@@ -80,6 +87,85 @@ def crowd_figure(counts: Sequence[int], seconds: float) -> Figure:
     detail = f"{min(counts)} to {middle:.0f} reads, {sum(counts) / seconds / 1000:.1f} thousand/s"
     name = f"{len(counts)} clients at once: the slowest, of the median"
     return at_least(name, min(counts) / middle if middle else 0, 0.5, detail)
+
+
+class SlaveReads(NamedTuple):
+    """One round: reads a second of all slaves at once, and the median trip of one in µs."""
+
+    ads: float
+    gateway: float
+    ads_us: float
+    gateway_us: float
+
+
+def slave_figures(rounds: Sequence[SlaveReads]) -> list[Figure]:
+    """Compare reads of slaves by ADS with those by the mailbox gateway."""
+    ads, gateway, ads_us, gateway_us = (median(column) for column in zip(*rounds, strict=True))
+    ratio = median_ratio([(each.ads, each.gateway) for each in rounds])
+    longer = median_ratio([(each.ads_us, each.gateway_us) for each in rounds])
+    name = f"{len(SLAVES)} slaves read at once: of reads by the mailbox gateway"
+    detail = f"{ads:.0f} to {gateway:.0f} reads/s"
+    one = "a slave read alone: time, ratio to the mailbox gateway"
+    return [
+        at_least(name, ratio, 0.8, detail),
+        at_most(one, longer, 1.2, "", f"{ads_us:.0f} to {gateway_us:.0f} µs"),
+    ]
+
+
+def _slaves(settings: Settings, folder: Path) -> list[Figure]:
+    """Read the slaves of a plant of its own by AMS/TCP and by the gateway, in turn."""
+    near, far = machine.cores()
+    (folder / "bus.yaml").write_bytes(buses.encode(buses.bus(len(SLAVES), 512)))
+    path = folder / "slaves.yaml"
+    path.write_text(slave_plant(), encoding="utf-8")
+    rounds = []
+    seconds, count = settings.latency_s, 100 * settings.rounds
+    with running(path, None) as environment:
+        os.sched_setaffinity(status(None, environment)["processes"]["services"]["pid"], {far})
+        _wait_up(environment)
+        for number in range(settings.rounds):
+            settings.tell(f"slaves by ADS, round {number + 1} of {settings.rounds}")
+            ads: dict[str, Any] = {"address": NEAR, "net_id": f"{NEAR}.3.1"}
+            jobs: list[tuple[str, dict[str, Any]]] = [
+                ("ads_roles.crowd", ads | {"ports": SLAVES, "seconds": seconds}),
+                ("gateway_roles.crowd", _GATEWAY | {"stations": SLAVES, "seconds": seconds}),
+                ("ads_roles.reads", ads | {"port": SLAVES[0], "count": count}),
+                ("gateway_roles.reads", _GATEWAY | {"station": SLAVES[0], "seconds": seconds}),
+            ]
+            found = []
+            for role, job in jobs:
+                with _worker(role, job, near) as client:
+                    answer = client.answer(seconds)
+                    found.append(client.answer(seconds) if "ready" in answer else answer)
+            both = [sum(each["counts"]) / seconds for each in found[:2]]
+            one = [median(each["trips"]) / 1000 for each in found[2:]]
+            rounds.append(SlaveReads(*both, *one))
+    return slave_figures(rounds)
+
+
+def _wait_up(environment: dict[str, str]) -> None:
+    """Wait until all slaves are in OP; raise RuntimeError if they do not get there."""
+    for _ in range(_UP_WITHIN_S):
+        wait(1.0)
+        (station,) = status(None, environment)["stations"]
+        bus = next(port["bus"] for port in station["ports"] if "bus" in port)
+        if [slave["state"] for slave in bus.get("slaves", [])] == ["OP"] * len(SLAVES):
+            return
+    raise RuntimeError(f"the bus of the plant does not come up: {bus}")
+
+
+def slave_plant() -> str:
+    """Return a plant of one station with a simulated bus."""
+    return f"""\
+plant: slaves
+defaults: {{cycle_us: 2000}}
+stations:
+  - name: near
+    net_id: {NEAR}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://{NEAR}", net_id: {NEAR}.2.1}}
+      - {{name: bus0, kind: bus, interface: "sim://bus.yaml", net_id: {NEAR}.3.1}}
+"""
 
 
 def _reads(settings: Settings, folder: Path) -> Figure:
@@ -135,7 +221,8 @@ def _crowd(settings: Settings, folder: Path) -> Figure:
     near, far = machine.cores()
     settings.tell(f"{CLIENTS} clients at once")
     seconds = settings.latency_s
-    job = {"address": NEAR, "net_id": f"{NEAR}.2.1", "clients": CLIENTS, "seconds": seconds}
+    ports = [DEVICE] * CLIENTS
+    job = {"address": NEAR, "net_id": f"{NEAR}.2.1", "ports": ports, "seconds": seconds}
     with (
         _appliance(folder, "near", far),
         _worker("ads_roles.crowd", job, near) as clients,

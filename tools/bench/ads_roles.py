@@ -53,7 +53,7 @@ def pyads_server(job: dict[str, Any]) -> None:
 
 def reads(job: dict[str, Any]) -> None:
     """Read 4 octets again and again by a plain socket; tell each round trip in nanoseconds."""
-    request = _request(job["net_id"])
+    request = _request(job["net_id"], job.get("port", DEVICE))
     with socket.create_connection((job["address"], PORT)) as sock:
         trips = _trips(sock, request, int(job["count"]))
         if request_failed(trips.last):
@@ -105,12 +105,12 @@ async def _asyncio_echo(address: str) -> None:
 
 
 def crowd(job: dict[str, Any]) -> None:
-    """Read by many connections at once, each asking when it has its answer; tell who had how many.
+    """Read by a connection for each of *ports* at once, again after each answer; tell the counts.
 
     All are served by one selector, which takes turns.
     """
-    request = _request(job["net_id"])
-    counts = [0] * int(job["clients"])
+    requests = [_request(job["net_id"], port) for port in job["ports"]]
+    counts = [0] * len(requests)
     with ExitStack() as stack:
         selector = stack.enter_context(selectors.DefaultSelector())
         socks = [
@@ -118,7 +118,7 @@ def crowd(job: dict[str, Any]) -> None:
         ]
         for number, sock in enumerate(socks):
             selector.register(sock, selectors.EVENT_READ, number)
-            sock.sendall(request)
+            sock.sendall(requests[number])
         end_ns = perf_counter_ns() + int(job["seconds"] * 1e9)
         while perf_counter_ns() < end_ns:
             for key, _ in selector.select(1):
@@ -126,7 +126,7 @@ def crowd(job: dict[str, Any]) -> None:
                 if request_failed(sock.recv(4096)):
                     raise RuntimeError("a request failed")
                 counts[key.data] += 1
-                sock.sendall(request)
+                sock.sendall(requests[key.data])
     answer({"counts": counts})
 
 
@@ -153,10 +153,10 @@ def request_failed(octets: bytes) -> bool:
     return len(octets) <= _ERROR_AT or octets[_ERROR_AT : _ERROR_AT + 4] != bytes(4)
 
 
-def _request(net_id: str) -> bytes:
-    """Return a request for 4 octets of the dictionary of *net_id*, with the prefix of AMS/TCP."""
+def _request(net_id: str, port: int = DEVICE) -> bytes:
+    """Return a request for 4 octets of a dictionary, with the prefix of AMS/TCP."""
     target = bytes(int(part) for part in net_id.split("."))
     body = _READ.pack(SDO, OBJECT, 4)
     source = bytes((127, 0, 0, 1, 1, 1))
-    ams = _AMS.pack(target, DEVICE, source, 40000, 2, 4, len(body), 0, 1) + body
+    ams = _AMS.pack(target, port, source, 40000, 2, 4, len(body), 0, 1) + body
     return struct.pack("<HI", 0, len(ams)) + ams

@@ -153,8 +153,7 @@ def _crowd(settings: Settings) -> Figure:
 
 @contextmanager
 def _clients(address: str, port: int, seconds: float) -> Iterator[Worker]:
-    job = {"address": address, "port": port, "station": MASTER}
-    job |= {"clients": CLIENTS, "seconds": seconds}
+    job = {"address": address, "port": port, "stations": [MASTER] * CLIENTS, "seconds": seconds}
     with _worker("crowd", job, machine.cores()[0]) as clients:
         clients.answer()
         yield clients

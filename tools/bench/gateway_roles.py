@@ -56,11 +56,11 @@ def echo(job: dict[str, Any]) -> None:
 
 
 def crowd(job: dict[str, Any]) -> None:
-    """Be many clients, each with one request on its way; tell how many answers each had."""
-    octets = request(job["station"])
-    counts = [0] * int(job["clients"])
+    """Be a client for each of *stations*, with one request on its way; tell the answers of each."""
+    requests = [request(station) for station in job["stations"]]
+    counts = [0] * len(requests)
     with selectors.DefaultSelector() as selector:
-        for number in range(len(counts)):
+        for number, octets in enumerate(requests):
             sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             sock.connect((job["address"], job["port"]))
             selector.register(sock, selectors.EVENT_READ, number)
@@ -71,9 +71,11 @@ def crowd(job: dict[str, Any]) -> None:
             for key, _ in selector.select(_ANSWER_S):
                 client = key.fileobj
                 assert isinstance(client, socket.socket)  # noqa: S101  as registered
-                client.recv(_LARGEST)
+                back = client.recv(_LARGEST)
+                if back[_ABORT_AT] == _ABORT:
+                    raise RuntimeError(f"{job['address']} answers with {back.hex()}")
                 counts[key.data] += 1
-                client.send(octets)
+                client.send(requests[key.data])
         for key in list(selector.get_map().values()):
             assert isinstance(key.fileobj, socket.socket)  # noqa: S101
             key.fileobj.close()

@@ -4,8 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from eap.appliance.plantfile import load_plant
 from eap.config.load import load
-from tools.bench.ads import HOPS, Trips, crowd_figure, hop_figures, plant, reads_figure
+from tools.bench import buses
+from tools.bench.ads import (
+    HOPS,
+    SLAVES,
+    SlaveReads,
+    Trips,
+    crowd_figure,
+    hop_figures,
+    plant,
+    reads_figure,
+    slave_figures,
+    slave_plant,
+)
 from tools.bench.figures import Verdict
 
 
@@ -27,6 +40,24 @@ def test_slowest_client_is_compared_with_the_median() -> None:
     assert (figure.value, figure.verdict) == (0.5, Verdict.OK)
     assert crowd_figure([0, 100, 101], 2.0).verdict is Verdict.MISSED
     assert crowd_figure([0, 0, 0], 2.0).verdict is Verdict.MISSED
+
+
+def test_slave_reads_by_ads_are_compared_with_the_gateway() -> None:
+    at_once, alone = slave_figures([SlaveReads(600.0, 1000.0, 1500.0, 1000.0)] * 3)
+    assert (at_once.value, at_once.verdict) == (0.6, Verdict.MISSED)
+    assert at_once.measured == "0.60 (600 to 1000 reads/s)"
+    assert (alone.value, alone.verdict) == (1.5, Verdict.MISSED)
+    assert alone.measured == "1.50 (1500 to 1000 µs)"
+
+
+def test_slave_plant_has_the_slaves_that_are_read(tmp_path: Path) -> None:
+    (tmp_path / "bus.yaml").write_bytes(buses.encode(buses.bus(len(SLAVES), 512)))
+    (tmp_path / "plant.yaml").write_text(slave_plant())
+    result = load_plant(tmp_path / "plant.yaml")
+    assert result.plant is not None, result.findings
+    bus = result.plant.stations[0].ports[1].bus
+    assert bus is not None
+    assert [slave.station for slave in bus.slaves] == SLAVES
 
 
 def test_plants_can_be_loaded(tmp_path: Path) -> None:

@@ -61,6 +61,22 @@ def test_slave_by_its_address():
     play(scene)
 
 
+def test_request_to_a_slave_costs_one_engine_round_trip():
+    async def scene(client, engine):
+        await client.good(DRIVE, VENDOR)
+        engine.requests.clear()
+        for _ in range(20):
+            assert await client.good(DRIVE, VENDOR) == VENDOR_ID
+        assert [type(each) for each in engine.requests] == 20 * [AskMailbox]
+        engine.requests.clear()
+        for operation in (ReadState(), ReadDeviceInfo()):
+            await client.good(DRIVE, operation)
+            await client.good(MASTER, operation)
+        assert not engine.requests
+
+    play(scene, look_s=5.0)
+
+
 def test_master_by_port_0xffff():
     async def scene(client, engine):
         info = AdsDeviceInfo.decode(await client.good(MASTER, ReadDeviceInfo()))
