@@ -38,8 +38,8 @@ class FrameLostError(BusError):
 class WorkingCounterError(BusError):
     """Fewer slaves answered a datagram than were addressed."""
 
-    def __init__(self, what: str, expected: int, received: int) -> None:
-        super().__init__(f"{what}: working counter {received}, expected {expected}")
+    def __init__(self, message: str, *, expected: int, received: int) -> None:
+        super().__init__(message)
         self.expected = expected
         self.received = received
 

@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from devicebus.errors import WorkingCounterError
 from devicebus.master.access import DatagramRequest, bwr, fprd, frmw
-from devicebus.master.procedure import Procedure, read, write
+from devicebus.master.procedure import Procedure, not_answered, read, write
 from devicebus.master.scan import FoundSlave
 from devicebus.master.topology import Joint
 from devicebus.wire.register import Register
@@ -155,7 +154,7 @@ def _read_latched(station: int) -> Procedure[Latched]:
     ]
     for reply in replies:
         if reply.wkc != 1:
-            raise WorkingCounterError(f"slave {station}: reading receive times", 1, reply.wkc)
+            raise not_answered(f"slave {station}: reading receive times", reply)
     ports, processing = (reply.data for reply in replies)
     first, second, third, fourth = (
         int.from_bytes(ports[at : at + 4], "little") for at in range(0, 16, 4)

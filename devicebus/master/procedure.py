@@ -51,7 +51,7 @@ def read(
     """
     (reply,), _ = yield [fprd(station, ado, size, tries=tries)]
     if reply.wkc != 1:
-        raise WorkingCounterError(f"slave {station}: reading {what or hex(ado)}", 1, reply.wkc)
+        raise not_answered(f"slave {station}: reading {what or hex(ado)}", reply)
     return reply.data
 
 
@@ -61,7 +61,13 @@ def write(
     """Write registers or memory of one slave; raises as :func:`read` does."""
     (reply,), _ = yield [fpwr(station, ado, data, tries=tries)]
     if reply.wkc != 1:
-        raise WorkingCounterError(f"slave {station}: writing {what or hex(ado)}", 1, reply.wkc)
+        raise not_answered(f"slave {station}: writing {what or hex(ado)}", reply)
+
+
+def not_answered(what: str, reply: DatagramReply) -> WorkingCounterError:
+    """Return the error of a datagram that exactly one slave should have answered."""
+    text = f"{what}: working counter {reply.wkc}, expected 1"
+    return WorkingCounterError(text, expected=1, received=reply.wkc)
 
 
 def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from devicebus.errors import BusError, WorkingCounterError
+from devicebus.errors import BusError
 from devicebus.master.access import DatagramReply, DatagramRequest, aprd, apwr, brd, fprd
 from devicebus.master.eeprom import read_image, read_words, take_over
-from devicebus.master.procedure import Procedure, together
+from devicebus.master.procedure import Procedure, not_answered, together
 from devicebus.master.topology import Joint, find_joints
 from devicebus.wire import sii
 from devicebus.wire.register import AlStatus, DlStatus, Register
@@ -130,7 +130,7 @@ def assign_stations(places: Sequence[tuple[int, int]]) -> Procedure[None]:
     )
     for (position, _), reply in zip(places, replies, strict=True):
         if reply.wkc != 1:
-            raise WorkingCounterError(f"station address for position {position}", 1, reply.wkc)
+            raise not_answered(f"station address for position {position}", reply)
 
 
 def read_stations(count: int) -> Procedure[list[int]]:
@@ -171,7 +171,7 @@ def _read_registers(stations: Sequence[int]) -> Procedure[list[_Registers]]:
         info, alias, dl_status, al_status = replies[4 * number : 4 * number + 4]
         for reply in (info, alias, dl_status, al_status):
             if reply.wkc != 1:
-                raise WorkingCounterError(f"slave {station}: reading registers", 1, reply.wkc)
+                raise not_answered(f"slave {station}: reading registers", reply)
         found.append(
             _Registers(
                 EscInfo.decode(info.data),

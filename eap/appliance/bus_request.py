@@ -1,7 +1,7 @@
-"""What services ask the engine to do on a bus, and what it answers: one message each.
+"""Requests of services to the engine, its replies, and the description of a bus that they carry.
 
-They travel as MessagePack over a SOCK_SEQPACKET pair.  Requests are small steps, such as one
-mailbox message: whole transfers, files and retries are the business of who asks.
+They travel as MessagePack over a SOCK_SEQPACKET pair, one message each.  A request is a small step,
+such as one mailbox message: whole transfers, files and retries are the business of services.
 """
 
 from __future__ import annotations
@@ -10,72 +10,53 @@ from typing import TypeAlias
 
 import msgspec
 
+from devicebus.errors import NoMailboxError
+from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
+from devicebus.master.access import DatagramReply, DatagramRequest
+from devicebus.wire.alstatus import AlState
+from eap.appliance.bus_errors import ErrorRecord, to_error
 from eap.appliance.station_request import StationRequest
+from eap.codec.mailbox import MailboxType
+from eap.errors import EapError
 
 
-class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
-    """Base of all requests; *bus* counts the bus ports of the appliance in the handover's order."""
+class BusRequest(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
+    """Base of requests to a bus; *bus* counts the bus ports in the handover's order."""
 
     id: int
-    """Chosen by who asks; the answer repeats it."""
+    """Chosen by the requester and repeated in the reply."""
     bus: int
 
 
-class Describe(Message, frozen=True, tag="describe"):
-    """Say how the bus is: answered by *report*."""
+class DescribeBus(BusRequest, frozen=True, tag="describe"):
+    """Describe the bus: answered by *report*."""
 
 
-class AskMailbox(Message, frozen=True, kw_only=True, tag="mailbox"):
-    """One step of a conversation with a slave's mailbox: answered by *data*.
-
-    Fields as those of ``devicebus.mailbox.conversation.Ask``.
-    """
+class ExchangeMailbox(BusRequest, frozen=True, kw_only=True, tag="mailbox"):
+    """Do one step of a conversation with a slave's mailbox: answered by *message*."""
 
     station: int
-    type: int
-    request: bytes
-    listen: bool = False
-    timeout_ns: int
-    delay_ns: int = 0
-    expects_reply: bool = True
+    request: MailboxRequest
 
 
-class Datagram(msgspec.Struct, frozen=True, array_like=True):
-    """One datagram, as ``devicebus.master.access.Access``."""
+class ExchangeDatagrams(BusRequest, frozen=True, kw_only=True, tag="transfer"):
+    """Do one step of a procedure, without logical datagrams: answered by *replies*."""
 
-    command: int
-    adp: int
-    ado: int
-    data: bytes
-    tries: int
+    datagrams: tuple[DatagramRequest, ...]
 
 
-class Outcome(msgspec.Struct, frozen=True, array_like=True):
-    """What came back for one datagram, as ``devicebus.master.access.Reply``."""
-
-    wkc: int
-    data: bytes
-    tries: int
-
-
-class Transfer(Message, frozen=True, kw_only=True, tag="transfer"):
-    """One step of a procedure, datagrams without logical ones: answered by *outcomes*."""
-
-    datagrams: tuple[Datagram, ...]
-
-
-class Bring(Message, frozen=True, kw_only=True, tag="bring"):
-    """Bring a slave to an AL state where it is kept then; 0 is all slaves.  Answered when there."""
+class BringSlaves(BusRequest, frozen=True, kw_only=True, tag="bring"):
+    """Bring a slave, or with 0 all, to an AL state where it is kept: answered when there."""
 
     station: int
-    target: int
+    target: AlState
 
 
-class Forget(Message, frozen=True, tag="forget"):
+class ForgetFaults(BusRequest, frozen=True, tag="forget"):
     """Forget the faults that are over: answered when done."""
 
 
-class Republish(Message, frozen=True, tag="republish"):
+class Republish(BusRequest, frozen=True, tag="republish"):
     """Send a BusChange with all slaves, answered behind it: the sender knows nothing of the bus."""
 
 
@@ -86,30 +67,30 @@ class Ping(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="ping"
 
 
 class Cancel(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", tag="cancel"):
-    """Whoever asked *id* does not wait any more: not answered."""
+    """Drop request *id*, whose requester has gone: not answered."""
 
     id: int
 
 
-BusRequest: TypeAlias = Describe | AskMailbox | Transfer | Bring | Forget | Republish
-Request: TypeAlias = BusRequest | Ping | Cancel | StationRequest
+EngineRequest: TypeAlias = (
+    DescribeBus
+    | ExchangeMailbox
+    | ExchangeDatagrams
+    | BringSlaves
+    | ForgetFaults
+    | Republish
+    | Ping
+    | Cancel
+    | StationRequest
+)
 
 
 class PortErrorReport(msgspec.Struct, frozen=True, array_like=True):
-    """How many nanoseconds ago the error counters of a port grew first and last."""
+    """Nanoseconds since the error counters of a port grew first and last."""
 
     port: int
     since_ns: int
     until_ns: int
-
-
-class Failure(msgspec.Struct, frozen=True):
-    """Why a request was not done: the name of one of ``devicebus.errors``, and its text."""
-
-    kind: str
-    message: str
-    detail: int = 0
-    """Mailbox error code."""
 
 
 class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
@@ -128,7 +109,7 @@ class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
     to_slave: int = 0
     to_master: int = 0
     """Octets of the mailboxes, 0 while none is open."""
-    mailbox_fault: Failure | None = None
+    mailbox_fault: ErrorRecord | None = None
     """Why none is open: a NoMailboxError, or a MailboxClosedError that will pass."""
     protocols: int = 0
     """As in its EEPROM."""
@@ -142,13 +123,20 @@ class SlaveDescription(msgspec.Struct, frozen=True, kw_only=True):
     link_preset: int = 0
     """Bits 0 to 2: ports 1 to 3 led to a slave when it was found; bits 4 to 6: they had a link."""
     losses: int = 0
-    """How often it has stopped answering."""
+    """Times that it has stopped answering."""
     departures: int = 0
-    """How often it has left its state by itself."""
+    """Times that it has left its state by itself."""
     al_code: int = 0
     """AL status code when it last did."""
     fault: str = ""
-    """Why it is not where it belongs."""
+    """Reason why it is not in its target state."""
+
+
+def no_mailbox(slave: SlaveDescription) -> EapError:
+    """Return the error for which no mailbox of a slave is open, as its master gives it."""
+    if slave.mailbox_fault is not None:
+        return to_error(slave.mailbox_fault)
+    return NoMailboxError(f"slave {slave.station} ({slave.name}) has no open mailbox")
 
 
 class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
@@ -157,25 +145,25 @@ class SlaveReport(SlaveDescription, frozen=True, kw_only=True):
     past_fault: str = ""
     """The same of the last time, if that is over."""
     since_ns: int | None = None
-    """How many nanoseconds ago *fault* or *past_fault* began."""
+    """Nanoseconds since *fault* or *past_fault* began."""
     until_ns: int | None = None
-    """How many nanoseconds ago *past_fault* was over."""
+    """Nanoseconds since *past_fault* was over."""
     port_errors: tuple[PortErrorReport, ...] = ()
     """Ports whose errors were counted while the master looked."""
 
 
 class BusReport(msgspec.Struct, frozen=True, kw_only=True):
-    """How a bus is; counters since the engine started, times in nanoseconds."""
+    """Description of a bus; counters since the engine started, times in nanoseconds."""
 
     is_up: bool
-    """Whether it has been brought up, wherever its slaves are now."""
+    """True after it has been brought up, whatever the states of its slaves are now."""
     fault: str = ""
     """Why not."""
     slaves: tuple[SlaveReport, ...] = ()
     silent_since_ns: int | None = None
-    """How many nanoseconds ago frames stopped coming back, the last time."""
+    """Nanoseconds since frames stopped coming back, the last time."""
     silent_until_ns: int | None = None
-    """How many nanoseconds ago they came back again."""
+    """Nanoseconds since they came back again."""
     frames_sent: int = 0
     frames_received: int = 0
     frames_late: int = 0
@@ -184,7 +172,7 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     """Frames that never came back."""
     frames_retried: int = 0
     timeout_ns: int = 0
-    """How long the next frame may be under way before it is sent again."""
+    """Time-out of the next frame, after which it is sent again."""
     round_trip_ns: int = 0
     """Mean of the latest round trips, 0 before the first."""
     cycles: int = 0
@@ -199,38 +187,35 @@ class BusReport(msgspec.Struct, frozen=True, kw_only=True):
     trip_ns: int = 0
     max_trip_ns: int = 0
     malformed: int = 0
-    """Messages of services that were no request, for all buses of the engine together."""
+    """Malformed messages of services, for all buses of the engine together."""
     dropped: int = 0
-    """Answers that services did not take, likewise."""
+    """Replies that services did not take, for all buses of the engine together."""
 
 
-class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="answer"):
-    """The answer to one request: *failure*, or what the request says."""
+class EngineReply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="answer"):
+    """Reply to one request: *error*, or what the request names."""
 
     id: int
-    failure: Failure | None = None
-    data: bytes = b""
-    counter: int = 0
-    """Of the mailbox header of a slave's reply."""
-    outcomes: tuple[Outcome, ...] = ()
+    error: ErrorRecord | None = None
+    message: MailboxMessage | None = None
+    replies: tuple[DatagramReply, ...] = ()
     report: BusReport | None = None
 
 
-class Hello(msgspec.Struct, frozen=True, tag="hello"):
-    """The first message of an engine: what was asked of the one before is not answered."""
+class EngineStarted(msgspec.Struct, frozen=True, tag="hello"):
+    """First message of an engine: requests to the one before it are not answered."""
 
     pid: int
 
 
-class Heard(msgspec.Struct, frozen=True, tag="heard"):
-    """What a slave sent unasked: an Ethernet frame, an emergency, a notification."""
+class UnsolicitedMessage(msgspec.Struct, frozen=True, tag="heard"):
+    """Message that a slave sent unasked: an Ethernet frame, an emergency, a notification."""
 
     bus: int
     station: int
-    kind: int
-    """Mailbox type of the message."""
+    kind: MailboxType
     data: bytes
-    """What stands behind its mailbox header."""
+    """Without the mailbox header."""
 
 
 class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):
@@ -247,4 +232,8 @@ class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):
     slaves: tuple[SlaveDescription, ...]
 
 
-FromEngine: TypeAlias = Answer | Hello | Heard | BusChange
+EngineMessage: TypeAlias = EngineReply | EngineStarted | UnsolicitedMessage | BusChange
+
+AskMailbox = ExchangeMailbox
+Bring = BringSlaves
+Heard = UnsolicitedMessage

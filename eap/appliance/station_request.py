@@ -1,4 +1,4 @@
-"""What services ask the engine to do with a station, on the pair that carries requests to buses."""
+"""Requests of services to the engine for a station, on the pair that carries those to buses."""
 
 from __future__ import annotations
 
@@ -30,6 +30,3 @@ class SetState(StationMessage, frozen=True, tag="set_state"):
 
 
 StationRequest: TypeAlias = Configure | SetState
-
-REFUSED = "EngineRefusedError"
-"""Kind of the failure that answers a request."""

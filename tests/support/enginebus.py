@@ -11,8 +11,8 @@ import msgspec
 from devicebus.sim.spec import FaultSpec
 from devicebus.wire.alstatus import AlState
 from eap.appliance.busfile import load_or_raise
-from eap.appliance.engine.bus_settings import master_settings
 from eap.appliance.engine.engine_bus import EngineBus
+from eap.appliance.engine.engine_buses import master_settings
 from eap.appliance.plantfile import load_plant
 from eap.errors import EnvironmentalError
 from eap.pd.spec import StationSpec, Writer

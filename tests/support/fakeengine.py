@@ -20,30 +20,26 @@ from devicebus.master.master import Master, why_closed
 from devicebus.master.procedure import Procedure
 from devicebus.sim.command import obey
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import Command
-from eap.appliance.bus_failure import to_failure
+from eap.appliance.bus_errors import ErrorRecord, to_record
 from eap.appliance.bus_request import (
-    Answer,
-    AskMailbox,
-    Bring,
+    BringSlaves,
     BusChange,
     BusReport,
     Cancel,
-    Describe,
-    Failure,
-    Heard,
-    Hello,
-    Outcome,
+    DescribeBus,
+    EngineReply,
+    EngineRequest,
+    EngineStarted,
+    ExchangeDatagrams,
+    ExchangeMailbox,
     Ping,
     Republish,
-    Request,
     SlaveDescription,
     SlaveReport,
-    Transfer,
+    UnsolicitedMessage,
 )
-from eap.appliance.engine.bus_target import bring_all, bring_one
+from eap.appliance.engine.bus_requests import bring_all, bring_one
 from eap.appliance.handover import PortName
-from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
 from tests.support.loopbus import LoopBus
 
@@ -85,26 +81,21 @@ class FakeBus:
             master.receive_frame(bytes(back.frame), now_ns)
         master.handle_timeout(now_ns)
 
-    def do(self, request: Request) -> dict[str, Any]:
+    def do(self, request: EngineRequest) -> dict[str, Any]:
         """Return the fields of the answer, or raise."""
         self.catch_up()
         master, now_ns = self.master, self.line.now_ns
-        if isinstance(request, Describe):
+        if isinstance(request, DescribeBus):
             return {"report": self.report()}
         if isinstance(request, Republish):
             return {}
-        if isinstance(request, AskMailbox):
-            talk = _one(_ask_of(request))
-            message = self.finish(master.converse(request.station, talk, now_ns))
-            return {"data": message.data, "counter": message.counter}
-        if isinstance(request, Transfer):
-            accesses = [
-                DatagramRequest(Command(each[0]), *each[1:])
-                for each in map(_fields, request.datagrams)
-            ]
-            replies = self.finish(master.run(_transfer(accesses), now_ns))
-            return {"outcomes": tuple(Outcome(r.wkc, r.data, r.tries) for r in replies)}
-        assert isinstance(request, Bring)
+        if isinstance(request, ExchangeMailbox):
+            talk = _one(request.request)
+            return {"message": self.finish(master.converse(request.station, talk, now_ns))}
+        if isinstance(request, ExchangeDatagrams):
+            replies = self.finish(master.run(_transfer(request.datagrams), now_ns))
+            return {"replies": tuple(replies)}
+        assert isinstance(request, BringSlaves)
         target = AlState(request.target)
         self.finish(
             bring_one(master, request.station, target, now_ns)
@@ -164,23 +155,8 @@ def _slave(unit: Any) -> SlaveReport:
         target=unit.target,
         to_slave=box.sizes.to_slave if box else 0,
         to_master=box.sizes.to_master if box else 0,
-        mailbox_fault=None if box else to_failure(why_closed(unit)),
+        mailbox_fault=None if box else to_record(why_closed(unit)),
         protocols=unit.found.sii.fixed.protocols,
-    )
-
-
-def _fields(record: Any) -> Sequence[Any]:
-    return msgspec.structs.astuple(record)
-
-
-def _ask_of(request: AskMailbox) -> MailboxRequest:
-    return MailboxRequest(
-        MailboxType(request.type),
-        request.request,
-        request.listen,
-        request.timeout_ns,
-        request.delay_ns,
-        request.expects_reply,
     )
 
 
@@ -204,10 +180,10 @@ class FakeEngine:
 
     def __init__(self, *buses: FakeBus) -> None:
         self.buses = buses
-        self.requests: list[Request] = []
+        self.requests: list[EngineRequest] = []
         self.holds = False
         self.held_kind: type = object
-        self._held: list[Request] = []
+        self._held: list[EngineRequest] = []
         self._published: dict[int, BusChange] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._awaited = 0
@@ -224,7 +200,7 @@ class FakeEngine:
 
     def say_hello(self) -> None:
         """Be a new engine."""
-        self._send(Hello(1))
+        self._send(EngineStarted(1))
         self._published.clear()
 
     def publish(self) -> None:
@@ -235,7 +211,7 @@ class FakeEngine:
                 self._published[number] = change
                 self._send(change)
 
-    def tell(self, message: Heard) -> None:
+    def tell(self, message: UnsolicitedMessage) -> None:
         """Pass on what a slave sent unasked."""
         self._send(message)
 
@@ -259,7 +235,7 @@ class FakeEngine:
 
     def _receive(self) -> None:
         octets = self._sock.recv(1 << 20)
-        request: Request = msgspec.msgpack.decode(octets, type=Request)
+        request: EngineRequest = msgspec.msgpack.decode(octets, type=EngineRequest)
         self.requests.append(request)
         if len(self.requests) == self._awaited:
             self._enough.set()
@@ -268,21 +244,21 @@ class FakeEngine:
         else:
             self._take(request)
 
-    def _take(self, request: Request) -> None:
+    def _take(self, request: EngineRequest) -> None:
         if isinstance(request, Cancel):
             return
         fields: dict[str, Any] = {}
         try:
             fields = {} if isinstance(request, Ping) else self.buses[request.bus].do(request)
         except EapError as exc:
-            fields = {"failure": to_failure(exc)}
+            fields = {"error": to_record(exc)}
         except IndexError:
-            fields = {"failure": Failure("BusError", "no such bus")}
+            fields = {"error": ErrorRecord("BusError", "no such bus")}
         if isinstance(request, Republish):
             self._published.pop(request.bus, None)
             self._timer = self._timer or asyncio.get_running_loop().call_later(LOOK_S, self._look)
         self.publish()
-        self._send(Answer(id=request.id, **fields))
+        self._send(EngineReply(id=request.id, **fields))
 
     def _look(self) -> None:
         """Let time go on and send what has changed, as an engine does between its cycles."""

@@ -25,9 +25,8 @@ from devicebus.master.topology import find_joints
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.appliance import control_bus
-from eap.appliance.bus_failure import no_mailbox
 from eap.appliance.bus_findings import history_of, is_silent, report_findings
-from eap.appliance.bus_request import BusReport, SlaveReport
+from eap.appliance.bus_request import BusReport, SlaveReport, no_mailbox
 from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose
 from eap.appliance.commands.client import Client, connect_station
 from eap.appliance.control_bus import ask_parameters, datagram_row, protocol_of, to_replies

@@ -11,8 +11,7 @@ from typing import Any
 
 import msgspec
 
-from eap.appliance.bus_failure import to_error
-from eap.appliance.bus_request import Failure
+from eap.appliance.bus_errors import ErrorRecord, to_error
 from eap.appliance.control import MAX_LINE, ErrorCode, Reply, decode_reply, encode_request
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, describe_roots, find_running
 from eap.closing import Closing
@@ -113,7 +112,7 @@ def _checked(reply: Reply) -> Reply:
     if error is None:
         return reply
     if error.kind:
-        raise to_error(Failure(error.kind, error.message, error.detail))
+        raise to_error(ErrorRecord(error.kind, error.message, error.detail))
     raise ControlError(error.message, code=error.code)
 
 

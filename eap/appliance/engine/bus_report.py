@@ -1,23 +1,23 @@
-"""How a bus is, for services: slaves, faults and counters as one record."""
+"""Description of a bus for services: the whole as one record, and its changes as messages."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from msgspec.structs import asdict
 
 from devicebus.master.bus import Unit
 from devicebus.master.findings import NO_ANSWER
 from devicebus.master.master import why_closed
-from eap.appliance.bus_failure import to_failure
+from eap.appliance.bus_errors import to_record
 from eap.appliance.bus_request import (
+    BusChange,
     BusReport,
     PortErrorReport,
     SlaveDescription,
     SlaveReport,
 )
-from eap.appliance.engine.bus_faults import WHOLE_BUS
-from eap.appliance.engine.engine_bus import EngineBus
+from eap.appliance.engine.engine_bus import WHOLE_BUS, EngineBus
 
 
 def report_bus(bus: EngineBus, now_ns: int) -> BusReport:
@@ -89,7 +89,7 @@ def describe_slave(bus: EngineBus, unit: Unit, presets: Mapping[int, int]) -> Sl
         target=int(unit.target),
         to_slave=sizes.to_slave if sizes else 0,
         to_master=sizes.to_master if sizes else 0,
-        mailbox_fault=None if sizes else to_failure(why_closed(unit)),
+        mailbox_fault=None if sizes else to_record(why_closed(unit)),
         protocols=int(sii.fixed.protocols),
         order=sii.string(sii.general.order) if sii.general else "",
         usual_to_slave=sii.fixed.receive_size,
@@ -142,3 +142,56 @@ def expected_slaves(bus: EngineBus) -> list[SlaveDescription]:
         )
         for slave in bus.spec.slaves
     ]
+
+
+class BusPublisher:
+    """Sends the slaves that have changed since the message that was sent last.
+
+    A message that cannot be sent is not lost: its changes are part of the next one.
+
+    Args:
+        number: Of the bus in messages.
+        bus: The bus.
+        send: Sends a message; returns False if there is no room for it.
+    """
+
+    def __init__(self, number: int, bus: EngineBus, send: Callable[[BusChange], bool]) -> None:
+        self._number = number
+        self._bus = bus
+        self._send = send
+        self._sent: tuple[object, ...] = ()
+        self._units: Mapping[int, Unit] | None = None
+        self._presets: Mapping[int, int] = {}
+        self._changes = 0
+
+    def reset(self) -> None:
+        """Send all slaves next: the receiver is another one."""
+        self._sent, self._units = (), None
+
+    def flush(self) -> None:
+        """Send what has changed, if anything has."""
+        bus, master = self._bus, self._bus.master
+        revision = bus.revision
+        if revision == self._sent:
+            return
+        bus.faults.take_events(master)  # a change that they bring is counted already
+        units = master.units
+        if units is self._units:
+            presets = self._presets
+            changed = [unit for unit in units.values() if unit.revision > self._changes]
+        else:
+            presets = link_presets(units.values())
+            changed = list(units.values())
+        slaves = [describe_slave(bus, unit, presets) for unit in changed]
+        if not units:
+            slaves = expected_slaves(bus)
+        message = BusChange(
+            bus=self._number,
+            is_up=bus.is_up,
+            fault=bus.fault,
+            stations=tuple(units) or tuple(slave.station for slave in slaves),
+            slaves=tuple(slaves),
+        )
+        if self._send(message):
+            self._sent, self._units = revision, units
+            self._presets, self._changes = presets, master.changes

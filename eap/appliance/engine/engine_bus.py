@@ -7,20 +7,32 @@ whoever asks, and tried again.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from devicebus.errors import BusError, FrameLostError
 from devicebus.master.bus import MasterSettings
+from devicebus.master.event import (
+    BusBack,
+    BusLost,
+    Event,
+    SlaveBack,
+    SlaveFailed,
+    SlaveLeft,
+    SlaveLost,
+)
+from devicebus.master.findings import NO_ANSWER
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
 from devicebus.master.task import Task
-from devicebus.wire.alstatus import AlState
-from eap.appliance.engine.bus_faults import SlaveFaults
-from eap.appliance.engine.bus_ties import BusTies
+from devicebus.wire.alstatus import AlState, name_of, state_name
+from eap.appliance.engine.bus_mapping import BusMapping
 from eap.errors import EnvironmentalError
 from eap.net.busport import BusPort
 from eap.pd.image import Image
 from eap.pd.spec import BusPortSpec, PortSpec, Writer
 
+WHOLE_BUS = 0
+"""In place of a station address: no frame comes back."""
 RETRY_NS = 2_000_000_000
 """Between two attempts to bring a bus up."""
 SILENT_RETRY_NS = 100_000_000
@@ -29,6 +41,106 @@ BATCH = 16
 """Frames taken in one go; the rest waits until the cycles have had their turn."""
 _LONG_CYCLE_NS = 20_000_000
 _MOST_STALE = 4096
+
+
+class Past(NamedTuple):
+    """What has happened to a slave since the engine started."""
+
+    losses: int = 0
+    """How often it stopped answering."""
+    departures: int = 0
+    """How often it left its state by itself."""
+    al_code: int = 0
+    """AL status code when it last did."""
+
+
+class Trouble(NamedTuple):
+    """Why a slave is not where it belongs, or was not; *until_ns* is None while it lasts."""
+
+    text: str = ""
+    since_ns: int = 0
+    until_ns: int | None = None
+
+
+class SlaveFaults:
+    """Texts by station address; :meth:`of` returns one, and :meth:`past` what is over.
+
+    Attributes:
+        on_unsolicited: Called with each message that a slave sent unasked.
+    """
+
+    def __init__(self) -> None:
+        self.on_unsolicited: list[Callable[[Unsolicited], None]] = []
+        self._troubles: dict[int, Trouble] = {}
+        self._past: dict[int, Past] = {}
+
+    def of(self, station: int) -> str:
+        """Return why a slave is not where it belongs, empty if it is."""
+        trouble = self.last(station)
+        return trouble.text if trouble.until_ns is None else ""
+
+    def last(self, station: int) -> Trouble:
+        """Return the last trouble of a slave, which may be over."""
+        return self._troubles.get(station, Trouble())
+
+    def past(self, station: int) -> Past:
+        """Return what has happened to a slave."""
+        return self._past.get(station, Past())
+
+    def forget_past(self) -> None:
+        """Forget the troubles that are over; what was counted stays."""
+        self._troubles = {at: each for at, each in self._troubles.items() if each.until_ns is None}
+
+    def end_all(self, now_ns: int) -> None:
+        """End the troubles that last: a master that is replaced reports no end of them."""
+        for station, each in self._troubles.items():
+            if each.until_ns is None:
+                self._end(station, now_ns)
+
+    def take_events(self, master: Master) -> None:
+        """Take what has happened."""
+        while (event := master.next_event()) is not None:
+            self._remember(event)
+            if isinstance(event, BusLost):
+                self._begin(WHOLE_BUS, "no frame comes back", event.at_ns)
+            elif isinstance(event, BusBack):
+                self._end(WHOLE_BUS, event.at_ns)
+            elif isinstance(event, SlaveLost):
+                self._begin(event.station, NO_ANSWER, event.at_ns)
+            elif isinstance(event, SlaveFailed):
+                self._begin(event.station, event.reason, event.at_ns)
+            elif isinstance(event, SlaveLeft):
+                code = f": AL status code 0x{event.code:04X}, {name_of(event.code)}"
+                text = (
+                    f"it went to {state_name(event.status)} by itself{code if event.code else ''}"
+                )
+                self._begin(event.station, text, event.at_ns)
+            elif isinstance(event, SlaveBack):
+                self._end(event.station, event.at_ns)
+            elif isinstance(event, Unsolicited):
+                for call in self.on_unsolicited:
+                    call(event)
+
+    def _begin(self, station: int, text: str, at_ns: int) -> None:
+        """Note a trouble; one that follows another began with it."""
+        before = self.last(station)
+        lasts = bool(before.text) and before.until_ns is None
+        self._troubles[station] = Trouble(text, before.since_ns if lasts else at_ns)
+
+    def _end(self, station: int, at_ns: int) -> None:
+        trouble = self._troubles.get(station)
+        if trouble is not None:
+            self._troubles[station] = trouble._replace(until_ns=at_ns)
+
+    def _remember(self, event: Event) -> None:
+        if isinstance(event, SlaveLost):
+            past = self.past(event.station)
+            self._past[event.station] = past._replace(losses=past.losses + 1)
+        elif isinstance(event, SlaveLeft):
+            past = self.past(event.station)
+            self._past[event.station] = past._replace(
+                departures=past.departures + 1, al_code=event.code or past.al_code
+            )
 
 
 class EngineBus:
@@ -63,7 +175,7 @@ class EngineBus:
         self.tasks: set[Task[Any]] = set()
         self._settings = settings
         self._is_slow = cycle_ns > _LONG_CYCLE_NS
-        self._ties = BusTies(spec, image, memory_of)
+        self._mapping = BusMapping(spec, image, memory_of)
         self._port = port
         self._starting: Task[None] | None = None
         self._start_fault = "it is being brought up"
@@ -74,7 +186,7 @@ class EngineBus:
     @property
     def fault(self) -> str:
         """Why the bus is not wholly as it should be, empty if it is."""
-        faults = (self._wire_fault, self._start_fault, *self._ties.missing)
+        faults = (self._wire_fault, self._start_fault, *self._mapping.missing)
         return "\n".join(filter(None, faults))
 
     @property
@@ -116,21 +228,21 @@ class EngineBus:
         self.faults.forget_past()
         self.master.port_errors.clear()
 
-    def prepare_ties(
+    def prepare_mapping(
         self, port: PortSpec, image: Image, memory_of: Callable[[Writer], memoryview]
-    ) -> BusTies:
-        """Return what ties it to another *image* of its station, for :meth:`tie`."""
-        ties = BusTies(port, image, memory_of)
-        ties.lay_out(self.master.image)
-        return ties
+    ) -> BusMapping:
+        """Return the mapping to another *image* of its station, for :meth:`swap_mapping`."""
+        mapping = BusMapping(port, image, memory_of)
+        mapping.lay_out(self.master.image)
+        return mapping
 
-    def tie(self, ties: BusTies) -> None:
-        """Belong to another image from now on; it holds what the one before held."""
-        self._ties = ties
+    def swap_mapping(self, mapping: BusMapping) -> None:
+        """Use another image from now on; it holds what the one before held."""
+        self._mapping = mapping
 
     def take_inputs(self) -> None:
         """Copy what the last exchange brought into the image, and where the slaves are."""
-        self._ties.take_inputs(self.master)
+        self._mapping.take_inputs(self.master)
 
     def exchange(self, now_ns: int) -> None:
         """Copy the outputs out of the image and send them; do what is due."""
@@ -181,7 +293,7 @@ class EngineBus:
         self.faults.take_events(self.master)
         self.faults.end_all(now_ns)
         self.master = Master(self._settings)
-        self._ties.lay_out(None)
+        self._mapping.lay_out(None)
         self._starting = None
         self.is_up = False
         self._start_fault = f"the master has failed: {type(exc).__name__}: {exc}"
@@ -193,10 +305,10 @@ class EngineBus:
         self.master.handle_timeout(now_ns)
         if self._retry_ns is not None and now_ns >= self._retry_ns:
             self._start(now_ns)
-        if self.master.image is not self._ties.bus_image:
-            self._ties.lay_out(self.master.image)
-            self._ties.keep_inputs()
-        self._ties.put_outputs()
+        if self.master.image is not self._mapping.bus_image:
+            self._mapping.lay_out(self.master.image)
+            self._mapping.keep_inputs()
+        self._mapping.put_outputs()
         self.master.start_cycle(now_ns)
         self._send(now_ns)
         self.faults.take_events(self.master)

@@ -1,4 +1,4 @@
-"""All buses of an engine process: made from the handover, started, and brought to rest."""
+"""All buses of an engine process: made from the handover, started, and brought to INIT."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from eap.appliance.engine.bus_desk import BusDesk, ServeStation
-from eap.appliance.engine.bus_settings import master_settings
+from devicebus.master.bus import MasterSettings
+from devicebus.master.expected import ExpectedSlave
+from eap.appliance.engine.bus_requests import BusRequestHandler, ServeStation
 from eap.appliance.engine.engine_bus import EngineBus
 from eap.appliance.engine.successor import EngineStation
 from eap.appliance.handover import NO_DESCRIPTOR, BusSocket, Handover
 from eap.net.busport import BusPort
+from eap.pd.spec import BusPortSpec, PortSpec
 
 REST_NS = 300_000_000
 """How long slaves may take to rest when the engine ends."""
+_MIN_BUDGET, _BUDGET_PER_US = 1536, 3
 _EPOCH_S = 946_684_800
 """2000-01-01, from which the clocks of slaves count."""
 
@@ -26,7 +29,7 @@ class EngineBuses:
 
     Attributes:
         buses: By their numbers in requests.
-        desk: Where services asks for something; None in a test without services.
+        requests: Takes requests of services; None in a test without services.
         arrivals: What to call when a descriptor is readable.
     """
 
@@ -38,27 +41,29 @@ class EngineBuses:
     ) -> None:
         self._handover = handover
         self.buses = [self._make(given, stations[given.owner.station]) for given in handover.buses]
-        self.desk: BusDesk | None = None
+        self.requests: BusRequestHandler | None = None
         self.arrivals: dict[int, Callable[[int], None]] = {
             bus.fileno(): bus.drain for bus in self.buses
         }
         if handover.bus_fd != NO_DESCRIPTOR:
-            self.desk = BusDesk(socket.socket(fileno=handover.bus_fd), self.buses, serve_station)
-            self.arrivals[self.desk.fileno()] = self.desk.serve
+            self.requests = BusRequestHandler(
+                socket.socket(fileno=handover.bus_fd), self.buses, serve_station
+            )
+            self.arrivals[self.requests.fileno()] = self.requests.serve
             for number, bus in enumerate(self.buses):
-                bus.faults.on_unsolicited.append(partial(self.desk.tell, number))
+                bus.faults.on_unsolicited.append(partial(self.requests.forward, number))
 
     def start(self, now_ns: int) -> None:
         """Begin to bring all buses up."""
-        if self.desk is not None:
-            self.desk.greet()
+        if self.requests is not None:
+            self.requests.announce()
         for bus in self.buses:
             bus.start(now_ns)
 
     def publish(self) -> None:
         """Send services what has changed on the buses."""
-        if self.desk is not None:
-            self.desk.publish()
+        if self.requests is not None:
+            self.requests.publish()
 
     def rest(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         """Bring all slaves to INIT, or as far as they get in REST_NS."""
@@ -79,8 +84,8 @@ class EngineBuses:
         """Let go of all sockets."""
         for bus in self.buses:
             bus.close()
-        if self.desk is not None:
-            self.desk.close()
+        if self.requests is not None:
+            self.requests.close()
 
     def _make(self, given: BusSocket, place: EngineStation) -> EngineBus:
         port = self._handover.port(given.owner)
@@ -97,3 +102,30 @@ class EngineBuses:
         station.connect_bus(bus)
         place.buses[port.name] = bus
         return bus
+
+
+def master_settings(port: PortSpec, cycle_us: int, epoch_offset_ns: int = 0) -> MasterSettings:
+    """Return the settings of the master of *port*, which exchanges data every *cycle_us*.
+
+    *epoch_offset_ns* leads from the engine's clock to the time since 2000.
+    """
+    spec = port.bus or BusPortSpec()
+    expected = [
+        ExpectedSlave(
+            name=slave.name,
+            vendor=slave.vendor,
+            product=slave.product,
+            revision=slave.revision,
+            serial=slave.serial,
+            alias=slave.alias,
+        )
+        for slave in spec.slaves
+    ]
+    return MasterSettings(
+        expected=expected,
+        frame_timeout_ns=1000 * spec.frame_timeout_us,
+        frame_retries=spec.frame_retries,
+        acyclic_octets=max(_MIN_BUDGET, _BUDGET_PER_US * cycle_us),
+        clocks=spec.clocks,
+        epoch_offset_ns=epoch_offset_ns,
+    )

@@ -7,7 +7,7 @@ reads.  It belongs to nobody until it takes over, which copies numbers and littl
 from __future__ import annotations
 
 from eap.appliance.engine import tcp_ports
-from eap.appliance.engine.bus_ties import BusTies
+from eap.appliance.engine.bus_mapping import BusMapping
 from eap.appliance.engine.engine_bus import EngineBus
 from eap.errors import EngineRefusedError
 from eap.net.image_file import ImageFile, prepare_image
@@ -65,10 +65,10 @@ class Successor:
             self._station.prepare_to_follow(before, self._tcp_ports)
             self._images.settle()
             memory_of = self._station.memory_of
-            self._ties: list[tuple[EngineBus, BusTies]] = []
+            self._mappings: list[tuple[EngineBus, BusMapping]] = []
             for port in spec.ports:
                 if (bus := place.buses.get(port.name)) is not None:
-                    self._ties.append((bus, bus.prepare_ties(port, image, memory_of)))
+                    self._mappings.append((bus, bus.prepare_mapping(port, image, memory_of)))
         except BaseException:
             self.discard()
             raise
@@ -94,8 +94,8 @@ class Successor:
         if before.inputs.refresh():
             self._images.carry_values(before.inputs.memory)
         station.follow(before, now_ns)
-        for bus, ties in self._ties:
-            bus.tie(ties)
+        for bus, mapping in self._mappings:
+            bus.swap_mapping(mapping)
         engine.replace(before, station, now_ns)
         self._file.release()
         place.file.wake_waiters()

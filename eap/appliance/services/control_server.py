@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any, SupportsIndex
 
 from devicebus.errors import BusError
-from eap.appliance.bus_failure import to_failure
+from eap.appliance.bus_errors import to_record
 from eap.appliance.control import (
     MAX_CLIENTS,
     MAX_LINE,
@@ -256,7 +256,7 @@ class _Client:
             error = ControlError(str(exc), code=ErrorCode.UNAVAILABLE)
             await self.send(encode_error(number, error))
         except BusError as exc:
-            why = to_failure(exc)
+            why = to_record(exc)
             failure = Failure(ErrorCode.BUS, why.message, why.kind, why.detail)
             await self.send(encode_failure(number, failure))
         except SdoAbortError as exc:

@@ -15,16 +15,16 @@ from time import monotonic_ns
 
 import msgspec
 
-from eap.appliance.bus_failure import to_error
+from eap.appliance.bus_errors import to_error
 from eap.appliance.bus_request import (
-    Answer,
     BusChange,
     Cancel,
-    FromEngine,
-    Heard,
-    Hello,
+    EngineMessage,
+    EngineReply,
+    EngineRequest,
+    EngineStarted,
     Ping,
-    Request,
+    UnsolicitedMessage,
 )
 from eap.errors import EngineGoneError
 
@@ -58,13 +58,13 @@ class EngineLink:
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(sock, self._receive)
         self._encoder = msgspec.msgpack.Encoder()
-        self._decoder = msgspec.msgpack.Decoder(FromEngine)
-        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._decoder = msgspec.msgpack.Decoder(EngineMessage)
+        self._waiting: dict[int, asyncio.Future[EngineReply]] = {}
         # Numbers of a process before this one do not come again: late answers to it match nothing.
         self._last_id = monotonic_ns()
         self.heard_s = 0.0
         self.on_restart: list[Callable[[], None]] = []
-        self.on_heard: list[Callable[[Heard], None]] = []
+        self.on_heard: list[Callable[[UnsolicitedMessage], None]] = []
         self.on_change: list[Callable[[BusChange], None]] = []
 
     @property
@@ -72,7 +72,7 @@ class EngineLink:
         """Whether the engine has sent something within the time after which it counts as gone."""
         return self._loop.time() < self.heard_s + self._look_s
 
-    async def ask(self, make: Callable[[int], Request], timeout_s: float) -> Answer:
+    async def ask(self, make: Callable[[int], EngineRequest], timeout_s: float) -> EngineReply:
         """Send the request that *make* returns for its number, and wait for the answer.
 
         Whoever is cancelled here asks the engine to forget the request.
@@ -82,7 +82,7 @@ class EngineLink:
             BusError: it answers that it could not do it.
         """
         request = make(self._next_id())
-        future: asyncio.Future[Answer] = self._loop.create_future()
+        future: asyncio.Future[EngineReply] = self._loop.create_future()
         self._waiting[request.id] = future
         try:
             self.post(request)
@@ -93,15 +93,15 @@ class EngineLink:
             raise
         finally:
             del self._waiting[request.id]
-        if answer.failure is not None:
-            raise to_error(answer.failure)
+        if answer.error is not None:
+            raise to_error(answer.error)
         return answer
 
-    def tell(self, make: Callable[[int], Request]) -> None:
+    def tell(self, make: Callable[[int], EngineRequest]) -> None:
         """Send a request whose answer nobody waits for; raises as :meth:`post` does."""
         self.post(make(self._next_id()))
 
-    def post(self, request: Request) -> None:
+    def post(self, request: EngineRequest) -> None:
         """Send one message.
 
         Raises:
@@ -118,7 +118,7 @@ class EngineLink:
             self._loop.remove_reader(self._socket)
         self._socket.close()
 
-    async def _wait(self, future: asyncio.Future[Answer], end_s: float) -> Answer:
+    async def _wait(self, future: asyncio.Future[EngineReply], end_s: float) -> EngineReply:
         looked_s: float | None = None
         while True:
             rest_s = min(self._look_s, end_s - self._loop.time())
@@ -153,9 +153,9 @@ class EngineLink:
             logger.warning("an answer of the engine cannot be read: %s", exc)
             return
         self.heard_s = self._loop.time()
-        if isinstance(message, Hello):
+        if isinstance(message, EngineStarted):
             self._restarted()
-        elif isinstance(message, Heard):
+        elif isinstance(message, UnsolicitedMessage):
             for call in self.on_heard:
                 call(message)
         elif isinstance(message, BusChange):

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 from devicebus import errors
 from devicebus.errors import BusError, WorkingCounterError
+from devicebus.master.access import DatagramReply
+from devicebus.master.procedure import not_answered
 from eap.errors import EapError
 
 
@@ -14,6 +16,7 @@ def test_docstring_draws_every_error() -> None:
 
 
 def test_working_counter_tells_both_numbers() -> None:
-    error = WorkingCounterError("slave 1001, AL status", 1, 0)
+    error = not_answered("slave 1001, AL status", DatagramReply(b"", 0))
+    assert isinstance(error, WorkingCounterError)
     assert str(error) == "slave 1001, AL status: working counter 0, expected 1"
     assert (error.expected, error.received) == (1, 0)

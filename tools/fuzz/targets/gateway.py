@@ -22,7 +22,7 @@ from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite
 from eap.aoe.ads_request import take_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
-from eap.appliance.bus_request import BusReport, Heard, SlaveReport
+from eap.appliance.bus_request import BusReport, SlaveReport, UnsolicitedMessage
 from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
@@ -130,7 +130,7 @@ class _Link:
     ) -> T:
         return await drive_async(conversation, _Talk(self._box).ask)
 
-    def listen(self, heard: Callable[[Heard], None]) -> None:
+    def listen(self, heard: Callable[[UnsolicitedMessage], None]) -> None:
         """It says nothing unasked."""
 
 

@@ -1,7 +1,7 @@
-"""Services' side of the buses: conversations, procedures and states, step by step by the engine.
+"""Client of the engine for buses: conversations, procedures and states, step by step.
 
-Rule: the engine is asked for single steps only.  Whole transfers, their order and their errors are
-handled here, so that the engine never waits for a file or for a client.
+Rule: the engine does single steps only.  Whole transfers, their order and their errors are handled
+here, so that the engine never waits for a file or for a client.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from collections.abc import Callable, Hashable, Sequence
 from time import monotonic_ns
 from typing import TypeVar
 
-from msgspec.structs import astuple
-
 from devicebus.drive import drive_async
 from devicebus.errors import BusError, MailboxBusyError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
@@ -20,18 +18,16 @@ from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import (
-    Bring,
+    BringSlaves,
     BusReport,
-    Datagram,
-    Describe,
-    Forget,
-    Heard,
-    Transfer,
+    DescribeBus,
+    ExchangeDatagrams,
+    ForgetFaults,
+    UnsolicitedMessage,
 )
 from eap.appliance.control_bus import BRING_S, PATIENCE_S, TRANSFER_S
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus.bus_talk import Talk
-from eap.appliance.services.bus.turns import Turns
+from eap.appliance.services.bus.mailbox_queue import MailboxQueues, MailboxTurn
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.slaves.bus_view import BusView
 from eap.codec.mailbox import MailboxType
@@ -45,7 +41,7 @@ _S = 1_000_000_000
 
 
 class BusClient:
-    """What services do on the buses of the appliance.
+    """All buses of the appliance, as services use them.
 
     Args:
         link: To the engine.
@@ -59,26 +55,26 @@ class BusClient:
         self.ports = tuple(ports)
         self._link = link
         self._numbers = {port: number for number, port in enumerate(ports)}
-        self._turns = Turns()
+        self._queues = MailboxQueues()
         self.views = {port: BusView(link, number) for port, number in self._numbers.items()}
 
-    def listen(self, port: PortName, heard: Callable[[Heard], None]) -> None:
-        """Call *heard* with each message that a slave of a bus sends unasked."""
+    def listen(self, port: PortName, notify: Callable[[UnsolicitedMessage], None]) -> None:
+        """Call *notify* with each message that a slave of a bus sends unasked."""
         number = self._numbers[port]
 
-        def take(message: Heard) -> None:
+        def take(message: UnsolicitedMessage) -> None:
             if message.bus == number:
-                heard(message)
+                notify(message)
 
         self._link.on_heard.append(take)
 
     async def describe(self, port: PortName, timeout_s: float = DESCRIBE_S) -> BusReport:
-        """Return how a bus is now; raises EngineGoneError."""
+        """Return the report of a bus; raises EngineGoneError."""
         bus = self._numbers[port]
-        answer = await self._link.ask(lambda number: Describe(id=number, bus=bus), timeout_s)
-        if answer.report is None:
+        reply = await self._link.ask(lambda number: DescribeBus(id=number, bus=bus), timeout_s)
+        if reply.report is None:
             raise BusError(f"{_name(port)}: the engine says nothing about it")
-        return answer.report
+        return reply.report
 
     async def wait_up(self, port: PortName) -> BusReport:
         """Return the report of a bus once it is up.
@@ -110,14 +106,14 @@ class BusClient:
                 raise error
             await asyncio.sleep(_LOOK_S)
 
-    async def open_talk(
+    async def open_turn(
         self,
         port: PortName,
         station: int,
         kind: MailboxType,
         requester: Hashable,
         turn_s: float | None = None,
-    ) -> Talk:
+    ) -> MailboxTurn:
         """Wait for a turn at the mailbox of a slave, no longer than *turn_s* if that is given.
 
         Raises:
@@ -125,16 +121,18 @@ class BusClient:
             BusError, EngineGoneError: as :meth:`wait_up` does.
         """
         await self._be_up(port)
-        thing = port, station, kind
+        mailbox = port, station, kind
         try:
             async with asyncio.timeout(turn_s):
-                await self._turns.take(thing, requester)
+                await self._queues.take(mailbox, requester)
         except TimeoutError:
             raise MailboxBusyError(
                 f"slave {station}: the {kind.name} transfers of other clients took {turn_s:g} s"
             ) from None
         bus = self._numbers[port]
-        return Talk(self._link, bus, station, kind, lambda: self._turns.give_back(thing))
+        return MailboxTurn(self._link, bus, station, kind, lambda: self._queues.release(mailbox))
+
+    open_talk = open_turn
 
     async def converse(
         self,
@@ -144,7 +142,7 @@ class BusClient:
         requester: Hashable,
         turn_s: float | None = None,
     ) -> T:
-        """Lead a conversation with a slave to its end; return its result.
+        """Drive a conversation with a slave to its end; return its result.
 
         Raises:
             MailboxBusyError: its turn did not come within *turn_s*.
@@ -152,23 +150,23 @@ class BusClient:
             SdoAbortError: it refuses an SDO.
             EngineGoneError: there is no engine, or not the one with which it began.
         """
-        talk: Talk | None = None
+        turn: MailboxTurn | None = None
 
-        async def exchange(ask: MailboxRequest) -> MailboxMessage:
-            nonlocal talk
-            if talk is None:
-                talk = await self.open_talk(port, station, ask.type, requester, turn_s)
-            return await talk.ask(ask)
+        async def exchange(request: MailboxRequest) -> MailboxMessage:
+            nonlocal turn
+            if turn is None:
+                turn = await self.open_turn(port, station, request.type, requester, turn_s)
+            return await turn.exchange(request)
 
         try:
             return await drive_async(conversation, exchange)
         except asyncio.CancelledError:
-            if talk is not None:
-                talk.abandon()
+            if turn is not None:
+                turn.abandon()
             raise
         finally:
-            if talk is not None:
-                talk.close()
+            if turn is not None:
+                turn.close()
 
     async def run(self, port: PortName, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; return its result or raise what went wrong."""
@@ -185,7 +183,7 @@ class BusClient:
     async def transfer(
         self, port: PortName, accesses: Sequence[DatagramRequest]
     ) -> list[DatagramReply]:
-        """Send datagrams, none of them logical, and return what came back for each.
+        """Send datagrams, none of them logical, and return the reply to each.
 
         Raises:
             FrameLostError: nothing came back.
@@ -193,11 +191,11 @@ class BusClient:
         """
         await self._be_up(port)
         bus = self._numbers[port]
-        datagrams = tuple(Datagram(*astuple(access)) for access in accesses)
-        answer = await self._link.ask(
-            lambda number: Transfer(id=number, bus=bus, datagrams=datagrams), TRANSFER_S
+        datagrams = tuple(accesses)
+        reply = await self._link.ask(
+            lambda number: ExchangeDatagrams(id=number, bus=bus, datagrams=datagrams), TRANSFER_S
         )
-        return [DatagramReply(each.data, each.wkc, each.tries) for each in answer.outcomes]
+        return list(reply.replies)
 
     async def bring(self, port: PortName, station: int, target: AlState) -> None:
         """Bring a slave, or with station 0 all of them, to a state where they are kept then.
@@ -210,13 +208,14 @@ class BusClient:
         await self._be_up(port)
         bus = self._numbers[port]
         await self._link.ask(
-            lambda number: Bring(id=number, bus=bus, station=station, target=target), BRING_S
+            lambda number: BringSlaves(id=number, bus=bus, station=station, target=target),
+            BRING_S,
         )
 
     async def forget(self, port: PortName) -> None:
         """Have the engine forget the faults of a bus that are over; raises EngineGoneError."""
         bus = self._numbers[port]
-        await self._link.ask(lambda number: Forget(id=number, bus=bus), DESCRIBE_S)
+        await self._link.ask(lambda number: ForgetFaults(id=number, bus=bus), DESCRIBE_S)
 
 
 def _name(port: PortName) -> str:

@@ -20,7 +20,7 @@ from eap.appliance.control import ErrorCode, of_station, parameters
 from eap.appliance.control_bus import BusParameters, kind_of, reply_row, to_access, to_ask
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.bus.bus_talk import Talk
+from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError, EapError
@@ -85,12 +85,12 @@ class Buses:
 
 
 class _Held:
-    """A conversation that a connection has open."""
+    """A conversation that a connection has open, with its turn."""
 
     def __init__(
-        self, talk: Talk, kind: MailboxType, opened: control_bus.BusOpenParameters
+        self, turn: MailboxTurn, kind: MailboxType, opened: control_bus.BusOpenParameters
     ) -> None:
-        self.talk = talk
+        self.turn = turn
         self.kind = kind
         self.opened = opened
         self.idle: asyncio.TimerHandle | None = None
@@ -149,22 +149,22 @@ class BusConnection:
         kind = kind_of(wanted.protocol)
         try:
             async with asyncio.timeout(control_bus.TURN_S):
-                talk = await client.open_talk(port, wanted.slave, kind, id(self))
+                turn = await client.open_turn(port, wanted.slave, kind, id(self))
         except TimeoutError:
             reason = f"slave {wanted.slave}: others talk {kind.name} with it all the while"
             raise ControlError(reason, code=ErrorCode.BUSY) from None
         self._last += 1
-        self._held[self._last] = _Held(talk, kind, wanted)
+        self._held[self._last] = _Held(turn, kind, wanted)
         self._begin_idle(self._last)
         return {"conversation": self._last}
 
     async def _ask(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control_bus.BusAskParameters)
         held = self._of(wanted.conversation)
-        ask = to_ask(held.kind, wanted)
+        request = to_ask(held.kind, wanted)
         self._end_idle(held)
         try:
-            message = await held.talk.ask(ask)
+            message = await held.turn.exchange(request)
         finally:
             self._begin_idle(wanted.conversation)
         return {"data": message.data.hex()}
@@ -172,7 +172,7 @@ class BusConnection:
     async def _close(self, params: dict[str, Any]) -> dict[str, Any]:
         number = parameters(params, control_bus.BusCloseParameters).conversation
         self._of(number)
-        self._drop(number).talk.close()
+        self._drop(number).turn.close()
         return {"closed": number}
 
     async def _transfer(self, params: dict[str, Any]) -> dict[str, Any]:
@@ -223,7 +223,7 @@ class BusConnection:
             held.idle.cancel()
 
     def _abandon(self, number: int) -> None:
-        self._drop(number).talk.abandon()
+        self._drop(number).turn.abandon()
 
     def _drop(self, number: int) -> _Held:
         held = self._held.pop(number)

@@ -6,10 +6,9 @@ import itertools
 import os
 from pathlib import Path
 
-from devicebus.errors import BusError
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.station_request import Configure, SetState
-from eap.errors import EngineRefusedError, EnvironmentalError
+from eap.errors import EnvironmentalError
 from eap.pd import pieces
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -50,16 +49,11 @@ class EngineClient:
             await self._link.ask(
                 lambda number: Configure(id=number, station=station, path=str(path)), CONFIGURE_S
             )
-        except BusError as exc:
-            raise EngineRefusedError(str(exc)) from None
         finally:
             path.unlink(missing_ok=True)
 
     async def set_state(self, station: str, state: DeviceState) -> None:
         """Bring *station* to PreOp, SafeOp or Op; raises as :meth:`configure` does."""
-        try:
-            await self._link.ask(
-                lambda number: SetState(id=number, station=station, state=state), STATE_S
-            )
-        except BusError as exc:
-            raise EngineRefusedError(str(exc)) from None
+        await self._link.ask(
+            lambda number: SetState(id=number, station=station, state=state), STATE_S
+        )

@@ -29,7 +29,7 @@ def progress():
         (FrameLostError("x"), True),
         (MailboxClosedError("x"), True),
         (MailboxTimeoutError("x"), True),
-        (WorkingCounterError("x", 1, 0), True),
+        (WorkingCounterError("x", expected=1, received=0), True),
         (NoMailboxError("x"), False),
         (FoeError("x", code=1), False),
     ],

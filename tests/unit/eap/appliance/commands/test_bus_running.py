@@ -12,7 +12,7 @@ from devicebus.mailbox.conversation import MailboxRequest
 from devicebus.master.procedure import Sleep, read
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
-from eap.appliance.bus_request import AskMailbox
+from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.commands.bus_running import open_running
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
@@ -150,7 +150,7 @@ def test_who_leaves_gives_the_turn_back(bus, works):
     ):
         other.converse(other.find("sensor"), stuck, "stuck")
     works.wait_served()
-    farewell = works.engine.of(AskMailbox)[-1]
+    farewell = works.engine.of(ExchangeMailbox)[-1]
     assert (farewell.station, farewell.expects_reply) == (1003, False)
     assert bus.converse(bus.find("sensor"), vendor, "vendor") == b"\x5a\x0e\0\0"
 

@@ -4,7 +4,7 @@ import pytest
 
 from devicebus.master.event import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
 from devicebus.master.mailboxes import Unsolicited
-from eap.appliance.engine.bus_faults import Past, SlaveFaults
+from eap.appliance.engine.engine_bus import Past, SlaveFaults
 from eap.codec.mailbox import MailboxType
 
 

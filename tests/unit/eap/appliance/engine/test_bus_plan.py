@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from devicebus.master.layout import Layout, Variable
-from eap.appliance.engine.bus_plan import BusPlanner
+from eap.appliance.engine.bus_mapping import BusPlanner
 from eap.pd.layout import plan_layout
 from eap.pd.spec import (
     BusEntrySpec,

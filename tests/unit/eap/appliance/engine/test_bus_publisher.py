@@ -9,8 +9,7 @@ from msgspec.structs import asdict
 
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import BusChange, SlaveDescription
-from eap.appliance.engine.bus_publisher import BusPublisher
-from eap.appliance.engine.bus_report import report_bus
+from eap.appliance.engine.bus_report import BusPublisher, report_bus
 from tests.support.cyclic import MS
 from tests.support.enginebus import BusRig
 

@@ -5,7 +5,7 @@ import pytest
 from devicebus.master.expected import ExpectedSlave
 from devicebus.master.link import RETRIES
 from devicebus.master.roundtrip import CEILING_NS
-from eap.appliance.engine.bus_settings import master_settings
+from eap.appliance.engine.engine_buses import master_settings
 from eap.pd.spec import BusPortSpec, BusSlaveSpec, PortKind, PortSpec
 from tests.support.cyclic import MS
 

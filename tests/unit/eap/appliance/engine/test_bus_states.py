@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.wire.alstatus import AlState
-from eap.appliance.engine.bus_states import BusStates
+from eap.appliance.engine.bus_mapping import BusStates
 from eap.pd.spec import BusSlaveSpec, VariableSpec, Writer
 from tests.support.cyclic import image_of, station
 

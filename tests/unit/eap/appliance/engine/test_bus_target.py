@@ -5,7 +5,7 @@ import pytest
 from devicebus.errors import AlStatusError, BusError
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import AlState
-from eap.appliance.engine.bus_target import bring_all, bring_one
+from eap.appliance.engine.bus_requests import bring_all, bring_one
 from tests.support.busline import MS, Paced, segment, slave
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
-from eap.appliance.bus_request import FromEngine, Hello
+from eap.appliance.bus_request import EngineMessage, EngineStarted
 from eap.appliance.busfile import load_or_raise
 from eap.appliance.engine.engine_buses import REST_NS, EngineBuses
 from eap.appliance.engine.successor import EngineStation
@@ -101,8 +101,8 @@ def start(tmp_path):
 
 def test_slaves_get_to_op_and_rest_in_the_end(start):
     running = start()
-    message = msgspec.msgpack.decode(running.services.recv(100), type=FromEngine)
-    assert isinstance(message, Hello)
+    message = msgspec.msgpack.decode(running.services.recv(100), type=EngineMessage)
+    assert isinstance(message, EngineStarted)
     assert len(running.buses.arrivals) == 2
     running.services.send(msgspec.msgpack.encode(SetState(id=1, station="one", state=4)))
     running.run_until(lambda: running.station.image.read("bus0.state") == AlState.OP)
@@ -132,7 +132,7 @@ def test_buses_that_are_silent_are_not_waited_for_longer(start):
 
 def test_without_a_pair_there_is_no_desk(tmp_path):
     buses = EngineBuses(Handover(1, str(tmp_path), "p", "p.yaml", (), ()), {}, print)
-    assert buses.desk is None
+    assert buses.requests is None
     assert buses.arrivals == {}
     buses.start(0)
     buses.rest()

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from devicebus.errors import BusError
-from eap.appliance.bus_request import Cancel, Describe, Hello
+from eap.appliance.bus_request import Cancel, DescribeBus, EngineStarted
 from eap.appliance.services.engine_link import EngineLink
 from eap.errors import EngineGoneError
 from tests.support.fakeengine import FakeBus, FakeEngine
@@ -31,7 +31,7 @@ def play(scene, *buses, look_s=1.0):
 
 
 def describe(bus=0):
-    return lambda number: Describe(id=number, bus=bus)
+    return lambda number: DescribeBus(id=number, bus=bus)
 
 
 def tell_often(link):
@@ -125,7 +125,7 @@ def test_who_leaves_cancels():
         with pytest.raises(asyncio.CancelledError):
             await asked
         await settle()
-        assert [type(each) for each in engine.requests] == [Describe, Cancel]
+        assert [type(each) for each in engine.requests] == [DescribeBus, Cancel]
         assert engine.requests[0].id == engine.requests[1].id
         engine.release()  # an answer that nobody waits for does no harm
         await settle()
@@ -146,7 +146,7 @@ def test_nobody_takes_messages():
 def test_octets_that_are_no_answer(caplog):
     async def scene(engine, link):
         engine._sock.send(b"what")
-        engine._send(Hello(2))
+        engine._send(EngineStarted(2))
         await settle()
         assert "cannot be read" in caplog.text
 

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import msgspec
 import pytest
 
-from eap.appliance.bus_request import Answer, BusReport, Request
+from eap.appliance.bus_request import BusReport, EngineReply, EngineRequest
 from eap.appliance.commands.client import Client
 from eap.appliance.handover import Handover
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
@@ -108,8 +108,10 @@ def answer_one(fd: int, make) -> None:
 
 
 def say_up(octets: bytes) -> bytes:
-    request = msgspec.msgpack.decode(octets, type=Request)
-    return msgspec.msgpack.encode(Answer(id=request.id, report=BusReport(is_up=True, cycles=7)))
+    request = msgspec.msgpack.decode(octets, type=EngineRequest)
+    return msgspec.msgpack.encode(
+        EngineReply(id=request.id, report=BusReport(is_up=True, cycles=7))
+    )
 
 
 def say_ok(octets: bytes) -> bytes:

@@ -15,7 +15,7 @@ from devicebus.master.diagnosis import diagnose
 from devicebus.master.procedure import Sleep, read
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import Register
-from eap.appliance.bus_request import AskMailbox, Cancel
+from eap.appliance.bus_request import Cancel, ExchangeMailbox
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus import bus_client
 from eap.appliance.services.bus.bus_client import BusClient
@@ -77,7 +77,7 @@ def test_conversation_of_no_step():
             return 7
 
         assert await client.converse(PORT, SENSOR, nothing(), "me") == 7
-        assert not engine.of(AskMailbox)
+        assert not engine.of(ExchangeMailbox)
 
     play(scene)
 
@@ -85,7 +85,7 @@ def test_conversation_of_no_step():
 def test_whole_object_in_segments():
     async def scene(client, engine):
         assert len(await client.converse(PORT, SENSOR, coe_client.upload(0x8001, 0), 1)) == 2048
-        assert len(engine.of(AskMailbox)) > 5
+        assert len(engine.of(ExchangeMailbox)) > 5
 
     play(scene)
 
@@ -160,9 +160,9 @@ def test_who_leaves_in_the_middle_of_a_file_leaves_the_slave_usable():
         with pytest.raises(asyncio.CancelledError):
             await writing
         await asyncio.sleep(0.01)
-        asked = [each for each in engine.requests if isinstance(each, (AskMailbox, Cancel))]
+        asked = [each for each in engine.requests if isinstance(each, (ExchangeMailbox, Cancel))]
         assert isinstance(asked[-2], Cancel)
-        assert (asked[-1].type, asked[-1].expects_reply) == (MailboxType.FOE, False)
+        assert (asked[-1].request.type, asked[-1].request.expects_reply) == (MailboxType.FOE, False)
         engine.release()
         back = bytearray()
         await client.converse(PORT, DRIVE, foe_client.read("firmware.bin", back.extend, sizes), 1)
@@ -178,7 +178,7 @@ def test_turn_that_was_not_used_is_given_back_without_a_word():
         talk.abandon()
         talk.close()
         await asyncio.wait_for(client.open_talk(PORT, DRIVE, MailboxType.FOE, 2), 1)
-        assert not engine.of(AskMailbox)
+        assert not engine.of(ExchangeMailbox)
 
     play(scene, "drive")
 

@@ -8,7 +8,7 @@ import pytest
 
 from devicebus.errors import BusError, MailboxTimeoutError
 from eap.appliance import control_bus
-from eap.appliance.bus_request import AskMailbox, Cancel
+from eap.appliance.bus_request import Cancel, ExchangeMailbox
 from eap.appliance.control import ErrorCode
 from eap.appliance.control_bus import BUS_METHODS
 from eap.appliance.handover import PortName
@@ -135,8 +135,8 @@ def test_who_leaves_lets_others_talk():
             await asking
         connection.close()
         await stage.engine.wait_for(4)
-        assert [type(each) for each in stage.engine.requests[-2:]] == [Cancel, AskMailbox]
-        assert not stage.engine.requests[-1].expects_reply
+        assert [type(each) for each in stage.engine.requests[-2:]] == [Cancel, ExchangeMailbox]
+        assert not stage.engine.requests[-1].request.expects_reply
         stage.engine.release()
         other = stage.connect()
         assert (await ask(other, await open_coe(other)))["data"]

@@ -9,7 +9,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from eap.appliance.bus_request import Answer, Failure, Hello, Request
+from eap.appliance.bus_errors import ErrorRecord
+from eap.appliance.bus_request import EngineReply, EngineRequest, EngineStarted
 from eap.appliance.services.device.engine_client import EngineClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.station_request import Configure, SetState
@@ -38,7 +39,7 @@ class Engine:
         self._sock.close()
 
     def _receive(self):
-        request = msgspec.msgpack.decode(self._sock.recv(1 << 16), type=Request)
+        request = msgspec.msgpack.decode(self._sock.recv(1 << 16), type=EngineRequest)
         self.asked.append(request)
         if isinstance(request, Configure):
             self.specs.append(pieces.from_lines(Path(request.path).read_bytes(), StationSpec))
@@ -62,11 +63,11 @@ def run(answer, ask, folder):
 
 
 def done(request):
-    return Answer(id=request.id)
+    return EngineReply(id=request.id)
 
 
 def refused(request):
-    return Answer(id=request.id, failure=Failure("EngineRefusedError", "port eap0 is gone"))
+    return EngineReply(id=request.id, error=ErrorRecord("EngineRefusedError", "port eap0 is gone"))
 
 
 def test_a_specification_crosses_as_a_file_that_is_gone_afterwards(tmp_path):
@@ -96,7 +97,7 @@ def test_refusals_are_told(ask, tmp_path):
 
 def test_an_engine_that_was_started_again_is_told_apart(tmp_path):
     with pytest.raises(EngineGoneError, match="started again"):
-        run(lambda _: Hello(1), lambda client: client.configure("left", left()), tmp_path)
+        run(lambda _: EngineStarted(1), lambda client: client.configure("left", left()), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

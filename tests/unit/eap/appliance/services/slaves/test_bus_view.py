@@ -9,7 +9,14 @@ import msgspec
 import pytest
 
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_request import Bring, BusChange, Describe, Ping, Republish, SlaveDescription
+from eap.appliance.bus_request import (
+    BringSlaves,
+    BusChange,
+    DescribeBus,
+    Ping,
+    Republish,
+    SlaveDescription,
+)
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.slaves.bus_view import BusView
 from eap.errors import EngineGoneError
@@ -61,11 +68,11 @@ def test_view_asks_the_engine_once():
 def test_view_has_the_state_that_was_requested_when_the_answer_comes():
     async def scene(view, engine, link):
         await view.current()
-        await link.ask(lambda number: Bring(id=number, bus=0, station=1003, target=1), 1)
+        await link.ask(lambda number: BringSlaves(id=number, bus=0, station=1003, target=1), 1)
         assert view.latest.slaves[1003].state == AlState.INIT
-        await link.ask(lambda number: Bring(id=number, bus=0, station=1003, target=2), 1)
+        await link.ask(lambda number: BringSlaves(id=number, bus=0, station=1003, target=2), 1)
         assert view.latest.slaves[1003].state == AlState.PREOP
-        assert not engine.of(Describe)
+        assert not engine.of(DescribeBus)
 
     play(scene)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from eap.appliance.engine.bus_ties import BusTies
+from eap.appliance.engine.bus_mapping import BusMapping
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.succession import ImageSuccession
 from tests.support.cyclic import MS, image_of
@@ -20,12 +20,12 @@ def move(rig, ties_for=None):
     def memory_of(writer):
         return image.memory if writer is Writer.ENGINE else application
 
-    ties = (ties_for or rig.bus.prepare_ties)(spec.ports[1], image, memory_of)
+    ties = (ties_for or rig.bus.prepare_mapping)(spec.ports[1], image, memory_of)
     succession = ImageSuccession(rig.image, image)
     succession.carry_values(rig.application)
     succession.carry_values(rig.image.memory)
     application[:] = image.memory
-    rig.bus.tie(ties)
+    rig.bus.swap_mapping(ties)
     rig.image, rig.application = image, application
 
 
@@ -52,6 +52,6 @@ def test_the_exchange_goes_on_with_another_image(tmp_path):
 def test_a_bus_that_was_laid_out_anew_meanwhile_is_planned_anew(tmp_path):
     rig = BusRig(tmp_path).start()
     rig.wait_op()
-    move(rig, BusTies)
+    move(rig, BusMapping)
     rig.run(3 * MS)
     assert rig.value("level.height") == -7

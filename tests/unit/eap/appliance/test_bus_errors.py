@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus import errors
-from eap.appliance.bus_failure import to_error, to_failure
-from eap.appliance.bus_request import Failure
+from eap.appliance.bus_errors import ErrorRecord, to_error, to_record
 from eap.errors import ConfigError
 
 
@@ -15,7 +14,10 @@ from eap.errors import ConfigError
     [
         (errors.BusError("the cable"), {}),
         (errors.FrameLostError("no frame came back"), {}),
-        (errors.WorkingCounterError("reading", 3, 1), {"expected": 3, "received": 1}),
+        (
+            errors.WorkingCounterError("reading", expected=3, received=1),
+            {"expected": 3, "received": 1},
+        ),
         (errors.AlStatusError("refuses OP", code=0x1B, state=4), {"code": 0x1B, "state": 4}),
         (errors.MailboxRefusedError("size", detail=8), {"detail": 8}),
         (errors.SoeError("no IDN", code=0x1001), {"code": 0x1001}),
@@ -25,13 +27,13 @@ from eap.errors import ConfigError
     ],
 )
 def test_there_and_back(error, numbers):
-    back = to_error(to_failure(error))
+    back = to_error(to_record(error))
     assert type(back) is type(error)
     assert str(back) == str(error)
     assert {name: getattr(back, name) for name in numbers} == numbers
 
 
 def test_others_become_errors_of_the_bus():
-    assert to_failure(ConfigError("no number")) == Failure("BusError", "no number")
+    assert to_record(ConfigError("no number")) == ErrorRecord("BusError", "no number")
     for kind in ("EapError", "annotations", "os", ""):
-        assert type(to_error(Failure(kind, "text"))) is errors.BusError
+        assert type(to_error(ErrorRecord(kind, "text"))) is errors.BusError
