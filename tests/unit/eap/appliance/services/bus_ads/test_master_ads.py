@@ -11,7 +11,7 @@ from devicebus.master.access import Access, Reply, brd
 from devicebus.wire.datagram import Command
 from eap.aoe.ads_master import SlaveState
 from eap.aoe.ads_operation import AdsRefusedError, DeleteNotification, WriteControl
-from eap.appliance.bus_request import Bring, Cancel, Ping, SlaveDescription
+from eap.appliance.bus_request import BringSlaves, Cancel, Ping, SlaveDescription
 from eap.appliance.services.bus_ads import master_ads
 from eap.appliance.services.bus_ads.master_ads import MasterStates, RawCommands, StateRequests
 from eap.appliance.services.slaves.bus_view import BusDescription
@@ -64,17 +64,17 @@ def test_state_request_replaces_the_one_before():
     async def scene(client, engine):
         states = states_of(client)
         engine.holds = True
-        engine.held_kind = Bring
+        engine.held_kind = BringSlaves
         states.request_slave_state(1001, 1)
         states.request_state(1)
 
         async def has(count):
-            return len(engine.of(Bring)) == count
+            return len(engine.of(BringSlaves)) == count
 
         await until(lambda: has(2))
         states.request_slave_state(1001, 8)
         await until(lambda: has(3))
-        found = [(each.station, each.target) for each in engine.of(Bring)]
+        found = [(each.station, each.target) for each in engine.of(BringSlaves)]
         assert found == [(1001, 1), (0, 1), (1001, 8)]
         assert len(engine.of(Cancel)) == 1
 

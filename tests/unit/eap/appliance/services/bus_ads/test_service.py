@@ -16,7 +16,7 @@ from eap.aoe.ads_operation import (
     Write,
     WriteControl,
 )
-from eap.appliance.bus_request import AskMailbox
+from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.services.bus_ads import service, slave_ads, slave_files
 from eap.appliance.services.master.master_desk import MasterDesk
 from eap.codec.ads import (
@@ -67,7 +67,7 @@ def test_request_to_a_slave_costs_one_engine_round_trip():
         engine.requests.clear()
         for _ in range(20):
             assert await client.good(DRIVE, VENDOR) == VENDOR_ID
-        assert [type(each) for each in engine.requests] == 20 * [AskMailbox]
+        assert [type(each) for each in engine.requests] == 20 * [ExchangeMailbox]
         engine.requests.clear()
         for operation in (ReadState(), ReadDeviceInfo()):
             await client.good(DRIVE, operation)
@@ -243,7 +243,7 @@ def test_what_takes_too_long_is_answered_in_time(monkeypatch):
     monkeypatch.setattr(service, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
-        engine.holds, engine.held_kind = True, AskMailbox
+        engine.holds, engine.held_kind = True, ExchangeMailbox
         outcome = await client.do(DRIVE, sum_of(IndexGroup.SUM_READ, VENDOR, VENDOR))
         assert outcome.data[:8] == 2 * b"\x19\7\0\0"
         assert client.why == "; ".join(2 * ["not done within 0.05 s"])

@@ -7,7 +7,7 @@ import pytest
 from devicebus.mailbox import aoe_client
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Read, ReadState, ReadWrite, Write, WriteControl
-from eap.appliance.bus_request import AskMailbox
+from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.services.bus_ads import slave_ads
 from eap.codec.ads import AdsError, AdsRange, AdsState, IndexGroup, SoePlace
 from eap.codec.adsnotification import AddNotification, TransMode
@@ -280,8 +280,8 @@ def test_vendor_message_is_answered_with_its_header():
 def test_vendor_message_that_is_written_expects_no_answer():
     async def scene(client, engine):
         await client.write(DRIVE, IndexGroup.VOE, 0, HEAD + b"hello")
-        (sent,) = engine.of(AskMailbox)
-        assert (sent.request, sent.expects_reply) == (HEAD + b"hello", False)
+        (sent,) = engine.of(ExchangeMailbox)
+        assert (sent.request.request, sent.request.expects_reply) == (HEAD + b"hello", False)
 
     play(scene)
 
@@ -296,7 +296,7 @@ def test_vendor_message_without_a_whole_header_is_refused():
 
 
 def asked(engine) -> list[AmsHeader]:
-    return [AmsHeader.decode(each.request) for each in engine.of(AskMailbox)]
+    return [AmsHeader.decode(each.request.request) for each in engine.of(ExchangeMailbox)]
 
 
 def test_aoe_slave_gets_its_address_once():

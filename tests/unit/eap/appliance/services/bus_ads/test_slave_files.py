@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from eap.aoe.ads_operation import Read, ReadWrite, Write
-from eap.appliance.bus_request import AskMailbox
+from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.services.bus_ads import slave_files, transfer
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import NetId
@@ -288,7 +288,7 @@ def test_slave_that_says_yes_late(monkeypatch):
 
 
 def hold_mailboxes(engine):
-    engine.held_kind = AskMailbox
+    engine.held_kind = ExchangeMailbox
     engine.holds = True
 
 

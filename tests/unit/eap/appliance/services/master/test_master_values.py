@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 import msgspec
 import pytest
 
-from eap.appliance.bus_request import AskMailbox, Bring, Transfer
+from eap.appliance.bus_request import BringSlaves, ExchangeDatagrams, ExchangeMailbox
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.master.master_values import FRESH_S, MasterView
@@ -70,15 +70,15 @@ def test_who_is_wired_to_whom() -> None:
 def test_one_look_serves_all_who_ask_at_once() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         await asyncio.gather(*(view.refresh(with_registers=True) for _ in range(9)))
-        looks = len(engine.of(Transfer))
+        looks = len(engine.of(ExchangeDatagrams))
         await view.refresh(with_registers=True)
-        assert len(engine.of(Transfer)) == looks
+        assert len(engine.of(ExchangeDatagrams)) == looks
         await asyncio.sleep(FRESH_S + 0.01)
         await view.refresh(with_registers=False)
         await view.refresh(with_registers=True, place=0)  # links of the configuration
-        assert len(engine.of(Transfer)) == looks
+        assert len(engine.of(ExchangeDatagrams)) == looks
         await view.refresh(with_registers=True)
-        assert len(engine.of(Transfer)) > looks
+        assert len(engine.of(ExchangeDatagrams)) > looks
 
     play(scene)
 
@@ -101,8 +101,8 @@ def test_states_and_loops_are_written() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         await view.refresh(with_registers=True)
         view.write_slave(1001, Live.AL_CONTROL, 1)
-        await soon(lambda: bool(engine.of(Bring)))
-        assert engine.of(Bring)[0].target == 1
+        await soon(lambda: bool(engine.of(BringSlaves)))
+        assert engine.of(BringSlaves)[0].target == 1
         assert view.of_diagnosis(1001, Live.AL_CONTROL) == 1
         for value in (0, 5, 99):
             with pytest.raises(SdoAbortError, match=f"{value:#x} asks for no AL state"):
@@ -171,12 +171,12 @@ def test_slaves_are_asked_for_their_device_type_once() -> None:
         await asyncio.gather(*(view.refresh(with_registers=False, place=0) for _ in range(3)))
         assert view.of_configured(1001, Live.DEVICE_TYPE) == 0x0002_0192
         assert view.of_configured(1001, Live.TYPE) == "drive"
-        asked = len(engine.of(AskMailbox))
+        asked = len(engine.of(ExchangeMailbox))
         await asyncio.sleep(FRESH_S + 0.01)
         await view.refresh(with_registers=False, place=0)
         assert view.is_fresh(with_registers=False, place=0)
         assert view.is_fresh(with_registers=False, place=9), "there is none that could be asked"
-        assert len(engine.of(AskMailbox)) == asked
+        assert len(engine.of(ExchangeMailbox)) == asked
 
     play(scene, "drive")
 
