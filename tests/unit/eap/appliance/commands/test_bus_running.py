@@ -151,7 +151,7 @@ def test_who_leaves_gives_the_turn_back(bus, works):
         other.converse(other.find("sensor"), stuck, "stuck")
     works.wait_served()
     farewell = works.engine.of(ExchangeMailbox)[-1]
-    assert (farewell.station, farewell.expects_reply) == (1003, False)
+    assert (farewell.station, farewell.request.expects_reply) == (1003, False)
     assert bus.converse(bus.find("sensor"), vendor, "vendor") == b"\x5a\x0e\0\0"
 
 

@@ -84,7 +84,7 @@ def test_files() -> None:
         read(ReadFile("f"), first, bytes.fromhex("03 00 02000000") + b"b" * 52)
     with pytest.raises(DialectError, match="no file name") as caught:
         read(ReadFile(""))
-    assert caught.value.error is Failure.FILE_NAME
+    assert caught.value.failure is Failure.FILE_NAME
 
 
 def test_what_is_read_has_to_fit_one_packet() -> None:
