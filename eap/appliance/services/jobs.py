@@ -12,6 +12,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 from eap.appliance.control import ErrorCode
+from eap.appliance.services.tasks import TaskSet
 from eap.errors import ControlError
 
 MAX_WAITING = 256
@@ -27,6 +28,7 @@ class Jobs:
     def __init__(self, what: str) -> None:
         self._what = what
         self._lock = asyncio.Lock()
+        self._tasks = TaskSet(what)
         self._waiting = 0
 
     async def do(self, job: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
@@ -45,7 +47,7 @@ class Jobs:
             await self._lock.acquire()
         finally:
             self._waiting -= 1
-        task = asyncio.get_running_loop().create_task(job())
+        task = self._tasks.start_awaited(job())
         task.add_done_callback(lambda _: self._lock.release())
         try:
             return await asyncio.shield(task)

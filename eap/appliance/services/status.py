@@ -14,6 +14,7 @@ from eap.appliance.bus_request import BusReport
 from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
 from eap.appliance.services.bus.bus_status import bus_document, bus_link
+from eap.appliance.services.tasks import TaskSet
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.connections import ListenerStats
@@ -80,11 +81,12 @@ class SharedAnswer:
         self._make = make
         self._lock = asyncio.Lock()
         self._next: asyncio.Task[dict[str, Any]] | None = None
+        self._tasks = TaskSet("status")
 
     async def get(self) -> dict[str, Any]:
         """Return the next answer; raises what making it does."""
         if self._next is None:
-            self._next = asyncio.get_running_loop().create_task(self._run())
+            self._next = self._tasks.start_awaited(self._run())
         return await asyncio.shield(self._next)
 
     async def _run(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 from eap.appliance.discards import Refusal
 from eap.appliance.services.routes.ams_questions import AmsQuestions
 from eap.appliance.services.routes.route_desk import RouteDesk
+from eap.appliance.services.tasks import TaskSet
 from eap.codec.ams import SYSTEM_PORT
 from eap.codec.amsdiscovery import (
     RESPONSE,
@@ -74,7 +75,7 @@ class AmsDiscovery:
         self._desk = desk
         self._questions = questions
         self._refuse = refuse
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = TaskSet("AMS discovery")
 
     def watch(self, sock: socket.socket | None = None) -> None:
         """Answer whenever something arrives, as long as the running loop lives.
@@ -108,7 +109,6 @@ class AmsDiscovery:
                 yield _answer(self._routers[0], service, number, [tag])
 
     def _drain(self, sock: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
         for _ in range(_DATAGRAMS_PER_TURN):
             try:
                 data, sender = sock.recvfrom(_LONGEST)
@@ -118,9 +118,7 @@ class AmsDiscovery:
                 continue  # what ICMP says of an answer that went before
             if self._questions.take(data, sender[0]):
                 continue
-            task = loop.create_task(self._answer(data, sender))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._tasks.start(self._answer(data, sender))
 
     async def _answer(self, data: bytes, sender: tuple[str, int]) -> None:
         answers = await self.answers_to(data, sender[0])

@@ -5,7 +5,6 @@ Rule: what waits is bounded in number and octets; who is too many is told at onc
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
@@ -14,6 +13,7 @@ from typing import NamedTuple, TypeAlias
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
 from eap.appliance.services.routing.service import LocalRequest, Service
+from eap.appliance.services.tasks import TaskSet
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 
@@ -43,7 +43,7 @@ class Lanes:
     def __init__(self, finish: Finish) -> None:
         self._finish = finish
         self._lanes: dict[_Key, deque[_Waiting]] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = TaskSet("AoE requests")
         self._octets = 0
 
     def has_work(self, way: Way, header: AmsHeader) -> bool:
@@ -62,9 +62,7 @@ class Lanes:
                 return
             self._lanes[key] = lane = deque()
             self._octets += len(request.body)
-            task = asyncio.get_running_loop().create_task(self._run(key, lane, waiting, answer))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._tasks.start(self._run(key, lane, waiting, answer))
         elif len(lane) >= MAX_WAITING or self._octets + len(request.body) > MAX_OCTETS:
             self._finish(ticket, _FULL)
         else:
@@ -80,9 +78,7 @@ class Lanes:
 
     async def close(self) -> None:
         """Give up what is under way."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
 
     async def _run(
         self, key: _Key, lane: deque[_Waiting], first: _Waiting, answer: Awaitable[AmsAnswer]

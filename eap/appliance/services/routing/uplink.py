@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Protocol, TypeAlias
 
+from eap.appliance.services.tasks import TaskSet
 from eap.net.backoff import Backoff
 
 CONNECT_S = 3.0
@@ -60,6 +61,7 @@ class Uplinks:
         self._serve = serve
         self._source = source
         self._uplinks: dict[str, _Uplink] = {}
+        self._tasks = TaskSet("connections to other stations")
 
     def send(self, address: str, data: bytes) -> str | None:
         """Send *data*, now or when there is a connection; return why not if that cannot be."""
@@ -68,15 +70,12 @@ class Uplinks:
             if not _is_address(address):
                 return "the connection is closed"
             uplink = self._uplinks[address] = _Uplink()
-            uplink.task = asyncio.get_running_loop().create_task(self._run(address, uplink))
+            self._tasks.start(self._run(address, uplink))
         return uplink.send(data)
 
     async def close(self) -> None:
         """Close all connections."""
-        tasks = [uplink.task for uplink in self._uplinks.values() if uplink.task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._tasks.close()
 
     async def _run(self, address: str, uplink: _Uplink) -> None:
         loop = asyncio.get_running_loop()
@@ -124,7 +123,6 @@ class _Uplink:
     """One connection, or what waits for it."""
 
     def __init__(self) -> None:
-        self.task: asyncio.Task[None] | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._waiting: deque[bytes] = deque()
         self._octets = 0

@@ -1,0 +1,58 @@
+"""Tasks owned by an object that lives longer than one block: kept, reported, ended together.
+
+A TaskGroup ends with its block and with the first failure of a task; requests of clients, and
+transfers that go on when their client has gone, need neither.  This is the only other place that
+starts tasks (house rule, ``tools/check_tree.py``): a bare task can be collected, or lose its error.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Coroutine
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+logger = logging.getLogger(__name__)
+
+
+class TaskSet:
+    """Tasks of one owner; *name* is for the log.
+
+    Two kinds of tasks differ in where an exception goes: to the log, or to those that await it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    def __len__(self) -> int:
+        return len(self._tasks)
+
+    def start(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+        """Start a task that nothing awaits; an exception is logged."""
+        task = self.start_awaited(work)
+        task.add_done_callback(self._report)
+        return task
+
+    def start_awaited(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+        """Start a task whose result, or exception, is for those that await it."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def cancel(self) -> None:
+        """Cancel all tasks."""
+        for task in self._tasks:
+            task.cancel()
+
+    async def close(self) -> None:
+        """Cancel all tasks, and wait until they have ended."""
+        self.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def _report(self, task: asyncio.Task[Any]) -> None:
+        if not task.cancelled() and (exc := task.exception()) is not None:
+            logger.error("%s: a task failed", self._name, exc_info=exc)
