@@ -18,8 +18,8 @@ from eap.device.pdlayout import bus_variables, kept_versions
 from eap.device.rollout import without_alternates
 from eap.device.stored import StoredError
 from eap.pd.device import DeviceFault
+from eap.pd.handover import needs_new_start
 from eap.pd.spec import LinkSpec, PortKind, Source, StationSpec, VariableSpec
-from eap.pd.succession import needs_new_start
 
 
 class Plan(NamedTuple):

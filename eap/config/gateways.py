@@ -10,8 +10,7 @@ from eap.config.routes import MisfitError
 from eap.config.structs import Plain, Port, Station
 from eap.ids import NetId
 from eap.near import near
-from eap.pd.gateway import GatewayAddress, GatewaySpec
-from eap.pd.spec import BusSlaveSpec, PortKind
+from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
 
 MASTER_PORT = 0xFFFF
 ADDRESS = "a mailbox address from 1 to 0xFFFE"

@@ -20,10 +20,10 @@ from pathlib import Path
 
 from eap.closing import Closing
 from eap.errors import EnvironmentalError, ImageError, WriterConflictError
+from eap.pd.handover import ImageHandover
 from eap.pd.image import Image, format_image, read_generation, read_header
 from eap.pd.layout import WORDS_OFFSET, ImageLayout
 from eap.pd.spec import Writer
-from eap.pd.succession import ImageSuccession
 from eap.pd.words import StationWord
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -198,7 +198,7 @@ def _replace(existing: ImageFile | None, fresh: ImageFile, path: Path) -> ImageF
         raise
     if existing is not None:
         existing.retire()
-        succession = ImageSuccession(existing.image, fresh.image)
+        succession = ImageHandover(existing.image, fresh.image)
         succession.carry_words()
         succession.carry_values(existing.image.memory)
     fresh.release()

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from eap.errors import EnvironmentalError
 from eap.ids import MacAddr
-from eap.pd.presence import Evidence
+from eap.pd.monitor import Evidence
 
 _NETLINK_ROUTE = 0
 _NEWROUTE, _GETROUTE, _NEWNEIGH, _GETNEIGH = 24, 26, 28, 30

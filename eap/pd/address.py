@@ -1,13 +1,22 @@
-"""Destinations at run time: as one word of the process image, and as the NetID that one may be.
+"""Addresses at run time: destinations and sources as words of the image, learned and watched.
 
-The word is the kind, then a MAC address, or an IPv4 address and the port.
+A word is the kind, then a MAC address, or an IPv4 address and the port.  A :class:`Learner` tells
+which MAC address a NetID stands for, from the frames of the port that has it.  A
+:class:`SourceWatch` notes the addresses that the frames of one publisher come from: a publisher ID
+is no proof of identity, as any host can put it into a frame.  Where the publisher's address is
+known, its frames are told from those of all other hosts by that address.  Where it is not, two
+hosts that send with one publisher ID are seen by the address that goes back and forth.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Container, Iterable
 from ipaddress import IPv4Address
 
+from eap.codec.ethercat import FrameType
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
+from eap.pd.link import Origin, Taker
+from eap.pd.words import RxWord
 
 _KIND_SHIFT = 48
 _KINDS = {DestinationKind.MAC: 1, DestinationKind.IP: 2, DestinationKind.TCP: 3}
@@ -86,3 +95,118 @@ def net_id_of(destination: str) -> NetId | None:
     except ValueError:
         return None
     return NetId.parse(host) if kind is DestinationKind.NET_ID else None
+
+
+ALTERNATION_NS = 10_000_000_000
+"""Two changes of the address within this time are two senders; a single one is a new address."""
+_NEVER = -ALTERNATION_NS
+
+
+class SourceWatch:
+    """The source addresses of one publisher's frames, of one class.
+
+    The addresses that subscriptions of the port expect are a class each, all others one together.
+
+    Args:
+        words: Of the process image.
+        expected: The address that is this class; empty for all that nobody expects.
+        named: The addresses that somebody expects.
+
+    Attributes:
+        source: The address of the last frame.
+    """
+
+    __slots__ = (
+        "_changed_at_ns",
+        "_expected",
+        "_named",
+        "_refusing",
+        "_taking",
+        "_words",
+        "source",
+    )
+
+    def __init__(self, words: memoryview, expected: bytes, named: frozenset[bytes]) -> None:
+        self.source: bytes | None = None
+        self._words = words
+        self._expected = expected
+        self._named = named
+        self._taking: set[int] = set()
+        self._refusing: set[int] = set()
+        self._changed_at_ns = _NEVER
+
+    def follow(self, taking: Iterable[int], refusing: Iterable[int]) -> None:
+        """Note addresses for more RxPDs too, given by their first words.
+
+        Args:
+            taking: Those that take PDs of these frames.
+            refusing: Those that refuse PDs because of where these frames come from.
+        """
+        self._taking.update(taking)
+        self._refusing.update(refusing)
+        if self.source is not None:
+            self._note(source_word(self.source))
+
+    def includes(self, source: bytes, at_ns: int) -> bool:
+        """Tell whether a frame from *source* is of this class, and note it if the address is new.
+
+        Only called for another address than :attr:`source`.
+        """
+        if (source if source in self._named else b"") != self._expected:
+            return False
+        before, self.source = self.source, source
+        self._note(source_word(source))
+        if before is not None:
+            if at_ns - self._changed_at_ns < ALTERNATION_NS:
+                other = source_word(before)
+                for first in self._taking:
+                    self._words[first + RxWord.OTHER_SOURCE] = other
+                    self._words[first + RxWord.OTHER_SOURCE_AT_NS] = at_ns
+            self._changed_at_ns = at_ns
+        return True
+
+    def _note(self, word: int) -> None:
+        for first in self._taking:
+            self._words[first + RxWord.SOURCE] = word
+        for first in self._refusing:
+            self._words[first + RxWord.WRONG_SOURCE] = word
+
+
+LOOK_NS = 100_000_000
+"""How often the sender of one NetID's frames is looked at: addresses change rarely."""
+_PUBLISHER = slice(2, 8)
+
+
+class Learner:
+    """Looks at the frames of a port on their way to *taker*.
+
+    Attributes:
+        sought: The NetIDs whose address is wanted; it may change at any time.
+        learn: Called with such a NetID and the address that its frames come from.
+    """
+
+    def __init__(self, taker: Taker) -> None:
+        self.sought: Container[bytes] = ()
+        self.learn: Callable[[bytes, str], None] = forget
+        self._taker = taker
+        self._looked_at_ns: dict[bytes, int] = {}
+
+    def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
+        """Note who sent a frame, and hand it over."""
+        if self.sought and size >= _PUBLISHER.stop and data[1] >> 4 == FrameType.PROCESS_DATA:
+            publisher = bytes(data[_PUBLISHER])
+            if publisher in self.sought:
+                self._look(publisher, data, at_ns, origin)
+        self._taker(data, size, at_ns, origin)
+
+    def _look(self, publisher: bytes, data: memoryview, at_ns: int, origin: Origin) -> None:
+        looked_at_ns = self._looked_at_ns.get(publisher)
+        if looked_at_ns is None or not 0 <= at_ns - looked_at_ns < LOOK_NS:
+            self._looked_at_ns[publisher] = at_ns
+            if sender := origin.sender_of(data):
+                self.learn(publisher, sender)
+
+
+def forget(net_id: bytes, sender: str) -> None:
+    """Nobody wants to know."""
+    del net_id, sender

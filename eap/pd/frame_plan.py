@@ -1,4 +1,4 @@
-"""What to do with a frame of a known layout: learned once, then checked and copied.
+"""Plan of a received frame: PDs found once in a layout, then checked and copied.
 
 Publishers repeat the layout of their frames.  The plan of a layout compares all PD headers in one
 step and copies PDs that lie side by side, both in the frame and in the image, in one piece.
@@ -10,13 +10,15 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
-from eap.codec.ethercat import EtherCatHeader
-from eap.codec.pd import PD_FRAME_START, PdFrameHeader, PdHeader
+from eap.codec.ethercat import EtherCatHeader, FrameType
+from eap.codec.pd import FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
+from eap.errors import TruncatedError
 from eap.ids import NetId
-from eap.pd.account import Account
+from eap.pd.address import SourceWatch
 from eap.pd.copyplan import CopyPlan
 from eap.pd.poll import Answer
-from eap.pd.sourcewatch import SourceWatch
+from eap.pd.sequence import SequenceTracker
+from eap.pd.words import Discard
 
 Copy: TypeAlias = tuple[slice, slice]
 """Octets of the frame and where they go in the image."""
@@ -25,7 +27,7 @@ Copy: TypeAlias = tuple[slice, slice]
 class Taken(NamedTuple):
     """A PD of the frame that a subscription takes: offsets of its header here and there."""
 
-    account: Account
+    tracker: SequenceTracker
     words: int
     """Index of the first word of the RxPD."""
     source: int
@@ -54,14 +56,14 @@ class FramePlan:
         expected: What it must return for this plan to apply.
         end: Octets of the frame by its Length.
         is_single: Whether there is one PD in it.
-        parts: For each account that the frame concerns, the copies to make if it agrees.
+        parts: For each tracker that the frame concerns, the copies to make if it agrees.
         taken_words: First words of the RxPDs that take one of its PDs.
         has_more: Whether there is anything of the next four.
-        alternates: PDs that are laid out otherwise: account, offset in the frame, copy to make.
+        alternates: PDs that are laid out otherwise: tracker, offset in the frame, copy to make.
         refused: The PDs that nobody takes.
-        requests: RxPDs that ask this station for something, with their accounts.
+        requests: RxPDs that ask this station for something, with their trackers.
         answers: RxPDs that this station asked for, likewise.
-        roaming: Accounts that follow any publisher.
+        roaming: Trackers that follow any publisher.
         publisher: The frame's, as a number.
         watch: The addresses that such frames come from; it belongs to this plan if they do.
     """
@@ -91,9 +93,9 @@ class FramePlan:
         refused: Iterable[Refused],
         *,
         watch: SourceWatch,
-        requests: Iterable[tuple[Account, str]] = (),
-        answers: Iterable[tuple[Account, Answer]] = (),
-        roaming: Iterable[Account] = (),
+        requests: Iterable[tuple[SequenceTracker, str]] = (),
+        answers: Iterable[tuple[SequenceTracker, Answer]] = (),
+        roaming: Iterable[SequenceTracker] = (),
         publisher: bytes = b"",
     ) -> None:
         """Build the plan from (header without quality, data length) of each PD and their fate."""
@@ -106,7 +108,7 @@ class FramePlan:
         taken = tuple(taken)
         self.parts = _parts(taken)
         self.alternates = tuple(
-            (pd.account, pd.source, pd.alternate) for pd in taken if pd.alternate is not None
+            (pd.tracker, pd.source, pd.alternate) for pd in taken if pd.alternate is not None
         )
         self.taken_words = tuple(pd.words for pd in taken)
         self.refused = tuple(refused)
@@ -119,8 +121,8 @@ class FramePlan:
 
     def copy_alternates(self, data: memoryview, cycle: int, memory: memoryview) -> None:
         """Copy what is laid out otherwise from the frame *data* of *cycle*, if it was taken."""
-        for account, source, alternate in self.alternates:
-            if account.has_taken(cycle):
+        for tracker, source, alternate in self.alternates:
+            if tracker.has_taken(cycle):
                 alternate.run(data[source:], memory)
 
     def example(self) -> memoryview:
@@ -134,10 +136,10 @@ class FramePlan:
         return memoryview(frame.ljust(self.end, b"\0"))
 
 
-def _parts(taken: Iterable[Taken]) -> tuple[tuple[Account, tuple[Copy, ...]], ...]:
-    runs: dict[Account, list[Taken]] = {}
+def _parts(taken: Iterable[Taken]) -> tuple[tuple[SequenceTracker, tuple[Copy, ...]], ...]:
+    runs: dict[SequenceTracker, list[Taken]] = {}
     for pd in taken:
-        pieces = runs.setdefault(pd.account, [])
+        pieces = runs.setdefault(pd.tracker, [])
         if pd.alternate is not None:
             continue
         if pieces and _continues(pieces[-1], pd):
@@ -146,13 +148,13 @@ def _parts(taken: Iterable[Taken]) -> tuple[tuple[Account, tuple[Copy, ...]], ..
             pieces.append(pd)
     return tuple(
         (
-            account,
+            tracker,
             tuple(
                 (slice(p.source, p.source + p.size), slice(p.target, p.target + p.size))
                 for p in pieces
             ),
         )
-        for account, pieces in runs.items()
+        for tracker, pieces in runs.items()
     )
 
 
@@ -163,3 +165,25 @@ def _continues(run: Taken, pd: Taken) -> bool:
 HEADER_KEY = struct.Struct("<6s2x")
 """A PD header as plans compare it: everything but the quality."""
 assert HEADER_KEY.size == PdHeader.SIZE  # noqa: S101  the two must not drift apart
+
+
+def walk(data: memoryview, size: int) -> list[tuple[PdHeader, int]] | Discard:
+    """Return each PD header with its offset, or why the frame is dropped as a whole."""
+    try:
+        ethercat = EtherCatHeader.decode(data[:size])
+        if ethercat.type != FrameType.PROCESS_DATA:
+            return Discard.WRONG_TYPE
+        end = PD_FRAME_START + ethercat.length
+        frame = data[: min(end, size)]
+        count = PdFrameHeader.decode(frame, PD_FRAME_START).count
+        if FIRST_PD + count * PdHeader.SIZE > end:
+            return Discard.COUNT_TOO_LARGE
+        pds = []
+        offset = FIRST_PD
+        for _ in range(count):
+            header = PdHeader.decode(frame, offset)
+            pds.append((header, offset))
+            offset += PdHeader.SIZE + header.length
+    except TruncatedError:
+        return Discard.TRUNCATED
+    return pds if offset <= end <= size else Discard.TRUNCATED

@@ -1,12 +1,17 @@
-"""Where everything of one station lies in its process image.
+"""Layout of a station's process image: offsets of words, variables, PDs and slaves.
 
 The image is a header, the words of ``words.py``, one region of variables for each writer, and the
 directory: this layout as JSON, so that a program that attaches needs no plant file.
 
 A received PD lies in the engine's region as it travels: eight octets of PD header, then the data.
 PDs that follow each other in a frame also follow each other here, so that one copy takes them all.
-Behind them lie the inputs of slaves, as they travel as well, then their outputs in the region of
-whoever writes them.
+Behind them lie the inputs of slaves, bit for bit as in their PDOs, with padding, so that a bus and
+an image of the same order are one copy; then their outputs, in the region of their writer.  Where
+one slave's outputs have several writers, each region mirrors all of them and holds its own.
+
+An RxPD may have alternates: other layouts that are taken while its sender changes from one to the
+other.  What both have goes to its place in the image, and so does the quality, which says how old
+it is; what only the RxPD has keeps its value, and its PD header in the image stays as it was.
 
 Behind all regions is room for copies of them: samples of the latest cycles, for those who ask.
 """
@@ -14,16 +19,19 @@ Behind all regions is room for copies of them: samples of the latest cycles, for
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from eap.codec import datatypes, pdo
+from eap.codec.datatypes import DataType
 from eap.codec.pd import PdHeader
 from eap.pd import pieces
-from eap.pd.alternate import AlternatePlace, place_alternates
-from eap.pd.busplace import mirror
+from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.spec import (
     BusEntrySpec,
     Record,
+    RxAlternateSpec,
+    RxPdSpec,
     StationSpec,
     Substitute,
     TxFrameSpec,
@@ -374,3 +382,104 @@ def _rx_places(
             alternates=place_alternates(pd, kinds, bits, offset),
             source=pd.source,
         )
+
+
+_QUALITY_BITS = 16
+"""The quality is the last field of a PD header."""
+_QUALITY = 8 * PdHeader.SIZE - _QUALITY_BITS
+
+
+class AlternatePlace(Record, frozen=True):
+    """Another layout: *size* octets of data."""
+
+    version: int
+    size: int
+    moves: tuple[Move, ...]
+    """From bits of the PD, header included, to bits of the image."""
+    untouched: tuple[tuple[int, int], ...]
+    """Variables of the RxPD that it does not bring: first bit in the image, and how many."""
+
+    def copy_plan(self) -> CopyPlan:
+        """Return what copies a PD of this layout, header included, to the image."""
+        return CopyPlan(self.moves, used=self.untouched)
+
+
+def place_alternates(
+    pd: RxPdSpec, kinds: Sequence[DataType], bits: Sequence[int], offset: int
+) -> tuple[AlternatePlace, ...]:
+    """Return where the alternates of *pd* go.
+
+    Args:
+        pd: The RxPD.
+        kinds: Types of its variables, in PDO order.
+        bits: Where they lie in the image.
+        offset: Octet of the image at which its PD header lies.
+
+    Raises:
+        ValueError: an alternate brings what *pd* has not, or has as another type; or the same
+            variable twice; or it cannot be told from another layout by version and size.
+    """
+    if not pd.alternates:
+        return ()
+    own = dict(zip(pd.variables, zip(kinds, bits, strict=True), strict=True))
+    layouts = {(pd.version, pdo.layout(kinds).size)}
+    found = []
+    for alternate in pd.alternates:
+        found.append(_place_alternate(pd, alternate, own, 8 * offset))
+        key = found[-1].version, found[-1].size
+        if key in layouts:
+            problem = f"has {key[1]} octets like another layout of that version"
+            raise _refusal(pd, alternate, problem, "another version")
+        layouts.add(key)
+    return tuple(found)
+
+
+def _place_alternate(
+    pd: RxPdSpec, alternate: RxAlternateSpec, own: Mapping[str, tuple[DataType, int]], header: int
+) -> AlternatePlace:
+    theirs = [datatypes.parse(each.type) for each in alternate.variables]
+    plan = pdo.layout(theirs)
+    moves = [Move(_QUALITY, header + _QUALITY, _QUALITY_BITS)]
+    missing = dict(own)
+    for each, kind, start in zip(alternate.variables, theirs, plan.bit_offsets, strict=True):
+        if not each.name:
+            continue
+        expected, bit = missing.pop(each.name, (None, 0))
+        if kind != expected:
+            shown = ", ".join(f"{name} ({own[name][0].text})" for name in own)
+            problem = f"brings {each.name} ({kind.text})"
+            raise _refusal(pd, alternate, problem, f"each of {shown} at most once")
+        moves.append(Move(8 * PdHeader.SIZE + start, bit, kind.bit_length))
+    untouched = tuple((bit, kind.bit_length) for kind, bit in missing.values())
+    return AlternatePlace(alternate.version, plan.size, tuple(moves), untouched)
+
+
+def _refusal(pd: RxPdSpec, alternate: RxAlternateSpec, problem: str, expected: str) -> ValueError:
+    which = f"alternate of version {alternate.version} of RxPD {pd.name!r}"
+    return ValueError(f"{which} {problem}, expected {expected}")
+
+
+class Mirror(NamedTuple):
+    """One direction of a slave's process data."""
+
+    bit_offsets: dict[str, int]
+    """Of each variable, from where the slave's part begins."""
+    size: int
+    """In octets."""
+
+
+def mirror(entries: Iterable[BusEntrySpec], types: Mapping[str, DataType]) -> Mirror:
+    """Place the variables of *entries*.
+
+    What is no bit field starts on a whole octet, as everywhere in an image: behind an entry that a
+    slave has elsewhere all others are shifted.
+    """
+    offsets: dict[str, int] = {}
+    end = 0
+    for entry in entries:
+        if entry.variable:
+            if not types[entry.variable].is_bits:
+                end = -(-end // 8) * 8
+            offsets[entry.variable] = end
+        end += entry.bit_length
+    return Mirror(offsets, -(-end // 8))

@@ -2,18 +2,133 @@
 
 A target is asked for once an interval, sooner while the answer is in doubt, and all targets
 together at most so often a second.  Whoever drives this asks, and hands over what comes of it.
+
+Presence of a target, by :class:`PresenceTracker`:
+Rule 1: a round, from one question to the next, counts for one miss or one hit at most, however much
+is heard in it.  Presence changes after several rounds that agree, or at once for what is certain.
+Rule 2: nothing is present that was not seen.  Where nothing can be told, or nothing was for long,
+the presence is unknown.
 """
 
 from __future__ import annotations
 
 import heapq
 from collections import deque
+from enum import Enum, IntEnum, auto
 from typing import NamedTuple
 
 from eap.ids import MacAddr
-from eap.pd.presence import DEFAULT_POLICY, Evidence, Judge, Presence, PresencePolicy
 
 _SECOND_NS = 1_000_000_000
+
+
+class Presence(IntEnum):
+    """Whether the subscriber of a frame is there; the word of a frame in the process image."""
+
+    UNKNOWN = 0
+    PRESENT = 1
+    MISSING = 2
+
+
+class Evidence(Enum):
+    """What one question, or something heard without one, says."""
+
+    SEEN = auto()
+    """It answered, or somebody who checks says that it is there."""
+    MISSED = auto()
+    """It did not answer this time."""
+    ABSENT = auto()
+    """Its host refuses what is sent, or somebody has already asked often enough, in vain."""
+    PENDING = auto()
+    """Nothing new; somebody is still asking."""
+    BLIND = auto()
+    """It cannot be told by this way."""
+
+
+class PresencePolicy(NamedTuple):
+    """How quickly to believe."""
+
+    misses: int = 3
+    """Rounds without an answer until it is missing, or rounds blind until it is unknown."""
+    hits: int = 2
+    """Rounds with an answer until what was missing is present; from unknown the first will do."""
+    trust_ns: int = 15 * _SECOND_NS
+    """How long what was told last holds when nothing new is, and at least *misses* intervals.
+
+    More than the 8 s that a kernel with its usual settings takes to check a neighbour.
+    """
+
+
+DEFAULT_POLICY = PresencePolicy()
+
+
+class PresenceTracker:
+    """The presence of one subscriber, asked for every *interval_ns*."""
+
+    def __init__(
+        self, interval_ns: int, now_ns: int, policy: PresencePolicy = DEFAULT_POLICY
+    ) -> None:
+        self.presence = Presence.UNKNOWN
+        self._policy = policy
+        self._patience_ns = max(policy.trust_ns, policy.misses * interval_ns)
+        self._told_at_ns = now_ns
+        self._hits = self._misses = self._blind = 0
+        self._verdict: Evidence | None = None  # of this round
+
+    def begin_round(self) -> None:
+        """Take note that somebody asks anew."""
+        self._verdict = None
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the next round may change something: it had better come soon."""
+        return bool(self._hits if self.presence is Presence.MISSING else self._misses)
+
+    def take(self, evidence: Evidence, now_ns: int) -> Presence:
+        """Count *evidence* and return the presence that follows."""
+        before = self.presence
+        match evidence:
+            case Evidence.SEEN:
+                self._hit(now_ns)
+            case Evidence.MISSED | Evidence.ABSENT:
+                self._miss(evidence, now_ns)
+            case Evidence.BLIND:
+                self._look_in_vain()
+            case Evidence.PENDING:
+                if now_ns - self._told_at_ns > self._patience_ns:
+                    self.presence = Presence.UNKNOWN
+        if self.presence is not before:
+            self._hits = self._misses = self._blind = 0
+        return self.presence
+
+    def _hit(self, now_ns: int) -> None:
+        self._told_at_ns = now_ns
+        self._misses = self._blind = 0
+        if self._verdict is not Evidence.SEEN:
+            self._verdict = Evidence.SEEN
+            self._hits += 1
+        if self.presence is not Presence.MISSING or self._hits >= self._policy.hits:
+            self.presence = Presence.PRESENT
+
+    def _miss(self, evidence: Evidence, now_ns: int) -> None:
+        if evidence is Evidence.MISSED and self._verdict is Evidence.SEEN:
+            return
+        self._told_at_ns = now_ns
+        self._hits = self._blind = 0
+        if self._verdict is not Evidence.MISSED:
+            self._verdict = Evidence.MISSED
+            self._misses += 1
+        if evidence is Evidence.ABSENT or self._misses >= self._policy.misses:
+            self.presence = Presence.MISSING
+
+    def _look_in_vain(self) -> None:
+        if self._verdict is None:
+            self._verdict = Evidence.BLIND
+            self._blind += 1
+        if self._blind >= self._policy.misses:
+            self.presence = Presence.UNKNOWN
+
+
 _CLAIMANTS_KEPT = 64
 _NOT_PLANNED = -1
 
@@ -76,7 +191,7 @@ class _Watch:
 
     def __init__(self, target: MonitorTarget, now_ns: int, policy: PresencePolicy) -> None:
         self.target = target
-        self.judge = Judge(target.interval_ns, now_ns, policy)
+        self.tracker = PresenceTracker(target.interval_ns, now_ns, policy)
         self.answered_by: MacAddr | None = None
         self.waits = False
         self.queued = False
@@ -85,7 +200,7 @@ class _Watch:
         self.claims: dict[MacAddr, _Claim] = {}
 
     def ask(self, now_ns: int) -> None:
-        self.judge.begin_round()
+        self.tracker.begin_round()
         self.asked_at_ns = now_ns
         self.waits = True
         self.queued = False
@@ -134,7 +249,7 @@ class SubscriberMonitor:
     def presence(self, name: str) -> Presence:
         """Return what is known of target *name*; unknown for one that is not watched."""
         watch = self._watches.get(name)
-        return Presence.UNKNOWN if watch is None else watch.judge.presence
+        return Presence.UNKNOWN if watch is None else watch.tracker.presence
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`probes_to_send` must be called again; None if never."""
@@ -206,8 +321,8 @@ class SubscriberMonitor:
 
     def _take(self, watch: _Watch, evidence: Evidence, now_ns: int) -> None:
         watch.waits = False
-        old = watch.judge.presence
-        new = watch.judge.take(evidence, now_ns)
+        old = watch.tracker.presence
+        new = watch.tracker.take(evidence, now_ns)
         if new is not old:
             name = watch.target.name
             self._events.append(PresenceChanged(name, old, new, evidence, watch.answered_by))
@@ -224,7 +339,7 @@ class SubscriberMonitor:
         pause_ns = watch.target.interval_ns
         if watch.waits:
             pause_ns = min(pause_ns, self._policy.answer_ns)
-        elif watch.judge.in_doubt:
+        elif watch.tracker.in_doubt:
             pause_ns = min(pause_ns, self._policy.retry_ns)
         due_ns = watch.asked_at_ns + pause_ns
         if due_ns != watch.due_ns:

@@ -8,10 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from eap.codec.pd import PdHeader
-from eap.pd import outcome
 from eap.pd.address import source_text
 from eap.pd.device import DeviceState
-from eap.pd.frame_status import frame_state, frame_status, presence
+from eap.pd.frame_status import frame_state, frame_status, presence, tx_var_state
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace, TxPlace
 from eap.pd.words import (
@@ -106,9 +105,9 @@ def pd_list(image: Image) -> list[dict[str, Any]]:
     return sent + [row(place, "rx", publisher=place.publisher or None) for place in layout.rx]
 
 
-def account_word(image: Image, place: RxPlace) -> int:
-    """Return the index of the first word of the block that holds a subscription's account."""
-    return int(image.words[place.words + RxWord.ACCOUNT]) or place.words
+def tracker_word(image: Image, place: RxPlace) -> int:
+    """Return the index of the first word of the block that holds a subscription's tracker."""
+    return int(image.words[place.words + RxWord.TRACKER]) or place.words
 
 
 def quality(image: Image, place: RxPlace) -> int:
@@ -119,7 +118,7 @@ def quality(image: Image, place: RxPlace) -> int:
     to cycle.
     """
     words = image.words
-    first = account_word(image, place)
+    first = tracker_word(image, place)
     cycles = words[StationWord.CYCLE] - words[first + RxWord.ARRIVED_IN_CYCLE]
     own_ns = max(cycles, 0) * image.layout.cycle_us * 1000 + words[place.words + RxWord.RESPONSE_NS]
     sent = PdHeader.decode(image.memory, place.offset).quality
@@ -129,7 +128,7 @@ def quality(image: Image, place: RxPlace) -> int:
 def var_state(image: Image, place: RxPlace) -> int:
     """Return VarState: bit 0 version, bit 1 length differ in what arrives now; 0 is well."""
     words = image.words
-    first = account_word(image, place)
+    first = tracker_word(image, place)
     if words[place.words + RxWord.MISMATCH_AT_NS] <= words[first + RxWord.ARRIVED_AT_NS]:
         return 0
     return int(words[place.words + RxWord.MISMATCH])
@@ -164,7 +163,7 @@ def tx_status(image: Image, place: TxPlace) -> dict[str, Any]:
         "skipped": words[place.words + TxWord.SKIPPED],
         "reason": {r.value: n for r, n in zip(REASONS, counts, strict=True) if n},
         "last_reason": REASONS[last].value if sum(counts) else None,
-        "var_state": outcome.var_state(words, place),
+        "var_state": tx_var_state(words, place),
         "frame_state": frame_state(image, place.frame_words),
         "subscriber": presence(image, place.frame_words),
     }
@@ -172,7 +171,7 @@ def tx_status(image: Image, place: TxPlace) -> dict[str, Any]:
 
 def _rx(image: Image, place: RxPlace, now_ns: int, wall_ns: int | None) -> dict[str, Any]:
     words = image.words
-    first = account_word(image, place)
+    first = tracker_word(image, place)
     received = words[first + RxWord.RECEIVED]
     bins = words[first + RxWord.JITTER : first + RxWord.JITTER + HISTOGRAM_BINS].tolist()
     age_ns = now_ns - words[first + RxWord.ARRIVED_AT_NS]

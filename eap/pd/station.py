@@ -17,19 +17,16 @@ from types import MappingProxyType
 import msgspec
 
 from eap.ids import InterfaceUri, NetId
-from eap.pd.answerer import Answerer
+from eap.pd.address import Learner, forget
 from eap.pd.device import Device, DeviceState
 from eap.pd.generator import Generators
-from eap.pd.image import Image
-from eap.pd.inputs import Inputs
-from eap.pd.learner import Learner, forget
-from eap.pd.link import Channel, CyclicBus, Taker
+from eap.pd.image import Image, Inputs
+from eap.pd.link import Channel, CyclicBus, StateChannel, Taker
 from eap.pd.links import Links
 from eap.pd.poll import questions_of, requests_at
-from eap.pd.publisher import FrameRow, Publisher
+from eap.pd.publisher import Answerer, FrameRow, Publisher
 from eap.pd.samples import Sampler
 from eap.pd.spec import EngineSource, PortKind, StationSpec, Writer
-from eap.pd.statechannel import StateChannel
 from eap.pd.subscriber import Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
 
@@ -240,7 +237,7 @@ class Station:
         """Return what *port* is connected to."""
         return self._ports[port][0]
 
-    def prepare_to_follow(
+    def prepare_handover(
         self, before: Station, channels: Mapping[str, Channel] = MappingProxyType({})
     ) -> None:
         """Be connected as *before* is, or to *channels*, and know the frames that it receives.
@@ -270,7 +267,7 @@ class Station:
         replaced = [subscriber.handle_timeout for subscriber in self._subscribers.values()]
         self._supervisors = [each for each in self._supervisors if each not in replaced]
         for port, subscriber in before._subscribers.items():
-            subscriber.become(self._subscribers[port], now_ns)
+            subscriber.swap_in(self._subscribers[port], now_ns)
             if subscriber.has_timeouts:
                 self._supervisors.append(subscriber.handle_timeout)
         self._subscribers, before._subscribers = before._subscribers, self._subscribers
@@ -287,14 +284,14 @@ class Station:
             self._teach(port)
         self._enter(before.device.state)
 
-    def dissolve(self) -> None:
+    def release(self) -> None:
         """Let go of all that it is made of, bit by bit; it has been followed by another one."""
         for _, publisher in self._ports.values():
             if publisher is not None:
-                publisher.dissolve()
+                publisher.release()
         for subscriber in self._subscribers.values():
-            subscriber.dissolve()
-        self.image.dissolve()
+            subscriber.release()
+        self.image.release()
 
     def cycle(self, due_ns: int, now_ns: int) -> None:
         """Run one cycle that was due at *due_ns*."""

@@ -1,4 +1,4 @@
-"""All subscriptions of one EAP port: which PDs of a frame are taken, and why the others are not.
+"""Receiving side of one EAP port: which PDs of a frame are taken, and why the others are not.
 
 Nothing a publisher sends raises: what is not taken is counted under its reason.  Data goes from
 the frame straight into the process image; state and counters live there too.
@@ -13,17 +13,15 @@ from types import MappingProxyType
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
-from eap.pd.account import Account, Timing
-from eap.pd.frame_plan import FramePlan, Refused, Taken
-from eap.pd.frame_walk import walk
+from eap.pd.address import SourceWatch
+from eap.pd.frame_plan import FramePlan, Refused, Taken, walk
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace
 from eap.pd.link import Origin
 from eap.pd.poll import Question, Requests
-from eap.pd.sourcewatch import SourceWatch
+from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import RxPdSpec
-from eap.pd.subscription import Subscription
-from eap.pd.substitute import SubstituteValue
+from eap.pd.subscription import Subscription, SubstituteValue
 from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
 
 _KEY = struct.Struct("<10s4x6s").unpack_from
@@ -47,6 +45,9 @@ _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
 class Subscriber:
     """Takes the frames of one port.
 
+    Channels hand their frames to it as long as the port exists; the subscriptions may be replaced
+    by others, with the image that they are in.
+
     Args:
         image: The station's process image.
         subscriptions: The port's RxPDs, each with its place.
@@ -63,32 +64,10 @@ class Subscriber:
         requests: Requests,
         questions: Mapping[str, Question] = MappingProxyType({}),
     ) -> None:
-        self._requests = requests
-        self._memory = image.memory
-        self._words = image.words
-        self._subscriptions = [
-            Subscription(
-                spec, place, SubstituteValue(image, place), questions.get(spec.poll_request)
-            )
-            for spec, place in subscriptions
-        ]
-        self._by_key: dict[tuple[bytes, int], list[Subscription]] = {}
-        self._by_id: dict[int, list[Subscription]] = {}
-        for subscription in self._subscriptions:
-            place = subscription.place
-            publisher = NetId.parse(place.publisher) if place.publisher else b""
-            self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
-            self._by_id.setdefault(place.pd_id, []).append(subscription)
-        timeouts = [s.timeout_ns for s in self._subscriptions if s.timeout_ns]
-        self._shortest_timeout_ns = min(timeouts, default=_NEVER)
-        self._sources = frozenset(s.source for s in self._subscriptions if s.source)
-        self._plans: dict[tuple[bytes, bytes], list[FramePlan]] = {}
-        self._watches: dict[tuple[bytes, bytes], SourceWatch] = {}
-        self._pds_planned = 0
+        self._table = SubscriptionTable(image, subscriptions, own_cycle_ns, requests, questions)
         self._open_from_ns = _NEVER
         self._closed_reason = Discard.SUPPRESSED
         self._next_timeout_ns = _NEVER
-        self._open_accounts(own_cycle_ns)
 
     def open(self, from_ns: int) -> None:
         """Take what arrives from now on; what arrived earlier is stale (the station is in Op)."""
@@ -98,8 +77,8 @@ class Subscriber:
 
     def resume(self, from_ns: int) -> None:
         """Take what arrives from now on, after :meth:`close`; nothing was missed meanwhile."""
-        for account in {subscription.account for subscription in self._subscriptions}:
-            account.pause()
+        for tracker in {subscription.tracker for subscription in self._table.subscriptions}:
+            tracker.pause()
         self.open(from_ns)
 
     def close(self) -> None:
@@ -110,66 +89,58 @@ class Subscriber:
 
     def learn_from(self, before: Subscriber) -> None:
         """Plan for all layouts of frames that *before* knows, so that none is new."""
-        for plans in list(before._plans.values()):
-            for plan in list(plans):
-                self._learn(plan.example(), plan.end, plan.watch.source or b"", 0)
+        self._table.learn_from(before._table)
 
-    def become(self, after: Subscriber, now_ns: int) -> None:
-        """Exchange subscriptions, image and accounts with *after*.
+    def swap_in(self, after: Subscriber, now_ns: int) -> None:
+        """Go on with the subscriptions of *after*, which gets those of this one.
 
-        Whoever hands frames to this one goes on doing so; whether it is open stays as it is.
+        Whether this one is open stays as it is.
         """
-        mine = dict(vars(self))
-        vars(self).update(vars(after))
-        vars(after).update(mine)
-        self._open_from_ns, self._closed_reason = after._open_from_ns, after._closed_reason
+        self._table, after._table = after._table, self._table
         if self._open_from_ns != _NEVER:
             # What is new, or has another time-out now, has at least that long.
-            following_ns = now_ns + self._shortest_timeout_ns
-            self._next_timeout_ns = min(after._next_timeout_ns, following_ns)
+            following_ns = now_ns + self._table.shortest_timeout_ns
+            self._next_timeout_ns = min(self._next_timeout_ns, following_ns)
 
-    def dissolve(self) -> None:
-        """Let go of all subscriptions, one by one: freeing many keeps others from running."""
-        for container in (self._by_key, self._by_id, self._plans, self._watches):
-            while container:
-                container.popitem()
-        while self._subscriptions:
-            self._subscriptions.pop()
+    def release(self) -> None:
+        """Let go of all subscriptions bit by bit."""
+        self._table.release()
 
     def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
         """Take one EtherCAT frame of *size* octets that arrived at *at_ns* from *origin*."""
         source = origin.source_of(data)
-        plan = self._find_plan(data, size, source, at_ns) or self._learn(data, size, source, at_ns)
+        table = self._table
+        plan = table.find_plan(data, size, source, at_ns) or table.learn(data, size, source, at_ns)
         if plan is None:
             return
         if at_ns < self._open_from_ns:
-            self._discard(self._closed_reason, len(plan.expected), plan.taken_words)
+            table.discard(self._closed_reason, len(plan.expected), plan.taken_words)
             return
-        for account in plan.roaming:
-            account.follow(plan.publisher)
-        words, memory = self._words, self._memory
+        for tracker in plan.roaming:
+            tracker.follow(plan.publisher)
+        words, memory = table.words, table.memory
         # A frame taken outside the station's own cycle has to mark the region as changing itself.
         outside = not words[_SEQUENCE] & 1
         if outside:
             words[_SEQUENCE] += 1
         (cycle,) = _CYCLE_COUNTER(data, CYCLE_OFFSET)
         own_cycle = words[_CYCLE] + outside
-        for account, copies in plan.parts:
-            if account.arrived(cycle, at_ns, own_cycle):
+        for tracker, copies in plan.parts:
+            if tracker.arrived(cycle, at_ns, own_cycle):
                 for piece, target in copies:
                     memory[target] = data[piece]
         if plan.has_more:
             plan.copy_alternates(data, cycle, memory)
-            self._refuse(plan, at_ns)
-            self._enter_answers(plan, cycle, at_ns)
-            self._note_requests(plan, cycle, data, origin)
+            table.refuse(plan, at_ns)
+            table.enter_answers(plan, cycle, at_ns)
+            table.note_requests(plan, cycle, data, origin)
         if outside:
             words[_SEQUENCE] += 1
 
     @property
     def has_timeouts(self) -> bool:
         """Whether any subscription has one: otherwise handle_timeout() need not be called."""
-        return self._shortest_timeout_ns != _NEVER
+        return self._table.shortest_timeout_ns != _NEVER
 
     def next_timeout(self) -> int | None:
         """Return when handle_timeout() has to be called, None for never."""
@@ -183,12 +154,12 @@ class Subscriber:
         if now_ns < self._next_timeout_ns:
             return
         following = _NEVER
-        expired: dict[Account, list[Subscription]] = {}
-        for subscription in self._subscriptions:
-            timeout_ns, account = subscription.timeout_ns, subscription.account
+        expired: dict[SequenceTracker, list[Subscription]] = {}
+        for subscription in self._table.subscriptions:
+            timeout_ns, tracker = subscription.timeout_ns, subscription.tracker
             if not timeout_ns:
                 continue
-            if account.state is not RxState.RUNNING:
+            if tracker.state is not RxState.RUNNING:
                 # It may start to run at any moment, and then has this long.
                 following = min(following, now_ns + timeout_ns)
                 continue
@@ -196,19 +167,77 @@ class Subscriber:
             if deadline_ns is None:
                 following = min(following, now_ns + timeout_ns)
             elif deadline_ns <= now_ns:
-                expired.setdefault(account, []).append(subscription)
+                expired.setdefault(tracker, []).append(subscription)
                 following = min(following, now_ns + timeout_ns)
             else:
                 following = min(following, deadline_ns)
-        for account, subscriptions in expired.items():
-            account.time_out()
+        for tracker, subscriptions in expired.items():
+            tracker.time_out()
             for subscription in subscriptions:
                 subscription.substitute.apply()
         self._next_timeout_ns = following
 
-    def _find_plan(
-        self, data: memoryview, size: int, source: bytes, at_ns: int
-    ) -> FramePlan | None:
+
+class SubscriptionTable:
+    """The subscriptions of a port in one image, and the plans of the frames that come for them.
+
+    Arguments as for :class:`Subscriber`.
+
+    Attributes:
+        memory: Of the image.
+        words: Of the image.
+        subscriptions: All of them.
+        shortest_timeout_ns: Of theirs; never if they have none.
+    """
+
+    def __init__(
+        self,
+        image: Image,
+        subscriptions: Iterable[tuple[RxPdSpec, RxPlace]],
+        own_cycle_ns: int,
+        requests: Requests,
+        questions: Mapping[str, Question],
+    ) -> None:
+        self._requests = requests
+        self.memory = image.memory
+        self.words = image.words
+        self.subscriptions = [
+            Subscription(
+                spec, place, SubstituteValue(image, place), questions.get(spec.poll_request)
+            )
+            for spec, place in subscriptions
+        ]
+        self._by_key: dict[tuple[bytes, int], list[Subscription]] = {}
+        self._by_id: dict[int, list[Subscription]] = {}
+        for subscription in self.subscriptions:
+            place = subscription.place
+            publisher = NetId.parse(place.publisher) if place.publisher else b""
+            self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
+            self._by_id.setdefault(place.pd_id, []).append(subscription)
+        timeouts = [s.timeout_ns for s in self.subscriptions if s.timeout_ns]
+        self.shortest_timeout_ns = min(timeouts, default=_NEVER)
+        self._sources = frozenset(s.source for s in self.subscriptions if s.source)
+        self._plans: dict[tuple[bytes, bytes], list[FramePlan]] = {}
+        self._watches: dict[tuple[bytes, bytes], SourceWatch] = {}
+        self._pds_planned = 0
+        self._open_trackers(own_cycle_ns)
+
+    def learn_from(self, before: SubscriptionTable) -> None:
+        """Plan for all layouts of frames that *before* knows, so that none is new."""
+        for plans in list(before._plans.values()):
+            for plan in list(plans):
+                self.learn(plan.example(), plan.end, plan.watch.source or b"", 0)
+
+    def release(self) -> None:
+        """Let go of all subscriptions, one by one: freeing many keeps others from running."""
+        for container in (self._by_key, self._by_id, self._plans, self._watches):
+            while container:
+                container.popitem()
+        while self.subscriptions:
+            self.subscriptions.pop()
+
+    def find_plan(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
+        """Return the plan of a frame's layout, None if it is not known yet."""
         if size >= _SHORTEST:
             for plan in self._plans.get(_KEY(data), ()):
                 if plan.end <= size and (
@@ -219,11 +248,11 @@ class Subscriber:
                         return plan
         return None
 
-    def _learn(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
+    def learn(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
         """Make the plan of a layout not seen before from *source*, None without PDs."""
         pds = walk(data, size)
         if isinstance(pds, Discard):
-            self._discard(pds, 1)
+            self.discard(pds, 1)
             return None
         if not pds:
             return None  # nothing to take: what is kept is bounded by the PDs of all layouts
@@ -237,7 +266,7 @@ class Subscriber:
             else:
                 chosen += [(subscription, header, offset) for subscription in match]
         taking = [subscription for subscription, _, _ in chosen]
-        if self._part_accounts(set(taking)):
+        if self._part_trackers(set(taking)):
             self._forget_plans()
         plan = FramePlan(
             PD_FRAME_START + EtherCatHeader.decode(data).length,
@@ -246,10 +275,10 @@ class Subscriber:
             refused,
             watch=self._watch(publisher, source, at_ns, taking, refused),
             requests=[
-                (s.account, s.place.name) for s in taking if s.place.name in self._requests.names
+                (s.tracker, s.place.name) for s in taking if s.place.name in self._requests.names
             ],
-            answers=[(s.account, s.answer) for s in taking if s.answer is not None],
-            roaming={s.account for s in taking if not s.place.publisher},
+            answers=[(s.tracker, s.answer) for s in taking if s.answer is not None],
+            roaming={s.tracker for s in taking if not s.place.publisher},
             publisher=publisher,
         )
         if self._pds_planned > _PDS_PLANNED:
@@ -273,7 +302,7 @@ class Subscriber:
         expected = source if source in self._sources else b""
         watch = self._watches.get((publisher, expected))
         if watch is None:
-            watch = SourceWatch(self._words, expected, self._sources)
+            watch = SourceWatch(self.words, expected, self._sources)
             self._watches[publisher, expected] = watch
         if source != watch.source:
             watch.includes(source, at_ns)
@@ -301,14 +330,16 @@ class Subscriber:
         fitting = [candidate for candidate, reason in misfits if reason is None]
         return fitting or _refuse_all([(c, reason) for c, reason in misfits if reason is not None])
 
-    def _discard(self, reason: Discard, count: int, subscriptions: Iterable[int] = ()) -> None:
+    def discard(self, reason: Discard, count: int, subscriptions: Iterable[int] = ()) -> None:
+        """Count *count* PDs under *reason*, for the station and for *subscriptions*."""
         index = DISCARD_INDEX[reason]
-        self._words[StationWord.DISCARDED + index] += count
+        self.words[StationWord.DISCARDED + index] += count
         for first_word in subscriptions:
-            self._words[first_word + RxWord.DISCARDED + index] += 1
+            self.words[first_word + RxWord.DISCARDED + index] += 1
 
-    def _refuse(self, plan: FramePlan, at_ns: int) -> None:
-        words = self._words
+    def refuse(self, plan: FramePlan, at_ns: int) -> None:
+        """Count the PDs of a frame that nobody takes."""
+        words = self.words
         for pd in plan.refused:
             for counter in pd.counters:
                 words[counter] += 1
@@ -318,33 +349,35 @@ class Subscriber:
             for first_word in pd.wrong_source:
                 words[first_word + RxWord.WRONG_SOURCE_AT_NS] = at_ns
 
-    def _enter_answers(self, plan: FramePlan, cycle: int, at_ns: int) -> None:
-        entered: set[Account] = set()
-        for account, answer in plan.answers:
-            if not account.has_taken(cycle):
+    def enter_answers(self, plan: FramePlan, cycle: int, at_ns: int) -> None:
+        """Enter how long the answers in a frame took."""
+        entered: set[SequenceTracker] = set()
+        for tracker, answer in plan.answers:
+            if not tracker.has_taken(cycle):
                 continue
             response_ns = answer.question.answered(answer.name, at_ns)
-            self._words[answer.words + RxWord.RESPONSE_NS] = response_ns or 0
-            if response_ns is not None and account not in entered:
-                entered.add(account)
-                account.enter_response(response_ns)
+            self.words[answer.words + RxWord.RESPONSE_NS] = response_ns or 0
+            if response_ns is not None and tracker not in entered:
+                entered.add(tracker)
+                tracker.enter_response(response_ns)
 
-    def _note_requests(self, plan: FramePlan, cycle: int, data: memoryview, origin: Origin) -> None:
-        names = [name for account, name in plan.requests if account.has_taken(cycle)]
+    def note_requests(self, plan: FramePlan, cycle: int, data: memoryview, origin: Origin) -> None:
+        """Note who asks with a frame."""
+        names = [name for tracker, name in plan.requests if tracker.has_taken(cycle)]
         if not names:
             return
         sender = origin.sender_of(data)
         if not sender or not self._requests.add(sender, names):
             reason = Discard.TOO_MANY_REQUESTS if sender else Discard.NO_SENDER
-            refused = [s.place.words for s in self._subscriptions if s.place.name in names]
-            self._discard(reason, len(names), refused)
+            refused = [s.place.words for s in self.subscriptions if s.place.name in names]
+            self.discard(reason, len(names), refused)
 
-    def _open_accounts(self, own_cycle_ns: int) -> None:
-        """Find the accounts that an earlier engine left in the image, or start new ones."""
-        accounts: dict[object, Account] = {}
-        for subscription in self._subscriptions:
+    def _open_trackers(self, own_cycle_ns: int) -> None:
+        """Find the trackers that an earlier engine left in the image, or start new ones."""
+        trackers: dict[object, SequenceTracker] = {}
+        for subscription in self.subscriptions:
             place = subscription.place
-            first_word = self._words[place.words + RxWord.ACCOUNT]
+            first_word = self.words[place.words + RxWord.TRACKER]
             timing = Timing(
                 step=place.step,
                 sender_cycle_ns=place.sender_cycle_us * 1000,
@@ -363,27 +396,27 @@ class Subscriber:
                 if place.publisher
                 else place.name
             )
-            if history not in accounts:
-                accounts[history] = Account(self._words, first_word or place.words, timing)
-            self._assign(subscription, accounts[history])
+            if history not in trackers:
+                trackers[history] = SequenceTracker(self.words, first_word or place.words, timing)
+            self._assign(subscription, trackers[history])
 
-    def _assign(self, subscription: Subscription, account: Account) -> None:
-        subscription.account = account
-        self._words[subscription.place.words + RxWord.ACCOUNT] = account.first_word
+    def _assign(self, subscription: Subscription, tracker: SequenceTracker) -> None:
+        subscription.tracker = tracker
+        self.words[subscription.place.words + RxWord.TRACKER] = tracker.first_word
 
-    def _part_accounts(self, arriving: set[Subscription]) -> bool:
-        """Give PDs that arrive without the others of their account one of their own."""
+    def _part_trackers(self, arriving: set[Subscription]) -> bool:
+        """Give PDs that arrive without the others of their tracker one of their own."""
         parted = False
-        for account in {subscription.account for subscription in arriving}:
-            members = [s for s in self._subscriptions if s.account is account]
+        for tracker in {subscription.tracker for subscription in arriving}:
+            members = [s for s in self.subscriptions if s.tracker is tracker]
             here = [s for s in members if s in arriving]
             if len(here) == len(members):
                 continue
             parted = True
             # Whoever owns the block keeps it; the others move to the block of their first.
-            owner_arrives = any(s.place.words == account.first_word for s in here)
+            owner_arrives = any(s.place.words == tracker.first_word for s in here)
             leaving = [s for s in members if s not in arriving] if owner_arrives else here
-            new = account.part(self._words, leaving[0].place.words)
+            new = tracker.part(self.words, leaving[0].place.words)
             for subscription in leaving:
                 self._assign(subscription, new)
         return parted
@@ -398,7 +431,7 @@ def _take(subscription: Subscription, header: PdHeader, offset: int) -> Taken:
     place = subscription.place
     alternate = subscription.alternates.get((header.version, header.length))
     size = PdHeader.SIZE + place.size
-    return Taken(subscription.account, place.words, offset, place.offset, size, alternate)
+    return Taken(subscription.tracker, place.words, offset, place.offset, size, alternate)
 
 
 def _refuse_all(reasons: list[tuple[Subscription, Discard]]) -> Refused:

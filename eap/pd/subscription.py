@@ -1,13 +1,15 @@
-"""One RxPD at run time: what fits it, and when its data is too old."""
+"""One RxPD at run time: what fits it, when its data is too old, and what replaces it then."""
 
 from __future__ import annotations
 
-from eap.pd.account import Account
+from eap.codec import datatypes
+from eap.codec.pd import PdHeader
 from eap.pd.address import source_octets
+from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxPlace
 from eap.pd.poll import Answer, Question
-from eap.pd.spec import RxPdSpec
-from eap.pd.substitute import SubstituteValue
+from eap.pd.sequence import SequenceTracker
+from eap.pd.spec import RxPdSpec, Substitute
 from eap.pd.words import Discard
 
 
@@ -21,14 +23,13 @@ class Subscription:
         question: What asks for it; None if it comes by itself.
 
     Attributes:
-        account: Where its arrivals are entered; the subscriber opens it.
+        tracker: Where its arrivals are entered; the subscriber opens it.
         alternates: What copies another layout that is taken as well, by version and length.
         answer: What it is to its question; None if it comes by itself.
         source: The address that its frames must come from; empty for any.
     """
 
     __slots__ = (
-        "account",
         "alternates",
         "answer",
         "ignore_version",
@@ -36,6 +37,7 @@ class Subscription:
         "source",
         "substitute",
         "timeout_ns",
+        "tracker",
     )
 
     def __init__(
@@ -52,7 +54,7 @@ class Subscription:
         self.timeout_ns = spec.timeout_ms * 1_000_000
         self.substitute = substitute
         self.source = source_octets(spec.source) if spec.source else b""
-        self.account: Account
+        self.tracker: SequenceTracker
 
     def mismatch(self, version: int, length: int, source: bytes) -> Discard | None:
         """Return why such a PD from the address *source* does not fit, None if it does."""
@@ -68,7 +70,37 @@ class Subscription:
 
     def deadline_ns(self) -> int | None:
         """Return when its data is too old, None while that cannot be: nobody asked again."""
-        since_ns: int | None = self.account.arrived_at_ns
+        since_ns: int | None = self.tracker.arrived_at_ns
         if self.answer is not None:
             since_ns = self.answer.question.waiting_since(self.answer.name)
         return None if since_ns is None else since_ns + self.timeout_ns
+
+
+class SubstituteValue:
+    """The octets that replace a PD's data after its time-out; with HOLD there are none."""
+
+    def __init__(self, image: Image, place: RxPlace) -> None:
+        start = place.offset + PdHeader.SIZE
+        self._memory = image.memory
+        self._data = slice(start, start + place.size)
+        self._octets = _octets(image, place)
+
+    def apply(self) -> None:
+        """Put the substitute in the place of the data."""
+        if self._octets is not None:
+            self._memory[self._data] = self._octets
+
+
+def _octets(image: Image, place: RxPlace) -> bytes | None:
+    if place.substitute is Substitute.HOLD:
+        return None
+    if place.substitute is Substitute.ZERO:
+        return bytes(place.size)
+    octets = memoryview(bytearray(place.size))
+    start = 8 * (place.offset + PdHeader.SIZE)
+    for name in place.variables:
+        variable = image.places[name]
+        kind = datatypes.parse(variable.type)
+        value = kind.encode(default_value(variable))
+        put(octets, variable.bit_offset - start, kind.bit_length, value)
+    return bytes(octets)

@@ -130,7 +130,7 @@ class TxWord(IntEnum):
     SKIPPED = 0
     """Due, but suppressed, or its frame was."""
     LAST_REASON = 1
-    """Index into REASONS of the last time it was sent on its own account."""
+    """Index into REASONS of the last time it was sent on its own."""
     SENT_AT_NS = 2
     UNSENT_AT_NS = 3
     """When it was due last and not sent; VarState follows from it (outcome.py)."""
@@ -139,13 +139,13 @@ class TxWord(IntEnum):
 
 
 class RxWord(IntEnum):
-    """The block of an RxPD: what is its own, then the account that it may share.
+    """The block of an RxPD: what is its own, then the tracker that it may share.
 
-    PDs that have always arrived together share one account; ACCOUNT says whose block holds it.
+    PDs that have always arrived together share one tracker; TRACKER says whose block holds it.
     """
 
-    ACCOUNT = 0
-    """Index of the first word of the block that holds the account."""
+    TRACKER = 0
+    """Index of the first word of the block that holds the tracker."""
     MISMATCH = 1
     """VarState: bit 0 version, bit 1 length, of the last PD refused."""
     MISMATCH_AT_NS = 2
@@ -179,15 +179,15 @@ class RxWord(IntEnum):
     """Bit n: of the PDs counted as lost, the one n + 1 steps before HOLES_BELOW may still come."""
     HOLES_BELOW = RECEIVED + 12
     SENDER = RECEIVED + 13
-    """With any publisher: the NetID that the account follows, as a number."""
+    """With any publisher: the NetID that the tracker follows, as a number."""
     JITTER_MAX_US = RECEIVED + 14
     """This and JITTER: deviation from the sender's rhythm; of answers the time they took."""
     JITTER = RECEIVED + 15
     SIZE = JITTER + HISTOGRAM_BINS
 
 
-ACCOUNT_START = RxWord.RECEIVED
-"""First word of the account within an RxPD's block; it reaches to the end of the block."""
+TRACKER_START = RxWord.RECEIVED
+"""First word of the tracker within an RxPD's block; it reaches to the end of the block."""
 
 
 class RxState(IntEnum):

@@ -10,6 +10,7 @@ from eap.device.rollout import steps
 from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
 from eap.pd.engine import Engine
+from eap.pd.handover import ImageHandover
 from eap.pd.report import station_status
 from eap.pd.spec import (
     CounterSource,
@@ -21,7 +22,6 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import Station
-from eap.pd.succession import ImageSuccession
 from tests.support.cyclic import MS, eap_port, image_of
 
 NAMES = ("a", "b", "c", "d")
@@ -103,12 +103,12 @@ class Line:
         """Let one station run *spec* from its next cycle on, as the engine does."""
         before = self.stations[name]
         image = image_of(spec)
-        images = ImageSuccession(before.image, image)
+        images = ImageHandover(before.image, image)
         images.carry_words()
         images.carry_values(before.inputs.memory)
         station = Station(spec, image, lambda: None)
-        station.prepare_to_follow(before)
-        images.settle()
+        station.prepare_handover(before)
+        images.commit()
         images.carry_words()
         images.carry_values(before.inputs.memory)
         station.follow(before, self.now)

@@ -123,7 +123,7 @@ class Receiver:
         place = self.place(name)
         first = place.words
         if word >= RxWord.RECEIVED:
-            first = self.image.words[place.words + RxWord.ACCOUNT]
+            first = self.image.words[place.words + RxWord.TRACKER]
         return self.image.words[first + word]
 
     def discarded(self, name: str | None = None) -> dict[str, int]:

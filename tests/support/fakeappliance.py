@@ -184,7 +184,7 @@ def _receive(file: ImageFile) -> None:
     image.words[StationWord.CYCLE] = 1000
     image.words[StationWord.STATE] = 8
     for place in image.layout.rx:
-        image.words[place.words + RxWord.ACCOUNT] = place.words
+        image.words[place.words + RxWord.TRACKER] = place.words
     left = image.layout.rx[0].words
     image.words[left + RxWord.RECEIVED] = 5
     image.words[left + RxWord.ARRIVED_IN_CYCLE] = 997

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import msgspec
 
 from eap.codec.pd import iter_pds
+from eap.pd.handover import ImageHandover
 from eap.pd.image import Image
 from eap.pd.link import OutFrame
 from eap.pd.spec import (
@@ -21,7 +22,6 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import Station
-from eap.pd.succession import ImageSuccession
 from eap.pd.words import StationWord
 from tests.support.cyclic import (
     PEER,
@@ -111,11 +111,11 @@ def set_value(image: Image, name: str, value: int) -> None:
 
 def succeed(before: Station, spec: StationSpec) -> Station:
     """Configure a station anew between two cycles, as the engine does."""
-    images = ImageSuccession(before.image, image_of(spec))
+    images = ImageHandover(before.image, image_of(spec))
     images.carry_words()
     after = Station(spec, images._new, lambda: None)
-    after.prepare_to_follow(before)
-    images.settle()
+    after.prepare_handover(before)
+    images.commit()
     images.carry_words()
     after.follow(before, 0)
     return after
@@ -124,12 +124,12 @@ def succeed(before: Station, spec: StationSpec) -> Station:
 def succeed_with_values(before: Station, spec: StationSpec, now_ns: int = 0) -> Station:
     """Configure a station anew, its variables included."""
     image = image_of(spec)
-    images = ImageSuccession(before.image, image)
+    images = ImageHandover(before.image, image)
     images.carry_words()
     images.carry_values(before.inputs.memory)
     after = Station(spec, image, lambda: None)
-    after.prepare_to_follow(before)
-    images.settle()
+    after.prepare_handover(before)
+    images.commit()
     images.carry_words()
     before.inputs.refresh()
     images.carry_values(before.inputs.memory)

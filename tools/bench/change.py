@@ -120,7 +120,7 @@ def _change(place: EngineStation, engine: Engine, spec: Any) -> Change:
     for _ in range(2):
         engine.handle_timeout(engine.next_timeout())
         times.append(perf_counter_ns())
-    before.dissolve()
+    before.release()
     return Change(*(end - begin for begin, end in pairwise(times)))
 
 

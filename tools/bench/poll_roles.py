@@ -11,7 +11,7 @@ from typing import Any
 from eap.net import realtime
 from eap.net.ticker import Ticker
 from eap.pd.engine import Engine
-from eap.pd.report import account_word, station_status
+from eap.pd.report import station_status, tracker_word
 from eap.pd.spec import (
     REQUESTER,
     CounterSource,
@@ -46,7 +46,7 @@ def ask(job: dict[str, Any]) -> None:
         end_ns = monotonic_ns() + int(job["seconds"] * 1e9)
         while monotonic_ns() < end_ns:
             step()
-            first = account_word(made.file.image, place)
+            first = tracker_word(made.file.image, place)
             if words[first + RxWord.RECEIVED] != received:
                 received = words[first + RxWord.RECEIVED]
                 trips.append((words[first + RxWord.ARRIVED_IN_CYCLE] - 1) % EVERY + 1)

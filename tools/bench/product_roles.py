@@ -14,7 +14,7 @@ from typing import Any
 from eap.net.image_file import open_image
 from eap.net.ticker import Ticker
 from eap.pd.engine import Engine
-from eap.pd.report import account_word
+from eap.pd.report import tracker_word
 from eap.pd.words import RxWord
 from tools.bench.network import Page
 from tools.bench.pacing import BURST, answer, send_for
@@ -51,7 +51,7 @@ def publish(job: dict[str, Any]) -> None:
                 cycle(now_ns, now_ns)
 
         def arrived() -> int:
-            first = account_word(far.image, place)
+            first = tracker_word(far.image, place)
             return int(words[first + RxWord.RECEIVED]) * shape.frames
 
         seconds = send_for(job["seconds"], send_burst, arrived)

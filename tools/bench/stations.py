@@ -13,7 +13,7 @@ from eap.net.image_file import ImageFile, create_image
 from eap.net.packetsocket import open_packet_pair
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
-from eap.pd.report import account_word
+from eap.pd.report import tracker_word
 from eap.pd.spec import (
     PortKind,
     PortSpec,
@@ -142,7 +142,7 @@ def frames_sent(image: Image) -> int:
 def frames_received(image: Image, shape: Shape) -> tuple[int, int]:
     """Return how many frames were taken and how many were lost, by the subscriber's counters."""
     first_of_frames = image.layout.rx[:: shape.pds]
-    accounts = [account_word(image, place) for place in first_of_frames]
+    accounts = [tracker_word(image, place) for place in first_of_frames]
     received = sum(image.words[first + RxWord.RECEIVED] for first in accounts)
     return received, sum(image.words[first + RxWord.LOST] for first in accounts)
 

@@ -71,7 +71,7 @@ class _Job:
         self._taken.acquire()
         self.successor = None
         if self._before is not None:
-            self._before.dissolve()
+            self._before.release()
             self._before = None
         tell()
 

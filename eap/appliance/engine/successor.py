@@ -13,10 +13,10 @@ from eap.errors import EngineRefusedError
 from eap.net.image_file import ImageFile, prepare_image
 from eap.net.tcpport import TcpPort
 from eap.pd.engine import Engine
+from eap.pd.handover import ImageHandover, needs_new_start
 from eap.pd.layout import plan_layout
 from eap.pd.spec import StationSpec
 from eap.pd.station import Station
-from eap.pd.succession import ImageSuccession, needs_new_start
 
 
 class EngineStation:
@@ -57,13 +57,13 @@ class Successor:
         self._file = prepare_image(place.file.path, plan_layout(spec), place.file.generation + 1)
         try:
             image = self._file.image
-            self._images = ImageSuccession(before.image, image)
+            self._images = ImageHandover(before.image, image)
             self._images.carry_words()
             self._images.carry_values(before.inputs.memory)
             self._station = Station(spec, image, self._file.wake_waiters)
             self._tcp_ports = _new_tcp_ports(place, spec)
-            self._station.prepare_to_follow(before, self._tcp_ports)
-            self._images.settle()
+            self._station.prepare_handover(before, self._tcp_ports)
+            self._images.commit()
             memory_of = self._station.memory_of
             self._mappings: list[tuple[EngineBus, BusMapping]] = []
             for port in spec.ports:

@@ -20,7 +20,7 @@ from eap.errors import ControlError, WriterConflictError
 from eap.near import near
 from eap.pd.image import Image
 from eap.pd.layout import VariablePlace
-from eap.pd.report import account_word, pd_list, quality
+from eap.pd.report import pd_list, quality, tracker_word
 from eap.pd.spec import Writer
 from eap.pd.words import RxWord, StationWord
 
@@ -219,7 +219,7 @@ def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
     """Return the quality of those of *names* that are received, None before the first time."""
     qualities: dict[str, int | None] = {}
     for rx in image.layout.rx:
-        received = image.words[account_word(image, rx) + RxWord.RECEIVED]
+        received = image.words[tracker_word(image, rx) + RxWord.RECEIVED]
         value = quality(image, rx) if received else None
         qualities.update((name, value) for name in rx.variables if name in names)
     return qualities

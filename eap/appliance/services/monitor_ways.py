@@ -15,7 +15,7 @@ from eap.ids import Destination
 from eap.net.arpprobe import ArpProber
 from eap.net.neighbour import NeighbourTable
 from eap.net.udperrors import ERRORS_PER_CALL, enable_errors, take_errors
-from eap.pd.presence import Evidence
+from eap.pd.monitor import Evidence
 
 logger = logging.getLogger(__name__)
 

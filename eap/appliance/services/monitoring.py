@@ -22,8 +22,7 @@ from eap.net.arpprobe import ArpProber
 from eap.pd.address import from_word
 from eap.pd.image import Image
 from eap.pd.layout import FramePlace
-from eap.pd.monitor import MonitorTarget, PresenceChanged, SubscriberMonitor
-from eap.pd.presence import Evidence, Presence
+from eap.pd.monitor import Evidence, MonitorTarget, Presence, PresenceChanged, SubscriberMonitor
 from eap.pd.words import FrameWord
 
 logger = logging.getLogger(__name__)

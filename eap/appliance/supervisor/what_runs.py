@@ -10,11 +10,11 @@ from eap.appliance.handover import Handover
 from eap.appliance.store import effective
 from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
+from eap.pd.handover import needs_new_start
 from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, StationSpec
 from eap.pd.station import Station
-from eap.pd.succession import needs_new_start
 
 logger = logging.getLogger(__name__)
 

@@ -131,6 +131,6 @@ def _counted() -> int:
     words = _IMAGE.words
     total = sum(words[StationWord.DISCARDED : StationWord.DISCARDED + len(DISCARDS)])
     for place in _LAYOUT.rx:
-        first = words[place.words + RxWord.ACCOUNT]
+        first = words[place.words + RxWord.TRACKER]
         total += words[first + RxWord.RECEIVED] + words[first + RxWord.REORDERED]
     return total

@@ -16,8 +16,7 @@ from eap.codec.values import DataType
 from eap.errors import ImageError
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import Live
-from eap.pd import outcome
-from eap.pd.frame_status import frame_state
+from eap.pd.frame_status import frame_state, tx_var_state
 from eap.pd.image import Image
 from eap.pd.layout import (
     FRAME_CTRL,
@@ -27,7 +26,7 @@ from eap.pd.layout import (
     RxPlace,
     TxPlace,
 )
-from eap.pd.report import account_word, quality, tx_status, var_state
+from eap.pd.report import quality, tracker_word, tx_status, var_state
 from eap.pd.words import (
     DISCARD_INDEX,
     REASON_INDEX,
@@ -149,8 +148,8 @@ def _control(suffix: str) -> Callable[[Image, FramePlace | TxPlace], int]:
     return lambda image, place: int(image.read(place.name + suffix))
 
 
-def _account(word: RxWord) -> Callable[[Image, RxPlace], int]:
-    return lambda image, place: int(image.words[account_word(image, place) + word])
+def _tracked(word: RxWord) -> Callable[[Image, RxPlace], int]:
+    return lambda image, place: int(image.words[tracker_word(image, place) + word])
 
 
 def _discarded(reason: Discard) -> Callable[[Image, RxPlace], int]:
@@ -159,12 +158,12 @@ def _discarded(reason: Discard) -> Callable[[Image, RxPlace], int]:
 
 
 def _quality(image: Image, place: RxPlace) -> int:
-    return quality(image, place) if _account(RxWord.RECEIVED)(image, place) else _NEVER
+    return quality(image, place) if _tracked(RxWord.RECEIVED)(image, place) else _NEVER
 
 
 def _cycle_index(image: Image, place: RxPlace) -> int:
-    last = _account(RxWord.LAST_CYCLE)(image, place)
-    return last & 0xFFFF if _account(RxWord.RECEIVED)(image, place) else 0
+    last = _tracked(RxWord.LAST_CYCLE)(image, place)
+    return last & 0xFFFF if _tracked(RxWord.RECEIVED)(image, place) else 0
 
 
 _CONTROLS = frozenset((Live.FRAME_CTRL, Live.TX_VAR_CTRL))
@@ -188,7 +187,7 @@ _OF_FRAME: dict[str, Callable[[Image, FramePlace], int]] = {
     Live.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
 }
 _OF_TX: dict[str, Callable[[Image, TxPlace], int]] = {
-    Live.TX_VAR_STATE: lambda image, place: outcome.var_state(image.words, place),
+    Live.TX_VAR_STATE: lambda image, place: tx_var_state(image.words, place),
     Live.TX_VAR_CTRL: _control(VAR_CTRL),
     Live.TX_LAST_REASON: _last_reason,
     Live.TX_SKIPPED: _tx_word(TxWord.SKIPPED),
@@ -197,12 +196,12 @@ _OF_RX: dict[str, Callable[[Image, RxPlace], int]] = {
     Live.RX_QUALITY: _quality,
     Live.RX_CYCLE_INDEX: _cycle_index,
     Live.RX_VAR_STATE: var_state,
-    Live.RX_STATE: _account(RxWord.STATE),
-    Live.RX_RECEIVED: _account(RxWord.RECEIVED),
-    Live.RX_LOST: _account(RxWord.LOST),
-    Live.RX_DUPLICATED: _account(RxWord.DUPLICATED),
-    Live.RX_REORDERED: _account(RxWord.REORDERED),
-    Live.RX_LATE: _account(RxWord.LATE),
-    Live.RX_TIMEOUTS: _account(RxWord.TIMEOUTS),
-    Live.RX_JITTER_MAX: _account(RxWord.JITTER_MAX_US),
+    Live.RX_STATE: _tracked(RxWord.STATE),
+    Live.RX_RECEIVED: _tracked(RxWord.RECEIVED),
+    Live.RX_LOST: _tracked(RxWord.LOST),
+    Live.RX_DUPLICATED: _tracked(RxWord.DUPLICATED),
+    Live.RX_REORDERED: _tracked(RxWord.REORDERED),
+    Live.RX_LATE: _tracked(RxWord.LATE),
+    Live.RX_TIMEOUTS: _tracked(RxWord.TIMEOUTS),
+    Live.RX_JITTER_MAX: _tracked(RxWord.JITTER_MAX_US),
 } | {key: _discarded(reason) for reason in Discard if (key := f"rx_discarded_{reason}") in _KINDS}

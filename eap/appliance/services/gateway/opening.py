@@ -17,7 +17,7 @@ from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.gateway.address import AddressMap, Group, RemoteSlave, Slave
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
-from eap.pd.gateway import GatewayAddress, GatewaySpec
+from eap.pd.spec import GatewayAddress, GatewaySpec
 
 _MS = 1000
 

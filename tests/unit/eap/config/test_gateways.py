@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.pd.gateway import GatewayAddress
+from eap.pd.spec import GatewayAddress
 from tests.unit.eap.config.test_check_gateways import OTHER, bus, with_gateway
 
 SAID = "{silent: true, answer_ms: 50, addresses: {0x9000: valves, 9: right/bus0/valves, 0xA: [9]}}"

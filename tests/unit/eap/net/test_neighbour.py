@@ -8,7 +8,7 @@ import pytest
 
 from eap.ids import MacAddr
 from eap.net.neighbour import Neighbour, NeighbourState, NeighbourTable, Route, RouteKind
-from eap.pd.presence import Evidence
+from eap.pd.monitor import Evidence
 from tests.unit.eap.net.conftest import ip
 
 pytestmark = [pytest.mark.net, pytest.mark.root]

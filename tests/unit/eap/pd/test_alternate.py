@@ -13,8 +13,7 @@ from eap.codec import datatypes, pdo
 from eap.codec.pd import PdHeader
 from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
-from eap.pd.alternate import AlternatePlace
-from eap.pd.layout import RxPlace, plan_layout
+from eap.pd.layout import AlternatePlace, RxPlace, plan_layout
 from eap.pd.report import station_status
 from eap.pd.spec import (
     CounterSource,
@@ -220,4 +219,4 @@ def test_a_sender_that_changes_over_in_the_middle_of_a_run_is_followed(
         assert (row["received"], row["lost"], row["duplicated"], row["late"]) == (40, 0, 0, 0)
         assert (row["state"], row["timeouts"], row["var_state"]) == ("running", 0, 0)
     firsts = {receiving.image.words[place.words] for place in receiving.image.layout.rx}
-    assert len(firsts) == 1, "the account is shared as before"
+    assert len(firsts) == 1, "the tracker is shared as before"

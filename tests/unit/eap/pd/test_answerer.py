@@ -2,9 +2,9 @@ from __future__ import annotations
 
 from eap.codec.pd import iter_pds
 from eap.ids import NetId
-from eap.pd.answerer import ANSWERS_KEPT, Answerer
-from eap.pd.inputs import Inputs
+from eap.pd.image import Inputs
 from eap.pd.poll import Requests
+from eap.pd.publisher import ANSWERS_KEPT, Answerer
 from eap.pd.report import station_status
 from eap.pd.spec import REQUESTER, RxPdSpec, TxFrameSpec, TxPdSpec, Writer
 from tests.support.cyclic import PEER, Wire, image_of, received, station, written

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from eap.codec import datatypes
-from eap.pd.busplace import mirror
+from eap.pd.layout import mirror
 from eap.pd.spec import BusEntrySpec
 
 TYPES = {name: datatypes.parse(name) for name in ("BOOL", "BIT3", "UINT", "USINT")}

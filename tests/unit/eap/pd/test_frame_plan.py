@@ -1,9 +1,9 @@
 from __future__ import annotations
 
 from eap.codec.pd import FIRST_PD
-from eap.pd.account import Account, Timing
+from eap.pd.address import SourceWatch
 from eap.pd.frame_plan import FramePlan, Refused, Taken
-from eap.pd.sourcewatch import SourceWatch
+from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.words import RxWord
 from tests.support.cyclic import PEER, octets
 
@@ -11,12 +11,12 @@ WATCH = SourceWatch(memoryview(b""), b"", frozenset())
 TIMING = Timing(step=1, sender_cycle_ns=0, own_cycle_ns=1)
 
 
-def account() -> Account:
-    return Account(memoryview(bytearray(8 * RxWord.SIZE)).cast("q"), 0, TIMING)
+def tracker() -> SequenceTracker:
+    return SequenceTracker(memoryview(bytearray(8 * RxWord.SIZE)).cast("q"), 0, TIMING)
 
 
 def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
-    one = account()
+    one = tracker()
     pds = [(b"\x01\0\0\0\x02\0", 2), (b"\x02\0\0\0\x04\0", 4), (b"\x03\0\0\0\x01\0", 1)]
     plan = FramePlan(
         100,
@@ -34,8 +34,8 @@ def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
     )
 
 
-def test_each_account_has_its_own_copies():
-    one, other = account(), account()
+def test_each_tracker_has_its_own_copies():
+    one, other = tracker(), tracker()
     plan = FramePlan(
         100,
         [(b"\x01\0\0\0\0\0", 0), (b"\x02\0\0\0\0\0", 0)],

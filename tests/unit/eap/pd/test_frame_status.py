@@ -5,7 +5,7 @@ import pytest
 from eap.pd.address import to_word
 from eap.pd.frame_status import frame_state, frame_status
 from eap.pd.image import Image
-from eap.pd.presence import Presence
+from eap.pd.monitor import Presence
 from eap.pd.spec import TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord
 from tests.support.cyclic import image_of, station, written

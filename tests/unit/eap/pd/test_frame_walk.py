@@ -4,7 +4,7 @@ import pytest
 
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import FIRST_PD
-from eap.pd.frame_walk import walk
+from eap.pd.frame_plan import walk
 from eap.pd.words import Discard
 from tests.support.cyclic import octets
 

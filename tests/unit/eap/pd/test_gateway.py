@@ -3,7 +3,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from eap.pd.gateway import GatewayAddress, GatewaySpec
+from eap.pd.spec import GatewayAddress, GatewaySpec
 
 
 def test_a_specification_crosses_as_json():

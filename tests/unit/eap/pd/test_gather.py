@@ -5,10 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.codec import datatypes, pdo
-from eap.pd.gather import Gather
-from eap.pd.image import Image
-from eap.pd.inputs import Inputs
+from eap.pd.image import Image, Inputs
 from eap.pd.spec import RxPdSpec, VariableSpec, Writer
+from eap.pd.txframe import Gather
 from tests.support.cyclic import Receiver, image_of, octets, station
 
 KINDS = ["BOOL", "BIT3", "BIT7", "BIT8", "USINT", "UINT24", "LREAL", "INT[2]", "BLOCK(3)"]

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-from eap.pd.image import Image
-from eap.pd.inputs import Inputs
+from eap.pd.image import Image, Inputs
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
 from tests.support.cyclic import image_of, station

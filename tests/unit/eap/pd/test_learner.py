@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from eap.ids import NetId
-from eap.pd.learner import LOOK_NS, Learner
+from eap.pd.address import LOOK_NS, Learner
 from tests.support.cyclic import OWN, PEER, From, octets
 
 THEIR_MAC = "02:00:00:00:00:02"

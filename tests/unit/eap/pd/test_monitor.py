@@ -7,8 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ids import MacAddr
-from eap.pd.monitor import USUAL_POLICY, MonitorTarget, PresenceChanged, SubscriberMonitor
-from eap.pd.presence import Evidence, Presence
+from eap.pd.monitor import (
+    USUAL_POLICY,
+    Evidence,
+    MonitorTarget,
+    Presence,
+    PresenceChanged,
+    SubscriberMonitor,
+)
 
 MS = 1_000_000
 SECOND = 1000 * MS

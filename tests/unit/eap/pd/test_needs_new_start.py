@@ -2,9 +2,8 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from eap.pd.gateway import GatewaySpec
-from eap.pd.spec import BusPortSpec, PortKind, PortSpec
-from eap.pd.succession import needs_new_start
+from eap.pd.handover import needs_new_start
+from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec
 from tests.unit.eap.appliance.conftest import eap_port, left
 
 END = ": this needs a new start of the appliance"

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.pd.presence import DEFAULT_POLICY, Evidence, Judge, Presence
+from eap.pd.monitor import DEFAULT_POLICY, Evidence, Presence, PresenceTracker
 
 SECOND = 1_000_000_000
 SEEN, MISSED, ABSENT = Evidence.SEEN, Evidence.MISSED, Evidence.ABSENT
@@ -12,9 +12,9 @@ PENDING, BLIND = Evidence.PENDING, Evidence.BLIND
 UNKNOWN, PRESENT, MISSING = Presence.UNKNOWN, Presence.PRESENT, Presence.MISSING
 
 
-def run(*rounds: Evidence, judge: Judge | None = None) -> list[Presence]:
+def run(*rounds: Evidence, judge: PresenceTracker | None = None) -> list[Presence]:
     """Return what each of *rounds*, one a second, made of the presence."""
-    judge = judge or Judge(SECOND, 0)
+    judge = judge or PresenceTracker(SECOND, 0)
     found = []
     for number, evidence in enumerate(rounds, 1):
         judge.begin_round()
@@ -46,7 +46,7 @@ def test_missing_is_present_again_after_two_answers() -> None:
 
 
 def test_a_round_counts_once_however_much_is_heard() -> None:
-    judge = Judge(SECOND, 0)
+    judge = PresenceTracker(SECOND, 0)
     run(ABSENT, judge=judge)
     judge.begin_round()
     assert [judge.take(SEEN, 2 * SECOND) for _ in range(5)] == [MISSING] * 5
@@ -55,7 +55,7 @@ def test_a_round_counts_once_however_much_is_heard() -> None:
 
 
 def test_silence_after_an_answer_in_the_same_round_is_no_miss() -> None:
-    judge = Judge(SECOND, 0)
+    judge = PresenceTracker(SECOND, 0)
     for number in range(5):
         judge.begin_round()
         judge.take(SEEN, number * SECOND)
@@ -69,14 +69,14 @@ def test_blind_rounds_end_in_unknown() -> None:
 
 
 def test_what_was_told_last_holds_for_a_while_only() -> None:
-    judge = Judge(SECOND, 0)
+    judge = PresenceTracker(SECOND, 0)
     judge.take(SEEN, 0)
     assert judge.take(PENDING, DEFAULT_POLICY.trust_ns) is PRESENT
     assert judge.take(PENDING, DEFAULT_POLICY.trust_ns + 1) is UNKNOWN
 
 
 def test_long_intervals_are_trusted_for_longer() -> None:
-    judge = Judge(60 * SECOND, 0)
+    judge = PresenceTracker(60 * SECOND, 0)
     judge.take(SEEN, 0)
     assert judge.take(PENDING, 180 * SECOND) is PRESENT
     assert judge.take(PENDING, 180 * SECOND + 1) is UNKNOWN
@@ -87,7 +87,7 @@ def test_long_intervals_are_trusted_for_longer() -> None:
     [((SEEN,), False), ((SEEN, MISSED), True), ((ABSENT,), False), ((ABSENT, SEEN), True)],
 )
 def test_doubt_is_one_round_that_disagrees(rounds: tuple[Evidence, ...], doubt: bool) -> None:
-    judge = Judge(SECOND, 0)
+    judge = PresenceTracker(SECOND, 0)
     run(*rounds, judge=judge)
     assert judge.in_doubt is doubt
 

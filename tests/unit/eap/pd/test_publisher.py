@@ -2,8 +2,7 @@ from __future__ import annotations
 
 from eap.codec.pd import iter_pds
 from eap.ids import NetId
-from eap.pd.image import Image
-from eap.pd.inputs import Inputs
+from eap.pd.image import Image, Inputs
 from eap.pd.publisher import Publisher
 from eap.pd.report import station_status
 from eap.pd.spec import OnChangeSpec, StationSpec, TriggerSpec, TxFrameSpec, TxPdSpec, Writer

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.pd.presence import Presence
+from eap.pd.monitor import Presence
 from eap.pd.report import pd_list, quality, station_status
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, Writer
 from eap.pd.words import FrameWord, RxWord, StationWord
@@ -151,14 +151,14 @@ def test_a_station_before_its_start_is_in_init():
     assert station_status(image, 0)["state"] == "OP"
 
 
-def test_members_of_one_account_report_the_same_counters_and_their_own_discards():
+def test_members_of_one_tracker_report_the_same_counters_and_their_own_discards():
     r = Receiver(
         RxPdSpec("r", "eap0", 1, ("x",), PEER, step=1),
         RxPdSpec("s", "eap0", 2, ("y",), PEER, step=1),
         variables=received("x:UINT", "y:UINT"),
     )
     r.give(octets([(1, b"ab"), (2, b"cd")], cycle=3), MS)
-    assert r.image.words[r.place("s").words + RxWord.ACCOUNT] == r.place("r").words
+    assert r.image.words[r.place("s").words + RxWord.TRACKER] == r.place("r").words
     r.give(octets([(2, b"toolong")], cycle=4), MS)
     rows = station_status(r.image, MS)["pd"]["rx"]
     assert [row["received"] for row in rows] == [1, 1]

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.ids import MacAddr
+from eap.pd.address import ALTERNATION_NS
 from eap.pd.report import station_status
-from eap.pd.sourcewatch import ALTERNATION_NS
 from eap.pd.spec import RxPdSpec
 from tests.support.cyclic import MS, PEER, Receiver, octets, received
 

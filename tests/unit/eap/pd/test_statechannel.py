@@ -6,9 +6,8 @@ from msgspec.structs import replace
 
 from eap.codec.pd import decode_frame_header
 from eap.pd.device import DeviceState
-from eap.pd.link import OutFrame
+from eap.pd.link import OutFrame, StateChannel
 from eap.pd.spec import TxFrameSpec, TxPdSpec
-from eap.pd.statechannel import StateChannel
 from eap.pd.station import Station
 from tests.support.cyclic import MS, eap_port, image_of, station, written
 

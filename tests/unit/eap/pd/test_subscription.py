@@ -1,10 +1,9 @@
 from __future__ import annotations
 
-from eap.pd.account import Account, Timing
 from eap.pd.poll import Question
+from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
-from eap.pd.subscription import Subscription
-from eap.pd.substitute import SubstituteValue
+from eap.pd.subscription import Subscription, SubstituteValue
 from eap.pd.words import Discard, FrameWord
 from tests.support.cyclic import MS, PEER, image_of, received, station, written
 
@@ -23,7 +22,7 @@ def subscription(*, polled: bool = False, **options: object) -> tuple[Subscripti
     question = Question(image.words, image.layout.tx[0], ["in"]) if polled else None
     made = Subscription(spec, place, SubstituteValue(image, place), question)
     timing = Timing(step=1, sender_cycle_ns=MS, own_cycle_ns=MS)
-    made.account = Account(image.words, place.words, timing)
+    made.tracker = SequenceTracker(image.words, place.words, timing)
     return made, image.words
 
 
@@ -42,14 +41,14 @@ def test_the_version_may_be_of_no_interest_but_never_the_length():
 
 def test_what_comes_by_itself_is_too_old_when_nothing_has_come_for_so_long():
     made, _ = subscription()
-    made.account.arrived(1, 10 * MS, 1)
+    made.tracker.arrived(1, 10 * MS, 1)
     assert made.answer is None
     assert made.deadline_ns() == 15 * MS
 
 
 def test_an_answer_is_too_old_when_it_was_asked_for_so_long_ago():
     made, words = subscription(polled=True)
-    made.account.arrived(1, 10 * MS, 1)
+    made.tracker.arrived(1, 10 * MS, 1)
     assert made.deadline_ns() is None
     words[made.answer.question._place.frame_words + FrameWord.WHOLE] += 1
     made.answer.question.look(40 * MS)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.pd.spec import RxPdSpec, Substitute, VariableSpec, Writer
-from eap.pd.substitute import SubstituteValue
+from eap.pd.subscription import SubstituteValue
 from tests.support.cyclic import Receiver, octets
 
 DATA = bytes([0b1011, 0xAA, 0xBB])

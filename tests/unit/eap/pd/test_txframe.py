@@ -2,12 +2,10 @@ from __future__ import annotations
 
 from eap.codec.pd import iter_pds
 from eap.ids import NetId
-from eap.pd.gather import Gather
-from eap.pd.image import Image
-from eap.pd.inputs import Inputs
+from eap.pd.image import Image, Inputs
 from eap.pd.spec import OnChangeSpec, TriggerSpec, TxFrameSpec, TxPdSpec
 from eap.pd.trigger import Trigger, plan_schedule
-from eap.pd.txframe import TxFrame, TxPd
+from eap.pd.txframe import Gather, TxFrame, TxPd
 from tests.support.cyclic import PEER, Wire, image_of, station, written
 
 NAMES = ("a", "b", "c")

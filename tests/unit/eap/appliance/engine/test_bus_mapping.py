@@ -5,8 +5,8 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from eap.appliance.engine.bus_mapping import BusMapping
+from eap.pd.handover import ImageHandover
 from eap.pd.spec import VariableSpec, Writer
-from eap.pd.succession import ImageSuccession
 from tests.support.cyclic import MS, image_of
 from tests.support.enginebus import BusRig
 
@@ -21,9 +21,9 @@ def move(rig, ties_for=None):
         return image.memory if writer is Writer.ENGINE else application
 
     ties = (ties_for or rig.bus.prepare_mapping)(spec.ports[1], image, memory_of)
-    succession = ImageSuccession(rig.image, image)
-    succession.carry_values(rig.application)
-    succession.carry_values(rig.image.memory)
+    handover = ImageHandover(rig.image, image)
+    handover.carry_values(rig.application)
+    handover.carry_values(rig.image.memory)
     application[:] = image.memory
     rig.bus.swap_mapping(ties)
     rig.image, rig.application = image, application

@@ -16,9 +16,9 @@ from eap.errors import EngineRefusedError, EnvironmentalError
 from eap.net.image_file import ImageFile, open_image
 from eap.pd import pieces
 from eap.pd.device import DeviceState
+from eap.pd.handover import ImageHandover
 from eap.pd.report import station_status
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, VariableSpec, Writer
-from eap.pd.succession import ImageSuccession
 from eap.pd.words import StationWord
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
@@ -221,7 +221,7 @@ def test_what_runs_already_is_no_change(running):
 def test_accounts_that_part_while_something_is_built_are_looked_at_again(running, monkeypatch):
     running.cycles(3)
     answers = [False, True]
-    monkeypatch.setattr(ImageSuccession, "is_current", property(lambda _: answers.pop(0)))
+    monkeypatch.setattr(ImageHandover, "is_current", property(lambda _: answers.pop(0)))
     assert running.configure(wider(running.left)) is None
     assert answers == []
     assert list(running.folder.path.glob(".*")) == []

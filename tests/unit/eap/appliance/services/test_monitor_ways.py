@@ -14,7 +14,7 @@ from eap.appliance.supervisor.sockets import SharedSockets
 from eap.errors import EnvironmentalError
 from eap.ids import Destination
 from eap.net.neighbour import NeighbourTable
-from eap.pd.presence import Evidence
+from eap.pd.monitor import Evidence
 from tests.unit.eap.appliance.conftest import left, right
 
 pytestmark = pytest.mark.net

@@ -13,8 +13,7 @@ import pytest
 from eap.appliance.handover import NO_DESCRIPTOR, PortName, SocketKind
 from eap.appliance.supervisor.sockets import SharedSockets, plan_sockets
 from eap.errors import EnvironmentalError
-from eap.pd.gateway import GatewaySpec
-from eap.pd.spec import BusPortSpec, PortKind, PortSpec, StationSpec
+from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
 LEFT, RIGHT = PortName("left", "eap0"), PortName("right", "eap0")

@@ -18,7 +18,7 @@ from eap.codec.adsnotification import AddNotification, TransMode, decode_notific
 from eap.codec.ams import AmsCommand, decode_packet
 from eap.ids import NetId
 from eap.net.image_file import create_image
-from eap.pd.inputs import Inputs
+from eap.pd.image import Inputs
 from eap.pd.layout import plan_layout
 from eap.pd.samples import Sampler, Samples
 from eap.pd.spec import VariableSpec, Writer

@@ -16,7 +16,7 @@ from eap.codec.adsnotification import TransMode, decode_notification
 from eap.codec.ams import AmsCommand
 from eap.device.eap_objects import Identity
 from eap.ids import NetId
-from eap.pd.inputs import Inputs
+from eap.pd.image import Inputs
 from eap.pd.samples import Sampler
 from eap.pd.words import StationWord
 from tests.support import aoe

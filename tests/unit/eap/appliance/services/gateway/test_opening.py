@@ -11,7 +11,7 @@ from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.opening import open_desks, open_gateways
 from eap.od.model import OdState
-from eap.pd.gateway import GatewayAddress, GatewaySpec
+from eap.pd.spec import GatewayAddress, GatewaySpec
 from tests.support.cyclic import bus_port, eap_port, station
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus

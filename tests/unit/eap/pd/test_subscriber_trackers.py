@@ -1,4 +1,4 @@
-"""Any changes of a layout: each account goes on where its subscription does."""
+"""Any changes of a layout: each tracker goes on where its subscription does."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ NAMES = ("p0", "p1", "p2", "p3")
 
 
 @examples(60, stateful_step_count=40)
-class PartingAccounts(RuleBasedStateMachine):
-    """PDs that share an account, part and are restarted count as if each had its own."""
+class PartingTrackers(RuleBasedStateMachine):
+    """PDs that share a tracker, part and are restarted count as if each had its own."""
 
     @initialize(first=st.integers(0, 0xFFFF))
     def begin(self, first: int) -> None:
@@ -110,4 +110,4 @@ class PartingAccounts(RuleBasedStateMachine):
             assert self.r.image.read(name) == self.data[name]
 
 
-TestPartingAccounts = PartingAccounts.TestCase
+TestPartingTrackers = PartingTrackers.TestCase

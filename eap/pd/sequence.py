@@ -1,8 +1,8 @@
-"""What the cycle counter and the arrival times of a publisher's frames tell.
+"""Sequence trackers: lost, late and reordered frames, told from cycle counters and arrival times.
 
-Rule 1: PDs that have always arrived together share one account; they part when they first arrive
-apart.  All members of an account have the same history, so the copy that starts the new account
-is exact, and a frame of a hundred PDs costs one account, not a hundred.
+Rule 1: PDs that have always arrived together share one tracker; they part when they first arrive
+apart.  All members of a tracker have the same history, so the copy that starts the new tracker
+is exact, and a frame of a hundred PDs costs one tracker, not a hundred.
 Rule 2: an older counter is a reordered frame and not taken, since newer data is here already; what
 was counted as lost because of it is not lost any more.  The third in a row that nobody missed is a
 sender that counts anew, and is taken.
@@ -13,24 +13,24 @@ from __future__ import annotations
 
 import struct
 
-from eap.pd.words import ACCOUNT_START, BIN_OF_US, RxState, RxWord, histogram_bin
+from eap.pd.words import BIN_OF_US, TRACKER_START, RxState, RxWord, histogram_bin
 
-_RECEIVED = RxWord.RECEIVED - ACCOUNT_START
-_DUPLICATED = RxWord.DUPLICATED - ACCOUNT_START
-_REORDERED = RxWord.REORDERED - ACCOUNT_START
-_LATE = RxWord.LATE - ACCOUNT_START
-_TIMEOUTS = RxWord.TIMEOUTS - ACCOUNT_START
-_LOST = RxWord.LOST - ACCOUNT_START
-_STATE = RxWord.STATE - ACCOUNT_START
-_LAST_CYCLE = RxWord.LAST_CYCLE - ACCOUNT_START
-_ARRIVED_AT_NS = RxWord.ARRIVED_AT_NS - ACCOUNT_START
-_ARRIVED_IN_CYCLE = RxWord.ARRIVED_IN_CYCLE - ACCOUNT_START
-_BEHIND = RxWord.BEHIND - ACCOUNT_START
-_HOLES = RxWord.HOLES - ACCOUNT_START
-_HOLES_BELOW = RxWord.HOLES_BELOW - ACCOUNT_START
-_SENDER = RxWord.SENDER - ACCOUNT_START
-_JITTER_MAX_US = RxWord.JITTER_MAX_US - ACCOUNT_START
-_JITTER = RxWord.JITTER - ACCOUNT_START
+_RECEIVED = RxWord.RECEIVED - TRACKER_START
+_DUPLICATED = RxWord.DUPLICATED - TRACKER_START
+_REORDERED = RxWord.REORDERED - TRACKER_START
+_LATE = RxWord.LATE - TRACKER_START
+_TIMEOUTS = RxWord.TIMEOUTS - TRACKER_START
+_LOST = RxWord.LOST - TRACKER_START
+_STATE = RxWord.STATE - TRACKER_START
+_LAST_CYCLE = RxWord.LAST_CYCLE - TRACKER_START
+_ARRIVED_AT_NS = RxWord.ARRIVED_AT_NS - TRACKER_START
+_ARRIVED_IN_CYCLE = RxWord.ARRIVED_IN_CYCLE - TRACKER_START
+_BEHIND = RxWord.BEHIND - TRACKER_START
+_HOLES = RxWord.HOLES - TRACKER_START
+_HOLES_BELOW = RxWord.HOLES_BELOW - TRACKER_START
+_SENDER = RxWord.SENDER - TRACKER_START
+_JITTER_MAX_US = RxWord.JITTER_MAX_US - TRACKER_START
+_JITTER = RxWord.JITTER - TRACKER_START
 
 _RUNNING = int(RxState.RUNNING)
 # Words that lie side by side are read in one call: each access to a memoryview costs 20 ns.  They
@@ -67,8 +67,8 @@ class Timing:
         self.polled = polled
 
 
-class Account:
-    """The account in the block of words that starts at *first_word*."""
+class SequenceTracker:
+    """The tracker in the block of words that starts at *first_word*."""
 
     __slots__ = (
         "_own_cycle_ns",
@@ -93,13 +93,13 @@ class Account:
         known = self._usual_ns > 0 and timing.step <= _NEAR
         self._usual_gap = timing.step if known else -1
         self._wrap_ns = timing.sender_cycle_ns << 14 or 1 << 62
-        self._words = words[first_word + ACCOUNT_START : first_word + RxWord.SIZE]
+        self._words = words[first_word + TRACKER_START : first_word + RxWord.SIZE]
         if not self._words[_RECEIVED]:
             self.forget_sender()
 
     @property
     def state(self) -> RxState:
-        """Where the subscriptions of this account stand."""
+        """Where the subscriptions of this tracker stand."""
         return RxState(self._words[_STATE])
 
     @property
@@ -141,10 +141,10 @@ class Account:
         self._words[_STATE] = RxState.STALE
         self._words[_TIMEOUTS] += 1
 
-    def part(self, words: memoryview, first_word: int) -> Account:
-        """Start an account of the same history in the block at *first_word*."""
-        words[first_word + ACCOUNT_START : first_word + RxWord.SIZE] = self._words
-        return Account(words, first_word, self._timing)
+    def part(self, words: memoryview, first_word: int) -> SequenceTracker:
+        """Start a tracker of the same history in the block at *first_word*."""
+        words[first_word + TRACKER_START : first_word + RxWord.SIZE] = self._words
+        return SequenceTracker(words, first_word, self._timing)
 
     def arrived(self, cycle: int, at_ns: int, own_cycle: int) -> bool:
         """Enter a frame; return whether its data is to be taken.

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.pd.account import REORDER_WINDOW, Account, Timing
+from eap.pd.sequence import REORDER_WINDOW, SequenceTracker, Timing
 from eap.pd.words import RxState, RxWord, histogram_bin
 from tests.support.cyclic import MS, SECOND
 
@@ -14,21 +14,21 @@ COUNTERS = ("received", "lost", "duplicated", "reordered", "late")
 
 
 class Book:
-    """An account, fed one frame a millisecond unless a test says otherwise."""
+    """A tracker, fed one frame a millisecond unless a test says otherwise."""
 
     def __init__(self, *, step: int = 1, sender_cycle_ns: int = MS, polled: bool = False) -> None:
         self.words = memoryview(bytearray(8 * RxWord.SIZE * 2)).cast("q")
         self.timing = Timing(
             step=step, sender_cycle_ns=sender_cycle_ns, own_cycle_ns=MS, polled=polled
         )
-        self.account = Account(self.words, 0, self.timing)
+        self.tracker = SequenceTracker(self.words, 0, self.timing)
         self.now = 0
 
     def feed(self, *cycles: int, every_ns: int = MS) -> list[bool]:
         taken = []
         for cycle in cycles:
             self.now += every_ns
-            taken.append(self.account.arrived(cycle & 0xFFFF, self.now, 7))
+            taken.append(self.tracker.arrived(cycle & 0xFFFF, self.now, 7))
         return taken
 
     def __getattr__(self, counter: str) -> int:
@@ -40,11 +40,11 @@ class Book:
 
 def test_frames_in_order_are_received_and_nothing_else():
     book = Book()
-    assert book.account.state is RxState.WAITING
+    assert book.tracker.state is RxState.WAITING
     assert book.feed(5, 6, 7) == [True] * 3
     assert book.counts() == (3, 0, 0, 0, 0)
-    assert book.account.state is RxState.RUNNING
-    assert (book.last_cycle, book.account.arrived_at_ns, book.arrived_in_cycle) == (7, 3 * MS, 7)
+    assert book.tracker.state is RxState.RUNNING
+    assert (book.last_cycle, book.tracker.arrived_at_ns, book.arrived_in_cycle) == (7, 3 * MS, 7)
 
 
 def test_what_came_before_the_first_frame_taken_is_not_lost():
@@ -224,16 +224,16 @@ def test_jitter_needs_the_senders_cycle():
 def test_silence_is_entered_once_for_each_time_out():
     book = Book()
     book.feed(1)
-    book.account.time_out()
-    assert (book.account.state, book.timeouts) == (RxState.STALE, 1)
+    book.tracker.time_out()
+    assert (book.tracker.state, book.timeouts) == (RxState.STALE, 1)
     book.feed(2)
-    assert book.account.state is RxState.RUNNING
+    assert book.tracker.state is RxState.RUNNING
 
 
 def test_parting_copies_the_history_and_then_each_counts_alone():
     book = Book()
     book.feed(1, 2, 4)
-    other = book.account.part(book.words, RxWord.SIZE)
+    other = book.tracker.part(book.words, RxWord.SIZE)
     assert book.words[:12].tolist() == [0] * 12  # what is the PD's own is not touched
     assert other.arrived(5, book.now + MS, 8)
     book.feed(3)
@@ -242,21 +242,21 @@ def test_parting_copies_the_history_and_then_each_counts_alone():
     assert (book.received, book.lost, book.reordered) == (3, 0, 1)
 
 
-def test_an_account_goes_on_where_an_earlier_engine_left_it():
+def test_an_tracker_goes_on_where_an_earlier_engine_left_it():
     book = Book()
     book.feed(1, 2)
-    book.account = Account(book.words, 0, book.timing)
+    book.tracker = SequenceTracker(book.words, 0, book.timing)
     book.feed(6)
     assert (book.received, book.lost) == (3, 3)
 
 
 def test_another_sender_has_another_counter():
     book = Book()
-    book.account.follow(11)
+    book.tracker.follow(11)
     book.feed(100)
-    book.account.follow(22)
+    book.tracker.follow(22)
     assert book.feed(7) == [True]
-    book.account.follow(22)
+    book.tracker.follow(22)
     book.feed(9)
     assert book.counts()[:4] == (3, 1, 0, 0)
 
@@ -278,7 +278,7 @@ def test_every_pd_sent_between_the_first_and_the_last_is_accounted_for(fates, fi
     distinct = {cycle for _, cycle in arrivals}
     for key, cycle in arrivals:
         book.now = int(key * step * MS)
-        book.account.arrived(cycle & 0xFFFF, book.now, 1)
+        book.tracker.arrived(cycle & 0xFFFF, book.now, 1)
     span = (max(distinct) - first) // step + 1
     assert book.lost == span - len(distinct)
     assert book.received + book.reordered == len(arrivals)
@@ -299,10 +299,10 @@ def test_any_counters_and_times_are_taken_without_an_exception(frames, step, sen
 
 def test_an_answer_is_late_when_it_missed_the_senders_next_cycle_too():
     book = Book(sender_cycle_ns=4 * MS)
-    book.account.enter_response(5 * MS)
+    book.tracker.enter_response(5 * MS)
     assert (book.late, book.jitter_max_us) == (0, 5000)
-    book.account.enter_response(5 * MS + 1)
-    book.account.enter_response(300_000)
+    book.tracker.enter_response(5 * MS + 1)
+    book.tracker.enter_response(300_000)
     assert (book.late, book.jitter_max_us) == (1, 5000)
     bins = book.words[RxWord.JITTER : RxWord.SIZE].tolist()
     assert (bins[histogram_bin(5000)], bins[histogram_bin(300)]) == (2, 1)
@@ -310,7 +310,7 @@ def test_an_answer_is_late_when_it_missed_the_senders_next_cycle_too():
 
 def test_answers_of_a_sender_that_tells_no_cycle_are_never_late():
     book = Book(sender_cycle_ns=0)
-    book.account.enter_response(SECOND)
+    book.tracker.enter_response(SECOND)
     assert book.late == 0
 
 
@@ -323,5 +323,5 @@ def test_answers_have_no_jitter_however_they_come():
 def test_what_was_entered_last_was_taken_or_not():
     book = Book()
     assert book.feed(0x1_0005, 0x1_0006, 0x1_0005) == [True, True, False]
-    assert book.account.has_taken(6)
-    assert not book.account.has_taken(5)
+    assert book.tracker.has_taken(6)
+    assert not book.tracker.has_taken(5)

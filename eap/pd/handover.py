@@ -1,9 +1,9 @@
-"""What a process image takes over from the one before it: counters, accounts and values.
+"""Handover of a process image to the one that replaces it: counters, trackers and values.
 
 Rule 1: what has the same name is the same thing.  Variables keep their value if their type is the
 same too; frames and PDs keep their counters.
-Rule 2: the account of a publisher goes on for all subscriptions that shared it, as long as they are
-judged alike.  A subscription that listens to somebody else now keeps its sums and forgets the
+Rule 2: the tracker of a publisher goes on for all subscriptions that shared it, as long as they are
+judged alike.  A subscription that listens to another publisher now keeps its sums and forgets the
 sender that it knew.
 Rule 3: everything is planned beside running cycles; when the moment comes, only octets are copied.
 """
@@ -21,11 +21,11 @@ from eap.codec.pd import PdHeader
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxPlace
-from eap.pd.presence import Presence
+from eap.pd.monitor import Presence
 from eap.pd.spec import PortSpec, StationSpec, Writer
 from eap.pd.words import (
-    ACCOUNT_START,
     REASON_INDEX,
+    TRACKER_START,
     FrameWord,
     Reason,
     RxWord,
@@ -64,7 +64,7 @@ class _Run(NamedTuple):
     size: int
 
 
-class ImageSuccession:
+class ImageHandover:
     """Carries what one image holds over to the next one of the same station.
 
     Args:
@@ -82,11 +82,11 @@ class ImageSuccession:
 
     @property
     def is_current(self) -> bool:
-        """Whether subscriptions still share accounts as they did when this was planned."""
+        """Whether subscriptions still share trackers as they did when this was planned."""
         return self._received.is_current
 
     def carry_words(self) -> None:
-        """Copy the words of the station, of its frames, PDs and accounts."""
+        """Copy the words of the station, of its frames, PDs and trackers."""
         old, new = self._old.words, self._new.words
         _copy(self._runs, old, new)
         new[StationWord.FUTEX] = new[StationWord.CYCLE] & 0xFFFFFFFF  # between two cycles
@@ -101,9 +101,9 @@ class ImageSuccession:
         self._from_engine.run(self._old.memory, self._new.memory)
         self._from_others.run(others, self._new.memory)
 
-    def settle(self) -> None:
-        """Note what the subscribers that were built on the new image have made of its accounts."""
-        self._received.settle()
+    def commit(self) -> None:
+        """Note what the subscribers that were built on the new image have made of its trackers."""
+        self._received.commit()
 
 
 class _Sent:
@@ -157,15 +157,15 @@ class _Sent:
 
 
 class _Received:
-    """The words of RxPDs, and the accounts that they share."""
+    """The words of RxPDs, and the trackers that they share."""
 
     def __init__(self, old: Image, new: Image) -> None:
         self._old, self._new = old.words, new.words
         self._old_column, self._new_column = _column(old.layout), _column(new.layout)
         self._shared: list[int] = old.words[self._old_column].tolist()
         before = {
-            place.name: (place, account or place.words)
-            for place, account in zip(old.layout.rx, self._shared, strict=True)
+            place.name: (place, tracker or place.words)
+            for place, tracker in zip(old.layout.rx, self._shared, strict=True)
         }
         self._heirs = [
             (index, *before[place.name], place)
@@ -176,30 +176,30 @@ class _Received:
             _Run(was.words, place.words, RxWord.SIZE) for _, was, _, place in self._heirs
         )
         self._owners = array("q", [0] * len(new.layout.rx))
-        """By RxPD of the new image: where its account is, as in RxWord.ACCOUNT."""
+        """By RxPD of the new image: where its tracker is, as in RxWord.TRACKER."""
         self._from_elsewhere = [
             place.words
             for _, was, _, place in self._heirs
             if (was.publisher, was.port, was.source) != (place.publisher, place.port, place.source)
         ]
         first_of: dict[object, int] = {}
-        for index, was, account, place in self._heirs:
-            judged = account, _begins_anew(was, place), _judged(place)
+        for index, was, tracker, place in self._heirs:
+            judged = tracker, _begins_anew(was, place), _judged(place)
             self._owners[index] = first_of.setdefault(judged, place.words)
-        self._plan_accounts()
+        self._plan_trackers()
 
     @property
     def is_current(self) -> bool:
         return bool(self._old[self._old_column].tolist() == self._shared)
 
-    def settle(self) -> None:
+    def commit(self) -> None:
         self._owners = array("q", self._new[self._new_column].tolist())
-        self._plan_accounts()
+        self._plan_trackers()
 
     def carry(self, old: memoryview, new: memoryview) -> None:
         """Copy them."""
         _copy(self._runs, old, new)
-        _copy(self._accounts, old, new)
+        _copy(self._trackers, old, new)
         new[self._new_column] = self._owners
         for first in self._strangers:
             new[first + RxWord.LAST_CYCLE] = -1
@@ -209,18 +209,18 @@ class _Received:
             for word in _SOURCE_WORDS:
                 new[first + word] = 0
 
-    def _plan_accounts(self) -> None:
+    def _plan_trackers(self) -> None:
         sources: dict[int, int] = {}
         self._strangers: set[int] = set()
-        for index, was, account, place in self._heirs:
+        for index, was, tracker, place in self._heirs:
             owner = self._owners[index]
-            sources[owner] = account
+            sources[owner] = tracker
             if _begins_anew(was, place):
                 self._strangers.add(owner)
-        size = RxWord.SIZE - ACCOUNT_START
-        self._accounts = [
-            _Run(account + ACCOUNT_START, owner + ACCOUNT_START, size)
-            for owner, account in sources.items()
+        size = RxWord.SIZE - TRACKER_START
+        self._trackers = [
+            _Run(tracker + TRACKER_START, owner + TRACKER_START, size)
+            for owner, tracker in sources.items()
         ]
 
 
@@ -239,7 +239,7 @@ def _begins_anew(was: RxPlace, place: RxPlace) -> bool:
 
 
 def _judged(place: RxPlace) -> tuple[object, ...]:
-    """Return what must be the same for all subscriptions of an account."""
+    """Return what must be the same for all subscriptions of a tracker."""
     return (
         place.port,
         place.publisher,
@@ -251,10 +251,10 @@ def _judged(place: RxPlace) -> tuple[object, ...]:
 
 
 def _column(layout: ImageLayout) -> slice:
-    """Return where RxWord.ACCOUNT of all RxPDs lies: their blocks lie side by side."""
+    """Return where RxWord.TRACKER of all RxPDs lies: their blocks lie side by side."""
     if not layout.rx:
         return slice(0, 0)
-    first = layout.rx[0].words + RxWord.ACCOUNT
+    first = layout.rx[0].words + RxWord.TRACKER
     return slice(first, first + len(layout.rx) * RxWord.SIZE, RxWord.SIZE)
 
 

@@ -1,4 +1,4 @@
-"""What a station that is configured anew keeps: counters, accounts, values, addresses, triggers."""
+"""What a station that is configured anew keeps: counters, trackers, values, addresses, triggers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eap.pd.handover import ImageHandover
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace, TxPlace
-from eap.pd.presence import Presence
-from eap.pd.report import account_word, station_status
+from eap.pd.monitor import Presence
+from eap.pd.report import station_status, tracker_word
 from eap.pd.spec import (
     OnChangeSpec,
     RxPdSpec,
@@ -25,7 +26,6 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import Station
-from eap.pd.succession import ImageSuccession
 from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 from tests.support.cyclic import (
     MS,
@@ -137,23 +137,23 @@ def all_scheduled(own: list[TxPlace]) -> bool:
 
 
 def shared(image: Image) -> dict[str, int]:
-    return {rx.name: account_word(image, rx) for rx in image.layout.rx}
+    return {rx.name: tracker_word(image, rx) for rx in image.layout.rx}
 
 
 @examples(200)
 @given(specs(), specs(), st.integers(0, 1 << 30))
 def test_what_has_the_same_name_goes_on(before, after, seed):
     old, new = image_of(before), image_of(after)
-    Station(before, old, lambda: None)  # gives subscriptions their accounts
+    Station(before, old, lambda: None)  # gives subscriptions their trackers
     used(old, seed)
     fresh = image_of(after)
-    succession = ImageSuccession(old, new)
-    assert succession.is_current
-    succession.carry_words()
-    succession.carry_values(old.memory)
+    handover = ImageHandover(old, new)
+    assert handover.is_current
+    handover.carry_words()
+    handover.carry_values(old.memory)
     Station(after, new, lambda: None)
-    succession.settle()
-    succession.carry_words()
+    handover.commit()
+    handover.carry_words()
     then, now = station_status(old, SECOND), station_status(new, SECOND)
     for key in now.keys() - {"pd", "frames"}:
         assert now[key] == then[key], key
@@ -166,7 +166,7 @@ def test_what_has_the_same_name_goes_on(before, after, seed):
     check_pds(then["pd"]["tx"], now["pd"]["tx"], unused["tx"], changed)
     changed = {"port", "lost", "quality", "cycle_index"}
     check_pds(then["pd"]["rx"], now["pd"]["rx"], unused["rx"], changed)
-    check_accounts(old, new)
+    check_trackers(old, new)
 
 
 def check_values(old: Image, new: Image, fresh: Image) -> None:
@@ -189,7 +189,7 @@ def check_pds(
             assert pd[key] == was[key], (pd["name"], key)
 
 
-def check_accounts(old: Image, new: Image) -> None:
+def check_trackers(old: Image, new: Image) -> None:
     """They are shared by those who shared them and are judged alike, and by nobody else."""
     then, now = shared(old), shared(new)
     before = {place.name: place for place in old.layout.rx}
@@ -218,7 +218,7 @@ def judged(place: RxPlace) -> tuple[object, ...]:
     return place.publisher, place.step, place.sender_cycle_us, place.timeout_ms
 
 
-def test_accounts_that_have_parted_are_noticed():
+def test_trackers_that_have_parted_are_noticed():
     spec = station(
         variables=received("a:UINT", "b:UINT"),
         subscriptions=(
@@ -228,12 +228,12 @@ def test_accounts_that_have_parted_are_noticed():
     )
     old, new = image_of(spec), image_of(spec)
     made = Station(spec, old, lambda: None)
-    succession = ImageSuccession(old, new)
+    handover = ImageHandover(old, new)
     made.start(0)
     give(made.takers["eap0"], octets([(1, b"\1\0"), (2, b"\2\0")], cycle=1), MS)
-    assert succession.is_current
+    assert handover.is_current
     give(made.takers["eap0"], octets([(1, b"\3\0")], cycle=2), 2 * MS)
-    assert not succession.is_current
+    assert not handover.is_current
 
 
 def test_a_station_configured_anew_keeps_the_addresses_that_it_learned():
@@ -373,7 +373,7 @@ def test_what_was_replaced_can_be_taken_apart():
     wire.waiting.append((octets([(7, b"\5\0")], cycle=1), MS))
     made.cycle(MS, MS)
     after = succeed_with_values(made, made.spec)
-    made.dissolve()
+    made.release()
     assert made.image.places == {}
     wire.sent.clear()
     wire.waiting.append((octets([(7, b"\6\0")], cycle=2), 2 * MS))
