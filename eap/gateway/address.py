@@ -17,32 +17,32 @@ ALL_SLAVES = 0xFFFF
 VIRTUAL_BIT = 0x8000
 
 
-class Master(NamedTuple):
+class MasterAddress(NamedTuple):
     """The dictionary of the master itself."""
 
 
-class Slave(NamedTuple):
+class SlaveAddress(NamedTuple):
     """A slave on the gateway's own bus."""
 
     station: int
     """Its station address."""
 
 
-class RemoteSlave(NamedTuple):
+class RemoteAddress(NamedTuple):
     """A slave, or with port 0xFFFF the master, of another bus; reached by AoE."""
 
     net_id: NetId
     port: int
 
 
-class Group(NamedTuple):
+class GroupAddress(NamedTuple):
     """Several that each answer for themselves; nobody knows beforehand who does not."""
 
     members: tuple[int, ...]
     """Station addresses, or virtual ones."""
 
 
-Destination: TypeAlias = Master | Slave | RemoteSlave | Group
+Destination: TypeAlias = MasterAddress | SlaveAddress | RemoteAddress | GroupAddress
 
 
 class AddressMap:
@@ -54,7 +54,9 @@ class AddressMap:
             are.
     """
 
-    def __init__(self, virtual: Mapping[int, Slave | RemoteSlave | Group] | None = None) -> None:
+    def __init__(
+        self, virtual: Mapping[int, SlaveAddress | RemoteAddress | GroupAddress] | None = None
+    ) -> None:
         self._virtual = dict(virtual or {})
 
     def resolve(self, address: int, stations: tuple[int, ...]) -> Destination:
@@ -63,12 +65,12 @@ class AddressMap:
         A station address that nobody has is returned as such: to say so is for who asks there.
         """
         if address == MASTER_ADDRESS:
-            return Master()
+            return MasterAddress()
         if address == ALL_SLAVES:
-            return Group(stations)
+            return GroupAddress(stations)
         found = self._virtual.get(address)
         if found is not None:
             return found
         if address & VIRTUAL_BIT and address not in stations:
-            return Slave(address & ~VIRTUAL_BIT)
-        return Slave(address)
+            return SlaveAddress(address & ~VIRTUAL_BIT)
+        return SlaveAddress(address)

@@ -148,6 +148,15 @@ class Cause(Enum):
         AdsError.SERVICE,
         Failure.GENERAL,
     )
+    PROTOCOL = ErrorCodes(
+        "its answer breaks the protocol",
+        MailboxError.SERVICE_IN_WORK,
+        AbortCode.GENERAL,
+        SoeErrorCode.GENERAL,
+        FoeErrorCode.NOT_DEFINED,
+        AdsError.GENERAL,
+        Failure.GENERAL,
+    )
     BUSY = ErrorCodes(
         "it is busy with another client's transfer",
         MailboxError.SERVICE_IN_WORK,
@@ -375,6 +384,7 @@ _BY_EXCEPTION: dict[type[EapError], tuple[Cause, AdsError]] = {
     errors.NoMailboxError: (Cause.NO_MAILBOX, AdsError.STATE),
     errors.MailboxClosedError: (Cause.TIMEOUT, AdsError.NOT_READY),
     errors.MailboxSizeError: (Cause.TOO_LONG, AdsError.SIZE),
+    errors.MailboxProtocolError: (Cause.PROTOCOL, AdsError.GENERAL),
     errors.MailboxBusyError: (Cause.BUSY, AdsError.BUSY),
     errors.MailboxTimeoutError: (Cause.TIMEOUT, AdsError.TIMEOUT),
     errors.FrameLostError: (Cause.TIMEOUT, AdsError.TIMEOUT),

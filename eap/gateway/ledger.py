@@ -28,6 +28,52 @@ class ClientLimits(NamedTuple):
     """Requests of all clients that wait."""
 
 
+class MemoryBudget:
+    """Octets that transfers of clients may hold while they are under way.
+
+    Args:
+        in_all: Octets of all clients.
+        of_client: Octets of one client.
+
+    Attributes:
+        held: Octets that are held now.
+    """
+
+    def __init__(self, in_all: int = 64 << 20, of_client: int = 16 << 20) -> None:
+        self.held = 0
+        self._in_all = in_all
+        self._of_client = of_client
+        self._clients: dict[Way, int] = {}
+
+    def grant(self, way: Way, more: int) -> bool:
+        """Change what a client holds by *more* octets; return False if there is no room."""
+        own = self._clients.get(way, 0) + more
+        if more > 0 and (own > self._of_client or self.held + more > self._in_all):
+            return False
+        self.held += more
+        if own:
+            self._clients[way] = own
+        else:
+            self._clients.pop(way, None)
+        return True
+
+
+class MemoryShare:
+    """What one session holds of a budget."""
+
+    def __init__(self, budget: MemoryBudget, way: Way) -> None:
+        self._budget = budget
+        self._way = way
+        self._held = 0
+
+    def hold(self, size: int) -> bool:
+        """Hold *size* octets instead of those before; return False, and hold those, if too many."""
+        if not self._budget.grant(self._way, size - self._held):
+            return False
+        self._held = size
+        return True
+
+
 class Admission(Enum):
     """What becomes of a request."""
 

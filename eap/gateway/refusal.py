@@ -20,17 +20,22 @@ from eap.codec.sdo import encode_abort
 from eap.codec.sdoinfo import InfoError, SdoInfoHeader, SdoInfoOpcode
 from eap.codec.soe import SoeHeader, SoeOpcode
 from eap.codec.soe import encode_message as encode_soe
-from eap.errors import CodecError
+from eap.errors import CodecError, EapError
 from eap.gateway.error_table import Cause
 
 _NOT_BEGUN = Busy(0, 100)
 _SUBINDEX = 5
 """Where it stands in an SDO request, CoE header included."""
 
+_ASK_AGAIN = frozenset((Cause.BUSY, Cause.TOO_FAST))
 
-Reason = Cause
 
-_ASK_AGAIN = frozenset((Reason.BUSY, Reason.TOO_FAST))
+class GatewayError(EapError):
+    """A request that the gateway itself refuses."""
+
+    def __init__(self, cause: Cause) -> None:
+        super().__init__(cause.text)
+        self.cause = cause
 
 
 class Answer(NamedTuple):
@@ -40,20 +45,20 @@ class Answer(NamedTuple):
     body: bytes
 
 
-def refuse(kind: MailboxType, request: bytes, reason: Reason, text: str = "") -> Answer:
+def refuse(kind: MailboxType, request: bytes, cause: Cause, text: str = "") -> Answer:
     """Return the error that answers a request.
 
     Args:
         kind: Its protocol.
         request: What it holds behind the mailbox header.
-        reason: Why it is refused.
-        text: More than *reason* says, where the protocol has room for words.
+        cause: Why it is refused.
+        text: More than *cause* says, where the protocol has room for words.
     """
     refuser = _REFUSERS.get(kind)
     if refuser is None:
-        return mailbox_error(reason.mailbox)
-    body = refuser(request, reason, text or reason.text)
-    return mailbox_error(reason.mailbox) if body is None else Answer(kind, body)
+        return mailbox_error(cause.mailbox)
+    body = refuser(request, cause, text or cause.text)
+    return mailbox_error(cause.mailbox) if body is None else Answer(kind, body)
 
 
 def mailbox_error(detail: int) -> Answer:
@@ -61,11 +66,11 @@ def mailbox_error(detail: int) -> Answer:
     return Answer(MailboxType.ERR, MailboxErrorReply(detail=detail).encode())
 
 
-def _refuse_coe(request: bytes, reason: Reason, text: str) -> bytes | None:
+def _refuse_coe(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     if len(request) < CoeHeader.SIZE:
         return None
-    code, service = reason.sdo, request[1] >> 4
+    code, service = cause.sdo, request[1] >> 4
     if service == CoeService.SDO_INFORMATION:
         body = SdoInfoHeader(SdoInfoOpcode.ERROR).encode() + InfoError(code).encode()
         return encode_coe(CoeService.SDO_INFORMATION, body)
@@ -75,16 +80,16 @@ def _refuse_coe(request: bytes, reason: Reason, text: str) -> bytes | None:
     return encode_abort(int.from_bytes(request[3:_SUBINDEX], "little"), subindex, code)
 
 
-def _refuse_foe(request: bytes, reason: Reason, text: str) -> bytes | None:
+def _refuse_foe(request: bytes, cause: Cause, text: str) -> bytes | None:
     words = text.encode() + b"\0"
     if not request:
         return None
-    if reason in _ASK_AGAIN:  # no end of the transfer, only of patience
+    if cause in _ASK_AGAIN:  # no end of the transfer, only of patience
         return encode_foe(FoeOpcode.BUSY, _NOT_BEGUN.number, words)
-    return encode_foe(FoeOpcode.ERROR, reason.foe, words)
+    return encode_foe(FoeOpcode.ERROR, cause.foe, words)
 
 
-def _refuse_soe(request: bytes, reason: Reason, text: str) -> bytes | None:
+def _refuse_soe(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     opcode = request[0] & 0x07 if len(request) >= SoeHeader.SIZE else 0
     if opcode not in {SoeOpcode.READ_REQUEST, SoeOpcode.WRITE_REQUEST}:
@@ -92,20 +97,20 @@ def _refuse_soe(request: bytes, reason: Reason, text: str) -> bytes | None:
     return encode_soe(
         SoeOpcode(opcode + 1),
         int.from_bytes(request[2:4], "little"),
-        reason.soe.to_bytes(2, "little"),
+        cause.soe.to_bytes(2, "little"),
         drive=request[0] >> 5,
         elements=request[1],
         error=True,
     )
 
 
-def _refuse_aoe(request: bytes, reason: Reason, text: str) -> bytes | None:
+def _refuse_aoe(request: bytes, cause: Cause, text: str) -> bytes | None:
     del text
     try:
         asked = AmsHeader.decode(request)
     except CodecError:
         return None
-    return response_to(asked, AmsAnswer(error_code=reason.ads))
+    return response_to(asked, AmsAnswer(error_code=cause.ads))
 
 
 _REFUSERS = {

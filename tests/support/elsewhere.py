@@ -1,4 +1,4 @@
-"""A station elsewhere as sessions of a gateway ask it: a table of one answer, or a bus."""
+"""Another station as sessions of a gateway reach it: a table of one answer, or a bus."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import asyncio
 from eap.aoe.ads_operation import Operation, OperationOutcome
 from eap.aoe.ads_request import encode_outcome, parse_request
 from eap.aoe.answer import AmsAnswer
-from eap.appliance.services.gateway.remote_link import RemoteLink
+from eap.appliance.services.slaves.remote_slave import RemoteSlave
 from eap.codec.ads import AdsError
 from tests.support import busads
 
@@ -35,9 +35,9 @@ class Station:
             await asyncio.Event().wait()
         return AmsAnswer(encode_outcome(command, OperationOutcome(self.result, self.data)))
 
-    def link(self, answer_s: float = 0.05) -> RemoteLink:
+    def link(self, answer_s: float = 0.05) -> RemoteSlave:
         """Return a way to its slave."""
-        return RemoteLink(self.ask, 1001, answer_s)
+        return RemoteSlave(self.ask, 1001, answer_s)
 
 
 class Bus:
@@ -61,6 +61,6 @@ class Bus:
         self.asked.extend(parse_request(command, body).operations)
         return await self._client.answer(port, command, body)
 
-    def link(self, station: int = 1001, answer_s: float = 1) -> RemoteLink:
+    def link(self, station: int = 1001, answer_s: float = 1) -> RemoteSlave:
         """Return a way to a slave."""
-        return RemoteLink(self.ask, station, answer_s)
+        return RemoteSlave(self.ask, station, answer_s)

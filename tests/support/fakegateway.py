@@ -26,7 +26,8 @@ from eap.codec.mailbox import (
 from eap.codec.soe import SoeAttribute
 from eap.device.eap_objects import Identity
 from eap.device.master_dictionary import MasterDictionary
-from eap.gateway.refusal import Reason, refuse
+from eap.gateway.error_table import Cause
+from eap.gateway.refusal import refuse
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.od.profiles.master1100 import Live
@@ -140,10 +141,10 @@ class FakeGateway:
         if header.address == 0 and self.is_master_silent:
             return []
         if header.address == self.aborts_for:
-            refusal = refuse(header.type, bytes(body), Reason.NO_SLAVE)
+            refusal = refuse(header.type, bytes(body), Cause.NO_SLAVE)
             return [_frame(MailboxHeader(0, header.address, type=refusal.type), refusal.body)]
         if header.address and len(body) + MailboxHeader.SIZE > self._sizes.to_slave:
-            refusal = refuse(header.type, bytes(body), Reason.TOO_LONG)
+            refusal = refuse(header.type, bytes(body), Cause.TOO_LONG)
             return [_frame(MailboxHeader(0, header.address, type=refusal.type), refusal.body)]
         box = self._boxes.get(header.address)
         if box is None or (header.address == 0 and not self.has_master):

@@ -68,14 +68,14 @@ class Line:
 
     def run(self, talk: Conversation[T]) -> T:
         """Run a conversation to its end."""
-        return drive(talk, self._exchange)
+        return drive(talk, self.exchange)
 
     def run_partly(self, talk: Conversation[object], steps: int) -> None:
         """Cancel a conversation after so many exchanges, or let it end before."""
         try:
             ask = next(talk)
             for _ in range(steps):
-                ask = talk.send(self._exchange(ask))
+                ask = talk.send(self.exchange(ask))
         except StopIteration:
             return
         self._send(ask)
@@ -89,7 +89,8 @@ class Line:
             self.others.append(message)
         return self.others
 
-    def _exchange(self, ask: MailboxRequest) -> MailboxMessage:
+    def exchange(self, ask: MailboxRequest) -> MailboxMessage:
+        """Do one step of a conversation."""
         if not ask.listen:
             self.now_ns += ask.delay_ns
             self._send(ask)

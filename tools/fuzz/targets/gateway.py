@@ -22,13 +22,14 @@ from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite
 from eap.aoe.ads_request import take_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
-from eap.appliance.bus_request import BusReport, SlaveReport, UnsolicitedMessage
+from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage
 from eap.appliance.services.bus.bus_talk import Talk
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
+from eap.appliance.services.slaves.bus_view import BusDescription
+from eap.appliance.services.slaves.remote_slave import RemoteSlave
 from eap.codec.mailbox import (
     MailboxHeader,
     MailboxType,
@@ -37,7 +38,7 @@ from eap.codec.mailbox import (
     encode_frame,
     encode_message,
 )
-from eap.gateway.address import AddressMap, RemoteSlave
+from eap.gateway.address import AddressMap, RemoteAddress
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
@@ -109,12 +110,20 @@ class _Link:
             _SIZES,
         )
 
-    async def describe(self) -> BusReport:
-        slave = SlaveReport(
+    @property
+    def view(self) -> _Link:
+        """Return what describes the bus."""
+        return self
+
+    async def current(self) -> BusDescription:
+        slave = SlaveDescription(
             station=_STATION, name="", vendor=0, product=0, revision=0, serial=0, alias=0, state=8,
             target=8, to_slave=_SIZES.to_slave, to_master=_SIZES.to_master, protocols=0x2C,
         )  # fmt: skip
-        return BusReport(is_up=True, slaves=(slave,))
+        return BusDescription(True, "", {_STATION: slave})
+
+    async def confirm(self) -> BusDescription:
+        return await self.current()
 
     async def open_talk(
         self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
@@ -175,13 +184,13 @@ async def _serve(data: bytes) -> None:
     dictionary = ObjectDictionary(
         [variable(0x1000, "A", "UDINT"), variable(0, "B", "BLOCK(90)", RW)]
     )
-    link = RemoteLink(_ask, _STATION, answer_s=1)
+    link = RemoteSlave(_ask, _STATION, answer_s=1)
     gateway = MailboxGateway(
         cast("BusMailboxes", _Link(dictionary)),
         lambda: MasterSession(dictionary, _SETTINGS.room, _nothing, lambda index: bool(index & 1)),
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,
-        AddressMap({_VIRTUAL: RemoteSlave(_SETTINGS.net_id, 1001)}),
+        AddressMap({_VIRTUAL: RemoteAddress(_SETTINGS.net_id, 1001)}),
         lambda slave: link,
     )
     door = GatewayDoor([(gateway, "udp:eap0")])
@@ -194,6 +203,8 @@ async def _serve(data: bytes) -> None:
     await gateway.close()
     if gateway.transfers() or gateway.ledger.table():
         raise AssertionError("transfers or clients are left over")
+    if gateway.memory.held:
+        raise AssertionError(f"{gateway.memory.held} octets are held for nothing")
 
 
 def fuzz_one(data: bytes) -> None:

@@ -101,6 +101,7 @@ class Transfer:
         password: Up to 32 bits.
         sizes: Of the slave's mailboxes.
         is_write: Whether it goes to the slave.
+        ahead: Octets that are read before anybody asks for them.
 
     Attributes:
         progress: How much of it the slave has, or has given.
@@ -112,7 +113,15 @@ class Transfer:
         sizes: As given.
     """
 
-    def __init__(self, name: str, password: int, sizes: MailboxSizes, *, is_write: bool) -> None:
+    def __init__(
+        self,
+        name: str,
+        password: int,
+        sizes: MailboxSizes,
+        *,
+        is_write: bool,
+        ahead: int = AHEAD,
+    ) -> None:
         self.is_write = is_write
         self.progress = Progress()
         self.has_turn = self.is_open = self.is_complete = self.has_ended = False
@@ -120,7 +129,7 @@ class Transfer:
         self._password = password
         self.sizes = sizes
         self._buffer = bytearray()
-        self._wanted = AHEAD
+        self._ahead = self._wanted = ahead
         self.is_whole = False
         self._past = _Past(is_kept=is_write)
         self._error: EapError | None = None
@@ -180,7 +189,7 @@ class Transfer:
 
         Whoever gives up waiting has taken nothing.
         """
-        self._wanted = max(AHEAD, size)
+        self._wanted = max(self._ahead, size)
         self._note()
         await self._until(lambda: len(self._buffer) >= size)
         return self._cut(size)

@@ -1,7 +1,8 @@
 """The mailbox gateway of one bus (ETG.8200): many clients, one master and its slaves.
 
-Whoever asks is answered: by the slave, by the master's dictionary, or with an error in the protocol
-of the request.  Requests of a client to different slaves or protocols do not wait for each other.
+Every request is answered: by the slave, by the master's dictionary, or with an error in the
+protocol of the request.  Requests of a client to different slaves or protocols do not wait for each
+other.
 """
 
 from __future__ import annotations
@@ -9,20 +10,32 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from time import monotonic_ns
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from msgspec.structs import replace
 
+from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.wire.sii import SiiProtocol
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation
 from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
-from eap.appliance.bus_request import Heard
-from eap.appliance.services.gateway.answering import Answering, Request, Send, refusals
-from eap.appliance.services.gateway.dialect_desk import DialectDesk
+from eap.appliance.bus_failure import no_mailbox
+from eap.appliance.bus_request import Heard, SlaveDescription
+from eap.appliance.services.gateway.client_session import (
+    ClientSession,
+    Reply,
+    SessionKey,
+    SessionTable,
+    cause_of,
+    refusals,
+)
+from eap.appliance.services.gateway.dialect_handler import DialectHandler, DialectTarget
 from eap.appliance.services.gateway.eoe_listeners import EoeListeners
+from eap.appliance.services.gateway.file_codec import FileCodec
 from eap.appliance.services.gateway.guard import (
     MASTER_PORT,
     Guard,
@@ -32,43 +45,52 @@ from eap.appliance.services.gateway.guard import (
     result_of,
 )
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.remote_link import LinkTo
-from eap.appliance.services.gateway.remote_session import RemoteSession
-from eap.appliance.services.gateway.sessions import SessionKey, Sessions
-from eap.appliance.services.gateway.slave_book import SlaveBook
-from eap.appliance.services.gateway.slave_session import (
-    Reply,
-    SlaveSession,
-    find_refusal,
-)
+from eap.appliance.services.gateway.message_codecs import codec_for
+from eap.appliance.services.gateway.reply_encoder import ReplyEncoder, Request, Send
+from eap.appliance.services.slaves.access import SlaveAccess
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
-from eap.codec.mailbox import MailboxType, decode_frame
+from eap.appliance.services.slaves.local_slave import LocalSlave
+from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
+from eap.errors import EngineGoneError
 from eap.gateway import dialect
-from eap.gateway.address import MASTER_ADDRESS, AddressMap, Group, Master, RemoteSlave, Slave
-from eap.gateway.ledger import Admission, ClientLimits, Ledger, Ticket
-from eap.gateway.refusal import Reason
+from eap.gateway.address import (
+    MASTER_ADDRESS,
+    AddressMap,
+    Destination,
+    GroupAddress,
+    MasterAddress,
+    RemoteAddress,
+    SlaveAddress,
+)
+from eap.gateway.error_table import Cause
+from eap.gateway.ledger import Admission, ClientLimits, Ledger, MemoryBudget, MemoryShare, Ticket
 from eap.gateway.rights import operation_of
 from eap.ids import NetId
 
 ANSWER_S = 0.9
-"""How long an answer may take: before a usual client gives up."""
+"""Limit for an answer, below the second after which usual clients give up."""
+PAUSE_S = 2.0
+"""Pause of a client in the middle of a file after which it gives way to another client's file."""
 
-_NOT_TAKEN = {Admission.CROWDED: Reason.CROWDED, Admission.TOO_FAST: Reason.TOO_FAST}
+OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
+"""Returns access to a slave, or the master, of another station."""
+
+_NOT_TAKEN = {Admission.CROWDED: Cause.CROWDED, Admission.TOO_FAST: Cause.TOO_FAST}
 
 _BY_TCP = f"{DoorKind.TCP}:"
-"""How the names of such doors begin."""
+"""Prefix of the names of TCP transports."""
 
 logger = logging.getLogger(__name__)
 
 
 class Settings(NamedTuple):
-    """How a gateway behaves."""
+    """Behaviour of a gateway."""
 
     net_id: NetId
     """Of the bus port: targets of access rules."""
     answer_s: float = ANSWER_S
     is_silent: bool = False
-    """Whether it keeps its own errors to itself, and answers what slaves answer."""
+    """Whether it keeps its own errors to itself, and answers only as slaves do."""
     room: int = 1486
     """Octets of the longest answer behind its headers: one datagram takes it."""
     limits: ClientLimits = ClientLimits()
@@ -80,20 +102,21 @@ class MailboxGateway:
     """A gateway.
 
     Args:
-        bus: Its slaves.
+        bus: The mailboxes of its slaves.
         open_master: Begins a session with the master's dictionary.
-        access: Returns the rules by which is judged who may do what.
-        settings: How it behaves.
+        access: Returns the access rules in force.
+        settings: Its behaviour.
         addresses: Beside those of the standard.
-        link_to: Returns the way to a slave of another station.
+        open_remote: Returns access to a slave of another station.
 
     Attributes:
-        tally: What it did, by slave and protocol.
-        ledger: What it did, by client.
-        guard: Judges requests, and has the audit written.
+        statistics: Requests and answers by slave and protocol.
+        ledger: Requests by client.
+        memory: Octets that transfers hold.
+        guard: Access rules and audit.
         settings: As given.
         is_open: Whether it takes requests.
-        turned_away: Frames that came while it did not.
+        turned_away: Frames that were dropped while it did not.
     """
 
     def __init__(
@@ -103,11 +126,12 @@ class MailboxGateway:
         access: Callable[[], AccessList],
         settings: Settings,
         addresses: AddressMap,
-        link_to: LinkTo,
+        open_remote: OpenRemote,
     ) -> None:
         self.ledger = Ledger(settings.limits)
-        self._answering = Answering(self.ledger, settings.name, is_silent=settings.is_silent)
-        self.tally = self._answering.tally
+        self.memory = MemoryBudget()
+        self._encoder = ReplyEncoder(self.ledger, settings.name, is_silent=settings.is_silent)
+        self.statistics = self._encoder.statistics
         self.guard = Guard(access)
         self.settings = settings
         self.is_open = True
@@ -116,15 +140,10 @@ class MailboxGateway:
         self._master = Target(settings.net_id, MASTER_PORT)
         self._open_master = open_master
         self._addresses = addresses
-        self._link_to = link_to
-        self._book = SlaveBook(bus.describe)
-        self._dialect = DialectDesk(
-            bus, self._book, self.guard, open_master, link_to, settings.room,
-            settings.answer_s,
-        )  # fmt: skip
-        self._slaves: Sessions[SlaveSession] = Sessions()
-        self._masters: Sessions[MasterSession] = Sessions()
-        self._remotes: Sessions[RemoteSession] = Sessions()
+        self._open_remote = open_remote
+        self._dialect = DialectHandler(self.guard, settings.room, settings.answer_s)
+        self._masters: SessionTable[MasterSession] = SessionTable()
+        self._slaves: SessionTable[ClientSession] = SessionTable()
         self._tasks: set[asyncio.Task[None]] = set()
         self._count = 0
         self._listeners = EoeListeners()
@@ -141,7 +160,7 @@ class MailboxGateway:
 
     def transfers(self) -> list[SessionKey]:
         """Return the transfers that are under way."""
-        return [*self._slaves.running(), *self._remotes.running()]
+        return [*self._slaves.running()]
 
     def receive(self, frame: bytes, way: Way, send: Send) -> asyncio.Task[None] | None:
         """Take a request; its answers go back by *send*, until the task that is returned is done.
@@ -153,7 +172,7 @@ class MailboxGateway:
 
         Raises:
             TruncatedError: it is shorter than its headers say.
-            MalformedError: nobody knows its protocol.
+            MalformedError: its protocol is unknown.
         """
         header, body = decode_frame(frame)
         key = frame
@@ -166,7 +185,7 @@ class MailboxGateway:
             return None
         request = Request(header, bytes(body), way, send)
         if admission is not Admission.TAKEN:
-            self._answering.refuse(request, _NOT_TAKEN[admission])
+            self._encoder.refuse(request, _NOT_TAKEN[admission])
             return None
         if self._answer_at_once(request, key, now_ns):
             return None
@@ -182,7 +201,6 @@ class MailboxGateway:
         self._listeners.forget(way)
         self._slaves.close_of(way)
         self._masters.close_of(way)
-        self._remotes.close_of(way)
 
     async def wait_below(self, way: Way, count: int) -> None:
         """Wait until fewer than *count* requests of a client wait."""
@@ -199,7 +217,6 @@ class MailboxGateway:
             self._listeners.forget(way)
         self._slaves.close()
         self._masters.close()
-        self._remotes.close()
 
     def _done(self, request: Request, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
@@ -212,20 +229,22 @@ class MailboxGateway:
         if kind is not None:
             await self._serve_dialect(request, kind)
             return
+        address = request.header.address
         if request.header.type is MailboxType.ERR:
-            self._answering.refuse(request, Reason.SERVICE)
+            self._encoder.refuse(request, Cause.SERVICE)
             return
-        stations = await self._stations(request.header.address)
-        found = self._addresses.resolve(request.header.address, stations)
-        if not isinstance(found, Group):
-            await self._ask(request, found, request.header.address)
-        elif not found.members:
-            self._answering.refuse(request, Reason.NO_SLAVE)
-        else:
-            members = ((self._addresses.resolve(each, stations), each) for each in found.members)
-            await asyncio.gather(
-                *(self._ask(request, one, address, is_group=True) for one, address in members)
-            )
+        stations = () if address == MASTER_ADDRESS else await self._stations()
+        match self._addresses.resolve(address, stations):
+            case GroupAddress(members):
+                if not members:
+                    self._encoder.refuse(request, Cause.NO_SLAVE)
+                    return
+                found = ((self._addresses.resolve(each, stations), each) for each in members)
+                await asyncio.gather(
+                    *(self._ask(request, one, each, is_group=True) for one, each in found)
+                )
+            case destination:
+                await self._ask(request, destination, address)
 
     def _answer_at_once(self, request: Request, key: bytes, start_ns: int) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
@@ -235,8 +254,8 @@ class MailboxGateway:
         if self.ledger.waiting(way) > 1:
             return False  # what came first is answered first
         operation = operation_of(MailboxType.COE, body)
-        whose = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
-        master = self._masters.take(whose, self._open_master)
+        key_of_session = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
+        master = self._masters.take(key_of_session, self._open_master)
         if not master.is_ready(operation):
             return False
         self.ledger.answered(way, key)
@@ -249,35 +268,39 @@ class MailboxGateway:
         self._finish(request, judged, MASTER_ADDRESS, replies, start_ns)
         return True
 
-    async def _stations(self, address: int) -> tuple[int, ...]:
-        """Return the slaves there are, as far as that matters for *address*."""
-        if address == MASTER_ADDRESS:
-            return ()
-        return await self._book.stations()
-
     async def _ask(
-        self, request: Request, found: object, address: int, *, is_group: bool = False
+        self, request: Request, destination: Destination, address: int, *, is_group: bool = False
     ) -> None:
-        """Ask the master or one slave, and answer from *address*."""
+        """Have the master or a slave answer a request, from *address*."""
         kind, body, way = request.header.type, request.body, request.way
         start_ns = monotonic_ns()
         operation = operation_of(kind, body)
-        station = found.station if isinstance(found, Slave) else address
-        judged = self._judge(way, station, self._target(found), operation, by_rule=is_group)
-        if not judged.is_allowed:
+        station = destination.station if isinstance(destination, SlaveAddress) else address
+        target = self._target(destination)
+        judged = self._judge(way, station, target, operation, by_rule=is_group)
+        if judged.is_allowed:
+            is_step = operation is None
+            replies = await self._ask_allowed(request, destination, station, is_step=is_step)
+        else:
             replies = refusals(kind, body, reason_of_refusal(judged.verdict))
-        elif isinstance(found, Slave):
-            replies = await self._ask_slave(request, station, is_step=operation is None)
-        elif isinstance(found, Master):
-            master = self._masters.take(SessionKey(way, station, kind), self._open_master)
-            replies = await master.ask(kind, body)
-        elif isinstance(found, RemoteSlave):
-            link, room = self._link_to(found), self.settings.room
-            begin = partial(RemoteSession, kind, link, room=room)
-            replies = await self._remotes.take(SessionKey(way, station, kind), begin).ask(body)
-        else:  # a group within a group
-            replies = refusals(kind, body, Reason.NO_SLAVE)
         self._finish(request, judged, address, replies, start_ns)
+
+    async def _ask_allowed(
+        self, request: Request, destination: Destination, station: int, *, is_step: bool
+    ) -> list[Reply]:
+        kind, body, way = request.header.type, request.body, request.way
+        key = SessionKey(way, station, kind)
+        match destination:
+            case MasterAddress():
+                return await self._masters.take(key, self._open_master).ask(kind, body)
+            case SlaveAddress():
+                return await self._ask_slave(request, key, is_step=is_step)
+            case RemoteAddress():
+                sizes = MailboxSizes.of_data(self.settings.room)
+                begin = partial(self._begin, key, self._open_remote(destination), sizes)
+                return await self._slaves.take(key, begin).ask(body, is_step=is_step)
+            case GroupAddress():  # a group within a group
+                return refusals(kind, body, Cause.NO_SLAVE)
 
     def _judge(
         self,
@@ -306,48 +329,124 @@ class MailboxGateway:
         if operation is not None and verdict is not None:
             self.guard.tell(request.way, judged.target, operation, verdict, result_of(replies))
         took_ns = monotonic_ns() - start_ns
-        self._answering.answer(request, judged.station, address, replies, took_ns)
+        self._encoder.answer(request, judged.station, address, replies, took_ns)
 
-    def _target(self, found: object) -> Target:
-        """Return by what rules name somebody."""
-        if isinstance(found, RemoteSlave):
-            return Target(found.net_id, found.port)
-        port = found.station if isinstance(found, Slave) else MASTER_PORT
-        return Target(self.settings.net_id, port)
+    def _target(self, destination: Destination) -> Target:
+        """Return the name of a destination in access rules."""
+        match destination:
+            case RemoteAddress(net_id, port):
+                return Target(net_id, port)
+            case SlaveAddress(station):
+                return Target(self.settings.net_id, station)
+        return self._master
 
-    async def _ask_slave(self, request: Request, station: int, *, is_step: bool) -> list[Reply]:
-        kind, body = request.header.type, request.body
-        slave = await self._book.find(station)
-        if isinstance(slave, Reason):
+    async def _ask_slave(self, request: Request, key: SessionKey, *, is_step: bool) -> list[Reply]:
+        kind, body, station = key.kind, request.body, key.address
+        slave = await self._find(station)
+        if isinstance(slave, Cause):
             return refusals(kind, body, slave)
-        reason = find_refusal(kind, body, slave)
-        if reason is not None:
-            return refusals(kind, body, reason)
-
+        cause = find_refusal(kind, body, slave)
+        if cause is not None:
+            return refusals(kind, body, cause)
         if kind is MailboxType.EOE:
             address, now_ns = request.header.address, monotonic_ns()
             self._listeners.note(station, request.way, address, request.send, now_ns)
+        session = self._slaves.take(key, partial(self._begin_local, key, slave))
+        sizes = session.codec.sizes
+        if (sizes.to_slave, sizes.to_master) != (slave.to_slave, slave.to_master):
+            self._slaves.drop(key)  # the mailbox is another one than before, as in BOOT
+            session = self._slaves.take(key, partial(self._begin_local, key, slave))
+        replies = await session.ask(body, is_step=is_step)
+        if isinstance(session.codec, FileCodec) and session.codec.waits_for_turn:
+            self._end_pauses(key)
+        return replies
 
-        def begin() -> SlaveSession:
-            talk = partial(self._bus.open_talk, station, kind, request.way)
-            return SlaveSession(kind, slave, talk, answer_s=self.settings.answer_s)
+    async def _stations(self) -> tuple[int, ...]:
+        """Return the station addresses in the order of the bus, none while it is down."""
+        with suppress(EngineGoneError):
+            bus = await self._bus.view.current()
+            return tuple(bus.slaves) if bus.is_up else ()
+        return ()
 
-        session = self._slaves.take(SessionKey(request.way, station, kind), begin)
-        return await session.ask(body, is_step=is_step)
+    async def _find(self, station: int) -> SlaveDescription | Cause:
+        """Return a slave, or why it cannot be reached."""
+        try:
+            bus = await self._bus.view.current()
+            slave = bus.slaves.get(station)
+            if not bus.is_up or slave is None or not slave.to_slave:
+                # Clients that have just seen a slave come to PREOP send their requests at once.
+                bus = await self._bus.view.confirm()
+        except EngineGoneError:
+            return Cause.BUS_DOWN
+        return bus.slaves.get(station, Cause.NO_SLAVE) if bus.is_up else Cause.BUS_DOWN
+
+    def _begin_local(self, key: SessionKey, slave: SlaveDescription) -> ClientSession:
+        access = LocalSlave(self._bus, slave, key.way, turn_s=self.settings.answer_s)
+        return self._begin(key, access, MailboxSizes(slave.to_slave, slave.to_master))
+
+    def _begin(self, key: SessionKey, access: SlaveAccess, sizes: MailboxSizes) -> ClientSession:
+        answer_s, memory = self.settings.answer_s, MemoryShare(self.memory, key.way)
+        # The rest of the time is for the probe of a station that lets a client wait.
+        codec = codec_for(key.kind, access, sizes, memory, wait_s=answer_s / 3)
+        return ClientSession(key.kind, codec, answer_s=answer_s)
+
+    def _end_pauses(self, key: SessionKey) -> None:
+        """Give up the files of other clients at a slave that were left for a while."""
+        for other, session in self._slaves.of_slave(key.address, key.kind):
+            if other.way != key.way and session.pause_s() > PAUSE_S:
+                logger.info(
+                    "gateway %s: file of slave %d given up: %s has paused for %g s, and %s waits",
+                    self.settings.name, key.address, other.way.connection, PAUSE_S,
+                    key.way.connection,
+                )  # fmt: skip
+                session.close()
 
     def _take_unasked(self, message: Heard) -> None:
-        """Hand an Ethernet frame of a slave to the clients that talk EoE to it."""
+        """Send an Ethernet frame of a slave to the clients that talk EoE to it."""
         if message.kind != MailboxType.EOE:
             return
         for listener in self._listeners.of(message.station, monotonic_ns()):
-            self._answering.send(listener.send, listener.address, MailboxType.EOE, message.data)
+            self._encoder.send(listener.send, listener.address, MailboxType.EOE, message.data)
 
     async def _serve_dialect(self, request: Request, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()
-        found = self._addresses.resolve(address, ())
-        whom = Slave(address) if isinstance(found, Group) else found  # nobody has that address
-        answer, reason = await self._dialect.answer(
-            kind, whom, self._target(whom), request.body, request.way
-        )
+        destination = self._addresses.resolve(address, ())
+        if isinstance(
+            destination, GroupAddress
+        ):  # the dialect knows none: no slave has the address
+            destination = SlaveAddress(address)
+        answer, cause = await self._dialect.answer(
+            kind, request.body, request.way, self._target(destination),
+            partial(self._dialect_target, kind, destination, request.way),
+        )  # fmt: skip
         took_ns = monotonic_ns() - start_ns
-        self._answering.answer_dialect(request, kind, answer, reason, took_ns)
+        self._encoder.answer_dialect(request, kind, answer, cause, took_ns)
+
+    async def _dialect_target(
+        self, kind: MailboxType, destination: Destination, way: Way
+    ) -> DialectTarget | Cause:
+        match destination:
+            case MasterAddress():
+                return self._open_master()
+            case RemoteAddress():
+                return self._open_remote(destination)
+            case SlaveAddress(station):
+                slave = await self._find(station)
+                if isinstance(slave, Cause):
+                    return slave
+                turn_s = self.settings.answer_s
+                return find_refusal(kind, b"", slave) or LocalSlave(
+                    self._bus, slave, way, turn_s=turn_s
+                )
+        return Cause.NO_SLAVE
+
+
+def find_refusal(kind: MailboxType, body: bytes, slave: SlaveDescription) -> Cause | None:
+    """Return why a request does not even go to the slave that it is for."""
+    if not slave.to_slave:
+        return cause_of(no_mailbox(slave))
+    if not slave.protocols & SiiProtocol[kind.name]:
+        return Cause.NO_PROTOCOL
+    if len(body) + MailboxHeader.SIZE > slave.to_slave:
+        return Cause.TOO_LONG
+    return None

@@ -123,7 +123,7 @@ def gateway_row(gateway: MailboxGateway) -> dict[str, Any]:
             }
             for way, counts in gateway.ledger.table().items()
         ],
-        "slaves": gateway.tally.report(),
+        "slaves": gateway.statistics.report(),
     }
 
 

@@ -16,7 +16,7 @@ from eap.aoe.ads_operation import Operation, Read
 from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
-from eap.appliance.services.gateway.slave_session import Reply
+from eap.appliance.services.gateway.client_session import Reply
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.codec.coe import CoeHeader, CoeService
@@ -24,8 +24,7 @@ from eap.codec.foe import FoeOpcode
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SdoHeader, SdoRequest
 from eap.codec.soe import SoeHeader
-from eap.gateway.error_table import ads_result
-from eap.gateway.refusal import Reason
+from eap.gateway.error_table import Cause, ads_result
 from eap.ids import NetId
 from eap.od.abort import SdoAbortError
 
@@ -137,10 +136,10 @@ def _entry(way: Way, target: Target, audited: AuditedOperation) -> AuditEntry:
     return AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
 
 
-def reason_of_refusal(verdict: Verdict | None) -> Reason:
+def reason_of_refusal(verdict: Verdict | None) -> Cause:
     """Return why a request with this verdict is refused."""
     is_recordable = verdict is None or verdict.is_recordable
-    return Reason.DENIED if is_recordable else Reason.NOT_RECORDED
+    return Cause.DENIED if is_recordable else Cause.NOT_RECORDED
 
 
 def result_of(replies: Sequence[Reply]) -> int | None:

@@ -9,13 +9,11 @@ from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.access import place_of
 from eap.aoe.ads_operation import Operation
-from eap.appliance.services.gateway.dialect_task import DialectError
-from eap.appliance.services.gateway.slave_session import Reply
+from eap.appliance.services.gateway.client_session import Reply, refusals
 from eap.codec.mailbox import MailboxError, MailboxType
-from eap.gateway.dialect import Failure, ReadSdo, Task, WriteSdo
-from eap.gateway.refusal import Reason, mailbox_error, refuse
+from eap.gateway.error_table import Cause
+from eap.gateway.refusal import mailbox_error, refuse
 from eap.gateway.rights import operation_of
-from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdState
 
@@ -47,8 +45,7 @@ class MasterSession:
     async def ask(self, kind: MailboxType, body: bytes) -> list[Reply]:
         """Return the answers to a request."""
         if kind is not MailboxType.COE:
-            reason = Reason.NO_PROTOCOL
-            return [Reply(*refuse(kind, body, reason), reason=reason)]
+            return refusals(kind, body, Cause.NO_PROTOCOL)
         await self._refresh(_index_of(operation_of(kind, body)))
         return self.ask_now(body)
 
@@ -62,28 +59,19 @@ class MasterSession:
             answers = self._server.receive_message(body, 0)
         except MailboxRefusedError as exc:
             if exc.detail == MailboxError.SIZE_TOO_SHORT:
-                return [Reply(*refuse(MailboxType.COE, body, Reason.TOO_SHORT))]
+                return [Reply(*refuse(MailboxType.COE, body, Cause.TOO_SHORT))]
             return [Reply(*mailbox_error(exc.detail))]
         return [Reply(MailboxType.COE, answer) for answer in answers]
 
-    async def perform(self, task: Task) -> bytes:
-        """Do a task of the dialect; return what was read.
+    async def read(self, index: int, subindex: int, *, complete: bool) -> bytes:
+        """Return an entry or an object as it is now; raise SdoAbortError."""
+        await self._refresh(index)
+        read = self._dictionary.upload_complete if complete else self._dictionary.upload
+        return read(index, subindex, OdState.OP)
 
-        Raises:
-            DialectError: it is none for the master, or refused.
-        """
-        try:
-            match task:
-                case ReadSdo(index, subindex, complete):
-                    await self._refresh(index)
-                    read = self._dictionary.upload_complete if complete else self._dictionary.upload
-                    return read(index, subindex, OdState.OP)
-                case WriteSdo(index, subindex, data):
-                    self._dictionary.download(index, subindex, data, OdState.OP)
-                    return b""
-        except SdoAbortError as exc:
-            raise DialectError(Failure.GENERAL, str(exc), exc.code) from None
-        raise DialectError(Failure.NOT_SUPPORTED, "the master has only a CoE dictionary")
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Write an entry; raise SdoAbortError."""
+        self._dictionary.download(index, subindex, data, OdState.OP)
 
     def close(self) -> None:
         """Forget what is under way."""

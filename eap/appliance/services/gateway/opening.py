@@ -10,11 +10,11 @@ from eap.appliance.handover import Handover, PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.remote_link import RemoteLink
 from eap.appliance.services.master.master_desk import MasterDesk
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
-from eap.gateway.address import AddressMap, Group, RemoteSlave, Slave
+from eap.appliance.services.slaves.remote_slave import RemoteSlave
+from eap.gateway.address import AddressMap, GroupAddress, RemoteAddress, SlaveAddress
 from eap.gateway.ledger import ClientLimits
 from eap.ids import NetId
 from eap.pd.spec import GatewayAddress, GatewaySpec
@@ -69,8 +69,8 @@ def open_gateways(
             partial(MasterSession, desk.dictionary, settings.room, desk.refresh, desk.is_fresh),
             partial(_access_of, router),
             settings,
-            AddressMap({each.address: _whom(each) for each in told.addresses}),
-            partial(_link, router, settings),
+            AddressMap({each.address: _destination(each) for each in told.addresses}),
+            partial(_open_remote, router, settings),
         )
         gateway.is_open = told.enabled
         gateways[bus.owner] = gateway
@@ -85,13 +85,13 @@ def _access_of(router: StationRouter) -> AccessList:
     return router.access
 
 
-def _link(router: StationRouter, settings: Settings, slave: RemoteSlave) -> RemoteLink:
-    return RemoteLink(partial(router.ask, slave.net_id), slave.port, settings.answer_s)
+def _open_remote(router: StationRouter, settings: Settings, slave: RemoteAddress) -> RemoteSlave:
+    return RemoteSlave(partial(router.ask, slave.net_id), slave.port, settings.answer_s)
 
 
-def _whom(told: GatewayAddress) -> Slave | RemoteSlave | Group:
-    if told.members:
-        return Group(told.members)
-    if told.net_id:
-        return RemoteSlave(NetId.parse(told.net_id), told.port)
-    return Slave(told.station)
+def _destination(address: GatewayAddress) -> SlaveAddress | RemoteAddress | GroupAddress:
+    if address.members:
+        return GroupAddress(address.members)
+    if address.net_id:
+        return RemoteAddress(NetId.parse(address.net_id), address.port)
+    return SlaveAddress(address.station)

@@ -19,6 +19,8 @@ from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.errors import EapError
 from eap.gateway.error_table import cause_of_result
 
+AHEAD = 64 << 10
+"""Octets of a file that are read before its reader wants them, unless it says otherwise."""
 UploadSink: TypeAlias = Callable[[int, bytes], object]
 """Called with the size of an object and each piece of it, in their order, as the slave sends it."""
 
@@ -49,6 +51,10 @@ class FileStream(Protocol):
 
     sizes: MailboxSizes
     has_turn: bool
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether nothing more goes to the slave or comes from it."""
 
     async def wait_open(self) -> None:
         """Wait until the slave has opened the file."""
@@ -101,8 +107,10 @@ class SlaveAccess(Protocol):
     async def write_elements(self, idn: int, elements: int, data: bytes, *, drive: int) -> None:
         """Write an element of an IDN; a list or text with its head."""
 
-    def open_file(self, name: str, password: int, *, is_write: bool) -> FileStream:
-        """Begin to move a file; it is closed by the caller."""
+    def open_file(
+        self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
+    ) -> FileStream:
+        """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
 
     async def exchange_vendor(self, message: bytes) -> bytes:
         """Return the answer to a VoE message, both with their VoE headers."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable
 from typing import TypeVar
 
 from devicebus.mailbox.conversation import Conversation
-from eap.appliance.bus_request import BusReport, Heard
+from eap.appliance.bus_request import Heard
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.bus_talk import Talk
@@ -16,19 +16,20 @@ T = TypeVar("T")
 
 
 class BusMailboxes:
-    """The bus client, narrowed to one port."""
+    """The bus client, narrowed to one port.
+
+    Attributes:
+        view: Cached description of the bus.
+    """
 
     def __init__(self, client: BusClient, port: PortName) -> None:
+        self.view = client.views[port]
         self._client = client
         self._port = port
 
     def listen(self, receive: Callable[[Heard], None]) -> None:
         """Call *receive* with each message that a slave sends unasked."""
         self._client.listen(self._port, receive)
-
-    async def describe(self) -> BusReport:
-        """Return the state of the bus and its slaves; raises EngineGoneError."""
-        return await self._client.describe(self._port)
 
     async def open_talk(
         self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None

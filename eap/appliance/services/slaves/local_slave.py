@@ -11,7 +11,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_failure import no_mailbox
 from eap.appliance.bus_request import SlaveDescription
 from eap.appliance.services.bus_ads.transfer import Transfer
-from eap.appliance.services.slaves.access import UploadSink
+from eap.appliance.services.slaves.access import AHEAD, UploadSink
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
@@ -86,9 +86,11 @@ class LocalSlave:
             soe_client.write(Idn.of(idn), data, sizes, elements=elements, drive=drive)
         )
 
-    def open_file(self, name: str, password: int, *, is_write: bool) -> Transfer:
-        """Begin to move a file; it is closed by the caller."""
-        file = Transfer(name, password, self._sizes(), is_write=is_write)
+    def open_file(
+        self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
+    ) -> Transfer:
+        """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
+        file = Transfer(name, password, self._sizes(), is_write=is_write, ahead=ahead)
         # By the file, not by the requester: two of its files take turns like those of two.
         file.start(lambda: self.bus.open_talk(self._slave.station, MailboxType.FOE, file))
         return file

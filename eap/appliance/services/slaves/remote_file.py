@@ -17,32 +17,23 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import ReadWrite
 from eap.appliance.services.slaves.access import RemoteAccessError
 from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.foe import DATA_OVERHEAD, FoeErrorCode, name_of
+from eap.codec.foe import DATA_OVERHEAD, name_of
 from eap.errors import EapError
+from eap.gateway.error_table import cause_of_result
 
 if TYPE_CHECKING:
     from eap.appliance.services.slaves.remote_slave import RemoteSlave
 
 BLOCK = 16 << 10
 """Octets of the longest block; where there are only datagrams, one that is lost costs all of it."""
-AHEAD = 2 * BLOCK
-"""Octets that are read before the client wants them, or taken before they have gone on."""
+BEHIND = 2 * BLOCK
+"""Octets that are taken of a file before those have gone on."""
 STEP_S = 5.0
 """How long the answer to a block may take: routers give up after 4.5 s."""
 PAUSE_S = 0.02
 """Before a station that is busy is asked again."""
 _HANDLE_SIZE = 4
 _GIVE_UP = b"\1"
-_FOE: dict[int, FoeErrorCode] = {
-    AdsError.NOT_FOUND: FoeErrorCode.NOT_FOUND,
-    AdsError.SERVICE: FoeErrorCode.ILLEGAL,
-    AdsError.STATE: FoeErrorCode.ILLEGAL,
-    AdsError.ACCESS: FoeErrorCode.ACCESS_DENIED,
-    AdsError.NO_MEMORY: FoeErrorCode.DISK_FULL,
-    AdsError.EXISTS: FoeErrorCode.ALREADY_EXISTS,
-    AdsError.VALUE: FoeErrorCode.CHECKSUM,
-    AdsError.NO_MORE_HANDLES: FoeErrorCode.NO_USER,
-}
 
 
 class RemoteFile:
@@ -53,25 +44,34 @@ class RemoteFile:
         name: Of the file, at the slave.
         password: Up to 32 bits.
         is_write: Whether it goes to the slave.
+        ahead: Octets that are read before the client wants them.
 
     Attributes:
         sizes: Of the slave's mailboxes, known when the file is open.
-        has_turn: Whether it is open: another station does not tell who has its slave.
+        has_turn: Whether it is open: another station does not tell which client has its slave.
     """
 
-    def __init__(self, slave: RemoteSlave, name: str, password: int, *, is_write: bool) -> None:
+    def __init__(
+        self, slave: RemoteSlave, name: str, password: int, *, is_write: bool, ahead: int = BEHIND
+    ) -> None:
         self.sizes = MailboxSizes()
         self.has_turn = False
         self._slave = slave
         self._name = name
         self._password = password
         self._is_write = is_write
+        self._ahead = ahead
         self._buffer = bytearray()
         self._handle = 0
-        self._is_whole = self._is_complete = False
+        self._is_whole = self._is_complete = self._is_closed = False
         self._error: EapError | None = None
         self._changed = asyncio.Event()
         self._task = asyncio.get_running_loop().create_task(self._run())
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether nothing more goes to the slave or comes from it."""
+        return self._is_complete or self._error is not None
 
     async def wait_open(self) -> None:
         """Wait until the slave has opened the file; raise EapError if it refuses."""
@@ -93,7 +93,7 @@ class RemoteFile:
 
         Cancelling it gives nothing.
         """
-        await self._until(lambda: len(self._buffer) < AHEAD)
+        await self._until(lambda: len(self._buffer) < BEHIND)
         self._buffer += data
         self._notify()
 
@@ -105,12 +105,15 @@ class RemoteFile:
 
     def close(self) -> None:
         """Give the file up if it is not complete, at the slave too."""
-        self._task.cancel()
+        self._is_closed = True
+        if self.has_turn:  # else the handle is not known yet by which the slave is told
+            self._task.cancel()
 
     async def _run(self) -> None:
         try:
             await self._open()
-            await (self._drain() if self._is_write else self._fill())
+            if not self._is_closed:
+                await (self._drain() if self._is_write else self._fill())
         except RemoteAccessError as exc:
             self._error = _foe_error(exc)
         finally:
@@ -122,6 +125,8 @@ class RemoteFile:
     async def _open(self) -> None:
         sizes = await self._slave.sizes()
         self.sizes.set(sizes.to_slave, sizes.to_master)
+        if self._is_closed:
+            return  # a slave may forget its old file as soon as a new one is begun
         group = IndexGroup.FOE_OPEN_WRITE if self._is_write else IndexGroup.FOE_OPEN_READ
         opened = await self._ask(group, self._password, _HANDLE_SIZE, self._name.encode())
         self._handle = int.from_bytes(opened, "little")
@@ -131,7 +136,7 @@ class RemoteFile:
     async def _fill(self) -> None:
         size = self.sizes.to_master - DATA_OVERHEAD
         while not self._is_complete:
-            await self._wait(lambda: len(self._buffer) < AHEAD)
+            await self._wait(lambda: len(self._buffer) < self._ahead)
             data = await self._ask(IndexGroup.FOE_READ, self._handle, size)
             self._buffer += data
             self._is_complete = len(data) < size
@@ -159,14 +164,14 @@ class RemoteFile:
             await self._slave.perform(last)
 
     async def _ask(self, group: int, offset: int, length: int = 0, data: bytes = b"") -> bytes:
-        """Send a request, and again as long as the answer is BUSY."""
+        """Send a request, and again as long as the answer is BUSY and the file is wanted."""
         while True:
             try:
                 return await self._slave.perform(
                     ReadWrite(group, offset, length, data), timeout_s=STEP_S
                 )
             except RemoteAccessError as exc:
-                if exc.result != AdsError.BUSY:
+                if exc.result != AdsError.BUSY or self._is_closed:
                     raise
             await asyncio.sleep(PAUSE_S)
 
@@ -177,7 +182,7 @@ class RemoteFile:
 
     async def _until(self, is_so: Callable[[], bool]) -> None:
         """Wait until it is so, or the transfer has ended; raise what has ended it."""
-        await self._wait(lambda: is_so() or self._is_complete or self._error is not None)
+        await self._wait(lambda: is_so() or self.has_ended)
         if self._error is not None:
             raise self._error
 
@@ -190,6 +195,6 @@ def _foe_error(error: RemoteAccessError) -> RemoteAccessError | FoeError:
     """Return the refusal with an FoE code; errors of the way to the slave stay as they are."""
     if error.is_of_way:
         return error
-    code = _FOE.get(error.result, FoeErrorCode.NOT_DEFINED)
+    code = cause_of_result(error.result).foe
     text = f"{name_of(code)}: ADS error 0x{error.result:x} ({AdsError.name_of(error.result)})"
     return FoeError(text, code=code, text=text)

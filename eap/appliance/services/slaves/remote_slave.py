@@ -14,7 +14,7 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Operation, Read, ReadState, ReadWrite, Write
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer, response_to
-from eap.appliance.services.slaves.access import RemoteAccessError, UploadSink
+from eap.appliance.services.slaves.access import AHEAD, RemoteAccessError, UploadSink
 from eap.appliance.services.slaves.remote_file import RemoteFile
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
@@ -169,9 +169,11 @@ class RemoteSlave:
         except RemoteAccessError as exc:
             raise _soe_error(exc) from None
 
-    def open_file(self, name: str, password: int, *, is_write: bool) -> RemoteFile:
-        """Begin to move a file; it is closed by the caller."""
-        return RemoteFile(self, name, password, is_write=is_write)
+    def open_file(
+        self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
+    ) -> RemoteFile:
+        """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
+        return RemoteFile(self, name, password, is_write=is_write, ahead=ahead)
 
     async def exchange_vendor(self, message: bytes) -> bytes:
         """Return the answer to a VoE message, both with their VoE headers."""

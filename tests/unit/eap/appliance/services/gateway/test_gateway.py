@@ -17,8 +17,9 @@ from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.remote_link import RemoteLink
+from eap.appliance.services.slaves.access import SlaveAccess
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
+from eap.appliance.services.slaves.remote_slave import LONGEST_ANSWER
 from eap.codec.ads import IndexGroup
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.mailbox import (
@@ -27,8 +28,7 @@ from eap.codec.mailbox import (
     decode_frame,
     encode_frame,
 )
-from eap.gateway.address import AddressMap, RemoteSlave, Slave
-from eap.gateway.elsewhere import ROOM
+from eap.gateway.address import AddressMap, RemoteAddress, SlaveAddress
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, array, variable
@@ -68,7 +68,7 @@ class Desk:
     """
 
     def __init__(self, bus: str, rules: tuple[AccessRule, ...], settings: Settings) -> None:
-        self.asked: list[RemoteSlave] = []
+        self.asked: list[RemoteAddress] = []
         self.station = Station(b"\7\0\0\0")
         self.engine = FakeEngine(FakeBus(LoopBus(bus)))
         self._link = EngineLink(self.engine.services)
@@ -78,11 +78,11 @@ class Desk:
             lambda: MasterSession(MASTER, settings.room, nothing, lambda index: next(turns)),
             lambda: AccessList(rules),
             settings,
-            AddressMap({0x9000: Slave(1001), 0x9001: RemoteSlave(ELSEWHERE_BUS, 1003)}),
-            self._link_to,
+            AddressMap({0x9000: SlaveAddress(1001), 0x9001: RemoteAddress(ELSEWHERE_BUS, 1003)}),
+            self._open_remote,
         )
 
-    def _link_to(self, slave: RemoteSlave) -> RemoteLink:
+    def _open_remote(self, slave: RemoteAddress) -> SlaveAccess:
         self.asked.append(slave)
         return self.station.link()
 
@@ -109,6 +109,17 @@ class Desk:
         assert header.type is kind
         assert header.address == address
         return body.hex(" ")
+
+    async def write_file(self, name: str, content: bytes) -> None:
+        """Write a file of the drive."""
+        room = 1024 - 12
+        while (await self.one(FOE, 1001, "02 00 00000000" + name))[:2] == "06":
+            pass
+        for number, at in enumerate(range(0, len(content) + 1, room), 1):
+            packet = bytes((3, 0)) + number.to_bytes(4, "little") + content[at : at + room]
+            while (answer := await self.one(FOE, 1001, packet))[:2] == "06":
+                pass
+            assert answer == (bytes((4, 0)) + number.to_bytes(4, "little")).hex(" ")
 
     async def close(self) -> None:
         await self.gateway.close()
@@ -153,7 +164,7 @@ def test_each_protocol_of_a_slave() -> None:
     play(scene)
 
 
-def test_a_slaves_own_counter_comes_back() -> None:
+def test_gateway_counts_its_answers() -> None:
     async def scene(desk: Desk) -> None:
         counters = []
         for _ in range(9):
@@ -207,7 +218,7 @@ def test_a_slave_that_is_silent_is_answered_for_in_time() -> None:
         await desk.ask(COE, 1001, VENDOR)
         desk.engine.buses[0].line.fault(kind="mailbox", slave="drive")
         assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 04 05"
-        (row,) = desk.gateway.tally.report()
+        (row,) = desk.gateway.statistics.report()
         assert row["errors"] == {"timeout": 1}
         assert (row["requests"], row["replies"], row["address"]) == (2, 1, 1001)
 
@@ -262,9 +273,9 @@ def test_virtual_addresses_stand_for_slaves_here_and_elsewhere() -> None:
     async def scene(desk: Desk) -> None:
         assert await desk.one(COE, 0x9000, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
         assert await desk.one(COE, 0x9001, VENDOR) == "00 30 43 18 10 01 07 00 00 00"
-        assert desk.asked == [RemoteSlave(ELSEWHERE_BUS, 1003)]
+        assert desk.asked == [RemoteAddress(ELSEWHERE_BUS, 1003)]
         (operation,) = desk.station.asked
-        assert operation == Read(IndexGroup.SDO, 0x1018_0001, ROOM)
+        assert operation == Read(IndexGroup.SDO, 0x1018_0001, LONGEST_ANSWER)
 
     rule = AccessRule("no", targets=(AccessTarget(str(ELSEWHERE_BUS), 1003),), allow=False)
     play(scene)

@@ -10,10 +10,10 @@ import pytest
 
 from eap.aoe.way import Way
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.appliance.services.gateway.client_session import SessionKey
 from eap.appliance.services.gateway.gateway import Settings
 from eap.appliance.services.gateway.gateway_methods import GatewayMethods
-from eap.appliance.services.gateway.sessions import SessionKey
-from eap.appliance.services.gateway.tally import Tally
+from eap.appliance.services.gateway.reply_encoder import GatewayStatistics
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
 from eap.gateway.ledger import Ledger
@@ -31,7 +31,7 @@ class Gateway:
         self.turned_away = 0
         self.settings = Settings(NetId.parse("5.1.1.1.3.1"))
         self.ledger = Ledger()
-        self.tally = Tally()
+        self.statistics = GatewayStatistics()
 
     def start(self) -> None:
         self.is_open = True
@@ -75,7 +75,7 @@ def ask(gateways):
 
 def test_what_is_told_of_a_gateway(ask, gateways) -> None:
     gateways[FIRST].ledger.admit(HERE, b"request", 0)
-    gateways[FIRST].tally.note(1001, MailboxType.COE, [None], 2000)
+    gateways[FIRST].statistics.note(1001, MailboxType.COE, [None], 2000)
     first, second = ask("status", station="left")
     assert first["served"] == ["udp://127.0.9.1:34980", "ethernet://eth0"]
     assert second["served"] == ["tcp://127.0.9.1:34981"]

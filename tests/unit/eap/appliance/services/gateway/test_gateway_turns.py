@@ -60,7 +60,7 @@ def test_who_is_too_fast_is_told_so() -> None:
     async def scene(desk: Desk) -> None:
         await desk.one(COE, 1001, VENDOR)
         assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
-        assert desk.gateway.tally.report()[0]["errors"] == {"too_fast": 1}
+        assert desk.gateway.statistics.report()[0]["errors"] == {"too_fast": 1}
 
     play(scene, settings=Settings(NET_ID, limits=ClientLimits(rate=1)))
 

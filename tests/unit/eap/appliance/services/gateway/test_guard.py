@@ -9,11 +9,12 @@ from eap.aoe.ads_operation import Read, Write
 from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, AccessService
 from eap.aoe.way import Way
+from eap.appliance.services.gateway.client_session import Reply
 from eap.appliance.services.gateway.guard import Guard, Target, reason_of_refusal, result_of
-from eap.appliance.services.gateway.slave_session import Reply
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
-from eap.gateway.refusal import Reason, refuse
+from eap.gateway.error_table import Cause
+from eap.gateway.refusal import refuse
 from eap.ids import NetId
 
 TARGET = Target(NetId.parse("5.1.1.1.3.1"), 1001)
@@ -51,8 +52,8 @@ def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
     guard.before_change = lambda entry: recorded.append(entry) or "the audit cannot be written"  # type: ignore[func-returns-value]
     verdict = guard.judge(HERE, TARGET, WRITE)
     assert (verdict.is_allowed, verdict.why) == (False, "the audit cannot be written")
-    assert reason_of_refusal(verdict) is Reason.NOT_RECORDED
-    assert reason_of_refusal(guard.judge(ELSEWHERE, TARGET, WRITE)) is Reason.DENIED
+    assert reason_of_refusal(verdict) is Cause.NOT_RECORDED
+    assert reason_of_refusal(guard.judge(ELSEWHERE, TARGET, WRITE)) is Cause.DENIED
     assert guard.judge(HERE, TARGET, READ).is_allowed
     assert not guard.judge(ELSEWHERE, TARGET, WRITE).is_allowed
     assert [each.operations[0].operation for each in recorded] == [WRITE]
@@ -77,6 +78,6 @@ def test_how_a_request_came_out(kind: MailboxType, body: str, result: int) -> No
 
 
 def test_how_a_request_came_out_that_the_gateway_answers() -> None:
-    refusal = refuse(MailboxType.COE, bytes(10), Reason.TIMEOUT)
-    assert result_of([Reply(*refusal, reason=Reason.TIMEOUT)]) == AdsError.TIMEOUT
+    refusal = refuse(MailboxType.COE, bytes(10), Cause.TIMEOUT)
+    assert result_of([Reply(*refusal, reason=Cause.TIMEOUT)]) == AdsError.TIMEOUT
     assert result_of([]) is None

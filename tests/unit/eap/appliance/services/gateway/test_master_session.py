@@ -6,11 +6,10 @@ import asyncio
 
 import pytest
 
-from eap.appliance.services.gateway.dialect_task import DialectError
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.codec.mailbox import MailboxType
-from eap.gateway.dialect import Failure, ReadIdn, ReadSdo, WriteSdo
-from eap.gateway.refusal import Reason
+from eap.gateway.error_table import Cause
+from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, variable
 
@@ -44,26 +43,23 @@ def test_segments_of_two_clients_do_not_meet() -> None:
 
 def test_refusals() -> None:
     (reply,) = asyncio.run(session().ask(MailboxType.FOE, b"\1\0\0\0\0\0f"))
-    assert (reply.type, reply.reason) == (MailboxType.FOE, Reason.NO_PROTOCOL)
+    assert (reply.type, reply.reason) == (MailboxType.FOE, Cause.NO_PROTOCOL)
     assert reply.body[:6] == bytes.fromhex("0500 00800000")
     (reply,) = asyncio.run(session().ask(MailboxType.SOE, bytes.fromhex("01 40 2000")))
-    assert (reply.type, reply.reason) == (MailboxType.SOE, Reason.NO_PROTOCOL)
+    assert (reply.type, reply.reason) == (MailboxType.SOE, Cause.NO_PROTOCOL)
     assert reply.body == bytes.fromhex("12 40 2000 0110")
     (reply,) = asyncio.run(session().ask(MailboxType.VOE, bytes(6)))
-    assert (reply.type, reply.reason) == (MailboxType.ERR, Reason.NO_PROTOCOL)
+    assert (reply.type, reply.reason) == (MailboxType.ERR, Cause.NO_PROTOCOL)
     (reply,) = asyncio.run(session().ask(COE, b"\0"))
     assert (reply.type, reply.body) == (MailboxType.ERR, bytes.fromhex("0100 0600"))
     (reply,) = asyncio.run(session().ask(COE, bytes.fromhex("0020 40 0020 01 0000")))
     assert (reply.type, reply.body) == (COE, bytes.fromhex("0020 80 0020 01 01000405"))
 
 
-def test_tasks_of_the_dialect() -> None:
+def test_master_session_reads_and_writes_objects() -> None:
     one = session()
-    assert asyncio.run(one.perform(WriteSdo(0x2000, 0, bytes(4)))) == b""
-    assert asyncio.run(one.perform(ReadSdo(0x2000, 0, complete=False))) == bytes(4)
-    with pytest.raises(DialectError) as caught:
-        asyncio.run(one.perform(ReadSdo(0x3000, 0, complete=False)))
-    assert (caught.value.failure, caught.value.code) == (Failure.GENERAL, 0x06020000)
-    with pytest.raises(DialectError, match="only a CoE dictionary") as caught:
-        asyncio.run(one.perform(ReadIdn(32, 0, 0x40)))
-    assert caught.value.failure is Failure.NOT_SUPPORTED
+    one.write(0x2000, 0, bytes(4))
+    assert asyncio.run(one.read(0x2000, 0, complete=False)) == bytes(4)
+    with pytest.raises(SdoAbortError) as caught:
+        asyncio.run(one.read(0x3000, 0, complete=False))
+    assert caught.value.code == AbortCode.NO_OBJECT

@@ -19,7 +19,7 @@ def test_bus_mailboxes_name_their_port_in_each_request() -> None:
         link = EngineLink(engine.services)
         port = BusMailboxes(BusClient(link, [PORT]), PORT)
         try:
-            assert [each.station for each in (await port.describe()).slaves] == [1001]
+            assert list((await port.view.current()).slaves) == [1001]
             talk = await port.open_talk(1001, MailboxType.COE, "me")
             talk.close()
             vendor = await port.converse(1001, coe_client.upload(0x1018, 1), "me")

@@ -37,7 +37,8 @@ def play(
         link = EngineLink(engine.services)
         mailboxes = BusMailboxes(BusClient(link, [PORT]), PORT)
         try:
-            slave = replace((await mailboxes.describe()).slaves[0], **fields)
+            found, *_ = (await mailboxes.view.current()).slaves.values()
+            slave = replace(found, **fields)
             await scene(LocalSlave(mailboxes, slave, "me", turn_s=turn_s), engine)
         finally:
             link.close()

@@ -1,4 +1,4 @@
-"""Files of a slave elsewhere, packet by packet; mailboxes have room for 244 octets of a file."""
+"""Files of a remote slave, packet by packet; mailboxes have room for 244 octets of a file."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
+from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_request import AskMailbox
-from eap.appliance.services.gateway.remote_files import RemoteFiles
+from eap.appliance.services.gateway.file_codec import FileCodec
+from eap.appliance.services.slaves.access import RemoteAccessError
 from eap.codec.ads import AdsError
 from eap.codec.foe import FoeErrorCode, FoeOpcode, decode_message, encode_message
-from eap.gateway.elsewhere import ElsewhereError
+from eap.gateway.error_table import Cause
+from eap.gateway.refusal import GatewayError
 from tests.support import busads
 from tests.support.elsewhere import Bus
 from tests.support.fakeengine import FakeEngine
+from tests.support.memoryslave import memory_share
 
 READ, WRITE, DATA, ACK, ERROR, BUSY = FoeOpcode
 CONTENT = bytes(range(250)) * 300
@@ -25,7 +29,8 @@ class Files:
     """One client's session."""
 
     def __init__(self, bus: Bus, answer_s: float = 1) -> None:
-        self.speaker = RemoteFiles(bus.link(answer_s=answer_s))
+        access = bus.link(answer_s=answer_s)
+        self.codec = FileCodec(access, MailboxSizes(), memory_share(), answer_s / 3)
 
     async def ask(self, opcode: int, number: int, body: bytes = b"") -> tuple[int, int, bytes]:
         """Return opcode, number and body of an answer, when it is another one than BUSY."""
@@ -35,7 +40,7 @@ class Files:
 
     async def once(self, opcode: int, number: int, body: bytes = b"") -> tuple[int, int, bytes]:
         """Return opcode, number and body of an answer."""
-        (answer,) = await self.speaker.answer(encode_message(FoeOpcode(opcode), number, body))
+        (answer,) = await self.codec.answer(encode_message(FoeOpcode(opcode), number, body))
         header, rest = decode_message(answer)
         return header.opcode, header.number, bytes(rest)
 
@@ -57,7 +62,7 @@ class Files:
             content += data
             if len(data) < ROOM:
                 last = encode_message(FoeOpcode.ACK, number)
-                assert await self.speaker.answer(last) == []
+                assert await self.codec.answer(last) == []
                 return content
             opcode, got, data = await self.ask(ACK, number)
 
@@ -81,22 +86,20 @@ def test_files_of_any_size(size: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("opcode", "name", "result"),
+    ("opcode", "name", "code"),
     [
-        (READ, b"none.bin", AdsError.NOT_FOUND),
-        (WRITE, b"boot.bin", AdsError.STATE),
-        (READ, b"locked.bin", AdsError.ACCESS),
-        (READ, bytes(300).replace(b"\0", b"n"), AdsError.SIZE),
+        (READ, b"none.bin", FoeErrorCode.NOT_FOUND),
+        (WRITE, b"boot.bin", FoeErrorCode.ILLEGAL),
+        (READ, b"locked.bin", FoeErrorCode.ACCESS_DENIED),
+        (READ, bytes(300).replace(b"\0", b"n"), FoeErrorCode.NOT_DEFINED),
     ],
 )
-def test_what_the_slave_refuses(opcode: FoeOpcode, name: bytes, result: AdsError) -> None:
+def test_what_the_slave_refuses(opcode: FoeOpcode, name: bytes, code: FoeErrorCode) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
         for _ in range(2):  # asking again is another try
-            with pytest.raises(ElsewhereError) as caught:
-                await desk.ask(opcode, 0, name)
-            assert caught.value.result == result
-            desk.speaker.reset()
+            assert (await desk.ask(opcode, 0, name))[:2] == (ERROR, code)
+            assert not desk.codec.is_running
         assert await desk.read() == b"first file"
 
     play(scene)
@@ -111,9 +114,13 @@ def test_a_password() -> None:
 
 def test_a_slave_that_takes_no_more() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        with pytest.raises(ElsewhereError) as caught:
-            await Files(bus).write(bytes(5000), b"small.bin")
-        assert caught.value.result == AdsError.NO_MEMORY
+        desk = Files(bus)
+        await desk.ask(WRITE, 0, b"small.bin")
+        for number in range(1, 22):
+            opcode, code, _ = await desk.ask(DATA, number, bytes(ROOM if number < 21 else 1))
+            if opcode == ERROR:
+                break
+        assert (opcode, code) == (ERROR, FoeErrorCode.DISK_FULL)
 
     play(scene)
 
@@ -139,9 +146,9 @@ def test_a_packet_longer_than_the_mailbox() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)
         await desk.ask(WRITE, 0, b"a.bin")
-        with pytest.raises(ElsewhereError) as caught:
+        with pytest.raises(GatewayError) as caught:
             await desk.ask(DATA, 1, bytes(ROOM + 1))
-        assert caught.value.result == AdsError.SIZE
+        assert caught.value.cause is Cause.TOO_LONG
 
     play(scene)
 
@@ -162,7 +169,7 @@ def test_who_has_to_wait_is_told_busy(goes_on: bool) -> None:
             engine.release()
             assert (await desk.ask(DATA, 1, b"written"))[0] == ACK
         else:
-            assert await desk.speaker.answer(encode_message(FoeOpcode.ERROR, 0x8000)) == []
+            assert await desk.codec.answer(encode_message(FoeOpcode.ERROR, 0x8000)) == []
             engine.release()
         assert await desk.read() == (b"written" if goes_on else b"first file")
 
@@ -182,10 +189,10 @@ def test_a_station_that_vanishes(opcode: FoeOpcode) -> None:
         desk = Files(bus, answer_s=0.1)
         await desk.ask(opcode, 0, b"a.bin")
         bus.is_gone = True
-        with pytest.raises(ElsewhereError) as caught:
+        with pytest.raises(RemoteAccessError) as caught:
             await go_on(desk)
         assert caught.value.result == AdsError.TIMEOUT
-        desk.speaker.reset()
+        desk.codec.reset()
 
     play(scene)
 
@@ -195,7 +202,7 @@ def test_what_was_begun_and_left_does_not_count() -> None:
         desk = Files(bus)
         await desk.ask(WRITE, 0, b"a.bin")
         await desk.ask(DATA, 1, bytes(ROOM))
-        desk.speaker.reset()
+        desk.codec.reset()
         assert await Files(bus).read() == b"first file"
 
     play(scene)

@@ -1,31 +1,18 @@
-"""What goes to the other station for a file, and when; packets are in test_remote_files.py."""
+"""What goes to the other station for a file, and when; packets are in test_file_codec.py."""
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from typing import TypeVar
 
-from devicebus.mailbox.foe_server import NotReadyError
-from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Read, ReadWrite
-from eap.appliance.services.gateway.remote_file import BLOCK, RemoteFile, Wanted
+from eap.appliance.services.slaves.remote_file import BLOCK, RemoteFile
 from eap.codec.ads import IndexGroup
 from tests.support import busads
 from tests.support.elsewhere import Bus
 
-T = TypeVar("T")
 CONTENT = bytes(range(250)) * 300
 DISK = 256 - 12
 """Octets of a file in a packet of the slave."""
-
-
-async def ready(step: Callable[[], T], file: RemoteFile) -> T:
-    """Do a step as soon as it can be done."""
-    while True:
-        try:
-            return step()
-        except NotReadyError:
-            await file.wait_change()
 
 
 def play(scene: Callable[[Bus], Awaitable[None]]) -> None:
@@ -36,14 +23,14 @@ def play(scene: Callable[[Bus], Awaitable[None]]) -> None:
 
 
 def opened(bus: Bus, *, is_write: bool) -> RemoteFile:
-    return RemoteFile(bus.link(), Wanted("a.bin", 0, is_write), MailboxSizes())
+    return bus.link().open_file("a.bin", 0, is_write=is_write)
 
 
 async def write(bus: Bus, content: bytes) -> None:
     file = opened(bus, is_write=True)
-    await ready(file.check_open, file)
-    await ready(lambda: file.write(content), file)
-    await ready(file.commit, file)
+    await file.wait_open()
+    await file.write(content)
+    await file.finish()
 
 
 def groups(bus: Bus) -> list[int]:
@@ -57,13 +44,20 @@ def asked(bus: Bus, group: int) -> Callable[[], Awaitable[bool]]:
     return look
 
 
+def ended(file: RemoteFile) -> Callable[[], Awaitable[bool]]:
+    async def look() -> bool:
+        return file.has_ended
+
+    return look
+
+
 def test_blocks_are_longer_and_longer() -> None:
     async def scene(bus: Bus) -> None:
         await write(bus, CONTENT)
         file = opened(bus, is_write=False)
-        await ready(file.check_open, file)
+        await file.wait_open()
         got = b""
-        while part := await ready(lambda: file.read(1000), file):
+        while part := await file.read(1000):
             got += part
         assert got == CONTENT
         blocks = [
@@ -90,7 +84,7 @@ def test_who_gives_up_before_the_file_is_opened() -> None:
     async def scene(bus: Bus) -> None:
         file = opened(bus, is_write=True)
         file.close()
-        await file.wait_change()
+        await busads.until(ended(file))
         assert set(groups(bus)) == {IndexGroup.SDO}
 
     play(scene)
@@ -110,7 +104,7 @@ def test_who_gives_up_a_file_closes_it_there() -> None:
     async def scene(bus: Bus) -> None:
         await write(bus, CONTENT)
         file = opened(bus, is_write=False)
-        await ready(file.check_open, file)
+        await file.wait_open()
         bus.asked.clear()
         file.close()
         await busads.until(asked(bus, IndexGroup.FOE_CLOSE))

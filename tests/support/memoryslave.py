@@ -1,0 +1,110 @@
+"""A slave whose mailbox is in memory, and clients of a session codec in front of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Hashable
+from typing import Any, TypeVar, cast
+
+from devicebus.drive import drive_async
+from devicebus.errors import MailboxTimeoutError
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
+from devicebus.mailbox.match import answers
+from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
+from eap.aoe.way import Way
+from eap.appliance.bus_request import SlaveDescription
+from eap.appliance.services.bus.bus_talk import Talk
+from eap.appliance.services.gateway.client_session import SessionCodec
+from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
+from eap.appliance.services.slaves.local_slave import LocalSlave
+from eap.codec.mailbox import MailboxType
+from eap.gateway.ledger import MemoryBudget, MemoryShare
+from tests.support.mailbox import Line, open_line
+
+T = TypeVar("T")
+CLIENT = Way("udp:eap0", "127.0.0.1:1")
+
+
+class MemoryMailbox:
+    """The bus of one slave; stands for BusMailboxes, and for its only Talk.
+
+    Attributes:
+        asked: Requests that the slave got.
+        is_abandoned: Whether a conversation was left in the middle.
+    """
+
+    def __init__(self, line: Line) -> None:
+        self.asked: list[bytes] = []
+        self.is_abandoned = False
+        self._line = line
+
+    async def converse(
+        self,
+        station: int,
+        conversation: Conversation[T],
+        requester: Hashable,
+        turn_s: float | None = None,
+    ) -> T:
+        try:
+            return await drive_async(conversation, self.ask)
+        except asyncio.CancelledError:
+            self.abandon()
+            raise
+
+    async def open_talk(
+        self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
+    ) -> Talk:
+        return cast("Talk", self)
+
+    async def ask(self, ask: MailboxRequest) -> MailboxMessage:
+        self.asked.append(ask.request)
+        await asyncio.sleep(0)  # other clients have their turns
+        return self._line.exchange(ask)
+
+    def abandon(self) -> None:
+        self.is_abandoned = True
+
+    def close(self) -> None:
+        """Each conversation has the slave for itself."""
+
+
+def memory_slave(
+    kind: MailboxType, server: ProtocolServer, sizes: MailboxSizes
+) -> tuple[LocalSlave, MemoryMailbox]:
+    """Return access to a slave that has one protocol, and its mailbox."""
+    mailbox = MemoryMailbox(open_line(kind, server, sizes))
+    slave = SlaveDescription(
+        station=1001, name="s", vendor=1, product=2, revision=3, serial=4, alias=0, state=8,
+        target=8, to_slave=sizes.to_slave, to_master=sizes.to_master, protocols=0x3F,
+    )  # fmt: skip
+    return LocalSlave(cast("BusMailboxes", mailbox), slave, CLIENT), mailbox
+
+
+def memory_share(octets: int = 1 << 20) -> MemoryShare:
+    """Return memory for one session."""
+    return MemoryShare(MemoryBudget(octets, octets), CLIENT)
+
+
+async def lead(
+    codec: SessionCodec, conversation: Conversation[Any], running: list[bool] | None = None
+) -> Any:
+    """Drive a client's conversation with a codec; note whether a transfer runs after each step."""
+    waiting: deque[bytes] = deque()
+
+    async def exchange(ask: MailboxRequest) -> MailboxMessage:
+        if not ask.listen:
+            waiting.clear()
+            waiting.extend(await codec.answer(ask.request))
+            if running is not None:
+                running.append(codec.is_running)
+        if not ask.expects_reply:
+            assert not waiting
+            return MailboxMessage(ask.type, b"")
+        if not waiting:
+            raise MailboxTimeoutError("no answer")
+        reply = waiting.popleft()
+        assert answers(ask.type, ask.request, reply), f"{reply.hex()} answers another request"
+        return MailboxMessage(ask.type, reply)
+
+    return await drive_async(conversation, exchange)
