@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol, TypeAlias
 
-from devicebus.mailbox.conversation import Message
+from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
@@ -123,5 +123,5 @@ class SlaveAccess(Protocol):
 
     async def exchange(
         self, kind: MailboxType, request: bytes, *, expects_reply: bool = True
-    ) -> Message:
+    ) -> MailboxMessage:
         """Pass a mailbox message that has no operation here, and return its answer."""

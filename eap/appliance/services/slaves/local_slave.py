@@ -6,7 +6,7 @@ from collections.abc import Hashable
 from typing import TypeVar
 
 from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client, voe_client
-from devicebus.mailbox.conversation import Ask, Conversation, Message
+from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_failure import no_mailbox
 from eap.appliance.bus_request import SlaveDescription
@@ -115,9 +115,11 @@ class LocalSlave:
 
     async def exchange(
         self, kind: MailboxType, request: bytes, *, expects_reply: bool = True
-    ) -> Message:
+    ) -> MailboxMessage:
         """Pass a mailbox message that has no operation here, and return its answer."""
-        return await self._converse(_single(Ask(kind, request, expects_reply=expects_reply)))
+        return await self._converse(
+            _single(MailboxRequest(kind, request, expects_reply=expects_reply))
+        )
 
     def _sizes(self) -> MailboxSizes:
         if not self._slave.to_slave:
@@ -129,5 +131,5 @@ class LocalSlave:
         return await self.bus.converse(station, conversation, self._requester, self._turn_s)
 
 
-def _single(ask: Ask) -> Conversation[Message]:
+def _single(ask: MailboxRequest) -> Conversation[MailboxMessage]:
     return (yield ask)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from devicebus.errors import SoeError
-from devicebus.mailbox.conversation import Message
+from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Operation, Read, ReadState, ReadWrite, Write
 from eap.aoe.ads_query import decode_outcome, encode_query
@@ -197,7 +197,7 @@ class RemoteSlave:
 
     async def exchange(
         self, kind: MailboxType, request: bytes, *, expects_reply: bool = True
-    ) -> Message:
+    ) -> MailboxMessage:
         """Refuse: ADS has no service that passes mailbox messages."""
         raise RemoteAccessError(AdsError.SERVICE)
 
