@@ -14,7 +14,7 @@ from devicebus.mailbox.match import answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from eap.aoe.way import Way
 from eap.appliance.bus_request import SlaveDescription
-from eap.appliance.services.bus.bus_talk import Talk
+from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.appliance.services.gateway.client_session import SessionCodec
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
@@ -27,7 +27,7 @@ CLIENT = Way("udp:eap0", "127.0.0.1:1")
 
 
 class MemoryMailbox:
-    """The bus of one slave; stands for BusMailboxes, and for its only Talk.
+    """The bus of one slave; stands for BusMailboxes, and for its only MailboxTurn.
 
     Attributes:
         asked: Requests that the slave got.
@@ -47,20 +47,22 @@ class MemoryMailbox:
         turn_s: float | None = None,
     ) -> T:
         try:
-            return await drive_async(conversation, self.ask)
+            return await drive_async(conversation, self.exchange)
         except asyncio.CancelledError:
             self.abandon()
             raise
 
-    async def open_talk(
+    async def open_turn(
         self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
-    ) -> Talk:
-        return cast("Talk", self)
+    ) -> MailboxTurn:
+        return cast("MailboxTurn", self)
 
-    async def ask(self, ask: MailboxRequest) -> MailboxMessage:
+    async def exchange(self, ask: MailboxRequest) -> MailboxMessage:
         self.asked.append(ask.request)
         await asyncio.sleep(0)  # other clients have their turns
         return self._line.exchange(ask)
+
+    ask = exchange
 
     def abandon(self) -> None:
         self.is_abandoned = True

@@ -23,7 +23,7 @@ from eap.aoe.ads_request import take_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
 from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage
-from eap.appliance.services.bus.bus_talk import Talk
+from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
@@ -125,10 +125,10 @@ class _Link:
     async def confirm(self) -> BusDescription:
         return await self.current()
 
-    async def open_talk(
+    async def open_turn(
         self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
-    ) -> Talk:
-        return cast("Talk", _Talk(self._box))
+    ) -> MailboxTurn:
+        return cast("MailboxTurn", _Talk(self._box))
 
     async def converse(
         self,

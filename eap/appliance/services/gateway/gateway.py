@@ -24,7 +24,7 @@ from eap.aoe.ads_operation import Operation
 from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
 from eap.appliance.bus_failure import no_mailbox
-from eap.appliance.bus_request import Heard, SlaveDescription
+from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage
 from eap.appliance.services.gateway.client_session import (
     ClientSession,
     Reply,
@@ -401,7 +401,7 @@ class MailboxGateway:
                 )  # fmt: skip
                 session.close()
 
-    def _take_unasked(self, message: Heard) -> None:
+    def _take_unasked(self, message: UnsolicitedMessage) -> None:
         """Send an Ethernet frame of a slave to the clients that talk EoE to it."""
         if message.kind != MailboxType.EOE:
             return

@@ -6,10 +6,10 @@ from collections.abc import Callable, Hashable
 from typing import TypeVar
 
 from devicebus.mailbox.conversation import Conversation
-from eap.appliance.bus_request import Heard
+from eap.appliance.bus_request import UnsolicitedMessage
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.bus.bus_talk import Talk
+from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.codec.mailbox import MailboxType
 
 T = TypeVar("T")
@@ -27,15 +27,15 @@ class BusMailboxes:
         self._client = client
         self._port = port
 
-    def listen(self, receive: Callable[[Heard], None]) -> None:
+    def listen(self, receive: Callable[[UnsolicitedMessage], None]) -> None:
         """Call *receive* with each message that a slave sends unasked."""
         self._client.listen(self._port, receive)
 
-    async def open_talk(
+    async def open_turn(
         self, station: int, kind: MailboxType, requester: Hashable, turn_s: float | None = None
-    ) -> Talk:
-        """Wait for a turn at the mailbox of a slave; raises as ``BusClient.open_talk``."""
-        return await self._client.open_talk(self._port, station, kind, requester, turn_s)
+    ) -> MailboxTurn:
+        """Wait for a turn at the mailbox of a slave; raises as ``BusClient.open_turn``."""
+        return await self._client.open_turn(self._port, station, kind, requester, turn_s)
 
     async def converse(
         self,

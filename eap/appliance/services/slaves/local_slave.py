@@ -92,7 +92,7 @@ class LocalSlave:
         """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
         file = Transfer(name, password, self._sizes(), is_write=is_write, ahead=ahead)
         # By the file, not by the requester: two of its files take turns like those of two.
-        file.start(lambda: self.bus.open_talk(self._slave.station, MailboxType.FOE, file))
+        file.start(lambda: self.bus.open_turn(self._slave.station, MailboxType.FOE, file))
         return file
 
     async def exchange_vendor(self, message: bytes) -> bytes:

@@ -20,7 +20,7 @@ def test_bus_mailboxes_name_their_port_in_each_request() -> None:
         port = BusMailboxes(BusClient(link, [PORT]), PORT)
         try:
             assert list((await port.view.current()).slaves) == [1001]
-            talk = await port.open_talk(1001, MailboxType.COE, "me")
+            talk = await port.open_turn(1001, MailboxType.COE, "me")
             talk.close()
             vendor = await port.converse(1001, coe_client.upload(0x1018, 1), "me")
             assert vendor == bytes.fromhex("5a0e0000")

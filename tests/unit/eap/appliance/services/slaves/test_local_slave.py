@@ -97,7 +97,7 @@ def test_local_slave_passes_messages_of_vendors() -> None:
 def test_local_slave_without_turn_is_busy() -> None:
     async def scene(slave: SlaveAccess, engine: FakeEngine) -> None:
         assert isinstance(slave, LocalSlave)
-        other = await slave.bus.open_talk(1001, MailboxType.COE, "other")
+        other = await slave.bus.open_turn(1001, MailboxType.COE, "other")
         with pytest.raises(MailboxBusyError):
             await slave.read_object(0x1018, 1)
         await other.ask(MailboxRequest(MailboxType.COE, bytes.fromhex("0020 40 1810 01 00000000")))
