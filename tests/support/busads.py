@@ -15,7 +15,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.service import BusService
 from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.master.master_desk import MasterDesk
+from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.appliance.services.routing.service import LocalRequest
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsHeader
@@ -151,9 +151,9 @@ def play(
         link = EngineLink(engine.services, look_s=look_s)
         bus = BusClient(link, [PORT])
         told: list[tuple[Way, bytes]] = []
-        desk = MasterDesk(bus, PORT, "1.2.3")
+        provider = MasterDictionaryProvider(bus, PORT, "1.2.3")
         service = BusService(
-            bus, PORT, BUS, "1.2.3", lambda way, packet: told.append((way, packet)), desk
+            bus, PORT, BUS, "1.2.3", lambda way, packet: told.append((way, packet)), provider
         )
         try:
             async with asyncio.timeout(20):

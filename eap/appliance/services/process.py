@@ -67,7 +67,7 @@ from eap.release import RELEASE
 
 if TYPE_CHECKING:
     from eap.appliance.services.gateway.gateway import MailboxGateway
-    from eap.appliance.services.master.master_desk import MasterDesk
+    from eap.appliance.services.master.master_values import MasterDictionaryProvider
     from eap.appliance.services.routing.mqtt_door import MqttDoor
 
 STATUS_PATIENCE_S = 0.3
@@ -114,7 +114,7 @@ class Services:
         devices = self._devices(images, link)
         self._startup.step("opening gateways and sockets")
         client = BusClient(link, [bus.owner for bus in self._handover.buses])
-        desks, gateways = self._gateways(client, devices.routers)
+        providers, gateways = self._gateways(client, devices.routers)
         doors = open_doors(
             self._handover,
             devices.routers,
@@ -127,7 +127,7 @@ class Services:
         )
         brokers = self._brokers(devices.routers)
         audit = self._audit(devices.routers, gateways)
-        buses = self._buses(client, devices, desks)
+        buses = self._buses(client, devices, providers)
         methods = self._methods(images, buses, devices, gateways, audit)
         server = ControlServer(methods, buses, audit.write_request, begin=audit.begin_request)
         async with asyncio.TaskGroup() as group:
@@ -182,13 +182,13 @@ class Services:
 
     def _gateways(
         self, client: BusClient, routers: Mapping[str, StationRouter]
-    ) -> tuple[Mapping[PortName, MasterDesk], Mapping[PortName, MailboxGateway]]:
+    ) -> tuple[Mapping[PortName, MasterDictionaryProvider], Mapping[PortName, MailboxGateway]]:
         if not self._handover.buses:
             return {}, {}
-        from eap.appliance.services.gateway.opening import open_desks, open_gateways
+        from eap.appliance.services.gateway.opening import open_dictionaries, open_gateways
 
-        desks = open_desks(self._handover, client, RELEASE)
-        return desks, open_gateways(self._handover, client, desks, routers)
+        providers = open_dictionaries(self._handover, client, RELEASE)
+        return providers, open_gateways(self._handover, client, providers, routers)
 
     def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttDoor]:
         routing = self._handover.routing
@@ -277,7 +277,10 @@ class Services:
         return found
 
     def _buses(
-        self, client: BusClient, devices: Devices, desks: Mapping[PortName, MasterDesk]
+        self,
+        client: BusClient,
+        devices: Devices,
+        providers: Mapping[PortName, MasterDictionaryProvider],
     ) -> Buses:
         handover = self._handover
         segments = {}
@@ -291,7 +294,7 @@ class Services:
             net_id = NetId.parse(handover.port(bus.owner).net_id)
             router = devices.routers[bus.owner.station]
             service = BusService(
-                client, bus.owner, net_id, RELEASE, router.send_notification, desks[bus.owner]
+                client, bus.owner, net_id, RELEASE, router.send_notification, providers[bus.owner]
             )
             router.add_service(net_id, service)
         return Buses(handover.stations, client if handover.buses else None, segments)

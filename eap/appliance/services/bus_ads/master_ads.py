@@ -33,7 +33,7 @@ from eap.aoe.way import Way
 from eap.appliance.handover import PortName
 from eap.appliance.services.ads.eap_ads import device_info
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.master.master_desk import MasterDesk
+from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.appliance.services.slaves.bus_view import BusDescription
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, to_filetime
@@ -152,7 +152,7 @@ class MasterAds:
         net_id: Of the port.
         release: Of this software, such as ``0.1.0``.
         send: Sends a notification to a client.
-        desk: The dictionary of the master.
+        provider: The dictionary of the master.
         requests: Takes requests for states.
     """
 
@@ -163,13 +163,13 @@ class MasterAds:
         net_id: NetId,
         release: str,
         send: Send,
-        desk: MasterDesk,
+        provider: MasterDictionaryProvider,
         requests: StateRequests,
     ) -> None:
         self._client = client
         self._port = port
         self._view = client.views[port]
-        self._desk = desk
+        self._provider = provider
         self._watched: set[int] = set()
         """Indexes of objects for which there were ever notifications."""
         states = MasterStates(client, port, requests)
@@ -178,7 +178,7 @@ class MasterAds:
             states.states,
             [
                 MasterSpace(states),
-                ObjectSpace(desk.dictionary, lambda: OdState.OP, ads_result),
+                ObjectSpace(provider.dictionary, lambda: OdState.OP, ads_result),
             ],
             control=states.control,
         )
@@ -192,7 +192,7 @@ class MasterAds:
         group, offset = place_of(operation)
         is_object = group in ObjectSpace.groups
         if is_object:
-            await self._desk.refresh(offset >> 16)
+            await self._provider.refresh(offset >> 16)
         outcome = self._device.perform(operation, client, monotonic_ns())
         if is_object and isinstance(operation, AddNotification) and not outcome.result:
             self._watched.add(offset >> 16)
@@ -214,7 +214,7 @@ class MasterAds:
     async def _look(self) -> None:
         await self._view.confirm()
         for index in self._watched:
-            await self._desk.refresh(index)
+            await self._provider.refresh(index)
 
 
 class NotificationSender:

@@ -28,7 +28,7 @@ from eap.appliance.services.ads.ads_requests import answer_request
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.master_ads import MasterAds, Send, StateRequests, check_up
 from eap.appliance.services.bus_ads.slave_ads import SlaveAds
-from eap.appliance.services.master.master_desk import MasterDesk
+from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.appliance.services.routing.service import LocalRequest
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.ads import AdsError
@@ -56,7 +56,7 @@ class BusService:
         net_id: Of the port.
         release: Of this software, such as ``0.1.0``.
         send: Sends a notification to a client.
-        desk: The dictionary of the master.
+        provider: The dictionary of the master.
 
     Attributes:
         ports: AMS ports that it answers for; a port without a slave is refused here.
@@ -69,13 +69,13 @@ class BusService:
         net_id: NetId,
         release: str,
         send: Send,
-        desk: MasterDesk,
+        provider: MasterDictionaryProvider,
     ) -> None:
         self.ports: Container[int] = range(1, DEVICE_PORT + 1)
         self._port = port
         self._view = client.views[port]
         states = StateRequests(client, port)
-        self._master = MasterAds(client, port, net_id, release, send, desk, states)
+        self._master = MasterAds(client, port, net_id, release, send, provider, states)
         self._slaves = SlaveAds(BusMailboxes(client, port), net_id, states)
 
     async def answer(self, request: LocalRequest) -> AmsAnswer:

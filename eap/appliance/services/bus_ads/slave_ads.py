@@ -28,8 +28,7 @@ from eap.aoe.ads_operation import (
 )
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.ads_state import DeviceDataSpace, al_state_for, states_of
-from eap.appliance.bus_failure import no_mailbox
-from eap.appliance.bus_request import SlaveDescription
+from eap.appliance.bus_request import SlaveDescription, no_mailbox
 from eap.appliance.services.bus_ads.master_ads import StateRequests
 from eap.appliance.services.bus_ads.slave_files import SlaveFiles
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes

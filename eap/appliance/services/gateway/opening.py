@@ -10,7 +10,7 @@ from eap.appliance.handover import Handover, PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.master.master_desk import MasterDesk
+from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.remote_slave import RemoteSlave
@@ -22,7 +22,9 @@ from eap.pd.spec import GatewayAddress, GatewaySpec
 _MS = 1000
 
 
-def open_desks(handover: Handover, client: BusClient, release: str) -> dict[PortName, MasterDesk]:
+def open_dictionaries(
+    handover: Handover, client: BusClient, release: str
+) -> dict[PortName, MasterDictionaryProvider]:
     """Return the dictionary of the master behind each bus port.
 
     Args:
@@ -30,19 +32,19 @@ def open_desks(handover: Handover, client: BusClient, release: str) -> dict[Port
         client: Asks the engine for something on them.
         release: Of this software.
     """
-    desks = {}
+    providers = {}
     for bus in handover.buses:
         told = _told(handover, bus.owner)
-        desks[bus.owner] = MasterDesk(
+        providers[bus.owner] = MasterDictionaryProvider(
             client, bus.owner, release, full=told.full, padded=told.padded
         )
-    return desks
+    return providers
 
 
 def open_gateways(
     handover: Handover,
     client: BusClient,
-    desks: Mapping[PortName, MasterDesk],
+    providers: Mapping[PortName, MasterDictionaryProvider],
     routers: Mapping[str, StationRouter],
 ) -> dict[PortName, MailboxGateway]:
     """Return the gateway to each bus, in their order.
@@ -50,13 +52,13 @@ def open_gateways(
     Args:
         handover: The stations and their buses.
         client: Asks the engine for something on them.
-        desks: Dictionaries of the masters, one for each bus.
+        providers: Dictionaries of the masters, one for each bus.
         routers: Of the stations: they know the access rules, and the way to other buses.
     """
     gateways = {}
     for bus in handover.buses:
         told, router = _told(handover, bus.owner), routers[bus.owner.station]
-        desk = desks[bus.owner]
+        provider = providers[bus.owner]
         settings = Settings(
             NetId.parse(handover.port(bus.owner).net_id),
             answer_s=told.answer_ms / _MS,
@@ -66,7 +68,13 @@ def open_gateways(
         )
         gateway = MailboxGateway(
             BusMailboxes(client, bus.owner),
-            partial(MasterSession, desk.dictionary, settings.room, desk.refresh, desk.is_fresh),
+            partial(
+                MasterSession,
+                provider.dictionary,
+                settings.room,
+                provider.refresh,
+                provider.is_fresh,
+            ),
             partial(_access_of, router),
             settings,
             AddressMap({each.address: _destination(each) for each in told.addresses}),

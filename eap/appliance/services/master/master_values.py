@@ -1,271 +1,399 @@
-"""What the dictionary of a master shows: the bus as it was seen a moment ago.
+"""The dictionary of a master, for its mailbox gateway and for ADS (ETG.1510).
 
-Reading an entry cannot wait for the bus, so whoever serves the dictionary has it looked at first
-(:meth:`MasterView.refresh`): the engine's report always, registers of slaves where these are asked
-for.  What the bus counts and loses between two looks is not seen.
+Reading an entry cannot wait for the bus, so a server of the dictionary brings up to date what an
+object shows before it reads it.  Slaves and their states come from the view of the bus, counters
+and registers from requests that are repeated after FRESH_S at the earliest.  What the bus counts
+and loses between two requests is not seen.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Coroutine, Sequence
-from typing import Any, NamedTuple
+import math
+import os
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from devicebus.errors import AlStatusError
+from devicebus.mailbox import coe_client
+from devicebus.mailbox.conversation import Conversation
 from devicebus.master.access import fpwr
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_request import BusReport, SlaveReport
+from devicebus.wire.register import DlStatus
+from devicebus.wire.sii import SiiProtocol
+from eap.appliance.bus_request import BusReport, SlaveDescription
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.master.configured_values import configured_value
-from eap.appliance.services.master.master_look import (
+from eap.appliance.services.master.master_registers import (
     LOOPS,
     PORTS,
-    Found,
-    Seen,
+    DetectedSlave,
+    SlaveRegisters,
     communicating,
-    detect,
-    look_at,
+    detect_slaves,
     neighbour,
+    read_registers,
 )
-from eap.appliance.services.master.slave_facts import SlaveFacts
+from eap.device.eap_objects import Identity
+from eap.device.master_dictionary import MasterDictionary
 from eap.errors import EapError
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.profiles.master1100 import Live
+from eap.od.profiles.master1100 import CONFIGURED, DIAGNOSIS, Live
+
+T = TypeVar("T")
 
 FRESH_S = 0.1
-"""How long a look at the bus is good for."""
-LINKS_FRESH_S = 1.0
-"""How long more a look at registers is good for the configuration, which shows links only."""
+"""Age up to which counters and registers are shown."""
+LINKS_FRESH_S = 1.1
+"""Age up to which registers are shown in the configuration, which has only links of them."""
+FACTS_ANSWER_S = 0.3
+"""How long a client of the dictionary waits for the objects of a slave."""
+_DEVICE_TYPE, _HISTORY = 0x1000, 0x10F3
+_OF_REGISTERS = range(0x8000, 0xB000)
+_OF_CONFIGURED = range(CONFIGURED.first, CONFIGURED.last + 1)
+_OF_COUNTERS = frozenset((*range(DIAGNOSIS.first, DIAGNOSIS.last + 1), 0xF120, 0xF200))
 _STATES = frozenset((AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP, AlState.BOOT))
 _AL_CONTROL_BITS = 6
-"""State, acknowledgement, request for an id: what stands above them is nothing."""
+"""State, acknowledgement, request for an id; there is nothing above them."""
+_RATE_S = 1.0
+"""Frames in a second are counted over this time at least."""
+_BUSY, _DONE, _FAILED = 255, 1, 3
+"""Of a command that has a response; 0 is one that has none (ETG.1000.6, type COMMAND_PAR)."""
+_NEIGHBOURS = (Live.NEIGHBOUR_0, Live.NEIGHBOUR_1, Live.NEIGHBOUR_2, Live.NEIGHBOUR_3)
+_CRCS = (Live.CRC_0, Live.CRC_1, Live.CRC_2, Live.CRC_3)
+_COUNTED = (*_CRCS, Live.ABSENCES, Live.ABNORMAL_CHANGES)
+"""Counters of each slave."""
+_TEXTS = frozenset((Live.TYPE, Live.NAME))
+_NO_LINK, _NO_COMMUNICATION, _LINK_MISSING, _ADDITIONAL_LINK = 1, 2, 4, 8
+_PORT_SHIFT = 4
+_PORTS_TO_OTHERS = (1, 2, 3)
 
 logger = logging.getLogger(__name__)
 
 
+class MasterDictionaryProvider:
+    """The dictionary of the master behind one bus port, and the values that it shows.
+
+    Args:
+        client: Of all buses.
+        port: The bus.
+        release: Of this software.
+        full: As the dictionary has it.
+        padded: Likewise.
+
+    Attributes:
+        dictionary: To be served after :meth:`refresh`.
+    """
+
+    def __init__(
+        self,
+        client: BusClient,
+        port: PortName,
+        release: str,
+        *,
+        full: bool = False,
+        padded: bool = False,
+    ) -> None:
+        self._values = MasterView(client, port)
+        identity = Identity(
+            device_name=f"EtherCAT master {port.station}/{port.port}",
+            hardware_version=os.uname().machine,
+            software_version=release,
+        )
+        self.dictionary = MasterDictionary(self._values, identity, full=full, padded=padded)
+
+    async def refresh(self, index: int) -> None:
+        """Bring what the object at *index* shows up to date."""
+        await self._values.refresh(index)
+
+    def is_fresh(self, index: int) -> bool:
+        """Return whether what the object at *index* shows may be read at once."""
+        return self._values.is_fresh(index)
+
+
+class AgedValue(Generic[T]):
+    """A value that is read again when it is older than its user wants.
+
+    Args:
+        read: Reads it.
+        value: Until it is read for the first time.
+    """
+
+    def __init__(self, read: Callable[[], Awaitable[T]], value: T) -> None:
+        self.value = value
+        self._read = read
+        self._read_s = -math.inf
+
+    def is_younger(self, age_s: float) -> bool:
+        """Return whether it was read within *age_s*."""
+        return asyncio.get_running_loop().time() < self._read_s + age_s
+
+    async def refresh(self, age_s: float) -> None:
+        """Read it if it is older than *age_s*."""
+        if not self.is_younger(age_s):
+            self.value = await self._read()
+            self._read_s = asyncio.get_running_loop().time()
+
+    def expire(self) -> None:
+        """Have it read the next time."""
+        self._read_s = -math.inf
+
+
+class SlaveFacts(NamedTuple):
+    """Objects of a slave that the dictionary repeats; 0 for one that does not answer soon."""
+
+    device_type: int = 0
+    has_history: bool = False
+
+
 class Detection(NamedTuple):
-    """The last scan, as object 0xF002 tells of it."""
+    """The last scan, as object 0xF002 shows it."""
 
     status: int = 0
-    slaves: int = 0
+    slaves: tuple[DetectedSlave, ...] | None = None
+    """None before one has ended."""
 
 
-_BUSY, _DONE, _FAILED = 255, 1, 3
-"""Of a command that has a response; 0 is one that has none (ETG.1000.6, type COMMAND_PAR)."""
+class Rates(NamedTuple):
+    """Frames in a second, and the counts from which the next ones are worked out."""
+
+    at_s: float = 0.0
+    cycles: int = 0
+    frames: int = 0
+    cyclic: int = 0
+    acyclic: int = 0
 
 
 class MasterView:
-    """The master behind one bus port.
+    """The master behind one bus port, as values of its dictionary.
 
     Args:
-        bus: Asks the engine.
-        port: Which bus.
+        client: Of all buses.
+        port: The bus.
     """
 
-    def __init__(self, bus: BusClient, port: PortName) -> None:
-        self._bus = bus
+    def __init__(self, client: BusClient, port: PortName) -> None:
+        self._client = client
         self._port = port
-        self._report = BusReport(is_up=False)
-        self._slaves: dict[int, SlaveReport] = {}
-        self._seen: dict[int, Seen] = {}
-        self._facts = SlaveFacts(bus, port)
-        self._found: tuple[Found, ...] | None = None
+        self._view = client.views[port]
+        self._view.on_change.append(self._forget_facts)
+        self._counters = AgedValue(self._read_counters, BusReport(is_up=False))
+        self._registers = AgedValue(self._read_registers, dict[int, SlaveRegisters]())
+        self._facts: dict[int, SlaveFacts] = {}
         self._detection = Detection()
+        self._rates = Rates()
         self._codes: dict[int, int] = {}
-        self._wanted: dict[int, int] = {}
+        """AL status codes that were seen last."""
+        self._requested: dict[int, int] = {}
+        """AL control as it was written last."""
         self._fixed: set[int] = set()
+        """Slaves whose loops stay as they are written."""
         self._base: dict[tuple[int, Live], int] = {}
-        self._rates = (0.0, 0, 0, 0, 0)
-        self._until_s = self._registers_until_s = 0.0
-        self._turn = asyncio.Lock()
+        """Counters at the last reset."""
+        self._lock = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def refresh(self, *, with_registers: bool, place: int | None = None) -> None:
-        """See to it that what is shown is not old; a bus that is down shows no slaves.
-
-        Args:
-            with_registers: Whether registers of slaves are shown.
-            place: Of the slave whose configuration is shown, in the order of the bus.
-        """
-        if self.is_fresh(with_registers=with_registers, place=place):
+    async def refresh(self, index: int) -> None:
+        """Bring what the object at *index* shows up to date; a bus that is down has no slaves."""
+        if self.is_fresh(index):
             return
-        loop = asyncio.get_running_loop()
-        async with self._turn:
-            if loop.time() >= self._until_s:
-                await self._look()
-                self._until_s = loop.time() + FRESH_S
-            if with_registers and self._is_blind(loop.time(), place):
-                await self._look_closely()
-                self._registers_until_s = loop.time() + FRESH_S
-            slave = self._at(place)
+        async with self._lock:
+            with suppress(EapError):
+                await self._view.current()
+            if index in _OF_COUNTERS:
+                await self._counters.refresh(FRESH_S)
+            if index in _OF_REGISTERS:
+                await self._registers.refresh(_register_age_s(index))
+            slave = self._without_facts(index)
             if slave is not None:
-                await self._facts.ask(slave)
+                self._facts[slave.station] = await self._read_facts(slave)
 
-    def is_fresh(self, *, with_registers: bool, place: int | None = None) -> bool:
-        """Say whether :meth:`refresh` has nothing to do."""
-        slave = self._at(place)
-        if slave is not None and not self._facts.is_known(slave):
-            return False
-        now_s = asyncio.get_running_loop().time()
-        return now_s < self._until_s and not (with_registers and self._is_blind(now_s, place))
+    def is_fresh(self, index: int) -> bool:
+        """Return whether :meth:`refresh` has nothing to do."""
+        return (
+            self._view.is_current
+            and (index not in _OF_COUNTERS or self._counters.is_younger(FRESH_S))
+            and (index not in _OF_REGISTERS or self._registers.is_younger(_register_age_s(index)))
+            and self._without_facts(index) is None
+        )
+
+    @property
+    def slaves(self) -> Mapping[int, SlaveDescription]:
+        """Slaves of a bus that is up, by station address."""
+        bus = self._view.latest
+        return bus.slaves if bus.is_up and self._view.is_current else {}
 
     def configured(self) -> Sequence[int]:
         """Return the station addresses of the configuration."""
-        return tuple(self._slaves)
+        return tuple(self.slaves)
 
     def detected(self) -> Sequence[int]:
         """Return those that the last scan has found; before one, those that answer."""
-        if self._found is not None:
-            return tuple(each.station for each in self._found)
-        return tuple(station for station, slave in self._slaves.items() if slave.state)
+        if self._detection.slaves is not None:
+            return tuple(each.station for each in self._detection.slaves)
+        return tuple(station for station, slave in self.slaves.items() if slave.state)
 
     def of_configured(self, station: int, key: Live) -> Any:
-        """Return what *key* stands for, of a configured slave; 0 for what nobody knows."""
-        slave = self._slaves.get(station)
+        """Return the value of *key* for a configured slave; 0 for one that is not known."""
+        slave = self.slaves.get(station)
         if slave is None:
             return "" if key in _TEXTS else 0
-        dl = self._seen.get(station, Seen()).dl
-        return configured_value(slave, dl, self._facts.of(station), key)
+        facts = self._facts.get(station, SlaveFacts())
+        return configured_value(slave, self._registers_of(station).dl, facts, key)
 
     def of_detected(self, station: int, key: Live) -> Any:
-        """Return what *key* stands for, of a slave that was found."""
-        for each in self._found or ():
+        """Return the value of *key* for a slave that was found."""
+        for each in self._detection.slaves or ():
             if each.station == station:
-                return _of_found(each, key)
+                return _detected_value(each, key)
         if key is Live.DL_STATUS:
-            return self._seen.get(station, Seen()).dl_word
+            return self._registers_of(station).dl_word
         return self.of_configured(station, key)
 
     def of_diagnosis(self, station: int, key: Live) -> Any:
-        """Return what *key* stands for, of how a configured slave is."""
-        seen = self._seen.get(station, Seen())
+        """Return the value of *key* for the diagnosis of a configured slave."""
+        registers = self._registers_of(station)
         if key in _NEIGHBOURS:
-            return neighbour(self._seen, tuple(self._slaves), station, _NEIGHBOURS.index(key))
+            return neighbour(
+                self._registers.value, self.configured(), station, _NEIGHBOURS.index(key)
+            )
         if key in _COUNTED:
             return self._since_reset(station, key)
-        slave = self._slaves.get(station)
+        slave = self.slaves.get(station)
         return {
-            Live.AL_STATUS: int.from_bytes(seen.al.encode()[:2], "little"),
-            Live.AL_CONTROL: self._wanted.get(station, slave.target if slave else 0),
+            Live.AL_STATUS: int.from_bytes(registers.al.encode()[:2], "little"),
+            Live.AL_CONTROL: self._requested.get(station, slave.target if slave else 0),
             Live.AL_STATUS_CODE: self._last_code(station),
-            Live.LINK_CONNECTION: seen.dl.link << PORTS | communicating(seen.dl),
-            Live.LINK_CONTROL: seen.loops,
+            Live.LINK_CONNECTION: registers.dl.link << PORTS | communicating(registers.dl),
+            Live.LINK_CONTROL: registers.loops,
             Live.WKC_ERRORS: self._since_reset(0, Live.WKC_ERRORS),
             Live.FIXED_LINKS: station in self._fixed,
             Live.HAS_NEW_DIAGNOSIS: False,
         }.get(key, 0)
 
     def of_master(self, key: Live) -> Any:
-        """Return what *key* stands for, of the master itself."""
-        status, count = self._detection
-        _, _, _, cyclic, acyclic = self._rates
+        """Return the value of *key* for the master itself."""
+        status, count = self._detection.status, len(self._detection.slaves or ())
+        count = count if status == _DONE else 0
         return {
             Live.DETECT_REQUEST: bytes(2),
             Live.DETECT_STATUS: status,
             Live.DETECT_RESPONSE: bytes((status, 0, 0, 0)) + count.to_bytes(2, "little"),
             Live.LOST_CYCLIC: self._since_reset(0, Live.LOST_CYCLIC),
             Live.LOST_ACYCLIC: self._since_reset(0, Live.LOST_ACYCLIC),
-            Live.RATE_CYCLIC: cyclic,
-            Live.RATE_ACYCLIC: acyclic,
-            Live.STATE: max((slave.state for slave in self._slaves.values()), default=1) or 1,
+            Live.RATE_CYCLIC: self._rates.cyclic,
+            Live.RATE_ACYCLIC: self._rates.acyclic,
+            Live.STATE: max((slave.state for slave in self.slaves.values()), default=1) or 1,
             Live.RESET: False,
         }.get(key, 0)
 
     def write_slave(self, station: int, key: Live, value: int) -> None:
-        """Ask for a state, or set the loops of ports; what goes wrong later is logged."""
+        """Request a state, or set the loops of ports; an error that comes later is logged."""
         if key is Live.AL_CONTROL:
             target = value & 0x0F
             if target not in _STATES or value >> _AL_CONTROL_BITS:
                 raise SdoAbortError(AbortCode.VALUE, 0xA000, 2, f"{value:#x} asks for no AL state")
-            self._wanted[station] = value
+            self._requested[station] = value
             self._start(self._bring(station, AlState(target)))
         elif key is Live.LINK_CONTROL:
             access = [fpwr(station, LOOPS, bytes((value,)))]
-            self._start(self._bus.transfer(self._port, access))
-            self._registers_until_s = 0.0
+            self._start(self._client.transfer(self._port, access))
+            self._registers.expire()
         elif value:
             self._fixed.add(station)
         else:
             self._fixed.discard(station)
 
     def write_master(self, key: Live, data: bytes) -> None:
-        """Start a scan, or set counters back."""
+        """Start a scan, or reset counters."""
         if key is Live.DETECT_REQUEST:
             if self._detection.status != _BUSY:
-                self._detection = Detection(_BUSY)
+                self._detection = self._detection._replace(status=_BUSY)
                 self._start(self._detect())
         elif any(data):
             self._reset()
 
-    def _is_blind(self, now_s: float, place: int | None) -> bool:
-        """Say whether what is known of registers is too old, where it matters."""
-        return now_s >= self._registers_until_s + (0 if place is None else LINKS_FRESH_S)
+    def _registers_of(self, station: int) -> SlaveRegisters:
+        return self._registers.value.get(station, SlaveRegisters())
 
-    def _at(self, place: int | None) -> SlaveReport | None:
-        slaves = self._report.slaves if place is not None else ()
-        return slaves[place] if place is not None and place < len(slaves) else None
+    def _without_facts(self, index: int) -> SlaveDescription | None:
+        """Return the configured slave at *index* if its objects are to be read first."""
+        number = index - CONFIGURED.first
+        if index not in _OF_CONFIGURED or number >= len(self.slaves):
+            return None
+        slave = list(self.slaves.values())[number]
+        has_coe = bool(slave.to_slave and slave.protocols & SiiProtocol.COE)
+        return slave if has_coe and slave.station not in self._facts else None
 
-    async def _look(self) -> None:
+    def _forget_facts(self) -> None:
+        """Forget the objects of slaves that do not answer: others may come in their place."""
+        for station, slave in self._view.latest.slaves.items():
+            if not slave.state:
+                self._facts.pop(station, None)
+
+    async def _read_facts(self, slave: SlaveDescription) -> SlaveFacts:
+        with suppress(EapError, TimeoutError):
+            async with asyncio.timeout(FACTS_ANSWER_S):
+                return await self._client.converse(
+                    self._port, slave.station, _ask_facts(), requester="dictionary of the master"
+                )
+        return SlaveFacts()
+
+    async def _read_counters(self) -> BusReport:
         try:
-            self._report = await self._bus.describe(self._port)
+            report = await self._client.describe(self._port)
         except EapError:
-            self._report = BusReport(is_up=False)
-        slaves = self._report.slaves if self._report.is_up else ()
-        self._slaves = {slave.station: slave for slave in slaves}
-        self._facts.forget(at for at, slave in self._slaves.items() if not slave.state)
-        self._measure()
+            report = BusReport(is_up=False)
+        now_s, last = asyncio.get_running_loop().time(), self._rates
+        if not last.at_s or report.cycles < last.cycles:
+            self._rates = Rates(now_s, report.cycles, report.frames_sent)
+        elif now_s - last.at_s >= _RATE_S:
+            cyclic = (report.cycles - last.cycles) / (now_s - last.at_s)
+            others = (report.frames_sent - last.frames) / (now_s - last.at_s) - cyclic
+            rates = round(cyclic), max(0, round(others))
+            self._rates = Rates(now_s, report.cycles, report.frames_sent, *rates)
+        return report
 
-    def _measure(self) -> None:
-        """Work out frames in a second, over at least a second."""
-        now_s, report = asyncio.get_running_loop().time(), self._report
-        at_s, cycles, frames, _, _ = self._rates
-        if not at_s or report.cycles < cycles:
-            self._rates = (now_s, report.cycles, report.frames_sent, 0, 0)
-        elif now_s - at_s >= 1.0:
-            cyclic = (report.cycles - cycles) / (now_s - at_s)
-            rest = (report.frames_sent - frames) / (now_s - at_s) - cyclic
-            rates = round(cyclic), max(0, round(rest))
-            self._rates = (now_s, report.cycles, report.frames_sent, *rates)
-
-    async def _look_closely(self) -> None:
+    async def _read_registers(self) -> dict[int, SlaveRegisters]:
+        if not self.slaves:
+            return {}
         try:
-            self._seen = await self._bus.run(self._port, look_at(tuple(self._slaves)))
+            found = await self._client.run(self._port, read_registers(self.configured()))
         except EapError:
-            self._seen = {}
-        for station, seen in self._seen.items():
-            if seen.al.code:
-                self._codes[station] = seen.al.code
+            return {}
+        self._codes |= {at: each.al.code for at, each in found.items() if each.al.code}
+        return found
 
     async def _bring(self, station: int, target: AlState) -> None:
         try:
-            await self._bus.bring(self._port, station, target)
+            await self._client.bring(self._port, station, target)
         except AlStatusError as exc:
             self._codes[station] = exc.code
             raise
 
     async def _detect(self) -> None:
         try:
-            self._found = await self._bus.run(self._port, detect())
+            found = await self._client.run(self._port, detect_slaves())
         except BaseException:
-            self._detection = Detection(_FAILED)
+            self._detection = self._detection._replace(status=_FAILED)
             raise
-        self._detection = Detection(_DONE, len(self._found))
+        self._detection = Detection(_DONE, found)
 
     def _counter(self, station: int, key: Live) -> int:
         if key in _CRCS:
-            return self._seen.get(station, Seen()).errors[_CRCS.index(key)]
-        report, slave = self._report, self._slaves.get(station)
+            return self._registers_of(station).errors[_CRCS.index(key)]
+        slave, counters = self.slaves.get(station), self._counters.value
         if slave is not None:
             return slave.losses if key is Live.ABSENCES else slave.departures
         if key is Live.WKC_ERRORS:
-            return report.wkc_errors
-        return report.cycles_lost if key is Live.LOST_CYCLIC else report.frames_lost
+            return counters.wkc_errors
+        return counters.cycles_lost if key is Live.LOST_CYCLIC else counters.frames_lost
 
     def _last_code(self, station: int) -> int:
         """Return the AL status code of when a slave last left its state, or that was seen last."""
-        slave = self._slaves.get(station)
+        slave = self.slaves.get(station)
         has_left = self._since_reset(station, Live.ABNORMAL_CHANGES)
         return (has_left and slave and slave.al_code) or self._codes.get(station, 0)
 
@@ -275,7 +403,7 @@ class MasterView:
     def _reset(self) -> None:
         self._codes.clear()
         keys = [(0, key) for key in (Live.WKC_ERRORS, Live.LOST_CYCLIC, Live.LOST_ACYCLIC)]
-        keys += [(station, key) for station in self._slaves for key in _COUNTED]
+        keys += [(station, key) for station in self.slaves for key in _COUNTED]
         self._base = {key: self._counter(*key) for key in keys}
 
     def _start(self, work: Coroutine[Any, Any, Any]) -> None:
@@ -290,14 +418,54 @@ class MasterView:
             logger.warning("%s/%s: %s", self._port.station, self._port.port, exc)
 
 
-_NEIGHBOURS = (Live.NEIGHBOUR_0, Live.NEIGHBOUR_1, Live.NEIGHBOUR_2, Live.NEIGHBOUR_3)
-_CRCS = (Live.CRC_0, Live.CRC_1, Live.CRC_2, Live.CRC_3)
-_COUNTED = (*_CRCS, Live.ABSENCES, Live.ABNORMAL_CHANGES)
-"""Of each slave."""
-_TEXTS = frozenset((Live.TYPE, Live.NAME))
+def configured_value(slave: SlaveDescription, dl: DlStatus, facts: SlaveFacts, key: Live) -> Any:
+    """Return the value of *key* in the configuration of a slave (0x8nnn); 0 if it is not known.
+
+    Args:
+        slave: As the engine knows it.
+        dl: Its links now.
+        facts: Its own objects.
+        key: Of a row of the profile.
+    """
+    return {
+        Live.ADDRESS: slave.station,
+        Live.TYPE: slave.order or slave.name,
+        Live.NAME: slave.name,
+        Live.DEVICE_TYPE: facts.device_type,
+        Live.VENDOR: slave.vendor,
+        Live.PRODUCT: slave.product,
+        Live.REVISION: slave.revision,
+        Live.SERIAL: slave.serial,
+        # In BOOT they are other ones than in the EEPROM.
+        Live.MAILBOX_OUT: slave.to_slave or slave.usual_to_slave,
+        Live.MAILBOX_IN: slave.to_master or slave.usual_to_master,
+        Live.LINK_STATUS: link_status(slave, dl),
+        Live.LINK_PRESET: slave.link_preset,
+        Live.PHYSICS: slave.port_physics,
+        Live.PROTOCOLS: slave.protocols,
+        Live.HAS_HISTORY: facts.has_history,
+    }.get(key, 0)
 
 
-def _of_found(found: Found, key: Live) -> int:
+def link_status(slave: SlaveDescription, dl: DlStatus) -> int:
+    """Return how the links of a slave differ from those it was found with."""
+    if not slave.state:
+        return _NO_LINK
+    alive = communicating(dl)
+    status = 0
+    for port in _PORTS_TO_OTHERS:
+        is_expected = slave.link_preset >> port - 1 & 1
+        has_link = dl.link >> port & 1
+        if is_expected and not has_link:
+            status |= _LINK_MISSING | 1 << _PORT_SHIFT + port
+        elif has_link and not is_expected:
+            status |= _ADDITIONAL_LINK | 1 << _PORT_SHIFT + port
+        elif has_link and not alive >> port & 1:
+            status |= _NO_COMMUNICATION | 1 << _PORT_SHIFT + port
+    return status
+
+
+def _detected_value(found: DetectedSlave, key: Live) -> int:
     identity = found.identity
     return {
         Live.ADDRESS: found.station,
@@ -307,3 +475,17 @@ def _of_found(found: Found, key: Live) -> int:
         Live.SERIAL: identity.serial,
         Live.DL_STATUS: found.dl_word,
     }.get(key, 0)
+
+
+def _register_age_s(index: int) -> float:
+    return LINKS_FRESH_S if index in _OF_CONFIGURED else FRESH_S
+
+
+def _ask_facts() -> Conversation[SlaveFacts]:
+    device_type = yield from coe_client.upload(_DEVICE_TYPE, 0)
+    try:
+        yield from coe_client.upload(_HISTORY, 0)
+        has_history = True
+    except SdoAbortError:
+        has_history = False
+    return SlaveFacts(int.from_bytes(device_type, "little"), has_history)

@@ -49,12 +49,17 @@ class BusView:
         link.on_change.append(self._take)
         link.on_restart.append(self._forget)
 
+    @property
+    def is_current(self) -> bool:
+        """Whether :meth:`current` returns without waiting."""
+        return self._is_complete and self._link.is_alive
+
     async def current(self) -> BusDescription:
         """Return the description, as a rule without waiting; raise EngineGoneError.
 
         The engine is asked only if it has sent nothing for a second, or nothing about this bus.
         """
-        if self._is_complete and self._link.is_alive:
+        if self.is_current:
             return self.latest
         return await self.confirm()
 

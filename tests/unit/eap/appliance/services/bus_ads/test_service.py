@@ -18,7 +18,7 @@ from eap.aoe.ads_operation import (
 )
 from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.services.bus_ads import service, slave_ads, slave_files
-from eap.appliance.services.master.master_desk import MasterDesk
+from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.codec.ads import (
     AdsDeviceInfo,
     AdsError,
@@ -130,11 +130,11 @@ def test_dictionary_of_the_master_is_live():
 
 def test_only_what_somebody_is_told_of_is_looked_at_again(monkeypatch):
     looked_at = []
-    refresh = MasterDesk.refresh
+    refresh = MasterDictionaryProvider.refresh
 
-    async def note(desk, index):
+    async def note(provider, index):
         looked_at.append(index)
-        await refresh(desk, index)
+        await refresh(provider, index)
 
     async def scene(client, engine):
         there, missing = (
@@ -151,7 +151,7 @@ def test_only_what_somebody_is_told_of_is_looked_at_again(monkeypatch):
         await until(is_looked_at)
         assert set(looked_at) == {0x8002}
 
-    monkeypatch.setattr(MasterDesk, "refresh", note)
+    monkeypatch.setattr(MasterDictionaryProvider, "refresh", note)
     play(scene, "coe")
 
 

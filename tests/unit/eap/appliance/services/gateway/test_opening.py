@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from eap.appliance.handover import BusSocket, Handover, PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
-from eap.appliance.services.gateway.opening import open_desks, open_gateways
+from eap.appliance.services.gateway.opening import open_dictionaries, open_gateways
 from eap.od.model import OdState
 from eap.pd.spec import GatewayAddress, GatewaySpec
 from tests.support.cyclic import bus_port, eap_port, station
@@ -40,17 +40,17 @@ def test_each_bus_has_one_as_the_plant_file_says() -> None:
         )  # fmt: skip
         try:
             client = BusClient(link, NAMES)
-            desks = open_desks(handover, client, "1.0")
-            gateways = open_gateways(handover, client, desks, {"left": router("5.1.1.1.1.1")})
+            providers = open_dictionaries(handover, client, "1.0")
+            gateways = open_gateways(handover, client, providers, {"left": router("5.1.1.1.1.1")})
             assert list(gateways) == NAMES
             first, second = gateways.values()
             assert (first.is_open, second.is_open) == (False, True)
             assert (first.settings.answer_s, first.settings.is_silent) == (0.25, True)
             assert first.settings.limits.in_flight == 3
             extents = []
-            for desk in desks.values():
-                await desk.refresh(0xA000)
-                extents.append(desk.dictionary.upload(0xA000, 0, OdState.OP)[0])
+            for provider in providers.values():
+                await provider.refresh(0xA000)
+                extents.append(provider.dictionary.upload(0xA000, 0, OdState.OP)[0])
             assert extents == [19, 17]
         finally:
             link.close()

@@ -1,4 +1,4 @@
-"""What a master reads of its slaves to tell how they are, and who is there."""
+"""Registers of slaves that the dictionary of a master shows, and the scan of its bus."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 
 PORTS = 4
 LOOPS = Register.DL_CONTROL + 1
-"""Where the loop control of the four ports stands, two bits each."""
+"""Register with the loop control of the four ports, two bits each."""
 _EACH, _AT_ONCE = 4, 15
 """Registers of a slave, and slaves that are read at a time: every step takes a cycle."""
 
 
-class Seen(NamedTuple):
-    """The registers of one slave; nothing of one that does not answer."""
+class SlaveRegisters(NamedTuple):
+    """The registers of one slave; all 0 for one that does not answer."""
 
     al: AlStatus = AlStatus(0)
     dl: DlStatus = DlStatus()
@@ -28,7 +28,7 @@ class Seen(NamedTuple):
     errors: tuple[int, ...] = (0,) * PORTS
 
 
-class Found(NamedTuple):
+class DetectedSlave(NamedTuple):
     """A slave that a scan has found."""
 
     station: int
@@ -47,17 +47,19 @@ def communicating(status: DlStatus) -> int:
     return sum(bool(bit) << port for port, bit in enumerate(alive))
 
 
-def neighbour(seen: Mapping[int, Seen], order: Sequence[int], station: int, port: int) -> int:
-    """Return who is connected to a port of a slave, 0 if that is the master or nobody.
+def neighbour(
+    registers: Mapping[int, SlaveRegisters], order: Sequence[int], station: int, port: int
+) -> int:
+    """Return the slave that is connected to a port of a slave, 0 for the master or none.
 
     Args:
-        seen: Slaves that answered.
+        registers: Of the slaves that answered.
         order: Station addresses in the order of the bus.
-        station: Whose port it is.
+        station: Address of the slave.
         port: Of that slave.
     """
-    stations = [each for each in order if each in seen]
-    joints = find_joints([seen[each].dl for each in stations])
+    stations = [each for each in order if each in registers]
+    joints = find_joints([registers[each].dl for each in stations])
     for position, joint in enumerate(joints):
         there = None if joint.parent is None else stations[joint.parent]
         if stations[position] == station and joint.entry_port == port:
@@ -67,16 +69,16 @@ def neighbour(seen: Mapping[int, Seen], order: Sequence[int], station: int, port
     return 0
 
 
-def look_at(stations: Sequence[int]) -> Procedure[dict[int, Seen]]:
-    """Read the registers that diagnosis shows."""
-    found: dict[int, Seen] = {}
+def read_registers(stations: Sequence[int]) -> Procedure[dict[int, SlaveRegisters]]:
+    """Read the registers that the dictionary shows, of all slaves that answer."""
+    found: dict[int, SlaveRegisters] = {}
     for start in range(0, len(stations), _AT_ONCE):
         part = stations[start : start + _AT_ONCE]
         replies, _ = yield [access for station in part for access in _accesses(station)]
         for number, station in enumerate(part):
             al, dl, loops, errors = own = replies[number * _EACH : (number + 1) * _EACH]
             if all(reply.wkc for reply in own):
-                found[station] = Seen(
+                found[station] = SlaveRegisters(
                     AlStatus.decode(al.data),
                     DlStatus.decode(dl.data),
                     int.from_bytes(dl.data, "little"),
@@ -95,13 +97,13 @@ def _accesses(station: int) -> list[Access]:
     ]
 
 
-def detect() -> Procedure[tuple[Found, ...]]:
-    """Find out who is there; nothing of what slaves do is disturbed."""
+def detect_slaves() -> Procedure[tuple[DetectedSlave, ...]]:
+    """Scan the bus without disturbing it."""
     count = yield from count_slaves()
     stations = yield from read_stations(count)
     found = []
     for station in stations:
         identity = yield from read_identity(station)
         replies, _ = yield [fprd(station, Register.DL_STATUS, DlStatus.SIZE)]
-        found.append(Found(station, identity, int.from_bytes(replies[0].data, "little")))
+        found.append(DetectedSlave(station, identity, int.from_bytes(replies[0].data, "little")))
     return tuple(found)

@@ -1,4 +1,4 @@
-"""Registers of slaves in memory."""
+"""Registers of slaves in memory, and a scan."""
 
 from __future__ import annotations
 
@@ -6,33 +6,38 @@ from collections.abc import Sequence
 
 from devicebus.master.access import Access, Reply
 from devicebus.wire.alstatus import AlState
-from eap.appliance.services.master.master_look import LOOPS, Seen, detect, look_at
+from eap.appliance.services.master.master_registers import (
+    LOOPS,
+    SlaveRegisters,
+    detect_slaves,
+    read_registers,
+)
 from tests.support.fakeengine import FakeBus
 from tests.support.loopbus import LoopBus
 
 
-def test_slaves_are_looked_at_and_who_does_not_answer_is_left_out() -> None:
+def test_registers_of_slaves_that_do_not_answer_are_left_out() -> None:
     bus = FakeBus(LoopBus("io"))
     stations = [1001, 1002, 1003, 1004, 1009]
-    seen = bus.finish(bus.master.run(look_at(stations), bus.line.now_ns))
+    seen = bus.finish(bus.master.run(read_registers(stations), bus.line.now_ns))
     assert list(seen) == [1001, 1002, 1003, 1004]
     assert {each.al.state for each in seen.values()} == {AlState.PREOP}
     assert seen[1001].errors == (0, 0, 0, 0)
     assert seen[1001].dl_word
-    assert Seen().errors == (0, 0, 0, 0)
+    assert SlaveRegisters().errors == (0, 0, 0, 0)
     assert LOOPS == 0x0101
 
 
-def test_many_slaves_are_looked_at_in_few_steps() -> None:
+def test_registers_of_many_slaves_are_read_in_few_steps() -> None:
     stations = range(1001, 1041)
-    look, steps = look_at(stations), 0
+    look, steps = read_registers(stations), 0
 
     def answered(asked: Sequence[Access]) -> tuple[list[Reply], int]:
         nonlocal steps
         steps += 1
         return [Reply(access.data, 1) for access in asked], 0
 
-    def run() -> dict[int, Seen]:
+    def run() -> dict[int, SlaveRegisters]:
         asked = next(look)
         while True:
             try:
@@ -44,8 +49,8 @@ def test_many_slaves_are_looked_at_in_few_steps() -> None:
     assert steps == 3
 
 
-def test_a_scan_finds_who_is_there() -> None:
+def test_scan_finds_all_slaves() -> None:
     bus = FakeBus(LoopBus("io"))
-    found = bus.finish(bus.master.run(detect(), bus.line.now_ns))
+    found = bus.finish(bus.master.run(detect_slaves(), bus.line.now_ns))
     assert [each.station for each in found] == [1001, 1002, 1003, 1004]
     assert all(each.identity.vendor for each in found)
