@@ -126,7 +126,7 @@ def _check_form(ctx: click.Context) -> None:
 
 def _blank_plant(name: str, interface: str, net_id: str, cycle_us: int) -> Plant:
     """Return a plant of one blank station; raise ConfigError that names the wrong options."""
-    from eap.config.blank import INTERFACE_PATH, NET_ID_PATHS, blank
+    from eap.config.load import INTERFACE_PATH, NET_ID_PATHS, blank
 
     result = blank(name, interface, net_id, cycle_us)
     if result.plant is not None:

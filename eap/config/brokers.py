@@ -1,13 +1,18 @@
-"""Brokers of a plant file: by which MQTT networks stations reach each other."""
+"""MQTT brokers of a plant file, auto-discovery of routes, and their checks."""
 
 from __future__ import annotations
 
+from ipaddress import IPv4Network
 from pathlib import Path
 from typing import NamedTuple
 
-from eap.aoe.spec import MqttSpec, TlsSpec
-from eap.config.structs import Route, Station, Tls
+from eap.aoe.mqtt_topics import check_network
+from eap.aoe.spec import DoorKind, MqttSpec, TlsSpec
+from eap.config.finding import Finding, Report
+from eap.config.index import Index
+from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import parse_host
+from eap.near import near
 
 URL = "mqtt://HOST[:PORT], or mqtts:// with TLS"
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
@@ -33,17 +38,17 @@ def parse_url(text: str) -> Broker:
     return Broker(host, port, scheme == "mqtts")
 
 
-def brokers_of(station: Station) -> list[Route]:
+def brokers_of(station: StationSection) -> list[RouteSection]:
     """Return the entries of *station* that name a broker."""
     return [route for route in station.routes if route.mqtt]
 
 
-def find_network(station: Station, network: str) -> Route | None:
+def find_network(station: StationSection, network: str) -> RouteSection | None:
     """Return by which entry *station* takes part in *network*."""
     return next((each for each in brokers_of(station) if each.network == network), None)
 
 
-def shared_network(station: Station, other: Station) -> str:
+def shared_network(station: StationSection, other: StationSection) -> str:
     """Return the network by which two stations reach each other, empty if there is none.
 
     A network is the same if its name is: stations may know a broker, or the brokers of a cluster,
@@ -55,10 +60,10 @@ def shared_network(station: Station, other: Station) -> str:
     return ""
 
 
-def broker_spec(route: Route, folder: Path) -> MqttSpec:
+def broker_spec(route: RouteSection, folder: Path) -> MqttSpec:
     """Return what services need to know of the broker of *route*; its files are in *folder*."""
     broker = parse_url(route.mqtt)
-    tls = route.tls or (Tls() if broker.is_secret else None)
+    tls = route.tls or (TlsSection() if broker.is_secret else None)
     return MqttSpec(
         network=route.network,
         host=broker.host,
@@ -74,7 +79,7 @@ def broker_spec(route: Route, folder: Path) -> MqttSpec:
     )
 
 
-def _tls(tls: Tls, folder: Path) -> TlsSpec:
+def _tls(tls: TlsSection, folder: Path) -> TlsSpec:
     return TlsSpec(
         ca=_path(folder, tls.ca),
         certificate=_path(folder, tls.certificate),
@@ -85,3 +90,161 @@ def _tls(tls: Tls, folder: Path) -> TlsSpec:
 
 def _path(folder: Path, file: str) -> str:
     return str((folder / file).resolve()) if file else ""
+
+
+_NETWORK = "one level of a topic: up to 128 characters, no spaces, no / + #, and no $ in front"
+_FILE = "a file, its path from the plant file on"
+_MAX_CLIENT_ID = 65_535
+
+
+def check_brokers(index: Index, report: Report, folder: Path) -> None:
+    """Report every broker that cannot be as it is; files are in *folder*."""
+    client_ids: dict[tuple[Broker, str], RouteSection] = {}
+    for station in index.plant.stations:
+        _check_networks(station, report)
+        for route in brokers_of(station):
+            broker = _check_url(route, report)
+            _check_secrets(route, report, folder)
+            if broker is not None and route.client_id:
+                first = client_ids.setdefault((broker, route.client_id), route)
+                if first is not route:
+                    line = report.line_of(f"{first.at}.client_id")
+                    message = f"client_id {route.client_id!r} is used twice (first in line {line})"
+                    expected = "one of its own: a broker drops who had it before, or none"
+                    report.add(f"{route.at}.client_id", message, expected)
+
+
+def _check_url(route: RouteSection, report: Report) -> Broker | None:
+    path = f"{route.at}.mqtt"
+    try:
+        broker = parse_url(route.mqtt)
+    except ValueError as exc:
+        report.add(path, f"mqtt: {exc}", URL)
+        return None
+    if len(route.client_id.encode()) > _MAX_CLIENT_ID:
+        message = "client_id is too long"
+        report.add(f"{route.at}.client_id", message, f"at most {_MAX_CLIENT_ID} octets")
+    return broker
+
+
+def _check_networks(station: StationSection, report: Report) -> None:
+    first: dict[str, RouteSection] = {}
+    for route in brokers_of(station):
+        path = f"{route.at}.network"
+        if not route.network:
+            report.add(route.at, f"broker {route.mqtt} has no network", _NETWORK)
+        elif not _is_network(route.network):
+            report.add(path, f"network {route.network!r}", _NETWORK)
+        elif route.network in first:
+            line = report.line_of(f"{first[route.network].at}.network")
+            message = f"station {station.name} is in network {route.network!r} already"
+            report.add(path, f"{message} (line {line})", "each network once")
+        else:
+            first[route.network] = route
+
+
+def _is_network(name: str) -> bool:
+    try:
+        check_network(name)
+    except ValueError:
+        return False
+    return not any(each == "/" or each.isspace() for each in name)
+
+
+def _check_secrets(route: RouteSection, report: Report, folder: Path) -> None:
+    if route.password_file and not route.user:
+        report.add(f"{route.at}.password_file", "a password without a user", "user: as well")
+    check_file(f"{route.at}.password_file", route.password_file, report, folder)
+    if route.tls is None:
+        return
+    at = f"{route.at}.tls"
+    for key, file in (
+        ("ca", route.tls.ca),
+        ("certificate", route.tls.certificate),
+        ("key", route.tls.key),
+    ):
+        check_file(f"{at}.{key}", file, report, folder)
+    if route.tls.key and not route.tls.certificate:
+        report.add(f"{at}.key", "a key without a certificate", "certificate: as well")
+
+
+def check_file(path: str, file: str, report: Report, folder: Path) -> None:
+    """Report *file*, named at *path*, if it is given and cannot be read."""
+    if file and (reason := why_unreadable(folder / file)):
+        report.add(path, f"{file}: {reason}", _FILE)
+
+
+HOST = "an IPv4 address or a host name, and :PORT if it is not the usual one"
+
+
+def why_unreadable(file: Path) -> str:
+    """Return why *file* cannot be read as a whole; empty if it can."""
+    try:
+        if file.exists() and not file.is_file() and not file.is_dir():
+            return "no regular file"  # a pipe would keep us waiting
+        with file.open("rb") as opened:
+            opened.read(1)
+    except (OSError, ValueError) as exc:  # ValueError: a NUL in the path
+        return f"{exc.strerror if isinstance(exc, OSError) else exc}"
+    return ""
+
+
+_MQTT = f"{DoorKind.MQTT}:"
+_SOURCES = "mqtt:NETWORK of a broker of the station, or an IPv4 address or network"
+
+
+def learn_sources(station: StationSection) -> bool | tuple[str, ...]:
+    """Return from where *station*, which has no findings, learns routes."""
+    if isinstance(station.learn, bool):
+        return station.learn
+    return tuple(_parse(station, text) for text in station.learn)
+
+
+def check_learning(index: Index, report: Report) -> None:
+    """Report every source of learned routes that is none."""
+    for station in index.plant.stations:
+        if isinstance(station.learn, bool):
+            continue
+        for position, text in enumerate(station.learn):
+            try:
+                _parse(station, text)
+            except ValueError as exc:
+                report.add(f"{station.at}.learn[{position}]", f"learn: {exc}", _SOURCES)
+
+
+def warn_of_open_brokers(index: Index, report: Report) -> tuple[Finding, ...]:
+    """Return a warning for each broker that teaches routes without knowing its clients.
+
+    A station that names the network in ``learn`` wants that.
+    """
+    found = []
+    for station in index.plant.stations:
+        for route in brokers_of(station) if station.learn is True else ():
+            if _is_anonymous(route):
+                message = (
+                    f"station {station.name} learns routes from anybody at {route.mqtt}: the"
+                    " broker asks for no user"
+                )
+                expected = f"learn: [mqtt:{route.network}] if that is meant, else learn: false"
+                line = report.line_of(f"{route.at}.mqtt")
+                found.append(Finding(report.file, line, route.at, message, expected))
+    return tuple(found)
+
+
+def _is_anonymous(route: RouteSection) -> bool:
+    """Say whether a station shows its broker neither a user nor a certificate."""
+    return not route.user and (route.tls is None or not route.tls.certificate)
+
+
+def _parse(station: StationSection, text: str) -> str:
+    """Return a source in its usual form; raise ValueError if it is none."""
+    if not text.startswith(_MQTT):
+        try:
+            return str(IPv4Network(text, strict=False))
+        except ValueError:
+            raise ValueError(f"{text!r} is no network of a broker and no IPv4 network") from None
+    network = text.removeprefix(_MQTT)
+    if find_network(station, network) is None:
+        known = [route.network for route in brokers_of(station)]
+        raise ValueError(f"the station is in no network {network!r}{near(network, known)}")
+    return text

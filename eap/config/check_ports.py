@@ -8,11 +8,11 @@ from ipaddress import IPv4Address
 from eap.codec.amsdiscovery import AMS_UDP_PORT
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
-from eap.config.check_buses import INTERFACE, check_bus_port
+from eap.config.bus import INTERFACE, check_bus_port
 from eap.config.destination import takes_tcp
 from eap.config.finding import Report
 from eap.config.index import Index
-from eap.config.structs import Port, Station
+from eap.config.structs import PortSection, StationSection
 from eap.ids import InterfaceUri, MacAddr, NetId
 from eap.od.profiles import eap1000 as profile
 from eap.pd.rules import NAME, check_phase, doubles, is_group, is_name
@@ -62,9 +62,9 @@ def check_names(names: Iterable[tuple[str, str]], what: str, report: Report) -> 
         report.add(path, message, "a name of its own")
 
 
-def _check_net_ids(stations: tuple[Station, ...], report: Report) -> None:
+def _check_net_ids(stations: tuple[StationSection, ...], report: Report) -> None:
     first: dict[NetId, str] = {}
-    owners: list[Station | Port] = []
+    owners: list[StationSection | PortSection] = []
     for station in stations:
         owners += [station, *station.ports]
     for section in owners:
@@ -84,7 +84,7 @@ def _check_net_ids(stations: tuple[Station, ...], report: Report) -> None:
             first[net_id] = path
 
 
-def _check_order(station: Station, report: Report) -> None:
+def _check_order(station: StationSection, report: Report) -> None:
     if not station.ports and f"{station.at}.ports[0]" not in report.lines:
         report.add(f"{station.at}.ports", f"station {station.name} has no ports", "an EAP port")
     bus_seen = False
@@ -95,7 +95,7 @@ def _check_order(station: Station, report: Report) -> None:
             report.add(port.at, f"EAP port {port.name} after a bus port", "EAP ports first")
 
 
-def _check_port(port: Port, report: Report) -> None:
+def _check_port(port: PortSection, report: Report) -> None:
     path = f"{port.at}.interface"
     _check_keys(port, report)
     try:
@@ -121,9 +121,9 @@ def _check_port(port: Port, report: Report) -> None:
     _check_options(port, uri, report)
 
 
-def _check_keys(port: Port, report: Report) -> None:
+def _check_keys(port: PortSection, report: Report) -> None:
     is_bus = port.kind is PortKind.BUS
-    for key in Port.EAP_KEYS if is_bus else Port.BUS_KEYS:
+    for key in PortSection.EAP_KEYS if is_bus else PortSection.BUS_KEYS:
         if f"{port.at}.{key}" in report.lines:
             what, other = ("bus", "EAP") if is_bus else ("EAP", "bus")
             message = f"{port.name} is a port of kind {port.kind.value}, {key} belongs to {other}"
@@ -143,7 +143,7 @@ def _is_station(mac: str) -> bool:
     return any(address) and not address.is_group
 
 
-def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
+def _check_options(port: PortSection, uri: InterfaceUri, report: Report) -> None:
     only = f"it only on a port of another kind than {uri.scheme}://"
     for key, does in _LIMITED.items():
         if getattr(port, key) and uri.scheme not in _SCHEMES[key]:
@@ -164,7 +164,7 @@ def _check_options(port: Port, uri: InterfaceUri, report: Report) -> None:
             report.add(f"{port.at}.join[{position}]", f"{group!r} cannot be joined", expected)
 
 
-def _check_ams(port: Port, uri: InterfaceUri, report: Report) -> None:
+def _check_ams(port: PortSection, uri: InterfaceUri, report: Report) -> None:
     path = f"{port.at}.ams"
     if uri.scheme not in {"udp", "tcp"}:
         if path in report.lines:
@@ -190,7 +190,7 @@ def _check_addresses(index: Index, report: Report) -> None:
     _check_segments(index, report)
 
 
-def _own_keys(station: str, port: Port, uri: InterfaceUri) -> Iterator[tuple[str, ...]]:
+def _own_keys(station: str, port: PortSection, uri: InterfaceUri) -> Iterator[tuple[str, ...]]:
     """Yield what nobody else may have of what *port* needs."""
     if uri.scheme == "udp":
         yield "UDP", uri.host, str(uri.port or EAP_PORT)

@@ -1,16 +1,20 @@
-"""Checks of routes: where they lead, and which NetIDs two of them claim."""
+"""Checks of routes: targets, NetIDs that two of them claim, and loops."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from itertools import count
 from pathlib import Path
 
-from eap.aoe.spec import DEFAULT_TARGET
-from eap.config.check_brokers import check_brokers
-from eap.config.finding import Report, one_of
+from eap.aoe.routes import Origin, RouteTable
+from eap.aoe.routes import Route as AmsRoute
+from eap.aoe.spec import DEFAULT_TARGET, RouteSpec, RoutingSpec
+from eap.aoe.way import Way
+from eap.config.brokers import check_brokers
+from eap.config.finding import Finding, Report, one_of
 from eap.config.index import Index
-from eap.config.reach import reach, without_prefix
-from eap.config.routes import MQTT, MisfitError, next_hop, target_of
-from eap.config.structs import Route, Station
+from eap.config.routes import MQTT, MisfitError, next_hop, reach, target_of, without_prefix
+from eap.config.structs import RouteSection, StationSection
 from eap.ids import NetId, prefix_text
 from eap.near import near
 
@@ -21,7 +25,7 @@ def check_routes(index: Index, report: Report, folder: Path) -> None:
     """Report every route and broker that cannot be as it is; files are in *folder*."""
     loose = without_prefix(index)
     for station in index.plant.stations:
-        claimed: dict[bytes, Route] = {}
+        claimed: dict[bytes, RouteSection] = {}
         for route in station.routes:
             _check_keys(route, report)
             if not route.mqtt:
@@ -30,12 +34,16 @@ def check_routes(index: Index, report: Report, folder: Path) -> None:
     check_brokers(index, report, folder)
 
 
-def _check_keys(route: Route, report: Report) -> None:
+def _check_keys(route: RouteSection, report: Report) -> None:
     """Report keys of routes at brokers, and the other way round."""
     if f"{route.at}.mqtt" in report.lines:
-        what, others, expected = "a broker", Route.ROUTE_KEYS, Route.MQTT_KEYS
+        what, others, expected = "a broker", RouteSection.ROUTE_KEYS, RouteSection.MQTT_KEYS
     else:
-        what, others, expected = "a route without mqtt", Route.MQTT_KEYS, Route.ROUTE_KEYS
+        what, others, expected = (
+            "a route without mqtt",
+            RouteSection.MQTT_KEYS,
+            RouteSection.ROUTE_KEYS,
+        )
     for key in others:
         if f"{route.at}.{key}" in report.lines:
             report.add(f"{route.at}.{key}", f"{key} does not belong to {what}", one_of(expected))
@@ -43,7 +51,9 @@ def _check_keys(route: Route, report: Report) -> None:
         report.add(route.at, "route has neither to nor mqtt", "to: STATION, or mqtt: URL")
 
 
-def _check_route(index: Index, station: Station, route: Route, report: Report) -> None:
+def _check_route(
+    index: Index, station: StationSection, route: RouteSection, report: Report
+) -> None:
     if route.to == station.name:
         report.add(f"{route.at}.to", f"route of {station.name} to itself", "another station")
         return
@@ -61,7 +71,7 @@ def _check_route(index: Index, station: Station, route: Route, report: Report) -
         pass  # a NetID or an interface that is a finding of its own
 
 
-def _check_net_id(index: Index, route: Route, report: Report) -> None:
+def _check_net_id(index: Index, route: RouteSection, report: Report) -> None:
     is_default, known = route.to == DEFAULT_TARGET, _is_known(index, route)
     path = f"{route.at}.net_id"
     names_router = is_default and route.via.startswith(MQTT)  # the one that takes the rest
@@ -82,7 +92,7 @@ def _check_net_id(index: Index, route: Route, report: Report) -> None:
             report.add(f"{route.at}.{key}", message, "six numbers such as 5.23.91.23.1.1")
 
 
-def _is_known(index: Index, route: Route) -> bool:
+def _is_known(index: Index, route: RouteSection) -> bool:
     return route.to == DEFAULT_TARGET or target_of(index, route) is not None
 
 
@@ -95,8 +105,8 @@ def _is_usable(text: str) -> bool:
 
 def _check_claims(
     index: Index,
-    sent: tuple[Station, Route],
-    claimed: dict[bytes, Route],
+    sent: tuple[StationSection, RouteSection],
+    claimed: dict[bytes, RouteSection],
     loose: set[str],
     report: Report,
 ) -> None:
@@ -119,7 +129,7 @@ def _check_claims(
         _check_owners(index, station, where, keys, report)
 
 
-def _report_doubled(first: Route, route: Route, report: Report) -> None:
+def _report_doubled(first: RouteSection, route: RouteSection, report: Report) -> None:
     line = report.line_of(first.at)
     if first.to == route.to:
         report.add(route.at, f"a second route to {route.to!r} (first in line {line})", "one")
@@ -130,7 +140,7 @@ def _report_doubled(first: Route, route: Route, report: Report) -> None:
 
 
 def _check_owners(
-    index: Index, station: Station, path: str, keys: list[bytes], report: Report
+    index: Index, station: StationSection, path: str, keys: list[bytes], report: Report
 ) -> None:
     for prefix in keys:
         for owner in index.plant.stations:
@@ -146,3 +156,90 @@ def _begins(text: str, prefix: bytes) -> bool:
         return NetId.parse(text).startswith(prefix)
     except ValueError:
         return False
+
+
+def follow_routes(
+    index: Index, routing: Mapping[str, RoutingSpec], report: Report
+) -> tuple[Finding, ...]:
+    """Return a warning for each written route that runs in a circle or gets nowhere.
+
+    Args:
+        index: A plant without findings.
+        routing: What its routers are told.
+        report: Of the plant file, for its lines.
+    """
+    plant = _Plant(index, routing)
+    found = []
+    for station in index.plant.stations:
+        for route in station.routes:
+            if message := _follow(plant, station, route.to):
+                expected = "routes that end at who is meant"
+                line = report.line_of(route.at)
+                found.append(Finding(report.file, line, route.at, message, expected))
+    return tuple(found)
+
+
+def _follow(plant: _Plant, station: StationSection, to: str) -> str:
+    """Return what is wrong with the route called *to*, empty if nothing is known to be."""
+    for spec in plant.routing[station.name].routes:
+        if spec.name == to and spec.octets:
+            names = [station.name]
+            net_id = NetId.parse(spec.net_id)
+            following = plant.next_station(spec.router)
+            while following and plant.owners.get(net_id) != following:
+                if following in names:
+                    circle = " -> ".join([*names, following])
+                    return f"the route to {to!r} runs in a circle: {circle}"
+                names.append(following)
+                found = plant.table(following).find(net_id)
+                if found is None:
+                    if plant.may_learn(following):
+                        break
+                    return f"the route to {to!r} ends at {following}, which has none on to it"
+                net_id = found[0].to_real(net_id)
+                following = plant.next_station(str(found[0].router or ""))
+    return ""
+
+
+class _Plant:
+    """The routers of a plant by their NetIDs."""
+
+    def __init__(self, index: Index, routing: Mapping[str, RoutingSpec]) -> None:
+        self.routing = routing
+        self.owners: dict[NetId, str] = {}
+        self._routers = {}
+        self._tables: dict[str, RouteTable] = {}
+        for station in index.plant.stations:
+            router = NetId.parse(station.net_id)
+            self._routers[str(router)] = station.name
+            self.owners[router] = station.name
+            self.owners |= {NetId.parse(port.net_id): station.name for port in station.ports}
+
+    def next_station(self, router: str) -> str:
+        """Return the station that has a router, empty if that is not of this plant."""
+        return self._routers.get(router, "")
+
+    def may_learn(self, station: str) -> bool:
+        """Tell whether others make routes known to a station."""
+        routing = self.routing[station]
+        return any(routing.learns_by_mqtt(each.network) for each in routing.mqtt)
+
+    def table(self, station: str) -> RouteTable:
+        """Return the routes of a station."""
+        if station not in self._tables:
+            self._tables[station] = RouteTable([*_routes(self.routing[station].routes)])
+        return self._tables[station]
+
+
+def _routes(specs: tuple[RouteSpec, ...]) -> Iterator[AmsRoute]:
+    for number, spec in zip(count(), specs):
+        net_id = NetId.parse(spec.net_id)
+        yield AmsRoute(
+            NetId.parse(spec.virtual) if spec.virtual else net_id,
+            spec.name,
+            Way(spec.hop.kind, str(number)),
+            Origin.STATIC,
+            spec.octets,
+            real=net_id if spec.virtual else None,
+            router=NetId.parse(spec.router) if spec.router else None,
+        )

@@ -8,7 +8,7 @@ from eap.config.check_publish import check_port_reference
 from eap.config.destination import reaches, resolve
 from eap.config.finding import Report, one_of
 from eap.config.index import Index, SentPd
-from eap.config.structs import ANY_SOURCE, From, Station, Subscribe
+from eap.config.structs import ANY_SOURCE, FromSection, StationSection, SubscribeSection
 from eap.ids import NetId
 from eap.near import near
 from eap.pd import rules
@@ -35,7 +35,7 @@ def check_subscribe(index: Index, report: Report) -> None:
 
 
 def _check_source(
-    index: Index, report: Report, subscription: Subscribe, publishers: list[SentPd]
+    index: Index, report: Report, subscription: SubscribeSection, publishers: list[SentPd]
 ) -> None:
     path, source = f"{subscription.at}.from", subscription.source
     if publishers:
@@ -43,10 +43,10 @@ def _check_source(
             message = f"{subscription.name!r} is foreign, but this plant publishes it as "
             expected = "no foreign, or another publisher"
             report.add(f"{subscription.at}.foreign", message + publishers[0].label, expected)
-        elif isinstance(source, From) and (source.cycle_us or source.step):
+        elif isinstance(source, FromSection) and (source.cycle_us or source.step):
             message = f"{publishers[0].label} is in this plant, which gives cycle_us and step"
             report.add(path, message, "both to be left out")
-    elif isinstance(source, From):
+    elif isinstance(source, FromSection):
         _check_numbers(report, subscription, source)
     elif subscription.foreign:
         report.add(path, f"{source} is foreign", "publisher and id of what is not in this plant")
@@ -57,7 +57,9 @@ def _check_source(
             report.add(path, message, f"STATION/PD: {one_of(known)}")
 
 
-def _check_sender(index: Index, report: Report, station: Station, subscription: Subscribe) -> None:
+def _check_sender(
+    index: Index, report: Report, station: StationSection, subscription: SubscribeSection
+) -> None:
     """Report a source that no frame of the subscription's port can have."""
     uri = index.uris.get((station.name, subscription.port))
     if subscription.sender in {"", ANY_SOURCE} or uri is None:
@@ -75,7 +77,7 @@ def _check_sender(index: Index, report: Report, station: Station, subscription: 
         report.add(f"{subscription.at}.source", message, expected)
 
 
-def _check_numbers(report: Report, subscription: Subscribe, source: From) -> None:
+def _check_numbers(report: Report, subscription: SubscribeSection, source: FromSection) -> None:
     path = f"{subscription.at}.from"
     if source.publisher != "any":
         try:
@@ -88,16 +90,16 @@ def _check_numbers(report: Report, subscription: Subscribe, source: From) -> Non
         report.add(path, message, "a publisher of this plant, or foreign: true")
 
 
-def _check_variables(subscription: Subscribe, report: Report) -> None:
+def _check_variables(subscription: SubscribeSection, report: Report) -> None:
     path, name = f"{subscription.at}.variables", subscription.name
     if subscription.variables is None:
-        if isinstance(subscription.source, From):
+        if isinstance(subscription.source, FromSection):
             report.add(subscription.at, f"subscription {name!r} has no variables", "its variables")
     elif not subscription.variables and not report.broken:
         report.add(path, f"subscription {name!r} has no variables", "at least one")
 
 
-def _check_ends(index: Index, report: Report, subscription: Subscribe, sent: SentPd) -> None:
+def _check_ends(index: Index, report: Report, subscription: SubscribeSection, sent: SentPd) -> None:
     """Report where *subscription* differs from the PD *sent*, naming both lines."""
     at, label = subscription.at, sent.label
     if not subscription.ignore_version and subscription.version not in (None, sent.pd.version):
@@ -126,7 +128,9 @@ def _check_ends(index: Index, report: Report, subscription: Subscribe, sent: Sen
             report.add(f"{at}.variables.{name}", f"{message}(line {line})", kind.text)
 
 
-def _check_arrival(index: Index, report: Report, station: Station, subscription: Subscribe) -> None:
+def _check_arrival(
+    index: Index, report: Report, station: StationSection, subscription: SubscribeSection
+) -> None:
     receiver = index.eap_port(station, subscription.port)
     uri = index.uris.get((station.name, subscription.port))
     if receiver is None or uri is None:
@@ -149,7 +153,9 @@ def _check_arrival(index: Index, report: Report, station: Station, subscription:
         report.add(f"{subscription.at}.from", f"{message} ({uri})", "a frame to this port")
 
 
-def _check_timeout(index: Index, report: Report, station: Station, subscription: Subscribe) -> None:
+def _check_timeout(
+    index: Index, report: Report, station: StationSection, subscription: SubscribeSection
+) -> None:
     if not subscription.timeout_ms:
         return
     path = f"{subscription.at}.timeout_ms"
@@ -168,14 +174,14 @@ def _check_timeout(index: Index, report: Report, station: Station, subscription:
 
 
 def _check_once(
-    subscription: Subscribe,
+    subscription: SubscribeSection,
     publishers: list[SentPd],
     taken: dict[tuple[str, str, int], str],
     report: Report,
 ) -> None:
     source = subscription.source
     keys = [(subscription.port, sent.port.net_id, sent.pd.id) for sent in publishers]
-    if isinstance(source, From):
+    if isinstance(source, FromSection):
         keys = [(subscription.port, source.publisher, source.id)]
     for key in keys:
         if key in taken:

@@ -10,7 +10,7 @@ from eap.codec.values import DataType
 from eap.config.check_ports import check_names
 from eap.config.finding import Report, one_of
 from eap.config.index import Index
-from eap.config.structs import Station, Variable
+from eap.config.structs import StationSection, VariableSection
 from eap.near import near
 from eap.pd.rules import MADE_SUFFIXES
 from eap.pd.spec import (
@@ -60,7 +60,7 @@ def check_variables(index: Index, report: Report, folder: Path) -> None:
                 _check_source(station, name, source, report, folder)
 
 
-def _check_variable(path: str, name: str, variable: Variable, report: Report) -> None:
+def _check_variable(path: str, name: str, variable: VariableSection, report: Report) -> None:
     if name.endswith(MADE_SUFFIXES):
         message = f"variable {name!r}: {' and '.join(MADE_SUFFIXES)} are made by the appliance"
         report.add(path, message, "another name")
@@ -80,7 +80,7 @@ def _check_variable(path: str, name: str, variable: Variable, report: Report) ->
 
 
 def _check_source(
-    station: Station, name: str, source: Source, report: Report, folder: Path
+    station: StationSection, name: str, source: Source, report: Report, folder: Path
 ) -> None:
     path = f"{station.at}.sources.{name}"
     if name not in station.variables:

@@ -1,4 +1,4 @@
-"""From the tree of a document to the structs, reporting everything that does not fit.
+"""Conversion of a document tree to structs, reporting everything that does not fit.
 
 msgspec stops at the first error, so the walk is ours and msgspec only describes the structs.  An
 item that cannot be read is left out and its name kept, so that references to it are not blamed.

@@ -1,4 +1,4 @@
-"""From a plant file without findings to what the engine is given.
+"""Specifications of engine and router from a plant file without findings.
 
 Only what the checks have passed comes here, so nothing can fail; what the file leaves open is
 derived: writers, phases, addresses, groups to join, and what a subscriber must know of the sender.
@@ -13,13 +13,33 @@ from typing import Any
 
 import msgspec
 
+from eap.aoe.spec import (
+    AmsUser,
+    DirectoryPort,
+    DirectoryStation,
+    DoorKind,
+    HopSpec,
+    RouteSpec,
+    RoutingSpec,
+)
 from eap.codec import datatypes
-from eap.config.check_buses import bus_file
+from eap.config.access import access_rules
+from eap.config.brokers import broker_spec, brokers_of, learn_sources, shared_network
+from eap.config.bus import bus_file
 from eap.config.destination import IP_BROADCAST, find_net_id, group_of, resolve
 from eap.config.gateways import gateway_spec
 from eap.config.index import Index, SentPd
 from eap.config.links import ends, in_order, is_bitwise
-from eap.config.structs import ANY_SOURCE, Frame, From, Port, Station, Subscribe, Variable
+from eap.config.routes import find_hop, net_ids_of, next_hop, reach, without_prefix
+from eap.config.structs import (
+    ANY_SOURCE,
+    FrameSection,
+    FromSection,
+    PortSection,
+    StationSection,
+    SubscribeSection,
+    VariableSection,
+)
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (
@@ -58,7 +78,7 @@ def derive(index: Index, folder: Path) -> tuple[StationSpec, ...]:
     )
 
 
-def _phase(index: Index, station: Station, position: int, count: int) -> int:
+def _phase(index: Index, station: StationSection, position: int, count: int) -> int:
     if station.phase_us is not None:
         return station.phase_us
     cycle = index.cycle_us(station)
@@ -66,7 +86,7 @@ def _phase(index: Index, station: Station, position: int, count: int) -> int:
     return position % groups * (cycle // groups)
 
 
-def _station(index: Index, station: Station, phase_us: int, folder: Path) -> StationSpec:
+def _station(index: Index, station: StationSection, phase_us: int, folder: Path) -> StationSpec:
     return StationSpec(
         name=station.name,
         net_id=str(NetId.parse(station.net_id)),
@@ -86,7 +106,7 @@ def _station(index: Index, station: Station, phase_us: int, folder: Path) -> Sta
     )
 
 
-def _variables(index: Index, station: Station) -> Iterator[VariableSpec]:
+def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
     linked = {link.target for link in station.links}
     for name, variable in station.variables.items():
         source = station.sources.get(name)
@@ -103,7 +123,7 @@ def _variables(index: Index, station: Station) -> Iterator[VariableSpec]:
             for name, text in index.received(subscription).items():
                 told = sent.station.variables.get(name.removeprefix(f"{subscription.name}."))
                 unit, comment = (told.unit, told.comment) if told else ("", "")
-                copy = Variable(type=text, unit=unit, comment=comment)
+                copy = VariableSection(type=text, unit=unit, comment=comment)
                 yield _variable(name, copy, Writer.ENGINE)
     for name, on_bus in index.bus_variables(station).items():
         is_free = on_bus.is_output and name not in linked
@@ -111,7 +131,7 @@ def _variables(index: Index, station: Station) -> Iterator[VariableSpec]:
         yield VariableSpec(name, on_bus.type, writer, comment=on_bus.comment)
 
 
-def _links(index: Index, station: Station) -> Iterator[LinkSpec]:
+def _links(index: Index, station: StationSection) -> Iterator[LinkSpec]:
     """Yield the links as they are to run: each behind those that write what it reads."""
     ways = [
         ends(link, _type(index, station, link.source), _type(index, station, link.target))
@@ -131,11 +151,11 @@ def _links(index: Index, station: Station) -> Iterator[LinkSpec]:
         )
 
 
-def _type(index: Index, station: Station, name: str) -> datatypes.DataType:
+def _type(index: Index, station: StationSection, name: str) -> datatypes.DataType:
     return datatypes.parse(index.type_text(station, name) or "")
 
 
-def _variable(name: str, variable: Variable, writer: Writer) -> VariableSpec:
+def _variable(name: str, variable: VariableSection, writer: Writer) -> VariableSpec:
     kind = datatypes.parse(variable.type)
     # As the type holds it, so that a dictionary gives back the same.
     default: Any = None
@@ -157,14 +177,14 @@ def _source(source: Source, folder: Path) -> Source:
     return source
 
 
-def _frames(index: Index, station: Station) -> Iterator[TxFrameSpec]:
+def _frames(index: Index, station: StationSection) -> Iterator[TxFrameSpec]:
     for frame in station.frames:
         destination = _destination(index, station, frame)
         pds = tuple(pd.spec() for pd in station.publish if pd.frame == frame.name)
         yield frame.spec(destination, pds, _mac(index, destination))
 
 
-def _destination(index: Index, station: Station, frame: Frame) -> str:
+def _destination(index: Index, station: StationSection, frame: FrameSection) -> str:
     if frame.to == REQUESTER:
         return REQUESTER
     return str(resolve(frame.to, index.uris[station.name, frame.port], index))
@@ -179,14 +199,14 @@ def _mac(index: Index, destination: str) -> str:
     return str(MacAddr.parse(text)) if text else ""
 
 
-def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
+def _subscription(index: Index, subscription: SubscribeSection) -> RxPdSpec:
     source, publishers = subscription.source, index.publishers(subscription)
     if publishers:
         sent = publishers[0]
         pd_id, version = sent.pd.id, sent.pd.version
         publisher = str(NetId.parse(sent.port.net_id))
         step, sender_cycle_us = _pace(index, publishers)
-    if isinstance(source, From):
+    if isinstance(source, FromSection):
         pd_id = source.id
         publisher = "" if source.publisher == "any" else str(NetId.parse(source.publisher))
         if not publishers:
@@ -209,7 +229,7 @@ def _subscription(index: Index, subscription: Subscribe) -> RxPdSpec:
     )
 
 
-def _sender_address(index: Index, subscription: Subscribe, publishers: list[SentPd]) -> str:
+def _sender_address(index: Index, subscription: SubscribeSection, publishers: list[SentPd]) -> str:
     """Return the address that the frames of *publishers* come from, empty for any.
 
     The plant knows it where the publisher's port has an address of its own: the IPv4 address of a
@@ -236,7 +256,7 @@ def _pace(index: Index, publishers: list[SentPd]) -> tuple[int, int]:
     return steps.pop() if len(steps) == 1 else 0, cycles.pop() if len(cycles) == 1 else 0
 
 
-def _port(index: Index, station: Station, port: Port) -> PortSpec:
+def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
     destinations = list(_heard(index, station, port))
     groups = [_group(text) for text in port.join]
     groups += [group for each in destinations if (group := group_of(each)) is not None]
@@ -257,7 +277,7 @@ def _port(index: Index, station: Station, port: Port) -> PortSpec:
     )
 
 
-def _bus_port(index: Index, station: Station, port: Port, folder: Path) -> PortSpec:
+def _bus_port(index: Index, station: StationSection, port: PortSection, folder: Path) -> PortSpec:
     uri = InterfaceUri.parse(port.interface)
     file = bus_file(port, folder)[1]
     path = "" if file is None else str(file.resolve())
@@ -283,7 +303,7 @@ def _group(text: str) -> str:
     return str(MacAddr.parse(text)) if len(text) == len("01:01:05:04:00:00") else text
 
 
-def _heard(index: Index, station: Station, port: Port) -> Iterator[Destination]:
+def _heard(index: Index, station: StationSection, port: PortSection) -> Iterator[Destination]:
     """Yield where the frames go that *port* subscribes to."""
     for subscription in station.subscribe:
         if subscription.port == port.name:
@@ -292,3 +312,98 @@ def _heard(index: Index, station: Station, port: Port) -> Iterator[Destination]:
                     continue
                 uri = index.uris[sent.station.name, sent.port.name]
                 yield resolve(sent.frame.to, uri, index)
+
+
+def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
+    """Return by its name what the router of each station is told; files are in *folder*."""
+    loose = without_prefix(index)
+    known = {each.name: net_ids_of(each, loose) for each in index.plant.stations}
+    return {
+        station.name: RoutingSpec(
+            routes=(*_written(index, station, loose), *_derived(index, station, known)),
+            mqtt=tuple(broker_spec(each, folder) for each in brokers_of(station)),
+            access=tuple(access_rules(index, station, loose)),
+            users=tuple(
+                AmsUser(user.name, str((folder / user.password_file).resolve()))
+                for user in station.users
+            ),
+            learn=learn_sources(station),
+        )
+        for station in index.plant.stations
+    }
+
+
+def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
+    """Return the names of everything in the plant."""
+    return tuple(
+        DirectoryStation(
+            name=station.name,
+            net_id=str(NetId.parse(station.net_id)),
+            ports=tuple(
+                DirectoryPort(
+                    name=port.name,
+                    is_bus=port.kind is PortKind.BUS,
+                    net_id=str(NetId.parse(port.net_id)),
+                    interface=str(InterfaceUri.parse(port.interface)),
+                    slaves=_slaves(index, station, port.name),
+                )
+                for port in station.ports
+            ),
+        )
+        for station in index.plant.stations
+    )
+
+
+def _slaves(index: Index, station: StationSection, port: str) -> dict[str, int]:
+    bus = index.buses.get((station.name, port))
+    return {slave.name: slave.station for slave in bus.slaves} if bus else {}
+
+
+def _written(index: Index, station: StationSection, loose: set[str]) -> Iterator[RouteSpec]:
+    for route in station.routes:
+        if route.mqtt:
+            continue
+        hop, router = next_hop(index, station, route)
+        for net_id, octets in reach(index, route, loose):
+            yield RouteSpec(
+                name=route.to,
+                net_id=net_id,
+                hop=hop,
+                octets=octets,
+                router=router,
+                virtual=str(NetId.parse(route.virtual)) if route.virtual else "",
+                is_unidirectional=route.unidirectional,
+                timeout_ms=route.timeout_ms,
+                is_probed=route.probe,
+            )
+
+
+def _derived(
+    index: Index, station: StationSection, known: dict[str, list[tuple[str, int]]]
+) -> Iterator[RouteSpec]:
+    """Yield routes to the stations that share an interface or a broker with *station*.
+
+    *known* has NetIDs and octets to match for each station; its router's come first.
+    """
+    written = {route.to for route in station.routes}
+    for target in index.plant.stations:
+        if target is station or target.name in written:
+            continue
+        router = known[target.name][0][0]
+        hop = find_hop(index, station, target)
+        network = "" if hop else shared_network(station, target)
+        if network:
+            hop = HopSpec(DoorKind.MQTT, network, router)
+        if hop is None:
+            continue
+        for net_id, octets in known[target.name]:
+            yield RouteSpec(
+                name=target.name,
+                net_id=net_id,
+                hop=hop,
+                octets=octets,
+                router=router,
+                # The broker tells who is there; all asking all each second is a load of its own.
+                is_probed=hop.kind is not DoorKind.MQTT,
+                is_derived=True,
+            )

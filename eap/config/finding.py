@@ -1,4 +1,4 @@
-"""What is wrong with a plant file, and where: collected, not raised, so that all is seen."""
+"""Findings in a plant file with their places: collected, not raised, so that all is seen."""
 
 from __future__ import annotations
 

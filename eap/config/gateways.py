@@ -1,13 +1,15 @@
-"""What a plant file says of the mailbox gateways of its bus ports, and what follows from it."""
+"""Mailbox gateways of bus ports in a plant file: specifications and checks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
+from eap.config.finding import Report
 from eap.config.index import Index
 from eap.config.routes import MisfitError
-from eap.config.structs import Plain, Port, Station
+from eap.config.structs import Plain, PortSection, StationSection
 from eap.ids import NetId
 from eap.near import near
 from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
@@ -21,7 +23,7 @@ _MEMBER = "station addresses, names of slaves of this bus, and virtual addresses
 _LAST = 0xFFFE
 
 
-def gateway_spec(index: Index, station: Station, port: Port) -> GatewaySpec:
+def gateway_spec(index: Index, station: StationSection, port: PortSection) -> GatewaySpec:
     """Return what the gateway of a bus port is told; the checks have passed it."""
     said = port.gateway
     return GatewaySpec(
@@ -41,7 +43,7 @@ def gateway_spec(index: Index, station: Station, port: Port) -> GatewaySpec:
     )
 
 
-def gateway_port(station: Station, port: Port) -> int:
+def gateway_port(station: StationSection, port: PortSection) -> int:
     """Return the port number that a gateway has to itself, 0 for none.
 
     The one to the first bus is served where the station takes all frames.
@@ -51,7 +53,7 @@ def gateway_port(station: Station, port: Port) -> int:
     return port.gateway.port or (EAP_PORT + number if number else 0)
 
 
-def hosts_of(index: Index, station: Station) -> Iterator[str]:
+def hosts_of(index: Index, station: StationSection) -> Iterator[str]:
     """Yield the IP addresses of a station, each once."""
     uris = (index.uris.get((station.name, each.name)) for each in _eap_ports(station))
     found = (uri.host for uri in uris if uri is not None and uri.scheme in {"udp", "tcp"})
@@ -70,7 +72,7 @@ def parse_address(text: str) -> int:
 
 
 def resolve(
-    index: Index, station: Station, port: Port, address: int, target: Plain
+    index: Index, station: StationSection, port: PortSection, address: int, target: Plain
 ) -> GatewayAddress:
     """Return whom *address* stands for; raise MisfitError if there is no such one."""
     if isinstance(target, list):
@@ -95,7 +97,11 @@ def resolve(
 
 
 def _member(
-    index: Index, station: Station, port: Port, member: object, known: dict[int, Plain]
+    index: Index,
+    station: StationSection,
+    port: PortSection,
+    member: object,
+    known: dict[int, Plain],
 ) -> int:
     text = str(member)
     if text.lower().startswith("0x") or isinstance(member, int):
@@ -107,7 +113,7 @@ def _member(
     return _slave(index, station, port, member)
 
 
-def _slave(index: Index, station: Station, port: Port, slave: object) -> int:
+def _slave(index: Index, station: StationSection, port: PortSection, slave: object) -> int:
     """Return the station address of a slave that is named by it, or by its name."""
     slaves = slaves_of(index, station, port)
     for each in slaves:
@@ -125,13 +131,13 @@ def _slave(index: Index, station: Station, port: Port, slave: object) -> int:
     raise MisfitError("", f"{name} has no slave {text!r}{hint}", TARGET)
 
 
-def slaves_of(index: Index, station: Station, port: Port) -> tuple[BusSlaveSpec, ...]:
+def slaves_of(index: Index, station: StationSection, port: PortSection) -> tuple[BusSlaveSpec, ...]:
     """Return the slaves that a bus is known to have, none where nothing describes it."""
     bus = index.buses.get((station.name, port.name))
     return bus.slaves if bus else ()
 
 
-def _virtual(port: Port) -> dict[int, Plain]:
+def _virtual(port: PortSection) -> dict[int, Plain]:
     found: dict[int, Plain] = {}
     for text, target in port.gateway.addresses.items():
         try:
@@ -141,9 +147,88 @@ def _virtual(port: Port) -> dict[int, Plain]:
     return found
 
 
-def _eap_ports(station: Station) -> Iterator[Port]:
+def _eap_ports(station: StationSection) -> Iterator[PortSection]:
     return (port for port in station.ports if port.kind is PortKind.EAP)
 
 
-def _is_bus(port: Port) -> bool:
+def _is_bus(port: PortSection) -> bool:
     return port.kind is PortKind.BUS
+
+
+_ANY = "0.0.0.0"  # noqa: S104  what a plant file may say
+_BIT_15 = 0x8000
+
+
+def check_gateways(index: Index, report: Report) -> None:
+    """Report every gateway that cannot be as it is."""
+    taken = list(_taken(index))
+    for station in index.plant.stations:
+        for port in station.ports:
+            if port.kind is PortKind.BUS:
+                _check_addresses(index, station, port, report)
+                _check_place(index, station, port, taken, report)
+
+
+def _check_addresses(
+    index: Index, station: StationSection, port: PortSection, report: Report
+) -> None:
+    path = f"{port.at}.gateway.addresses"
+    first: dict[int, str] = {}
+    stations = {slave.station for slave in slaves_of(index, station, port)}
+    is_unread = port.name in index.unread_buses(station)
+    for text, target in port.gateway.addresses.items():
+        try:
+            address = parse_address(text)
+            if address in first:
+                message = f"gateway address {text} is {first[address]} once more"
+                report.add(f"{path}.{text}", message, "each address once")
+                continue
+            first[address] = text
+            if address & _BIT_15 and address & ~_BIT_15 in stations:
+                slave = address & ~_BIT_15
+                message = f"gateway address {text} is that of slave {slave} with bit 15 set"
+                report.add(f"{path}.{text}", message, f"{ADDRESS} that stands for nobody yet")
+            resolve(index, station, port, address, target)
+        except MisfitError as exc:
+            if not is_unread:
+                report.add(f"{path}.{text}", str(exc), exc.expected)
+        except ValueError:
+            continue  # a NetID that is a finding of its own
+
+
+def _check_place(
+    index: Index,
+    station: StationSection,
+    port: PortSection,
+    taken: list[tuple[str, int, str, str]],
+    report: Report,
+) -> None:
+    number = gateway_port(station, port)
+    if not number:
+        return
+    path = f"{port.at}.gateway.port"
+    if path not in report.lines:
+        path = port.at
+    for host in hosts_of(index, station):
+        for other_host, other_number, what, at in taken:
+            if other_number == number and (host == other_host or _ANY in {host, other_host}):
+                line = report.line_of(at)
+                message = (
+                    f"the gateway to {port.name} is served at {host}, port {number}, which"
+                    f" belongs to {what} (line {line})"
+                )
+                report.add(path, message, f"gateway: {{port: NUMBER}} that is free at {host}")
+                return
+        taken.append((host, number, f"the gateway to {station.name}/{port.name}", path))
+
+
+def _taken(index: Index) -> Iterator[tuple[str, int, str, str]]:
+    """Yield what the ports of the plant have: address, port number, whose, and its path."""
+    for (station, name), uri in index.uris.items():
+        port = index.ports[station, name]
+        path = f"{port.at}.interface"
+        if uri.scheme in {"udp", "tcp"}:
+            yield uri.host, uri.port or EAP_PORT, f"{station}/{name}", path
+            if port.kind is PortKind.EAP and port.ams:
+                yield uri.host, AMS_TCP_PORT, f"AMS at {station}/{name}", path
+                yield uri.host, AMS_TCP_PORT + 1, f"AMS at {station}/{name}", path

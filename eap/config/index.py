@@ -1,4 +1,4 @@
-"""Everything of a plant file by name: what one part refers to in another.
+"""Index of a plant file: everything by name, and references between its parts.
 
 Names that occur twice stand for their first owner; the second one is a finding of its own.
 """
@@ -13,7 +13,15 @@ from typing import NamedTuple, TypeVar
 from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.config.bus import BusDescription, BusVariable, name_bus
-from eap.config.structs import Frame, From, PlantFile, Port, Publish, Station, Subscribe
+from eap.config.structs import (
+    FrameSection,
+    FromSection,
+    PlantFile,
+    PortSection,
+    PublishSection,
+    StationSection,
+    SubscribeSection,
+)
 from eap.ids import InterfaceUri
 from eap.pd.spec import PortKind
 
@@ -24,10 +32,10 @@ _Value = TypeVar("_Value")
 class SentPd(NamedTuple):
     """A PD that a station of the plant sends, with all that it hangs on."""
 
-    station: Station
-    pd: Publish
-    frame: Frame
-    port: Port
+    station: StationSection
+    pd: PublishSection
+    frame: FrameSection
+    port: PortSection
 
     @property
     def label(self) -> str:
@@ -68,7 +76,7 @@ class Index:
         }
         self.sent = _first(((s.station.name, s.pd.name), s) for s in self._sent())
 
-    def cycle_us(self, station: Station) -> int:
+    def cycle_us(self, station: StationSection) -> int:
         """Return the device cycle of *station*."""
         return station.cycle_us or self.plant.defaults.cycle_us
 
@@ -80,27 +88,27 @@ class Index:
                 if frame and port:
                     yield SentPd(station, pd, frame, port)
 
-    def eap_port(self, station: Station, name: str) -> Port | None:
+    def eap_port(self, station: StationSection, name: str) -> PortSection | None:
         """Return the EAP port *name* of *station*, if it has one."""
         port = self.ports.get((station.name, name))
         return port if port is not None and port.kind is PortKind.EAP else None
 
-    def bus_variables(self, station: Station) -> dict[str, BusVariable]:
+    def bus_variables(self, station: StationSection) -> dict[str, BusVariable]:
         """Return the variables that *station* has because of its buses."""
         return self._bus_variables.get(station.name, {})
 
-    def unread_buses(self, station: Station) -> list[str]:
+    def unread_buses(self, station: StationSection) -> list[str]:
         """Return the bus ports of *station* whose description could not be read."""
         return [port for name, port in self._unread if name == station.name]
 
-    def names(self, station: Station) -> list[str]:
+    def names(self, station: StationSection) -> list[str]:
         """Return the names of all variables of *station*."""
         names = [*station.variables]
         for subscription in station.subscribe:
             names += self.received(subscription)
         return [*names, *self.bus_variables(station)]
 
-    def publishers(self, subscription: Subscribe) -> list[SentPd]:
+    def publishers(self, subscription: SubscribeSection) -> list[SentPd]:
         """Return the PDs of this plant that *subscription* names: one, none, or several for any."""
         source = subscription.source
         if isinstance(source, str):
@@ -109,11 +117,11 @@ class Index:
             return [sent] if sent else []
         return [sent for sent in self.sent.values() if _matches(source, sent)]
 
-    def subscription(self, station: Station, name: str) -> Subscribe | None:
+    def subscription(self, station: StationSection, name: str) -> SubscribeSection | None:
         """Return the subscription *name* of *station*, if it has one."""
         return next((each for each in station.subscribe if each.name == name), None)
 
-    def received(self, subscription: Subscribe) -> dict[str, str]:
+    def received(self, subscription: SubscribeSection) -> dict[str, str]:
         """Return the variables of *subscription* and their types as texts, in PDO order."""
         if subscription.variables is not None:
             return {name: variable.type for name, variable in subscription.variables.items()}
@@ -126,7 +134,7 @@ class Index:
             if (text := self.type_text(sent.station, name)) is not None
         }
 
-    def type_text(self, station: Station, name: str) -> str | None:
+    def type_text(self, station: StationSection, name: str) -> str | None:
         """Return the type of a variable of *station* as written, None if it has no such one."""
         if name in station.variables:
             return station.variables[name].type
@@ -168,7 +176,7 @@ def parse_types(texts: list[str | None]) -> list[DataType] | None:
     return kinds if len(kinds) == len(texts) else None
 
 
-def _matches(source: From, sent: SentPd) -> bool:
+def _matches(source: FromSection, sent: SentPd) -> bool:
     return source.id == sent.pd.id and source.publisher in ("any", sent.port.net_id)
 
 

@@ -1,4 +1,4 @@
-"""What links copy, bit by bit, and the order in which they run.
+"""Links between variables: bits that they copy, their order, and their checks.
 
 A link whose source is the target of another one runs after it, so that a value goes through a chain
 of links in one cycle.
@@ -11,8 +11,13 @@ from collections.abc import Sequence
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
+from eap.codec import datatypes
 from eap.codec.values import DataType
-from eap.config.structs import Link
+from eap.config.check_publish import is_unread
+from eap.config.finding import Report, one_of
+from eap.config.index import Index
+from eap.config.structs import LinkSection, StationSection
+from eap.near import near
 
 
 class Span(NamedTuple):
@@ -38,17 +43,17 @@ class Ends(NamedTuple):
     target: Span
 
 
-def is_bitwise(link: Link) -> bool:
+def is_bitwise(link: LinkSection) -> bool:
     """Tell whether *link* says which bits it copies."""
     return any(each is not None for each in (link.from_bit, link.to_bit, link.bits))
 
 
-def is_scaled(link: Link) -> bool:
+def is_scaled(link: LinkSection) -> bool:
     """Tell whether *link* computes its value."""
     return link.scale is not None or link.offset is not None
 
 
-def ends(link: Link, source: DataType, target: DataType) -> Ends:
+def ends(link: LinkSection, source: DataType, target: DataType) -> Ends:
     """Return the bits at both ends of *link*; without ``bits`` as many as both have."""
     if not is_bitwise(link):
         return Ends(
@@ -122,3 +127,156 @@ def _predecessors(links: Sequence[Ends]) -> list[list[int]]:
         ]
         for link in links
     ]
+
+
+_TARGET = "a variable of the station's own, or an output of a bus"
+
+_KEYS = ("from_bit", "to_bit", "bits", "scale", "offset", "swap")
+
+
+def check_links(index: Index, report: Report) -> None:
+    """Report every link that cannot run, or that would write what somebody else writes."""
+    for station in index.plant.stations:
+        known: list[tuple[LinkSection, Ends]] = []
+        for link in station.links:
+            source = _kind(index, report, station, f"{link.at}.from", link.source)
+            target = _kind(index, report, station, f"{link.at}.to", link.target)
+            if target is not None:
+                _check_writer(index, report, station, link)
+            if source is None or target is None or not _fits(link, source, target, report):
+                continue
+            known.append((link, ends(link, source, target)))
+        _check_once(known, report)
+        _check_circles(known, report)
+
+
+def _kind(
+    index: Index, report: Report, station: StationSection, path: str, name: str
+) -> DataType | None:
+    """Return the type of a variable; None, with a finding, if there is none."""
+    text = index.type_text(station, name)
+    if text is None:
+        if not is_unread(index, report, station, name):
+            names = index.names(station)
+            message = f"station {station.name} has no variable {name!r}{near(name, names)}"
+            report.add(path, message, one_of(names))
+        return None
+    try:
+        return datatypes.parse(text)
+    except ValueError:
+        return None  # reported with the variable
+
+
+def _check_writer(index: Index, report: Report, station: StationSection, link: LinkSection) -> None:
+    name = link.target
+    on_bus = index.bus_variables(station).get(name)
+    if name in station.variables:
+        if name not in station.sources:
+            return
+        line = report.line_of(f"{station.at}.sources.{name}")
+        reason = f"has a source (line {line})"
+    elif on_bus is None:
+        reason = "is received"
+    elif on_bus.is_output:
+        return
+    else:
+        reason = "comes from a bus"
+    report.add(f"{link.at}.to", f"{name!r} {reason}, so no link can write it", _TARGET)
+
+
+def _fits(link: LinkSection, source: DataType, target: DataType, report: Report) -> bool:
+    """Tell whether a link can be between these types, after reporting why not."""
+    if any(report.has(f"{link.at}.{key}") for key in _KEYS):
+        return False
+    if is_bitwise(link):
+        return _fits_bitwise(link, source, target, report)
+    shown = f"{link.source} is {source.text}, {link.target} is {target.text}"
+    if is_scaled(link):
+        return _fits_scaled(link, source, target, shown, report)
+    return _fits_whole(link, source, target, shown, report)
+
+
+def _fits_whole(
+    link: LinkSection, source: DataType, target: DataType, shown: str, report: Report
+) -> bool:
+    if link.swap:
+        if source.size == target.size > 1 and not (source.is_bits or target.is_bits):
+            return True
+        report.add(f"{link.at}.swap", shown, "two variables of as many octets, at least 2")
+        return False
+    if source != target:
+        expected = (
+            f"both alike, or bits: {min(source.bit_length, target.bit_length)}, scale or swap"
+        )
+        report.add(link.at, shown, expected)
+        return False
+    return True
+
+
+def _fits_bitwise(link: LinkSection, source: DataType, target: DataType, report: Report) -> bool:
+    for key in ("scale", "offset", "swap"):
+        if getattr(link, key):
+            report.add(
+                f"{link.at}.{key}", f"the link copies bits and has a {key}", "one of the two"
+            )
+            return False
+    for key, bit, name, kind in (
+        ("from_bit", link.from_bit or 0, link.source, source),
+        ("to_bit", link.to_bit or 0, link.target, target),
+    ):
+        if bit >= kind.bit_length:
+            message = f"{name} is {kind.text} and has no bit {bit}"
+            report.add(f"{link.at}.{key}", message, f"0 to {kind.bit_length - 1}")
+            return False
+        if link.bits is not None and bit + link.bits > kind.bit_length:
+            message = f"{name} is {kind.text} and has no {link.bits} bits from bit {bit} on"
+            report.add(f"{link.at}.bits", message, f"at most {kind.bit_length - bit}")
+            return False
+    return True
+
+
+def _fits_scaled(
+    link: LinkSection, source: DataType, target: DataType, shown: str, report: Report
+) -> bool:
+    key = "scale" if link.scale is not None else "offset"
+    if link.scale == 0:
+        report.add(f"{link.at}.scale", "scale is 0", "another number")
+        return False
+    if not (_is_number(source) and _is_number(target)):
+        report.add(f"{link.at}.{key}", shown, f"numbers such as INT or REAL where there is a {key}")
+        return False
+    if link.swap and source.size < 2:
+        report.add(f"{link.at}.swap", shown, "a source of at least 2 octets")
+        return False
+    is_plain = link.scale in {None, 1} and not link.offset
+    if link.swap and is_plain and source != target and source.size == target.size:
+        # Who runs it could not tell it from a swap alone, which converts nothing.
+        message = f"{shown}: a swap with {key} {getattr(link, key):g} computes nothing"
+        report.add(f"{link.at}.{key}", message, "swap alone to copy the octets, or another number")
+        return False
+    return True
+
+
+def _is_number(kind: DataType) -> bool:
+    return kind.scalar_range is not None and kind.text != "BOOL"
+
+
+def _check_once(links: list[tuple[LinkSection, Ends]], report: Report) -> None:
+    first: dict[str, list[tuple[LinkSection, Ends]]] = {}
+    for link, both in links:
+        others = first.setdefault(link.target, [])
+        twice = next((other for other, span in others if span.target.overlaps(both.target)), None)
+        others.append((link, both))
+        if twice is not None:
+            line = report.line_of(f"{twice.at}.to")
+            message = f"{link.target!r} is linked twice (first in line {line})"
+            report.add(
+                f"{link.at}.to", message, "one link for each variable, or for each bit of it"
+            )
+
+
+def _check_circles(links: list[tuple[LinkSection, Ends]], report: Report) -> None:
+    for circle in find_circles([both for _, both in links]):
+        members = [links[position][0] for position in circle]
+        way = " → ".join([members[0].source, *(link.target for link in members)])
+        report.add(members[0].at, f"links go in a circle: {way}", "one of them to be left out")

@@ -1,4 +1,4 @@
-"""The door of this package: a plant file in, stations or findings out."""
+"""Loading of a plant file, or of a plant without one: stations, or findings."""
 
 from __future__ import annotations
 
@@ -8,27 +8,24 @@ from pathlib import Path
 import msgspec
 
 from eap.aoe.spec import DirectoryStation, RoutingSpec
-from eap.config.bus import DescribeBus
-from eap.config.check_access import check_access
-from eap.config.check_buses import describe_buses
-from eap.config.check_gateways import check_gateways
-from eap.config.check_links import check_links
-from eap.config.check_polls import check_polls
+from eap.config.access import check_access
+from eap.config.brokers import check_learning, warn_of_open_brokers
+from eap.config.bus import DescribeBus, describe_buses
 from eap.config.check_ports import check_ports
-from eap.config.check_publish import check_publish
-from eap.config.check_routes import check_routes
+from eap.config.check_publish import check_polls, check_publish
+from eap.config.check_routes import check_routes, follow_routes
 from eap.config.check_subscribe import check_subscribe
 from eap.config.check_variables import check_variables
 from eap.config.convert import convert
-from eap.config.derive import derive
-from eap.config.derive_routing import derive_directory, derive_routing
+from eap.config.derive import derive, derive_directory, derive_routing
 from eap.config.document import read
 from eap.config.finding import Finding, Report
-from eap.config.follow_routes import follow_routes
+from eap.config.gateways import check_gateways
 from eap.config.index import Index
-from eap.config.learning import check_learning, warn_of_open_brokers
-from eap.config.structs import AuditDuty
-from eap.pd.spec import StationSpec
+from eap.config.links import check_links
+from eap.config.structs import AuditDuty, PlantFile, PortSection, StationSection
+from eap.ids import NetId
+from eap.pd.spec import PortKind, StationSpec
 
 
 class Plant(msgspec.Struct, frozen=True):
@@ -88,3 +85,46 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     )
     warnings = (*follow_routes(index, plant.routing, report), *warn_of_open_brokers(index, report))
     return LoadResult(plant, (), report.lines, warnings)
+
+
+PORT = "eap0"
+_ROUTER, _PORT = "station", "port"
+INTERFACE_PATH = f"{_PORT}.interface"
+NET_ID_PATHS = f"{_PORT}.net_id", f"{_ROUTER}.net_id"
+
+
+def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
+    """Return a plant called *name* that has one station of that name.
+
+    A plant file's rules hold, and findings are told by their paths above.  *net_id* is that of the
+    port: publisher ID of its frames and address of its dictionary.  The router of a station has a
+    NetID of its own, which here is the port's with its fifth octet one less.
+
+    Args:
+        name: Of plant and station.
+        interface: Of the port, as in a plant file.
+        net_id: Of the port.
+        cycle_us: Device cycle.
+    """
+    port = PortSection(at=_PORT, name=PORT, kind=PortKind.EAP, interface=interface, net_id=net_id)
+    station = StationSection(
+        at=_ROUTER, name=name, net_id=_router(net_id), ports=(port,), cycle_us=cycle_us
+    )
+    index = Index(PlantFile(plant="blank", stations=(station,)))
+    report = Report("")
+    check_ports(index, report)
+    if findings := report.findings():
+        return LoadResult(None, findings)
+    plant = Plant(
+        name, derive(index, Path()), derive_routing(index, Path()), derive_directory(index)
+    )
+    return LoadResult(plant, ())
+
+
+def _router(net_id: str) -> str:
+    try:
+        octets = bytearray(NetId.parse(net_id))
+    except ValueError:
+        return net_id  # wrong there as it is wrong at the port
+    octets[4] = (octets[4] - 1) & 0xFF
+    return str(NetId(octets))

@@ -1,20 +1,28 @@
-"""Routes of a plant file: from what people write to door, address and next router."""
+"""Routes of a plant file: transport, address, next router and NetIDs of their targets."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from ipaddress import IPv4Address
 from typing import NamedTuple
 
 from eap.aoe.spec import DEFAULT_TARGET, DoorKind, HopSpec
+from eap.aoe.via import ip_hop, read_address
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
-from eap.config.brokers import brokers_of, find_network
+from eap.config.brokers import HOST, brokers_of, find_network
 from eap.config.finding import one_of
-from eap.config.hosts import HOST
 from eap.config.index import Index
-from eap.config.neighbours import find_hop
-from eap.config.structs import Route, Station
-from eap.ids import Destination, DestinationKind, InterfaceUri, NetId, parse_host
+from eap.config.structs import PortSection, RouteSection, StationSection
+from eap.ids import (
+    STATION_OCTETS,
+    Destination,
+    DestinationKind,
+    InterfaceUri,
+    MacAddr,
+    NetId,
+    parse_host,
+)
 from eap.near import near
 from eap.pd.spec import PortKind
 
@@ -56,12 +64,12 @@ class NextHop(NamedTuple):
     router: str
 
 
-def target_of(index: Index, route: Route) -> Station | None:
+def target_of(index: Index, route: RouteSection) -> StationSection | None:
     """Return the station of the plant that *route* leads to, None for anything else."""
     return None if route.to == DEFAULT_TARGET else index.stations.get(route.to)
 
 
-def next_hop(index: Index, station: Station, route: Route) -> NextHop:
+def next_hop(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     """Return where *route* of *station* leads first.
 
     Raises:
@@ -84,14 +92,14 @@ def next_hop(index: Index, station: Station, route: Route) -> NextHop:
     return _by_address(index, station, route)
 
 
-def _check_own_port(index: Index, station: Station, route: Route) -> None:
+def _check_own_port(index: Index, station: StationSection, route: RouteSection) -> None:
     if route.port and index.eap_port(station, route.port) is None:
         names = [port.name for port in station.ports if port.kind is PortKind.EAP]
         message = f"station {station.name} has no EAP port {route.port!r}{near(route.port, names)}"
         raise MisfitError("port", message, one_of(names))
 
 
-def _direct(index: Index, station: Station, route: Route) -> NextHop:
+def _direct(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     target = target_of(index, route)
     if target is None:
         raise MisfitError("", f"route {route.to!r} has no via and no ams_tcp", f"via: {VIA}")
@@ -102,7 +110,9 @@ def _direct(index: Index, station: Station, route: Route) -> NextHop:
     return NextHop(hop, _net_id(target))
 
 
-def _other_port(index: Index, station: Station, text: str, key: str) -> tuple[Station, str]:
+def _other_port(
+    index: Index, station: StationSection, text: str, key: str
+) -> tuple[StationSection, str]:
     """Return the station and the port that ``STATION/PORT`` names."""
     name, _, port = text.partition("/")
     other = index.stations.get(name)
@@ -117,7 +127,7 @@ def _other_port(index: Index, station: Station, text: str, key: str) -> tuple[St
     return other, port
 
 
-def _by_station(index: Index, station: Station, route: Route) -> NextHop:
+def _by_station(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     other, port = _other_port(index, station, route.via, "via")
     hop = find_hop(index, station, other, own=route.port, other=port)
     if hop is None:
@@ -127,7 +137,7 @@ def _by_station(index: Index, station: Station, route: Route) -> NextHop:
     return NextHop(hop, _net_id(other))
 
 
-def _by_ams_tcp(index: Index, station: Station, route: Route) -> NextHop:
+def _by_ams_tcp(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     if "/" in route.ams_tcp:
         other, port = _other_port(index, station, route.ams_tcp, "ams_tcp")
         uri = index.uris.get((other.name, port))
@@ -147,7 +157,7 @@ def _ams_tcp(host: str, port: int) -> HopSpec:
     return HopSpec(DoorKind.AMS_TCP, "", f"{host}:{port}")
 
 
-def _by_mqtt(index: Index, station: Station, route: Route) -> NextHop:
+def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     """``mqtt:NETWORK``: to the target itself; ``mqtt:NETWORK/STATION``: to who passes it on."""
     network, _, name = route.via.removeprefix(MQTT).partition("/")
     if find_network(station, network) is None:
@@ -165,7 +175,7 @@ def _by_mqtt(index: Index, station: Station, route: Route) -> NextHop:
     return NextHop(HopSpec(DoorKind.MQTT, network, router), router)
 
 
-def _foreign_router(route: Route) -> str:
+def _foreign_router(route: RouteSection) -> str:
     try:
         return str(NetId.parse(route.net_id))
     except ValueError:
@@ -173,7 +183,7 @@ def _foreign_router(route: Route) -> str:
         raise MisfitError("via", message, "mqtt:NETWORK/STATION, or a net_id") from None
 
 
-def _by_address(index: Index, station: Station, route: Route) -> NextHop:
+def _by_address(index: Index, station: StationSection, route: RouteSection) -> NextHop:
     try:
         destination = Destination.parse(route.via)
     except ValueError as exc:
@@ -200,7 +210,7 @@ def _by_address(index: Index, station: Station, route: Route) -> NextHop:
     return NextHop(hop, _net_id(target) if target else "")
 
 
-def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: Route) -> str:
+def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: RouteSection) -> str:
     """Return the port whose network *destination* is in."""
     if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
         there = int(IPv4Address(destination.host))
@@ -211,8 +221,130 @@ def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: Ro
     return next(iter(ports))
 
 
-def _net_id(station: Station) -> str:
+def _net_id(station: StationSection) -> str:
     try:
         return str(NetId.parse(station.net_id))
     except ValueError:
         return ""  # a finding of its own
+
+
+WHOLE = 6
+NOBODY = NetId(bytes(WHOLE))
+
+
+def reach(index: Index, route: RouteSection, loose: set[str]) -> list[tuple[str, int]]:
+    """Return NetID and octets to match of each part of *route*.
+
+    *loose* are the stations that :func:`without_prefix` returns.
+    """
+    if route.to == DEFAULT_TARGET:
+        return [(str(NOBODY), 0)]
+    target = target_of(index, route)
+    if target is None:
+        return [(str(NetId.parse(route.net_id)), route.octets or STATION_OCTETS)]
+    # One NetID only can stand for another, so a virtual one is for all that begin alike.
+    return net_ids_of(target, set() if route.virtual else loose)
+
+
+def net_ids_of(station: StationSection, loose: set[str]) -> list[tuple[str, int]]:
+    """Return by which NetIDs, and octets of them, everything at *station* is reached."""
+    router = str(NetId.parse(station.net_id))
+    if station.name not in loose:
+        return [(router, STATION_OCTETS)]
+    return [(router, WHOLE), *((str(NetId.parse(port.net_id)), WHOLE) for port in station.ports)]
+
+
+def without_prefix(index: Index) -> set[str]:
+    """Return the stations whose NetIDs have no four octets to themselves."""
+    owners: dict[bytes, set[str]] = {}
+    for station in index.plant.stations:
+        for prefix in prefixes(station):
+            owners.setdefault(prefix, set()).add(station.name)
+    shared = {name for names in owners.values() if len(names) > 1 for name in names}
+    return shared | {s.name for s in index.plant.stations if len(prefixes(s)) > 1}
+
+
+def prefixes(station: StationSection) -> set[bytes]:
+    """Return the first four octets of each NetID of *station* that is one."""
+    found = set()
+    for text in [station.net_id, *(port.net_id for port in station.ports)]:
+        try:
+            found.add(NetId.parse(text).station)
+        except ValueError:
+            continue  # a finding of its own
+    return found
+
+
+_IP_SCHEMES = {"udp", "tcp"}
+_PREFERENCE = (DoorKind.UDP, DoorKind.TCP, DoorKind.ETHERNET)
+"""UDP first: it needs no connection, and the kernel knows who has an address."""
+
+
+class _Candidate(NamedTuple):
+    """A way from port to port; the smallest one is taken."""
+
+    preference: int
+    differing_bits: int
+    """Of IPv4 addresses, from the first one that differs on: hosts of one network come first."""
+    order: int
+    hop: HopSpec
+
+
+def find_hop(
+    index: Index, station: StationSection, target: StationSection, *, own: str = "", other: str = ""
+) -> HopSpec | None:
+    """Return how packets go from *station* to *target* directly, None if no interface is shared.
+
+    Interfaces are taken for shared if both are of IP, on this host or both not, or if they are
+    Ethernet interfaces of one name and VLAN.
+
+    Args:
+        index: The plant.
+        station: From where.
+        target: To where; another station.
+        own: The port to leave by; any if empty.
+        other: The port to arrive at; any if empty.
+    """
+    found = (
+        _hop(index, (station.name, mine), (target.name, theirs), is_wanted=bool(other))
+        for mine in _eap_ports(index, station, own)
+        for theirs in _eap_ports(index, target, other)
+    )
+    ranked = [
+        _Candidate(_PREFERENCE.index(hop.kind), bits, order, hop)
+        for order, each in enumerate(found)
+        if each is not None
+        for hop, bits in [each]
+    ]
+    return min(ranked).hop if ranked else None
+
+
+def _eap_ports(index: Index, station: StationSection, name: str) -> Iterator[str]:
+    for port in station.ports:
+        known = port.kind is PortKind.EAP and (station.name, port.name) in index.uris
+        if known and name in {"", port.name}:
+            yield port.name
+
+
+def _hop(
+    index: Index, own: tuple[str, str], other: tuple[str, str], *, is_wanted: bool
+) -> tuple[HopSpec, int] | None:
+    """Return the hop from port to port, and how many bits of their addresses differ.
+
+    With *is_wanted* somebody said that it is there, whatever the names of the interfaces are.
+    """
+    uri, target = index.uris[own], index.uris[other]
+    if uri.scheme in _IP_SCHEMES and target.scheme in _IP_SCHEMES:
+        hop = ip_hop(own[1], uri, target)
+        bits = (int(read_address(uri.host)) ^ int(read_address(target.host))).bit_length()
+        return None if hop is None else (hop, bits)
+    if uri.scheme == target.scheme == "ethernet":
+        port, there = index.ports[own], index.ports[other]
+        if is_wanted or (uri.host == target.host and _vid(port) == _vid(there)):
+            address = MacAddr.parse(there.mac) if there.mac else NetId.parse(there.net_id)
+            return HopSpec(DoorKind.ETHERNET, own[1], str(address)), 0
+    return None
+
+
+def _vid(port: PortSection) -> int:
+    return port.vlan.id if port.vlan else 0

@@ -48,7 +48,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True):
     """The key that a bare text in place of the section stands for."""
 
 
-class Vlan(Section, frozen=True):
+class VlanSection(Section, frozen=True):
     """The tag of an Ethernet port's frames."""
 
     id: Annotated[int, Meta(ge=1, le=4094)]
@@ -63,7 +63,7 @@ class GatewayLimits(Section, frozen=True):
     clients: Annotated[int, Meta(ge=1, le=0xFFFF)] = 256
 
 
-class Gateway(Section, frozen=True):
+class GatewaySection(Section, frozen=True):
     """The mailbox gateway of a bus port; the short form just says whether it answers."""
 
     enabled: bool = True
@@ -78,7 +78,7 @@ class Gateway(Section, frozen=True):
     SHORT: ClassVar[str] = "enabled"
 
 
-class Port(Section, frozen=True):
+class PortSection(Section, frozen=True):
     """A port; the NetID of an EAP port is the publisher ID of its frames.
 
     *interface* and *bus* name bus files by their path from the plant file on.
@@ -88,7 +88,7 @@ class Port(Section, frozen=True):
     kind: PortKind
     interface: str
     net_id: str
-    vlan: Vlan | None = None
+    vlan: VlanSection | None = None
     join: tuple[str, ...] = ()
     broadcast: bool = False
     tcp: bool = False
@@ -102,7 +102,7 @@ class Port(Section, frozen=True):
     clocks: bool = False
     frame_timeout_us: FrameTimeout = 1_000_000
     frame_retries: FrameRetries = 4
-    gateway: Gateway = Gateway()
+    gateway: GatewaySection = GatewaySection()
 
     EAP_KEYS: ClassVar[tuple[str, ...]] = (
         "vlan",
@@ -125,7 +125,7 @@ class Port(Section, frozen=True):
     )
 
 
-class Variable(Section, frozen=True):
+class VariableSection(Section, frozen=True):
     """A variable; the short form in the file is just its type."""
 
     type: str
@@ -136,7 +136,7 @@ class Variable(Section, frozen=True):
     SHORT: ClassVar[str] = "type"
 
 
-class Frame(Section, frozen=True):
+class FrameSection(Section, frozen=True):
     """A frame to send."""
 
     name: str
@@ -164,7 +164,7 @@ class Frame(Section, frozen=True):
         )
 
 
-class Publish(Section, frozen=True):
+class PublishSection(Section, frozen=True):
     """A PD to send in a frame."""
 
     name: str
@@ -200,7 +200,7 @@ class Publish(Section, frozen=True):
         )
 
 
-class From(Section, frozen=True):
+class FromSection(Section, frozen=True):
     """A publisher that is known by its numbers."""
 
     publisher: str
@@ -213,13 +213,13 @@ ANY_SOURCE = "any"
 """Source of a subscription that takes frames from every address."""
 
 
-class Subscribe(Section, frozen=True):
+class SubscribeSection(Section, frozen=True):
     """A PD to receive."""
 
     name: str
     port: str
-    source: From | str = msgspec.field(name="from")
-    variables: dict[str, Variable] | None = None
+    source: FromSection | str = msgspec.field(name="from")
+    variables: dict[str, VariableSection] | None = None
     version: U16 | None = None
     ignore_version: bool = False
     timeout_ms: Milliseconds = 0
@@ -231,7 +231,7 @@ class Subscribe(Section, frozen=True):
     """Address that the frames must come from, ANY_SOURCE, or the publisher's where it is known."""
 
 
-class Link(Section, frozen=True):
+class LinkSection(Section, frozen=True):
     """One variable of a station follows another one."""
 
     source: str = msgspec.field(name="from")
@@ -244,7 +244,7 @@ class Link(Section, frozen=True):
     swap: bool = False
 
 
-class Tls(Section, frozen=True):
+class TlsSection(Section, frozen=True):
     """How a connection is kept secret; files by their paths from the plant file on."""
 
     ca: str = ""
@@ -253,7 +253,7 @@ class Tls(Section, frozen=True):
     check_name: bool = True
 
 
-class Route(Section, frozen=True):
+class RouteSection(Section, frozen=True):
     """A route of a station, or with *mqtt* a broker by which it reaches others."""
 
     to: str = ""
@@ -270,7 +270,7 @@ class Route(Section, frozen=True):
     network: str = ""
     user: str = ""
     password_file: str = ""
-    tls: Tls | None = None
+    tls: TlsSection | None = None
     client_id: str = ""
     no_retain: bool = False
     qos: Annotated[int, Meta(ge=0, le=2)] = 0
@@ -299,7 +299,7 @@ class Route(Section, frozen=True):
     )
 
 
-class Access(Section, frozen=True):
+class AccessSection(Section, frozen=True):
     """A rule: who may do what, or may not."""
 
     name: str = ""
@@ -312,31 +312,31 @@ class Access(Section, frozen=True):
     objects: tuple[str, ...] = ()
 
 
-class User(Section, frozen=True):
+class UserSection(Section, frozen=True):
     """Who may add routes from elsewhere."""
 
     name: str
     password_file: str
 
 
-class Station(Section, frozen=True):
+class StationSection(Section, frozen=True):
     """A router with its ports, and what the station sends and receives."""
 
     name: str
     net_id: str
-    ports: tuple[Port, ...]
+    ports: tuple[PortSection, ...]
     cycle_us: DeviceCycle | None = None
     phase_us: Annotated[int, Meta(ge=0, le=60_000_000)] | None = None
-    variables: dict[str, Variable] = {}
+    variables: dict[str, VariableSection] = {}
     sources: dict[str, Source] = {}
-    frames: tuple[Frame, ...] = ()
-    publish: tuple[Publish, ...] = ()
-    subscribe: tuple[Subscribe, ...] = ()
-    links: tuple[Link, ...] = ()
-    routes: tuple[Route, ...] = ()
+    frames: tuple[FrameSection, ...] = ()
+    publish: tuple[PublishSection, ...] = ()
+    subscribe: tuple[SubscribeSection, ...] = ()
+    links: tuple[LinkSection, ...] = ()
+    routes: tuple[RouteSection, ...] = ()
     learn: bool | tuple[str, ...] = True
-    access: tuple[Access, ...] = ()
-    users: tuple[User, ...] = ()
+    access: tuple[AccessSection, ...] = ()
+    users: tuple[UserSection, ...] = ()
 
 
 class Defaults(Section, frozen=True):
@@ -364,6 +364,6 @@ class PlantFile(Section, frozen=True):
     """The whole file; top-level keys that begin with ``x-`` are free for anchors."""
 
     plant: str
-    stations: tuple[Station, ...]
+    stations: tuple[StationSection, ...]
     defaults: Defaults = Defaults()
     access: PlantAccess = PlantAccess()

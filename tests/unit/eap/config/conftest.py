@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave
-from eap.config.check_buses import describe_buses
+from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave, describe_buses
 from eap.config.convert import convert
 from eap.config.document import read
 from eap.config.finding import Finding, Report

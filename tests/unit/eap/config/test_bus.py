@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -108,3 +109,114 @@ def test_names_are_unique_and_can_be_typed(outputs, inputs):
     for name in found:
         assert not any(each.isspace() or each in "/()" for each in name)
         assert name.count(".") == 2
+
+
+PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+
+
+def bus(interface, more="", name="bus0", last=3):
+    port = f"{{name: {name}, kind: bus, interface: {interface}, net_id: 127.0.9.1.{last}.1{more}}}"
+    return f"\n      - {port}"
+
+
+def with_bus(*args, **kwargs):
+    return PORT, PORT + bus(*args, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("interface", "more"),
+    [
+        ("sim://line.yaml", ""),
+        ("sim://line.yaml", ", bus: line.yaml"),
+        ("ethernet://eth1", ""),
+        ("ethernet://eth1", ", bus: line.yaml, target: PREOP, clocks: true"),
+        ("udp://127.0.9.7:40000", ", bus: line.yaml"),
+    ],
+)
+def test_these_are_bus_ports(findings, interface, more):
+    assert findings(with_bus(interface, more)) == []
+
+
+@pytest.mark.parametrize(
+    ("interface", "more", "finding"),
+    [
+        ("tcp://127.0.9.3", "", "tcp:// is no interface of a bus port; sim:// and a bus file, eth"),
+        ("loop://a", "", "loop:// is no interface of a bus port"),
+        ("line.yaml", "", "interface: 'line.yaml' is not an interface (one of udp"),
+        ("sim://", "", "interface: 'sim://' names no interface"),
+        ("sim://line.yaml?a=1", "", "sim:// takes no options; sim://line.yaml"),
+        ("sim://none.yaml", "", "bus file none.yaml does not exist; a bus file, its path from"),
+        (f"sim://{300 * 'x'}", "", f"bus file {300 * 'x'} cannot be read: File name"),
+        ("sim://.", "", "bus file . is no regular file"),
+        ("ethernet://eth1", ", bus: none.yaml", "bus file none.yaml does not exist"),
+        ("sim://line.yaml", ", bus: x.yaml", "port bus0 simulates line.yaml, but is described by"),
+        ("ethernet://much-too-long-name", "", "'much-too-long-name' is no interface name"),
+        ("udp://239.1.1.1", "", "239.1.1.1 is no address of a bus; the address of one segment"),
+        ("udp://0.0.0.0", "", "0.0.0.0 is no address of a bus"),
+        ("udp://255.255.255.255", "", "255.255.255.255 is no address of a bus"),
+        ("sim://line.yaml", ", target: BOOT", "target is 'BOOT'; one of INIT, PREOP, SAFEOP, OP"),
+        ("sim://line.yaml", ", clocks: 1", "clocks is 1; true or false"),
+        ("sim://line.yaml", ", frame_timeout_us: 1999", "frame_timeout_us is 1999; "),
+        ("sim://line.yaml", ", frame_retries: 21", "frame_retries is 21; "),
+        ("sim://line.yaml", ", wake: arrival", "bus0 is a port of kind bus, wake belongs to EAP"),
+        ("sim://line.yaml", ", vlan: {id: 3}", "bus0 is a port of kind bus, vlan belongs to EAP"),
+        ("sim://line.yaml", ", broadcast: false", "bus0 is a port of kind bus, broadcast belongs"),
+        ("udp://127.0.9.1", "", "udp://127.0.9.1 is used twice (first in line 6)"),
+        ("udp://127.0.9.1:34980", "", "udp://127.0.9.1:34980 is used twice (first in line 6)"),
+    ],
+)
+def test_a_bus_port_that_cannot_be_is_one_finding(findings, tmp_path, interface, more, finding):
+    found = findings(with_bus(f'"{interface}"', more))
+    [only] = [each.replace(f"{tmp_path}/", "").replace(str(tmp_path), ".") for each in found]
+    assert only.startswith(f"7: {finding}")
+
+
+def test_keys_of_buses_are_none_of_eap_ports(findings):
+    found = findings((PORT, PORT.replace("}", ", clocks: false}")))
+    assert found == [
+        "6: eap0 is a port of kind eap, clocks belongs to bus ports; no clocks on EAP ports"
+    ]
+
+
+def test_the_findings_of_a_bus_file_follow_once_with_its_name(load_plant, tmp_path):
+    use = "    links:\n      - {from: bus0.valves.limit, to: bus1.valves.valve}\n    sources:"
+    both = bus("sim://broken.yaml") + bus("sim://broken.yaml", name="bus1", last=4)
+    result = load_plant((PORT, PORT + both), ("    sources:", use), ("id: 1,", "id: 70000,"))
+    assert [str(each) for each in result.findings] == [
+        f"{tmp_path}/plant.yaml:19: id is 70000; expected a whole number from 0 to 65535",
+        f"{tmp_path}/broken.yaml:3: kind is 'x'; expected one of a, b",
+    ]
+
+
+def test_two_ports_may_simulate_one_file(load_plant):
+    both = bus("sim://line.yaml") + bus("sim://line.yaml", name="bus1", last=4)
+    ports = load_plant((PORT, PORT + both)).plant.stations[0].ports
+    assert ports[1].bus.file == ports[2].bus.file
+    assert ports[2].bus.slaves[0].inputs[0].variable == "bus1.valves.limit"
+
+
+@pytest.mark.parametrize("uri", ["ethernet://eth1", "udp://127.0.9.7"])
+def test_a_real_bus_has_one_port(findings, uri):
+    both = bus(uri) + bus(uri, name="bus1", last=4)
+    assert findings((PORT, PORT + both)) == [
+        f"8: {uri} is used twice (first in line 7); an address of its own for each port"
+    ]
+
+
+def test_an_eap_port_is_not_on_the_interface_of_a_bus(findings):
+    eap = '"ethernet://eth1", net_id: 127.0.9.1.2.1}'
+    shared = (PORT, eap + bus("ethernet://eth1")), ("to: 127.0.9.2", "to: multicast")
+    found = findings(*shared, ('"udp://127.0.9.2"', '"ethernet://eth1"'))
+    assert found == [
+        (
+            "7: ethernet://eth1 is the interface of eap0 too (line 6): the slaves of bus0 would"
+            " pass on and send back the frames of eap0; an interface of its own for a bus"
+        )
+    ]
+
+
+def test_a_bus_variable_is_none_of_another_name(findings):
+    twice = "count: UDINT\n      bus0.valves.valve: BOOL"
+    assert findings(with_bus("sim://line.yaml"), ("count: UDINT", twice)) == [
+        "7: variable 'bus0.valves.valve' exists already (line 11); a name of its own"
+    ]

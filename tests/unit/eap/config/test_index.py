@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from eap.config.index import parse_types
-from eap.config.structs import From
+from eap.config.structs import FromSection
 
 PD = "id: 1, version: 3,"
 PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
@@ -33,7 +33,7 @@ def test_a_publisher_is_found_by_name_by_numbers_or_by_id_alone(index):
         ("any", 2, 0),
         ("127.0.9.2.2.1", 1, 0),
     ):
-        source = From(publisher=publisher, id=pd_id)
+        source = FromSection(publisher=publisher, id=pd_id)
         other = type(subscription)(name="x", port="eap0", source=source)
         assert len(plant.publishers(other)) == found
 

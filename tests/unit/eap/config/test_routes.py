@@ -3,8 +3,17 @@ from __future__ import annotations
 import pytest
 
 from eap.aoe.spec import DoorKind, HopSpec
-from eap.config.routes import MisfitError, next_hop, target_of
-from eap.config.structs import Route
+from eap.config.routes import (
+    MisfitError,
+    find_hop,
+    net_ids_of,
+    next_hop,
+    prefixes,
+    reach,
+    target_of,
+    without_prefix,
+)
+from eap.config.structs import RouteSection as Route
 
 RIGHT = "127.0.9.2.1.1"
 LEFT_PORT = '- {name: eap0, kind: eap, interface: "udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
@@ -66,28 +75,68 @@ def test_a_route_leads_to_its_next_hop(follow, route, hop, router):
         (Route(to="x"), "", "route 'x' has no via and no ams_tcp"),
         (Route(to="right", port="far"), "to", "left and right share no interface"),
         (Route(to="x", via="a/b", ams_tcp="h"), "via", "route 'x' has via and ams_tcp"),
-        (Route(to="x", ams_tcp="h", port="eap0"), "port", "route 'x' leaves by no port of its own"),
-        (Route(to="x", via="mqtt:plant", port="eap0"), "port", "route 'x' leaves by no port of it"),
+        (
+            Route(to="x", ams_tcp="h", port="eap0"),
+            "port",
+            "route 'x' leaves by no port of its own",
+        ),
+        (
+            Route(to="x", via="mqtt:plant", port="eap0"),
+            "port",
+            "route 'x' leaves by no port of it",
+        ),
         (
             Route(to="x", via="1.1.1.1", port="eap9"),
             "port",
             "station left has no EAP port 'eap9', ",
         ),
-        (Route(to="x", via="1.1.1.1", port="bus0"), "port", "station left has no EAP port 'bus0'"),
-        (Route(to="x", via="1.1.1.1", port="eth0"), "via", "1.1.1.1 cannot be reached from port e"),
-        (Route(to="x", via="rigth/eap0"), "via", "no station 'rigth' in this plant, did you mean"),
+        (
+            Route(to="x", via="1.1.1.1", port="bus0"),
+            "port",
+            "station left has no EAP port 'bus0'",
+        ),
+        (
+            Route(to="x", via="1.1.1.1", port="eth0"),
+            "via",
+            "1.1.1.1 cannot be reached from port e",
+        ),
+        (
+            Route(to="x", via="rigth/eap0"),
+            "via",
+            "no station 'rigth' in this plant, did you mean",
+        ),
         (Route(to="x", via="left/eap0"), "via", "left/eap0 is of station left itself"),
         (Route(to="x", via="right/eap7"), "via", "station right has no EAP port 'eap7'"),
-        (Route(to="x", via="right/eap0", port="eth0"), "via", "right/eap0 cannot be reached from "),
-        (Route(to="x", via="right/eap0", port="far"), "via", "right/eap0 cannot be reached from p"),
+        (
+            Route(to="x", via="right/eap0", port="eth0"),
+            "via",
+            "right/eap0 cannot be reached from ",
+        ),
+        (
+            Route(to="x", via="right/eap0", port="far"),
+            "via",
+            "right/eap0 cannot be reached from p",
+        ),
         (Route(to="x", via="what"), "via", "via: 'what' is not an IPv4 address"),
         (Route(to="x", via="239.1.1.1"), "via", "239.1.1.1 is a group"),
-        (Route(to="x", ams_tcp="1.2.3"), "ams_tcp", "ams_tcp: '1.2.3' is not the IPv4 address"),
+        (
+            Route(to="x", ams_tcp="1.2.3"),
+            "ams_tcp",
+            "ams_tcp: '1.2.3' is not the IPv4 address",
+        ),
         (Route(to="x", ams_tcp="right/no"), "ams_tcp", "station right has no EAP port 'no'"),
         (Route(to="x", via="mqtt:what"), "via", "station left is in no MQTT network 'what'"),
         (Route(to="x", via="mqtt:plant/who"), "via", "no station 'who' in this plant"),
-        (Route(to="right", via="mqtt:alone"), "via", "station right is in no MQTT network 'alone'"),
-        (Route(to="default", via="mqtt:plant"), "via", "route 'default' does not say which router"),
+        (
+            Route(to="right", via="mqtt:alone"),
+            "via",
+            "station right is in no MQTT network 'alone'",
+        ),
+        (
+            Route(to="default", via="mqtt:plant"),
+            "via",
+            "route 'default' does not say which router",
+        ),
     ],
 )
 def test_a_way_that_there_is_not_says_why(follow, route, key, message):
@@ -117,3 +166,126 @@ def test_a_default_route_leads_to_no_station(index):
     plant = index(("name: right", "name: default"))
     assert target_of(plant, Route(to="default")) is None
     assert target_of(plant, Route(to="left")) is plant.stations["left"]
+
+
+def test_a_station_whose_net_ids_begin_alike_is_reached_by_four_octets(index):
+    plant = index()
+    assert without_prefix(plant) == set()
+    assert net_ids_of(plant.stations["left"], set()) == [("127.0.9.1.1.1", 4)]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "loose"),
+    [
+        ("net_id: 127.0.9.2.1.1", "net_id: 5.5.5.5.1.1", {"right"}),
+        ("net_id: 127.0.9.1.2.1", "net_id: 127.0.9.2.9.9", {"left", "right"}),
+    ],
+)
+def test_others_are_reached_by_each_of_their_net_ids(index, old, new, loose):
+    plant = index((old, new))
+    assert without_prefix(plant) == loose
+    found = net_ids_of(plant.stations["right"], loose)
+    assert [octets for _, octets in found] == [6, 6]
+    assert found[1][0] == "127.0.9.2.2.1"
+
+
+def test_net_ids_that_are_none_are_passed_over(index):
+    plant = index(("net_id: 127.0.9.2.1.1", "net_id: what"))
+    assert prefixes(plant.stations["right"]) == {bytes((127, 0, 9, 2))}
+
+
+@pytest.mark.parametrize(
+    ("route", "found"),
+    [
+        (Route(to="default"), [("0.0.0.0.0.0", 0)]),
+        (Route(to="plc", net_id="5.1.2.3.1.1"), [("5.1.2.3.1.1", 4)]),
+        (Route(to="plc", net_id="5.1.2.3.1.1", octets=6), [("5.1.2.3.1.1", 6)]),
+        (Route(to="left"), [("127.0.9.1.1.1", 6), ("127.0.9.1.2.1", 6)]),
+        (Route(to="left", virtual="9.9.9.9.1.1"), [("127.0.9.1.1.1", 4)]),
+    ],
+)
+def test_a_route_is_for_the_net_ids_of_its_target(index, route, found):
+    assert reach(index(), route, {"left"}) == found
+
+
+LEFT = '{name: eap0, kind: eap, interface: "udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
+RIGHT_SIDE = '{name: eap0, kind: eap, interface: "udp://127.0.9.2", net_id: 127.0.9.2.2.1}'
+
+
+def port(name, uri, net_id, more=""):
+    return f'{{name: {name}, kind: eap, interface: "{uri}", net_id: {net_id}{more}}}'
+
+
+def left(*uris, more=""):
+    ports = [port(f"eap{n}", uri, f"127.0.9.1.2.{n + 1}", more) for n, uri in enumerate(uris)]
+    return LEFT, "\n      - ".join(ports)
+
+
+def right(*uris, more=""):
+    ports = [port(f"eap{n}", uri, f"127.0.9.2.2.{n + 1}", more) for n, uri in enumerate(uris)]
+    return RIGHT_SIDE, "\n      - ".join(ports)
+
+
+@pytest.fixture
+def hop(index):
+    def of(*edits, **wanted):
+        plant = index(*edits)
+        return find_hop(plant, plant.stations["left"], plant.stations["right"], **wanted)
+
+    return of
+
+
+def test_udp_ports_reach_each_other_at_their_addresses(hop):
+    assert hop() == HopSpec(DoorKind.UDP, "eap0", "127.0.9.2:34980")
+    assert hop(right("udp://127.0.9.2:40000")).address == "127.0.9.2:40000"
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs"),
+    [("udp", "tcp"), ("tcp", "udp"), ("tcp", "tcp")],
+)
+def test_where_one_has_no_udp_it_is_a_tcp_connection(hop, mine, theirs):
+    found = hop(left(f"{mine}://127.0.9.1"), right(f"{theirs}://127.0.9.2"))
+    assert found == HopSpec(DoorKind.TCP, "eap0", "127.0.9.2:34980")
+
+
+def test_on_ethernet_a_port_is_its_mac_address_or_its_net_id(hop):
+    line = left("ethernet://eth0")
+    by_net_id = hop(line, right("ethernet://eth0"))
+    assert by_net_id == HopSpec(DoorKind.ETHERNET, "eap0", "127.0.9.2.2.1")
+    by_mac = hop(line, right("ethernet://eth0", more=", mac: 02-00-00-00-00-0A"))
+    assert by_mac.address == "02:00:00:00:00:0a"
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "more"),
+    [
+        ("ethernet://eth0", "ethernet://eth1", ""),
+        ("ethernet://eth0", "ethernet://eth0", ", vlan: {id: 3}"),
+        ("ethernet://eth0", "udp://127.0.9.2", ""),
+        ("loop://line", "loop://line", ""),
+        ("udp://10.0.0.1", "udp://127.0.9.2", ""),
+        ("udp://127.0.9.1", "udp://0.0.0.0", ""),
+    ],
+)
+def test_what_is_not_shared_is_no_way(hop, mine, theirs, more):
+    assert hop(left(mine), right(theirs, more=more)) is None
+
+
+def test_interfaces_of_other_names_are_one_wire_if_somebody_says_so(hop):
+    found = hop(left("ethernet://eth0"), right("ethernet://eth1"), other="eap0")
+    assert found == HopSpec(DoorKind.ETHERNET, "eap0", "127.0.9.2.2.1")
+
+
+def test_of_several_ways_the_one_in_the_same_network_is_taken_udp_before_others(hop):
+    both = [left("udp://10.1.0.1", "udp://10.2.0.1"), right("udp://10.2.0.2", "udp://10.3.0.2")]
+    assert hop(*both) == HopSpec(DoorKind.UDP, "eap1", "10.2.0.2:34980")
+    mixed = [left("ethernet://eth0", "udp://10.2.0.1"), right("ethernet://eth0", "udp://10.9.0.2")]
+    assert hop(*mixed) == HopSpec(DoorKind.UDP, "eap1", "10.9.0.2:34980")
+
+
+def test_a_port_that_is_named_is_the_only_one_that_counts(hop):
+    both = [left("udp://10.1.0.1", "udp://10.2.0.1"), right("udp://10.2.0.2", "udp://10.3.0.2")]
+    assert hop(*both, own="eap0").port == "eap0"
+    assert hop(*both, other="eap1").address == "10.3.0.2:34980"
+    assert hop(*both, other="eap9") is None

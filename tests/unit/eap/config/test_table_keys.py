@@ -12,13 +12,13 @@ from eap.od.profiles.table import OWN_TYPE
 from eap.pd import spec
 
 SECTIONS = {
-    "stations": (structs.Station, spec.StationSpec),
-    "ports": (structs.Port, spec.PortSpec),
-    "variables": (structs.Variable, spec.VariableSpec),
-    "subscribe.variables": (structs.Variable, spec.VariableSpec),
-    "frames": (structs.Frame, spec.TxFrameSpec),
-    "publish": (structs.Publish, spec.TxPdSpec),
-    "subscribe": (structs.Subscribe, spec.RxPdSpec),
+    "stations": (structs.StationSection, spec.StationSpec),
+    "ports": (structs.PortSection, spec.PortSpec),
+    "variables": (structs.VariableSection, spec.VariableSpec),
+    "subscribe.variables": (structs.VariableSection, spec.VariableSpec),
+    "frames": (structs.FrameSection, spec.TxFrameSpec),
+    "publish": (structs.PublishSection, spec.TxPdSpec),
+    "subscribe": (structs.SubscribeSection, spec.RxPdSpec),
 }
 ROWS = [(row, each) for row in eap1000.ALL for each in row.entries if each.key or each.field]
 

@@ -8,7 +8,7 @@ import pytest
 
 from eap.appliance.commands.od_load import Loaded, load
 from eap.appliance.plantfile import load_plant
-from eap.config.blank import blank
+from eap.config.load import blank
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
 from eap.device.eap_records import read_back

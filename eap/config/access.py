@@ -1,0 +1,316 @@
+"""Access rules of a plant file: specifications of rules, and checks of their sections."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from ipaddress import IPv4Network
+from pathlib import Path
+from typing import TypeVar
+
+from eap.aoe.spec import IP_DOORS, AccessRule, AccessService, AccessTarget, DoorKind, ObjectRange
+from eap.config.brokers import brokers_of, check_file
+from eap.config.check_ports import check_names
+from eap.config.finding import Report, one_of
+from eap.config.index import Index
+from eap.config.routes import WHOLE, MisfitError, net_ids_of, without_prefix
+from eap.config.structs import AccessSection, PortSection, StationSection
+from eap.ids import STATION_OCTETS, MacAddr, NetId, ObjectId
+from eap.near import near
+from eap.pd.spec import PortKind
+
+ALL = "all"
+SERVICES = (ALL, *map(str, AccessService))
+TARGET = "STATION, STATION/PORT, STATION/PORT/SLAVE, or four to six numbers of a NetID and :PORT"
+OBJECTS = "INDEX, INDEX:SUB or FIRST-LAST in hexadecimal, such as 0x8000:01"
+_WRITES = tuple(each for each in AccessService if each is not AccessService.READ)
+_TOP_PORT = 0xFFFF
+_MAC_COLONS = 5
+
+
+def access_rules(index: Index, station: StationSection, loose: set[str]) -> Iterator[AccessRule]:
+    """Yield the rules of *station*; *loose* are its plant's stations without their own prefix.
+
+    Raises:
+        MisfitError: a rule says something that there is not.
+    """
+    for number, access in enumerate(station.access):
+        yield AccessRule(
+            name=rule_name(access, number),
+            allow=bool(access.allow),
+            networks=tuple(parse_sender(text) for text in access.networks if not _is_mac(text)),
+            macs=tuple(parse_sender(text) for text in access.networks if _is_mac(text)),
+            net_ids=tuple(
+                net_id for text in access.net_ids for net_id in parse_source(index, text, loose)
+            ),
+            doors=access.doors,
+            targets=tuple(
+                target for text in access.to for target in parse_target(index, text, loose)
+            ),
+            services=parse_services(access.allow or access.deny),
+            objects=tuple(parse_objects(text) for text in access.objects),
+        )
+
+
+def rule_name(access: AccessSection, number: int) -> str:
+    """Return how people call the rule; *number* is its place, from 0."""
+    return access.name or str(number + 1)
+
+
+def parse_services(texts: tuple[str, ...]) -> tuple[AccessService, ...]:
+    """Return what a rule is about, nothing for everything; ``write`` is all that is no reading."""
+    found: list[AccessService] = []
+    for text in texts:
+        if text == ALL:
+            return ()
+        if text not in SERVICES:
+            raise MisfitError("", f"no access is called {text!r}{near(text, SERVICES)}", _SERVICES)
+        found += _WRITES if text == AccessService.WRITE else [AccessService(text)]
+    return tuple(dict.fromkeys(found))
+
+
+_SERVICES = one_of(SERVICES)
+
+
+def parse_sender(text: str) -> str:
+    """Return an IPv4 network, or address, or a MAC address in its usual form."""
+    try:
+        return str(MacAddr.parse(text) if _is_mac(text) else IPv4Network(text, strict=False))
+    except ValueError:
+        message = f"{text!r} is no IPv4 network and no MAC address"
+        raise MisfitError("", message, "a network such as 10.0.0.0/24, or an address") from None
+
+
+def _is_mac(text: str) -> bool:
+    return text.count(":") == _MAC_COLONS or text.count("-") == _MAC_COLONS
+
+
+def parse_source(index: Index, text: str, loose: set[str]) -> list[str]:
+    """Return the beginnings of NetIDs that *text*, a station or some numbers, stands for."""
+    if (station := index.stations.get(text)) is not None:
+        return _beginnings(station, loose)
+    return [_net_id(text)]
+
+
+def parse_target(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
+    """Return what *text* names."""
+    where, separator, number = text.partition(":")
+    if not separator:
+        return _targets(index, text, loose)
+    if not number.isdecimal() or int(number) > _TOP_PORT:
+        raise MisfitError("", f"{number!r} is no AMS port", TARGET)
+    return [AccessTarget(each.net_id, int(number)) for each in _targets(index, where, loose)]
+
+
+def parse_objects(text: str) -> ObjectRange:
+    """Return the objects that *text* stands for."""
+    first, dash, last = (part.strip() for part in text.partition("-"))
+    if dash and ":" in text:
+        raise MisfitError("", f"{text!r} names no objects", OBJECTS)
+    try:
+        low, high = ObjectId.parse(first), ObjectId.parse(last if dash else first)
+    except ValueError:
+        raise MisfitError("", f"{text!r} names no objects", OBJECTS) from None
+    if low > high:
+        raise MisfitError("", f"{text!r} ends before it begins", OBJECTS)
+    if ":" in text:
+        return ObjectRange(low.object_index, low.object_index, low.subindex, low.subindex)
+    return ObjectRange(low.object_index, high.object_index)
+
+
+def _parts(text: str) -> tuple[str, str, str]:
+    station, _, rest = text.partition("/")
+    port, _, slave = rest.partition("/")
+    return station, port, slave
+
+
+def _targets(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
+    name, port_name, slave = _parts(text)
+    station = index.stations.get(name)
+    if station is None:
+        if "/" not in text and text[:1].isdigit():
+            return [AccessTarget(_net_id(text))]
+        hint = near(name, index.stations)
+        raise MisfitError("", f"no station {name!r} in this plant{hint}", TARGET)
+    if not port_name:
+        return [AccessTarget(net_id) for net_id in _beginnings(station, loose)]
+    port = index.ports.get((name, port_name))
+    if port is None:
+        names = [each.name for each in station.ports]
+        message = f"station {name} has no port {port_name!r}{near(port_name, names)}"
+        raise MisfitError("", message, one_of(names))
+    net_id = str(NetId.parse(port.net_id))
+    if not slave:
+        return [AccessTarget(net_id)]
+    return [AccessTarget(net_id, _slave(index, station, port, slave))]
+
+
+def _slave(index: Index, station: StationSection, port: PortSection, slave: str) -> int:
+    """Return the station address of a slave; any number will do where nothing is expected."""
+    bus = index.buses.get((station.name, port.name))
+    known = {each.name: each.station for each in bus.slaves} if bus else {}
+    if port.kind is not PortKind.BUS:
+        raise MisfitError("", f"{station.name}/{port.name} has no slaves", "a bus port")
+    if slave in known:
+        return known[slave]
+    if slave.isdecimal() and (int(slave) in known.values() or not known) and int(slave) < _TOP_PORT:
+        return int(slave)
+    message = f"bus {station.name}/{port.name} has no slave {slave!r}{near(slave, known)}"
+    raise MisfitError("", message, one_of([*known, *map(str, known.values())]))
+
+
+def _beginnings(station: StationSection, loose: set[str]) -> list[str]:
+    return [".".join(net_id.split(".")[:octets]) for net_id, octets in net_ids_of(station, loose)]
+
+
+def _net_id(text: str) -> str:
+    numbers = text.split(".")
+    if STATION_OCTETS <= len(numbers) <= WHOLE and all(
+        each.isascii() and each.isdigit() and int(each) < 256 for each in numbers
+    ):
+        return ".".join(str(int(each)) for each in numbers)
+    raise MisfitError("", f"{text!r} is no NetID, nor the first numbers of one", TARGET)
+
+
+T = TypeVar("T")
+
+_OBJECT_SERVICES = {AccessService.READ, AccessService.WRITE}
+
+
+def check_access(index: Index, report: Report, folder: Path) -> None:
+    """Report every rule and user that cannot be as they are; files are in *folder*."""
+    loose = without_prefix(index)
+    for station in index.plant.stations:
+        named = ((each.at, each.name) for each in station.access if each.name)
+        check_names(named, "access rule", report)
+        fine = [_check_rule(index, station, each, loose, report) for each in station.access]
+        if all(fine):
+            _check_order(index, station, loose, report)
+        check_names(((user.at, user.name) for user in station.users), "user", report)
+        for user in station.users:
+            check_file(f"{user.at}.password_file", user.password_file, report, folder)
+
+
+def _check_rule(
+    index: Index, station: StationSection, access: AccessSection, loose: set[str], report: Report
+) -> bool:
+    """Report what is wrong with a rule; return whether it can be compared with others."""
+    is_fine = True
+
+    def try_all(key: str, texts: tuple[str, ...], parse: Callable[[str], object]) -> None:
+        nonlocal is_fine
+        for position, text in enumerate(texts):
+            try:
+                parse(text)
+            except MisfitError as exc:
+                report.add(f"{access.at}.{key}[{position}]", f"{key}: {exc}", exc.expected)
+                is_fine = False
+            except ValueError:
+                is_fine = False  # a NetID that is a finding of its own
+
+    if report.has(f"{access.at}.allow") or report.has(f"{access.at}.deny"):
+        is_fine = False
+    elif bool(access.allow) == bool(access.deny):
+        message = "access rule has both allow and deny" if access.allow else "nothing is said"
+        report.add(access.at, message, "allow or deny with what it is about, such as allow: [read]")
+        is_fine = False
+    key = "allow" if access.allow else "deny"
+    try_all(key, access.allow or access.deny, lambda text: parse_services((text,)))
+    try_all("from", access.networks, parse_sender)
+    try_all("net_ids", access.net_ids, lambda text: parse_source(index, text, loose))
+    try_all("to", access.to, lambda text: parse_target(index, text, loose))
+    try_all("objects", access.objects, parse_objects)
+    known = _doors(station)
+    try_all("doors", access.doors, lambda text: _check_door(text, known))
+    return is_fine
+
+
+def _doors(station: StationSection) -> list[str]:
+    """Return all that ``doors`` may name at *station*."""
+    found = [*map(str, DoorKind)]
+    names = [port.name for port in station.ports if port.kind is PortKind.EAP]
+    doors = [f"{kind}:{name}" for name in names for kind in ("udp", "tcp", "ethernet")]
+    return [*found, *doors, *(f"mqtt:{route.network}" for route in brokers_of(station))]
+
+
+def _check_door(text: str, known: list[str]) -> None:
+    if text not in known:
+        expected = f"{one_of(DoorKind)}, or one door such as udp:PORT or mqtt:NETWORK"
+        raise MisfitError("", f"no door {text!r}{near(text, known)}", expected)
+
+
+def _check_order(index: Index, station: StationSection, loose: set[str], report: Report) -> None:
+    """Report rules that never decide anything."""
+    before: list[tuple[AccessSection, AccessRule]] = []
+    try:
+        rules = list(access_rules(index, station, loose))
+    except ValueError:
+        return  # a finding of its own
+    for access, rule in zip(station.access, rules, strict=True):
+        if reason := _why_never(rule):
+            report.add(access.at, f"access rule can never fit: {reason}", "a rule that can")
+        for earlier, other in before:
+            if _covers(other, rule):
+                line = report.line_of(earlier.at)
+                message = f"access rule is never asked: the one of line {line} fits before it"
+                report.add(access.at, message, "it before that one, or not at all")
+                break
+        before.append((access, rule))
+
+
+def _why_never(rule: AccessRule) -> str:
+    kinds = {_kind(door) for door in rule.doors}
+    is_known = kinds.isdisjoint(IP_DOORS) if rule.networks else bool(rule.macs)
+    if kinds and is_known and not (rule.macs and DoorKind.ETHERNET in kinds):
+        return f"who comes by {', '.join(rule.doors)} has no such address"
+    if rule.objects and rule.services and _OBJECT_SERVICES.isdisjoint(rule.services):
+        return f"{', '.join(rule.services)} is not about objects"
+    return ""
+
+
+def _covers(one: AccessRule, other: AccessRule) -> bool:
+    """Tell whether *one* fits whenever *other* does."""
+    return (
+        _covers_senders(one, other)
+        and _all_in(one.net_ids, other.net_ids, _begins)
+        and _all_in(one.doors, other.doors, lambda outer, inner: outer in {inner, _kind(inner)})
+        and _all_in(
+            one.targets,
+            other.targets,
+            lambda outer, inner: (
+                _begins(outer.net_id, inner.net_id) and outer.port in {None, inner.port}
+            ),
+        )
+        and _all_in(one.services, other.services, lambda outer, inner: outer == inner)
+        and _all_in(one.objects, other.objects, ObjectRange.contains)
+    )
+
+
+def _covers_senders(one: AccessRule, other: AccessRule) -> bool:
+    if not (one.networks or one.macs):
+        return True
+    by_address = not other.networks or _within(one.networks, other.networks, _in_network)
+    is_any = not (other.networks or other.macs)
+    return not is_any and by_address and set(other.macs) <= set(one.macs)
+
+
+def _within(outer: tuple[T, ...], inner: tuple[T, ...], is_in: Callable[[T, T], bool]) -> bool:
+    return all(any(is_in(each, item) for each in outer) for item in inner)
+
+
+def _all_in(outer: tuple[T, ...], inner: tuple[T, ...], is_in: Callable[[T, T], bool]) -> bool:
+    """Tell whether each of *inner* is in one of *outer*; nothing given stands for everything."""
+    if not outer:
+        return True
+    return bool(inner) and _within(outer, inner, is_in)
+
+
+def _in_network(outer: str, inner: str) -> bool:
+    return IPv4Network(inner).subnet_of(IPv4Network(outer))
+
+
+def _begins(outer: str, inner: str) -> bool:
+    return f"{inner}.".startswith(f"{outer}.")
+
+
+def _kind(door: str) -> str:
+    return door.partition(":")[0]
