@@ -251,6 +251,35 @@ def test_a_transfer_in_segments_beside_another_clients_requests(plant: Appliance
             assert [work.result(20) for work in works] == [content, content]
 
 
+def test_slow_upload_leaves_the_slave_to_other_clients(plant: Appliance) -> None:
+    content = os.urandom(2048)
+    with wire(HOST) as slow, GatewayClient(HOST) as other:
+        other.sdo_write(SENSOR, 0x8001, 0, content)
+        begun = slow.talk(COE, SENSOR, bytes.fromhex("0020 40 0180 00 00000000"))[1]
+        found, toggle, last = begun[10:], 0, 0
+        while not last:
+            assert other.sdo_read(SENSOR, 0x1018, 1) == IDENTITY[6:]
+            step = bytes((0, 0x20, 0x60 | toggle << 4)) + bytes(7)
+            segment = slow.talk(COE, SENSOR, step)[1]
+            found, toggle, last = found + segment[3:], toggle ^ 1, segment[2] & 1
+        assert found[:2048] == content
+
+
+def test_slow_readers_and_writers_leave_the_slave_to_other_clients(plant: Appliance) -> None:
+    with wire(HOST) as slow, GatewayClient(HOST) as other:
+        begin = struct.pack("<BBBHBI", 0, 0x20, 0x21, 0x8001, 0, 2048) + bytes(100)
+        assert slow.talk(COE, SENSOR, begin)[1][2] == 0x60
+        assert other.sdo_read(SENSOR, 0x8001) != b""
+        slow.send(frame(COE, SENSOR, bytes.fromhex("0020 80 0180 00 00000008")))
+        content = os.urandom(50_000)
+        other.foe_write(DRIVE, "parameters.bin", content)
+        first = slow.talk(FOE, DRIVE, struct.pack("<BxI", 1, 0) + b"parameters.bin")[1]
+        assert other.foe_read(DRIVE, "parameters.bin") == content
+        second = slow.talk(FOE, DRIVE, struct.pack("<BxI", 4, 1))[1]
+        assert first[6:] + second[6:] == content[: 2 * 1012]
+        slow.send(frame(FOE, DRIVE, struct.pack("<BxI", 5, 0x8000)))
+
+
 def test_a_step_that_is_repeated_gets_the_same_reply(plant: Appliance) -> None:
     with wire(HOST) as udp:
         first = udp.talk(COE, SENSOR, bytes.fromhex("0020 40 0180 00 00000000"))[1]

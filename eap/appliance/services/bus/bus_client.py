@@ -123,7 +123,7 @@ class BusClient:
         await self._be_up(port)
         mailbox = port, station, kind
         try:
-            async with asyncio.timeout(turn_s):
+            async with asyncio.timeout(None if self._queues.is_free(mailbox) else turn_s):
                 await self._queues.take(mailbox, requester)
         except TimeoutError:
             raise MailboxBusyError(

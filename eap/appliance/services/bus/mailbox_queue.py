@@ -28,9 +28,13 @@ class MailboxQueues:
     def __init__(self) -> None:
         self._waiting: dict[Hashable, dict[Hashable, deque[asyncio.Future[None]]]] = {}
 
+    def is_free(self, mailbox: Hashable) -> bool:
+        """Return whether a turn begins without waiting."""
+        return mailbox not in self._waiting
+
     async def take(self, mailbox: Hashable, client: Hashable) -> None:
         """Wait for a turn, which lasts until :meth:`release`; cancelling it gives up the wait."""
-        if mailbox not in self._waiting:
+        if self.is_free(mailbox):
             self._waiting[mailbox] = {}
             return
         turn = asyncio.get_running_loop().create_future()

@@ -8,8 +8,7 @@ Rule 3: a transfer without a next step is given up, and what it holds is freed.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Iterator, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -126,11 +125,18 @@ class ClientSession:
         """
         now_s = asyncio.get_running_loop().time()
         times = WRITES if self.codec.completes_write(body) else 1
+        if self._lock.locked():
+            try:
+                async with asyncio.timeout_at(now_s + self._answer_s):
+                    await self._lock.acquire()
+            except TimeoutError:
+                return self._refuse(body, Cause.TIMEOUT)
+        else:
+            await self._lock.acquire()  # without waiting, and without the price of a time-out
         try:
-            async with _turn_of(self._lock, now_s + self._answer_s):
-                return await self._ask(body, now_s + times * self._answer_s, is_step=is_step)
-        except TimeoutError:
-            return self._refuse(body, Cause.TIMEOUT)
+            return await self._ask(body, now_s + times * self._answer_s, is_step=is_step)
+        finally:
+            self._lock.release()
 
     def close(self) -> None:
         """Give up what is under way."""
@@ -195,17 +201,6 @@ class ClientSession:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-
-
-@asynccontextmanager
-async def _turn_of(lock: asyncio.Lock, deadline_s: float) -> AsyncIterator[None]:
-    """Hold a lock; raise TimeoutError if others hold it until the deadline."""
-    async with asyncio.timeout_at(deadline_s):
-        await lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def refusals(kind: MailboxType, body: bytes, reason: Cause, text: str = "") -> list[Reply]:

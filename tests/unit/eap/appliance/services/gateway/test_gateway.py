@@ -110,14 +110,14 @@ class Desk:
         assert header.address == address
         return body.hex(" ")
 
-    async def write_file(self, name: str, content: bytes) -> None:
+    async def write_file(self, name: str, content: bytes, way: Way = HERE) -> None:
         """Write a file of the drive."""
         room = 1024 - 12
-        while (await self.one(FOE, 1001, "02 00 00000000" + name))[:2] == "06":
+        while (await self.one(FOE, 1001, "02 00 00000000" + name, way))[:2] == "06":
             pass
         for number, at in enumerate(range(0, len(content) + 1, room), 1):
             packet = bytes((3, 0)) + number.to_bytes(4, "little") + content[at : at + room]
-            while (answer := await self.one(FOE, 1001, packet))[:2] == "06":
+            while (answer := await self.one(FOE, 1001, packet, way))[:2] == "06":
                 pass
             assert answer == (bytes((4, 0)) + number.to_bytes(4, "little")).hex(" ")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from eap.appliance.services.gateway import gateway
 from eap.appliance.services.gateway.gateway import Settings
 from eap.codec.coe import CoeHeader
 from eap.codec.sdo import SEGMENT_MINIMUM, SdoHeader
@@ -12,6 +13,7 @@ from tests.unit.eap.appliance.services.gateway.test_gateway import (
     COE,
     FILE,
     FOE,
+    HERE,
     NET_ID,
     VENDOR,
     Desk,
@@ -90,6 +92,39 @@ def test_file_read_slowly_leaves_the_slave_to_other_clients() -> None:
             assert await desk.ask(FOE, 1001, "05 00 00800000", ALSO_HERE) == []
         second = await desk.one(FOE, 1001, "04 00 01000000")
         assert bytes.fromhex(first)[6:] + bytes.fromhex(second)[6:] == content[: 2 * 1012]
+
+    play(scene, settings=PATIENCE)
+
+
+def test_file_left_in_the_middle_gives_way_to_another_client(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene(desk: Desk) -> None:
+        assert await desk.one(FOE, 1001, "02 00 00000000" + FILE) == "04 00 00 00 00 00"
+        begin = "01 00 00000000" + FILE
+        assert (await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06")
+        (held, waiting) = desk.gateway.transfers()
+        assert (held.way, waiting.way) == (HERE, ALSO_HERE)
+        monkeypatch.setattr(gateway, "PAUSE_S", 0.0)
+        while (answer := await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06"):
+            pass
+        assert answer.startswith("03 00 01 00 00 00")
+        late = await desk.one(FOE, 1001, "03 00 01000000 61")
+        assert bytes.fromhex(late)[6:] == b"no transfer is under way\0"
+
+    play(scene, settings=PATIENCE)
+
+
+def test_file_that_is_fetched_ahead_does_not_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway, "PAUSE_S", 0.0)
+    content = bytes(range(251)) * 20
+
+    async def scene(desk: Desk) -> None:
+        await desk.write_file(FILE, content)
+        await desk.one(FOE, 1001, "01 00 00000000" + FILE)
+        await desk.write_file(b"parameters.bin".hex(), content, ALSO_HERE)
+        second = await desk.one(FOE, 1001, "04 00 01000000")
+        assert bytes.fromhex(second)[6:] == content[1012 : 2 * 1012]
 
     play(scene, settings=PATIENCE)
 
