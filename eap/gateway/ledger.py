@@ -29,46 +29,46 @@ class ClientLimits(NamedTuple):
 
 
 class MemoryBudget:
-    """Octets that transfers of clients may hold while they are under way.
+    """Octets that transfers may hold while they are under way, by host: ports cost a host nothing.
 
     Args:
         in_all: Octets of all clients.
-        of_client: Octets of one client.
+        of_host: Octets of one host.
 
     Attributes:
         held: Octets that are held now.
     """
 
-    def __init__(self, in_all: int = 64 << 20, of_client: int = 16 << 20) -> None:
+    def __init__(self, in_all: int = 64 << 20, of_host: int = 16 << 20) -> None:
         self.held = 0
         self._in_all = in_all
-        self._of_client = of_client
-        self._clients: dict[Way, int] = {}
+        self._of_host = of_host
+        self._hosts: dict[str, int] = {}
 
-    def grant(self, way: Way, more: int) -> bool:
-        """Change what a client holds by *more* octets; return False if there is no room."""
-        own = self._clients.get(way, 0) + more
-        if more > 0 and (own > self._of_client or self.held + more > self._in_all):
+    def grant(self, host: str, more: int) -> bool:
+        """Change what a host holds by *more* octets; return False if there is no room."""
+        own = self._hosts.get(host, 0) + more
+        if more > 0 and (own > self._of_host or self.held + more > self._in_all):
             return False
         self.held += more
         if own:
-            self._clients[way] = own
+            self._hosts[host] = own
         else:
-            self._clients.pop(way, None)
+            self._hosts.pop(host, None)
         return True
 
 
 class MemoryShare:
     """What one session holds of a budget."""
 
-    def __init__(self, budget: MemoryBudget, way: Way) -> None:
+    def __init__(self, budget: MemoryBudget, host: str) -> None:
         self._budget = budget
-        self._way = way
+        self._host = host
         self._held = 0
 
     def hold(self, size: int) -> bool:
         """Hold *size* octets instead of those before; return False, and hold those, if too many."""
-        if not self._budget.grant(self._way, size - self._held):
+        if not self._budget.grant(self._host, size - self._held):
             return False
         self._held = size
         return True

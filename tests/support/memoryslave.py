@@ -85,7 +85,7 @@ def memory_slave(
 
 def memory_share(octets: int = 1 << 20) -> MemoryShare:
     """Return memory for one session."""
-    return MemoryShare(MemoryBudget(octets, octets), CLIENT)
+    return MemoryShare(MemoryBudget(octets, octets), CLIENT.connection)
 
 
 async def lead(

@@ -203,8 +203,8 @@ async def _serve(data: bytes) -> None:
     await gateway.close()
     if gateway.transfers() or gateway.ledger.table():
         raise AssertionError("transfers or clients are left over")
-    if gateway.memory.held:
-        raise AssertionError(f"{gateway.memory.held} octets are held for nothing")
+    if held := gateway.memory.held + gateway.file_memory.held:
+        raise AssertionError(f"{held} octets are held for nothing")
 
 
 def fuzz_one(data: bytes) -> None:

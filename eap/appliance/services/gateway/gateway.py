@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.wire.sii import SiiProtocol
-from eap.aoe.access import AccessList
+from eap.aoe.access import AccessList, host_of
 from eap.aoe.ads_operation import Operation
 from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
@@ -112,7 +112,8 @@ class MailboxGateway:
     Attributes:
         statistics: Requests and answers by slave and protocol.
         ledger: Requests by client.
-        memory: Octets that transfers hold.
+        memory: Octets of objects and messages that are under way.
+        file_memory: Octets of files that are fetched ahead; without room fewer are.
         guard: Access rules and audit.
         settings: As given.
         is_open: Whether it takes requests.
@@ -129,7 +130,7 @@ class MailboxGateway:
         open_remote: OpenRemote,
     ) -> None:
         self.ledger = Ledger(settings.limits)
-        self.memory = MemoryBudget()
+        self.memory, self.file_memory = MemoryBudget(), MemoryBudget()
         self._encoder = ReplyEncoder(self.ledger, settings.name, is_silent=settings.is_silent)
         self.statistics = self._encoder.statistics
         self.guard = Guard(access)
@@ -385,7 +386,9 @@ class MailboxGateway:
         return self._begin(key, access, MailboxSizes(slave.to_slave, slave.to_master))
 
     def _begin(self, key: SessionKey, access: SlaveAccess, sizes: MailboxSizes) -> ClientSession:
-        answer_s, memory = self.settings.answer_s, MemoryShare(self.memory, key.way)
+        answer_s = self.settings.answer_s
+        budget = self.file_memory if key.kind is MailboxType.FOE else self.memory
+        memory = MemoryShare(budget, host_of(key.way))
         # The rest of the time is for the probe of a station that lets a client wait.
         codec = codec_for(key.kind, access, sizes, memory, wait_s=answer_s / 3)
         return ClientSession(key.kind, codec, answer_s=answer_s)

@@ -26,6 +26,10 @@ from eap.od.abort import AbortCode, SdoAbortError
 
 LONGEST_ANSWER = 0x20002
 """Octets of the longest answer: a list of all indexes there can be."""
+SHORT = 1 << 10
+"""Octets of an object that goes to a slave in a few messages."""
+LONG_TIMES = 5
+"""Answer times that writing a longer one may take."""
 _COMPLETE = 0x100
 _ADDRESSES, _SLAVES = 0xF020, 0x8000
 _TO_SLAVE, _TO_MASTER = 33, 34
@@ -124,8 +128,12 @@ class RemoteSlave:
             detail = "by ADS an object is written from subindex 0 on"
             raise SdoAbortError(AbortCode.NO_COMPLETE_ACCESS, index, subindex, detail)
         offset = _sdo_offset(index, subindex, complete=complete)
+        # The other station answers when its slave has all of it.
+        times = LONG_TIMES if len(data) > SHORT else 1
         try:
-            await self.perform(Write(IndexGroup.SDO, offset, data))
+            await self.perform(
+                Write(IndexGroup.SDO, offset, data), timeout_s=times * self._answer_s
+            )
         except RemoteAccessError as exc:
             raise _sdo_error(exc, index, subindex) from None
 

@@ -7,7 +7,9 @@ import pytest
 from eap.appliance.services.gateway import gateway
 from eap.appliance.services.gateway.gateway import Settings
 from eap.codec.coe import CoeHeader
+from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SEGMENT_MINIMUM, SdoHeader
+from eap.gateway.ledger import MemoryBudget, MemoryShare
 from tests.unit.eap.appliance.services.gateway.test_gateway import (
     ALSO_HERE,
     COE,
@@ -129,13 +131,38 @@ def test_file_that_is_fetched_ahead_does_not_give_way(monkeypatch: pytest.Monkey
     play(scene, settings=PATIENCE)
 
 
-@pytest.mark.parametrize("request_", ["0020 40 0180 00 00000000", "0020 21 0180 00 00080000"])
-def test_client_that_leaves_keeps_nothing(request_: str) -> None:
+@pytest.mark.parametrize(
+    ("bus", "kind", "address", "begin"),
+    [
+        ("coe", COE, SENSOR, "0020 40 0180 00 00000000"),
+        ("coe", COE, SENSOR, "0020 21 0180 00 00080000"),
+        ("drive", FOE, 1001, "01 00 00000000" + FILE),
+    ],
+)
+def test_client_that_leaves_keeps_nothing(
+    bus: str, kind: MailboxType, address: int, begin: str
+) -> None:
     async def scene(desk: Desk) -> None:
-        await desk.one(COE, SENSOR, request_)
+        await desk.one(kind, address, begin)
         assert desk.gateway.transfers()
+        assert desk.gateway.memory.held + desk.gateway.file_memory.held > 0
         await desk.gateway.stop()
         assert not desk.gateway.transfers()
-        assert desk.gateway.memory.held == 0
+        assert desk.gateway.memory.held == desk.gateway.file_memory.held == 0
 
-    play(scene, bus="coe", settings=PATIENCE)
+    play(scene, bus=bus, settings=PATIENCE)
+
+
+def test_memory_budget_is_shared_by_the_ports_of_a_host() -> None:
+    budget = MemoryBudget(100, 60)
+    first, second, other = (MemoryShare(budget, host) for host in ("a", "a", "b"))
+    assert first.hold(40)
+    assert not second.hold(30)
+    assert second.hold(20)
+    assert not other.hold(50)
+    assert other.hold(40)
+    assert not first.hold(41)
+    assert first.hold(0)
+    assert budget.held == 60
+    assert not second.hold(61)
+    assert second.hold(60)
