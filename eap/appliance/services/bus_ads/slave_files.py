@@ -19,8 +19,8 @@ from typing import TypeVar
 
 from eap.aoe.ads_notifications import Client
 from eap.aoe.ads_operation import AdsRefusedError, Read, ReadWrite, Write
-from eap.appliance.services.bus_ads.transfer import Transfer
-from eap.appliance.services.slaves.local_slave import LocalSlave
+from eap.appliance.services.slaves.access import SlaveAccess
+from eap.appliance.services.slaves.file_stream import FileStream
 from eap.codec.ads import AdsError, IndexGroup
 from eap.errors import EapError
 from eap.ids import NetId
@@ -52,7 +52,7 @@ logger = logging.getLogger(__name__)
 class _OpenFile:
     """A file with a handle."""
 
-    def __init__(self, owner: NetId, station: int, name: str, stream: Transfer) -> None:
+    def __init__(self, owner: NetId, station: int, name: str, stream: FileStream) -> None:
         self.owner = owner
         self.station = station
         self.name = name
@@ -81,7 +81,7 @@ class SlaveFiles:
 
     async def perform(
         self,
-        access: LocalSlave,
+        access: SlaveAccess,
         station: int,
         client: Client,
         operation: Read | Write | ReadWrite,
@@ -111,7 +111,7 @@ class SlaveFiles:
 
     async def _begin(
         self,
-        access: LocalSlave,
+        access: SlaveAccess,
         station: int,
         client: Client,
         name: bytes,
@@ -250,7 +250,7 @@ def _text(name: bytes) -> str:
         raise AdsRefusedError(AdsError.VALUE, "a file name that is no UTF-8") from None
 
 
-def _progress(stream: Transfer) -> bytes:
+def _progress(stream: FileStream) -> bytes:
     """Octets so far, and 1 if these are all and there was no error, of 32 bits each."""
     done = min(stream.progress.done, 0xFFFF_FFFF)
     return done.to_bytes(4, "little") + stream.is_complete.to_bytes(4, "little")

@@ -11,7 +11,8 @@ import asyncio
 
 from devicebus.errors import FoeError
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.appliance.services.slaves.access import FileStream, SlaveAccess
+from eap.appliance.services.slaves.access import SlaveAccess
+from eap.appliance.services.slaves.file_stream import FileStream
 from eap.codec.foe import (
     DATA_OVERHEAD,
     Busy,

@@ -12,6 +12,7 @@ from typing import Protocol, TypeAlias
 
 from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
+from eap.appliance.services.slaves.file_stream import AHEAD, FileStream
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.codec.mailbox import MailboxType
@@ -19,8 +20,6 @@ from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.errors import EapError
 from eap.gateway.error_table import cause_of_result
 
-AHEAD = 64 << 10
-"""Octets of a file that are read before its reader wants them, unless it says otherwise."""
 UploadSink: TypeAlias = Callable[[int, bytes], object]
 """Called with the size of an object and each piece of it, in their order, as the slave sends it."""
 
@@ -37,39 +36,6 @@ class RemoteAccessError(EapError):
         super().__init__(AdsError.words_of(result))
         self.result = result
         self.is_of_way = not cause_of_result(result).is_from_slave
-
-
-class FileStream(Protocol):
-    """A file that is read from a slave ahead of its reader, or written behind its writer.
-
-    All methods but :meth:`close` raise what has ended the transfer; cancelling one changes nothing.
-
-    Attributes:
-        sizes: Of the slave's mailboxes, known when the file is open.
-        has_turn: Whether the slave has been asked for it; before, other files are moved.
-    """
-
-    sizes: MailboxSizes
-    has_turn: bool
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether nothing more goes to the slave or comes from it."""
-
-    async def wait_open(self) -> None:
-        """Wait until the slave has opened the file."""
-
-    async def read(self, size: int) -> bytes:
-        """Return the next *size* octets, fewer only at the end."""
-
-    async def write(self, data: bytes) -> None:
-        """Take *data* when most of what came before has gone to the slave."""
-
-    async def finish(self) -> None:
-        """Wait until the slave has all that was written."""
-
-    def close(self) -> None:
-        """Give the file up if it is not complete, at the slave too."""
 
 
 class SlaveAccess(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from functools import partial
 from typing import TypeVar
 
 from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client, voe_client
@@ -10,9 +11,9 @@ from devicebus.mailbox.conversation import Conversation, MailboxMessage, Mailbox
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_failure import no_mailbox
 from eap.appliance.bus_request import SlaveDescription
-from eap.appliance.services.bus_ads.transfer import Transfer
-from eap.appliance.services.slaves.access import AHEAD, UploadSink
+from eap.appliance.services.slaves.access import UploadSink
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
+from eap.appliance.services.slaves.file_stream import AHEAD, LocalFile
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import SdoInfoOpcode
@@ -88,12 +89,11 @@ class LocalSlave:
 
     def open_file(
         self, name: str, password: int, *, is_write: bool, ahead: int = AHEAD
-    ) -> Transfer:
+    ) -> LocalFile:
         """Begin to move a file, *ahead* octets before its reader; it is closed by the caller."""
-        file = Transfer(name, password, self._sizes(), is_write=is_write, ahead=ahead)
         # By the file, not by the requester: two of its files take turns like those of two.
-        file.start(lambda: self.bus.open_turn(self._slave.station, MailboxType.FOE, file))
-        return file
+        open_turn = partial(self.bus.open_turn, self._slave.station, MailboxType.FOE)
+        return LocalFile(name, password, self._sizes(), open_turn, is_write=is_write, ahead=ahead)
 
     async def exchange_vendor(self, message: bytes) -> bytes:
         """Return the answer to a VoE message, both with their VoE headers."""

@@ -14,7 +14,8 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Operation, Read, ReadState, ReadWrite, Write
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer, response_to
-from eap.appliance.services.slaves.access import AHEAD, RemoteAccessError, UploadSink
+from eap.appliance.services.slaves.access import RemoteAccessError, UploadSink
+from eap.appliance.services.slaves.file_stream import AHEAD
 from eap.appliance.services.slaves.remote_file import RemoteFile
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags

@@ -8,7 +8,8 @@ import pytest
 
 from eap.aoe.ads_operation import Read, ReadWrite, Write
 from eap.appliance.bus_request import ExchangeMailbox
-from eap.appliance.services.bus_ads import slave_files, transfer
+from eap.appliance.services.bus_ads import slave_files
+from eap.appliance.services.slaves.file_stream import BEHIND
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import NetId
 from tests.support.busads import Client, play
@@ -222,7 +223,7 @@ def test_file_in_use_does_not_give_way_to_the_next_one_of_its_owner(monkeypatch)
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         hold_mailboxes(engine)
-        block = bytes(transfer.AHEAD + 1)
+        block = bytes(BEHIND + 1)
         await client.ask(DISK, WRITE, handle, block, 0)
         closing = asyncio.ensure_future(client.do(DISK, ReadWrite(CLOSE, handle, 0, b"")))
         await asyncio.sleep(0)
@@ -253,7 +254,7 @@ def test_slow_slave_is_waited_for_by_asking_again(monkeypatch):
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         hold_mailboxes(engine)
-        block = bytes(transfer.AHEAD + 1000)
+        block = bytes(BEHIND + 1000)
         await client.ask(DISK, WRITE, handle, block, 0)
         for group, data in ((WRITE, b"more"), (CLOSE, b"")):
             late = await client.do(DISK, ReadWrite(group, handle, 0, data))
