@@ -42,7 +42,7 @@ PYTEST := sh tools/isolated.sh $(BIN)/python -m pytest -n auto --dist loadfile -
 
 test: setup  ## run all tests of the product; as root, first install the programs they use
 	@sh tools/install_peers.sh test || echo 'make test: going on; what needs them is skipped and listed'
-	@$(PYTEST) $(ARGS)
+	@$(PYTEST) --ignore=tests/tools $(ARGS)
 
 test-tools: setup  ## run the tests of tools/: fuzz targets, page of faults, benchmarks
 	@$(PYTEST) tests/tools $(ARGS)

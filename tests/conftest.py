@@ -138,8 +138,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=_is_net)
 
 
+gc.disable()  # until all tests are collected: what that makes stays
+
+
 def pytest_collection_finish() -> None:
     """Let the garbage collector pass over the thousands of tests that are there to the end."""
+    gc.enable()
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)

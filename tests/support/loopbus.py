@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -18,12 +19,14 @@ from eap.appliance.commands.bus_session import BusSession
 BUSES = Path(__file__).parents[2] / "config" / "buses"
 STEP_NS = 20_000
 
+_load = cache(load_or_raise)
+
 
 class LoopBus:
     """Slaves that keep their states from session to session."""
 
     def __init__(self, name: str, folder: Path = BUSES) -> None:
-        self.segment = load_or_raise(folder / f"{name}.yaml").build()
+        self.segment = _load(folder / f"{name}.yaml").build()
         self.now_ns = 1_000_000_000
 
     def clock(self) -> int:

@@ -29,7 +29,7 @@ class Vector(NamedTuple):
 @cache
 def load(stem: str) -> tuple[Vector, ...]:
     """All vectors of the file ``STEM.yaml``."""
-    content = yaml.safe_load((FOLDER / f"{stem}.yaml").read_text())
+    content = read_yaml(stem)
     assert content["source"]
     return tuple(
         Vector(
@@ -43,6 +43,11 @@ def load(stem: str) -> tuple[Vector, ...]:
     )
 
 
+def read_yaml(stem: str) -> dict:
+    """What the file ``STEM.yaml`` holds; the loader in Python takes seconds for the longest."""
+    return yaml.load((FOLDER / f"{stem}.yaml").read_text(), Loader=yaml.CSafeLoader)
+
+
 def load_all(*layers: str) -> list[Vector]:
     """The vectors of *layers* of all files."""
     stems = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem != "type1_datagrams")
@@ -51,7 +56,7 @@ def load_all(*layers: str) -> list[Vector]:
 
 def load_datagrams() -> list[tuple[str, dict]]:
     """The datagrams of ``type1_datagrams.yaml``, which come as fields."""
-    content = yaml.safe_load((FOLDER / "type1_datagrams.yaml").read_text())
+    content = read_yaml("type1_datagrams")
     return [
         (f"{Path(name).stem}#{item.pop('frame')}", item)
         for name, items in content["files"].items()

@@ -278,6 +278,7 @@ def test_200_slaves_come_to_op_while_the_round_trip_jumps():
 def test_bring_up_with_one_frame_lost_fails_no_slave():
     for lost in range(0, 400, 17):
         line = Paced(Master(), segment(*(slave(f"s{number}") for number in range(5))))
+        line.period_ns = 4 * MS
         line.lose_back = lambda number, lost=lost: number == lost
         line.wait(line.core.bring_up(line.now_ns))
         line.elapse(200 * MS)

@@ -101,6 +101,7 @@ def test_two_that_lost_their_addresses_get_their_own_again(line):
 
 
 def test_a_slave_that_cannot_come_back_is_tried_each_second(line):
+    line.period_ns = 4 * MS
     slave_b = by_name(line)["b"]
     slave_b.refuses[AlState.OP] = 0x1A
     slave_b.fail(0x1A)
@@ -151,6 +152,7 @@ def test_watch_with_a_cut_first_cable_reports_the_bus_and_no_slave(line):
 
 
 def test_watch_with_a_short_silence_changes_nothing(line):
+    line.period_ns = 4 * MS
     mailboxes = [unit.mailbox for unit in line.core.units.values()]
     for _ in range(10):
         line.lose_back = lambda _: True
@@ -179,6 +181,7 @@ def test_slave_is_shown_lost_until_it_is_set_up_anew(line):
 
 @pytest.mark.parametrize("silent_ms", [12, 400])
 def test_slave_whose_return_was_interrupted_by_a_silent_bus_gets_its_mailbox_back(line, silent_ms):
+    line.period_ns = 4 * MS
     unit = line.core.units[1003]
     slave_b = by_name(line)["b"]
     for frames in range(1, 40, 9):  # the bus falls silent at another step each time

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
 import pytest
@@ -222,6 +223,7 @@ def settings_of(name: str) -> list[EscSettings]:
     return [EscSettings(), EscSettings(has_dc=False)]
 
 
+@cache
 def captures() -> dict[str, list[tuple[dict, dict]]]:
     """Datagrams of each capture as sent and as returned; without an answer nobody acted."""
     found: dict[str, list[tuple[dict, dict]]] = {}

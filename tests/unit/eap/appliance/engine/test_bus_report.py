@@ -105,7 +105,7 @@ def test_report_slave_back_from_power_fault_has_no_state_until_it_was_read(tmp_p
 
 
 def test_report_slave_that_left_op_by_itself_shows_the_state_that_was_read(tmp_path):
-    rig = BusRig(tmp_path).start()
+    rig = BusRig(tmp_path, cycle_us=4000).start()
     rig.wait_op()
     rig.fault(kind="refuse", slave="io", state="OP", code=0x52)
     rig.fault(kind="al-error", slave="io", code=0x52)
@@ -115,7 +115,7 @@ def test_report_slave_that_left_op_by_itself_shows_the_state_that_was_read(tmp_p
 
 
 def test_report_other_product_in_place_of_a_slave_has_no_state(tmp_path):
-    rig = BusRig(tmp_path).start()
+    rig = BusRig(tmp_path, cycle_us=4000).start()
     rig.wait_op()
     io = rig.wire.segment.segment.slaves[1]
     io.esc.image = io.esc.image[:20] + b"\x63" + io.esc.image[21:]
@@ -133,7 +133,7 @@ def findings(rig):
 
 
 def test_report_cut_cable_is_one_finding_and_over_once_it_is_mended(tmp_path):
-    rig = BusRig(tmp_path).start()
+    rig = BusRig(tmp_path, cycle_us=4000).start()
     rig.wait_op()
     rig.run(1_500 * MS)
     rig.fault(kind="cut", slave="io", for_ms=3_000)
@@ -157,7 +157,7 @@ def test_report_cut_cable_is_one_finding_and_over_once_it_is_mended(tmp_path):
 
 
 def test_report_silent_bus_blames_no_slave_and_has_no_states(tmp_path):
-    rig = BusRig(tmp_path).start()
+    rig = BusRig(tmp_path, cycle_us=4000).start()
     rig.wait_op()
     rig.fault(kind="loss", for_ms=2_000)
     rig.run(1_500 * MS)
