@@ -1,12 +1,16 @@
-"""The asynchronous client of a mailbox gateway, over UDP; see :mod:`eap.gateway.client`."""
+"""Asynchronous client of a mailbox gateway, over UDP; see :mod:`eap.gateway.client`."""
 
 from __future__ import annotations
 
 import asyncio
 import io
 from contextlib import suppress
+from functools import partial
+from time import monotonic_ns
 from types import TracebackType
 from typing import Self, TypeVar, cast
+
+from devicebus.drive import drive_async
 
 from devicebus.mailbox import (
     coe_client,
@@ -16,15 +20,19 @@ from devicebus.mailbox import (
     soe_client,
     voe_client,
 )
-from devicebus.mailbox.conversation import Conversation, Progress
+from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_browse import IdnDescription
 from eap.codec.sdo import EXPEDITED_SIZE
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
-from eap.gateway.dialogue import Dialogue, patience
-from eap.gateway.slaves import NOT_TOLD, MasterSlave, not_told, read_slaves, sizes_of
+from eap.gateway.conversations import (
+    GatewayConversation,
+    GatewayConversations,
+    PendingRequest,
+)
+from eap.gateway.slaves import NOT_TOLD, MasterSlave, read_sizes, read_slaves
 
 T = TypeVar("T")
 
@@ -34,8 +42,19 @@ TRIES = 3
 _S = 1_000_000_000
 
 
+def silence(duration_s: float, transport: str) -> str:
+    """Return the text for a gateway that did not answer."""
+    return (
+        f"was silent for {duration_s:g} s; is it started, and does a firewall let {transport}"
+        " through?"
+    )
+
+
 class AsyncGatewayClient:
-    """An asynchronous client over UDP; its requests may wait for answers side by side.
+    """An asynchronous client over UDP.
+
+    Its requests wait for answers side by side, those to one slave by one protocol one after the
+    other.
 
     Args:
         host: Name or address of the gateway.
@@ -53,15 +72,18 @@ class AsyncGatewayClient:
         self.mailboxes: dict[int, MailboxSizes] = {}
         self._master_tells = True
         self._place = host, port
-        self._timeout_s = timeout_s
-        self._tries = tries
-        self._counter = 0
-        self._protocol = _Datagrams()
+        self._link = _Datagrams(
+            GatewayConversations(
+                timeout_ns=round(timeout_s * _S),
+                tries=tries,
+                silence=f"gateway {host}:{port} {silence(timeout_s * tries, 'UDP')}",
+            )
+        )
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
         try:
-            await loop.create_datagram_endpoint(lambda: self._protocol, remote_addr=self._place)
+            await loop.create_datagram_endpoint(lambda: self._link, remote_addr=self._place)
         except OSError as exc:
             host, port = self._place
             raise EnvironmentalError(f"gateway {host}:{port}: {exc.strerror or exc}") from None
@@ -73,7 +95,7 @@ class AsyncGatewayClient:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._protocol.close()
+        self._link.close()
 
     async def sdo_read(
         self, address: int, index: int, subindex: int = 0, *, complete: bool = False
@@ -161,13 +183,7 @@ class AsyncGatewayClient:
 
     async def sizes_of(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave; raises as :meth:`GatewayClient.sizes_of`."""
-        if known := self.mailboxes.get(address):
-            return known
-        try:
-            return sizes_of(await self.slaves(), address)
-        except NOT_TOLD as exc:
-            exc.add_note(not_told(address))
-            raise
+        return self.mailboxes.get(address) or await self.converse(0, read_sizes(address))
 
     async def _sizes_or_default(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave, for messages that may as well be shorter."""
@@ -178,79 +194,72 @@ class AsyncGatewayClient:
         return self.mailboxes.get(address, MailboxSizes())
 
     async def converse(self, address: int, conversation: Conversation[T]) -> T:
-        """Lead any conversation."""
-        dialogue = Dialogue(conversation, address, self._counter)
+        """Run any conversation."""
+        place = GatewayConversation(address)
         try:
-            with self._protocol.listening() as frames:
-                while not dialogue.is_done:
-                    await self._step(dialogue, frames)
+            return await drive_async(conversation, partial(self._link.exchange, place))
         finally:
-            farewell = dialogue.close()
-            self._counter = dialogue.counter
-            if farewell is not None:
-                self._protocol.send(farewell)
-        return dialogue.result()
-
-    async def _step(self, dialogue: Dialogue[T], frames: asyncio.Queue[bytes]) -> None:
-        if dialogue.delay_ns:
-            await asyncio.sleep(dialogue.delay_ns / _S)
-        for _ in range(self._tries):
-            if dialogue.frame is not None:
-                self._protocol.send(dialogue.frame)
-                if not dialogue.expects_reply:
-                    dialogue.sent()
-                    return
-            try:
-                async with asyncio.timeout(self._timeout_s):
-                    while not dialogue.receive(await frames.get()):
-                        pass
-            except TimeoutError:
-                continue
-            return
-        host, port = self._place
-        dialogue.expire(f"gateway {host}:{port} {patience(self._timeout_s, self._tries, 'UDP')}")
+            self._link.end(place)
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    """Hands each datagram to all who listen: who asked knows his answer."""
+    """Socket and timer of the conversations of one client."""
 
-    def __init__(self) -> None:
+    def __init__(self, conversations: GatewayConversations) -> None:
+        self._conversations = conversations
         self._transport: asyncio.DatagramTransport | None = None
-        self._queues: list[asyncio.Queue[bytes]] = []
+        self._timer: asyncio.TimerHandle | None = None
+        self._results: dict[PendingRequest, asyncio.Future[None]] = {}
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Keep the way to send."""
+        """Keep the transport (asyncio)."""
         # No instance of DatagramTransport, though it has all its methods (Python 3.11).
         self._transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: object) -> None:
-        """Hand a datagram on."""
-        for queue in self._queues:
-            queue.put_nowait(data)
+        """Take a frame (asyncio)."""
+        self._conversations.receive_frame(data, monotonic_ns())
+        self._go_on()
 
-    def listening(self) -> _Listening:
-        """Listen for the length of a block."""
-        return _Listening(self._queues)
+    async def exchange(self, place: GatewayConversation, ask: Ask) -> Message:
+        """Make a request, and wait for its result."""
+        request = self._conversations.request(place, ask, monotonic_ns())
+        self._results[request] = result = asyncio.get_running_loop().create_future()
+        self._go_on()
+        try:
+            await result
+        finally:
+            self._results.pop(request, None)
+        return request.result()
 
-    def send(self, frame: bytes) -> None:
-        """Send a datagram."""
-        if self._transport is not None:
-            self._transport.sendto(frame)
+    def end(self, place: GatewayConversation) -> None:
+        """End a conversation."""
+        self._conversations.close(place, monotonic_ns())
+        self._go_on()
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         if self._transport is not None:
             self._transport.close()
 
+    def _go_on(self) -> None:
+        """Send, deliver and wait for what is due next."""
+        core = self._conversations
+        for frame in core.frames_to_send(monotonic_ns()):
+            if self._transport is not None:
+                self._transport.sendto(frame)
+        while (request := core.next_event()) is not None:
+            result = self._results.pop(request, None)
+            if result is not None and not result.done():
+                result.set_result(None)
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        due_ns = core.next_timeout()
+        if due_ns is not None:
+            wait_s = max(0, due_ns - monotonic_ns()) / _S
+            self._timer = asyncio.get_running_loop().call_later(wait_s, self._ring)
 
-class _Listening:
-    def __init__(self, queues: list[asyncio.Queue[bytes]]) -> None:
-        self._queues = queues
-        self._own: asyncio.Queue[bytes] = asyncio.Queue()
-
-    def __enter__(self) -> asyncio.Queue[bytes]:
-        self._queues.append(self._own)
-        return self._own
-
-    def __exit__(self, *about: object) -> None:
-        self._queues.remove(self._own)
+    def _ring(self) -> None:
+        self._conversations.handle_timeout(monotonic_ns())
+        self._go_on()

@@ -1,4 +1,4 @@
-"""A client of any mailbox gateway (ETG.8200), blocking or asynchronous, over UDP or TCP.
+"""Client of any mailbox gateway (ETG.8200), blocking or asynchronous, over UDP or TCP.
 
     with GatewayClient("10.0.0.5") as gateway:
         vendor = gateway.sdo_read(1001, 0x1018, 1)
@@ -6,19 +6,21 @@
 
 Address 0 is the master itself, 1001 usually the first slave.  Where a message may not fit, the
 mailbox of a slave is looked up in the master's dictionary; for objects and IDNs 128 octets will do
-if there is none.  What is refused raises SdoAbortError,
-SoeError, FoeError or MailboxRefusedError; who does not answer, MailboxTimeoutError.
+if there is none.  A refusal raises SdoAbortError, SoeError, FoeError or MailboxRefusedError, and
+silence MailboxTimeoutError.
 """
 
 from __future__ import annotations
 
 import io
-import select
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from time import monotonic
+from functools import partial
+from time import monotonic_ns
 from typing import TypeVar
+
+from devicebus.drive import drive
 
 from devicebus.errors import BusError
 from devicebus.mailbox import (
@@ -29,7 +31,7 @@ from devicebus.mailbox import (
     soe_client,
     voe_client,
 )
-from devicebus.mailbox.conversation import Conversation, Progress
+from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_browse import IdnDescription
 from eap.closing import Closing
@@ -38,9 +40,9 @@ from eap.codec.sdo import EXPEDITED_SIZE
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.errors import EnvironmentalError
-from eap.gateway.async_client import PORT, TIMEOUT_S, TRIES, AsyncGatewayClient
-from eap.gateway.dialogue import Dialogue, patience
-from eap.gateway.slaves import NOT_TOLD, MasterSlave, not_told, read_slaves, sizes_of
+from eap.gateway.async_client import PORT, TIMEOUT_S, TRIES, AsyncGatewayClient, silence
+from eap.gateway.conversations import GatewayConversation, GatewayConversations
+from eap.gateway.slaves import NOT_TOLD, MasterSlave, read_sizes, read_slaves
 
 T = TypeVar("T")
 
@@ -48,7 +50,6 @@ __all__ = ["AsyncGatewayClient", "GatewayClient"]
 
 _S = 1_000_000_000
 _LARGEST = 4096
-_DEFAULT_SIZES = MailboxSizes(128, 128)
 
 
 class GatewayClient(Closing):
@@ -81,16 +82,17 @@ class GatewayClient(Closing):
     ) -> None:
         self.mailboxes: dict[int, MailboxSizes] = {}
         self._master_tells = True
-        self._tries = 1 if tcp else tries
-        self._timeout_s = timeout_s * tries if tcp else timeout_s
         self._is_stream = tcp
-        self._counter = 0
         self._rest = b""
         kind = socket.SOCK_STREAM if tcp else socket.SOCK_DGRAM
         self._place = f"gateway {host}:{port}"
-        self._patience = patience(timeout_s, tries, "TCP" if tcp else "UDP")
+        self._conversations = GatewayConversations(
+            timeout_ns=round(timeout_s * (tries if tcp else 1) * _S),
+            tries=1 if tcp else tries,
+            silence=f"{self._place} {silence(timeout_s * tries, 'TCP' if tcp else 'UDP')}",
+        )
         self._socket = socket.socket(socket.AF_INET, kind)
-        self._socket.settimeout(self._timeout_s)
+        self._socket.settimeout(timeout_s * tries if tcp else timeout_s)
         try:
             self._socket.connect((host, port))
         except (ConnectionError, TimeoutError) as exc:
@@ -110,12 +112,13 @@ class GatewayClient(Closing):
     @contextmanager
     def waiting_once(self, timeout_s: float) -> Iterator[None]:
         """Send each request once and wait so long for its answer, for the length of a block."""
-        before = self._tries, self._timeout_s
-        self._tries, self._timeout_s = 1, timeout_s
+        core = self._conversations
+        before = core.tries, core.timeout_ns
+        core.tries, core.timeout_ns = 1, round(timeout_s * _S)
         try:
             yield
         finally:
-            self._tries, self._timeout_s = before
+            core.tries, core.timeout_ns = before
 
     def sdo_read(
         self, address: int, index: int, subindex: int = 0, *, complete: bool = False
@@ -127,7 +130,7 @@ class GatewayClient(Closing):
         self, address: int, index: int, subindex: int, data: bytes, *, complete: bool = False
     ) -> None:
         """Write an entry, or with *complete* a whole object."""
-        sizes = self._sizes_or_default(address) if len(data) > EXPEDITED_SIZE else _DEFAULT_SIZES
+        sizes = self._sizes_or_default(address) if len(data) > EXPEDITED_SIZE else MailboxSizes()
         talk = coe_client.download(index, subindex, data, sizes, complete=complete)
         self.converse(address, talk)
 
@@ -205,15 +208,9 @@ class GatewayClient(Closing):
 
         Raises:
             BusError: the master knows no such slave, or the slave has no mailbox.
-            MailboxTimeoutError, MailboxRefusedError, SdoAbortError: the master does not tell.
+            MailboxTimeoutError, MailboxRefusedError, SdoAbortError: the master has no dictionary.
         """
-        if known := self.mailboxes.get(address):
-            return known
-        try:
-            return sizes_of(self.slaves(), address)
-        except NOT_TOLD as exc:
-            exc.add_note(not_told(address))
-            raise
+        return self.mailboxes.get(address) or self.converse(0, read_sizes(address))
 
     def _sizes_or_default(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave, for messages that may as well be shorter."""
@@ -221,7 +218,7 @@ class GatewayClient(Closing):
             with suppress(*NOT_TOLD):
                 return self.sizes_of(address)
             self._master_tells = False  # each question would wait for as long
-        return self.mailboxes.get(address, _DEFAULT_SIZES)
+        return self.mailboxes.get(address, MailboxSizes())
 
     def converse(
         self,
@@ -229,60 +226,63 @@ class GatewayClient(Closing):
         conversation: Conversation[T],
         meanwhile: Callable[[], None] | None = None,
     ) -> T:
-        """Lead any conversation; *meanwhile* is called after each step."""
-        dialogue = Dialogue(conversation, address, self._counter)
+        """Run any conversation; *meanwhile* is called after each step."""
+        place = GatewayConversation(address)
         try:
-            while not dialogue.is_done:
-                self._step(dialogue)
-                if meanwhile is not None:
-                    meanwhile()
+            return drive(conversation, partial(self._exchange, place, meanwhile))
         finally:
-            farewell = dialogue.close()
-            self._counter = dialogue.counter
-            if farewell is not None:
-                with suppress(BusError):
-                    self._send(farewell)
-        return dialogue.result()
+            self._conversations.close(place, monotonic_ns())
+            with suppress(BusError):
+                self._send_frames()
 
-    def _step(self, dialogue: Dialogue[T]) -> None:
-        if dialogue.delay_ns:
-            select.select([], [], [], dialogue.delay_ns / _S)
-        for _ in range(self._tries):
-            if dialogue.frame is not None:
-                self._send(dialogue.frame)
-                if not dialogue.expects_reply:
-                    dialogue.sent()
-                    return
-            deadline_s = monotonic() + self._timeout_s
-            while (octets := self._receive(deadline_s)) is not None:
-                if dialogue.receive(octets):
-                    return
-        dialogue.expire(f"{self._place} {self._patience}")
+    def _exchange(
+        self, place: GatewayConversation, meanwhile: Callable[[], None] | None, ask: Ask
+    ) -> Message:
+        core = self._conversations
+        while (octets := self._receive(0)) is not None:  # late ones, which must not answer this
+            core.receive_frame(octets, monotonic_ns())
+        request = core.request(place, ask, monotonic_ns())
+        self._send_frames()
+        while not request.is_done:
+            octets = self._receive(core.next_timeout() or 0)
+            if octets is None:
+                core.handle_timeout(monotonic_ns())
+            else:
+                core.receive_frame(octets, monotonic_ns())
+            self._send_frames()
+        while core.next_event() is not None:
+            pass  # the only one is this request
+        if meanwhile is not None:
+            meanwhile()
+        return request.result()
 
-    def _send(self, frame: bytes) -> None:
+    def _send_frames(self) -> None:
         try:
-            self._socket.sendall(frame)
+            for frame in self._conversations.frames_to_send(monotonic_ns()):
+                self._socket.settimeout(self._conversations.timeout_ns / _S)
+                self._socket.sendall(frame)
         except OSError as exc:
             raise self._failure(exc) from None
 
-    def _receive(self, deadline_s: float) -> bytes | None:
-        """Return the next frame, None if there is none in time."""
-        while (rest_s := deadline_s - monotonic()) > 0:
-            self._socket.settimeout(rest_s)
+    def _receive(self, deadline_ns: int) -> bytes | None:
+        """Return the next frame, None if there is none until *deadline_ns*."""
+        while True:
+            if self._is_stream:
+                frame, self._rest = cut_frame(self._rest)
+                if frame is not None:
+                    return frame
+            self._socket.settimeout(max(0, deadline_ns - monotonic_ns()) / _S)
             try:
                 octets = self._socket.recv(_LARGEST)
-            except TimeoutError:
+            except (TimeoutError, BlockingIOError):
                 return None
             except OSError as exc:
                 raise self._failure(exc) from None
             if not self._is_stream:
                 return octets
-            frame, self._rest = cut_frame(self._rest + octets)
-            if frame is not None:
-                return frame
             if not octets:
                 raise BusError(f"{self._place} has closed the connection")
-        return None
+            self._rest += octets
 
     def _failure(self, error: OSError) -> BusError:
         hint = ": nobody serves it there" if isinstance(error, ConnectionRefusedError) else ""

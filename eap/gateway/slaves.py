@@ -17,14 +17,6 @@ NOT_TOLD = (SdoAbortError, MailboxRefusedError, MailboxTimeoutError)
 """Errors of a master that has no dictionary, or is silent at address 0."""
 
 
-def not_told(address: int) -> str:
-    """Return what to do where the master does not tell how long a mailbox is."""
-    return (
-        f"the mailbox of slave {address} has to be known, and the master does not tell it: put its"
-        f" sizes into mailboxes[{address}]"
-    )
-
-
 class MasterSlave(NamedTuple):
     """A slave as the master's dictionary tells of it."""
 
@@ -76,12 +68,26 @@ def _read_slave(number: int) -> Conversation[MasterSlave]:
     )
 
 
-def sizes_of(slaves: Sequence[MasterSlave], address: int) -> MailboxSizes:
-    """Return the mailboxes of a slave.
+def read_sizes(address: int) -> Conversation[MailboxSizes]:
+    """Read the mailbox sizes of one slave from the master's dictionary (address 0).
 
     Raises:
         BusError: the master knows no such slave, or the slave has no mailbox.
+        MailboxTimeoutError, MailboxRefusedError, SdoAbortError: the master has no dictionary.
     """
+    try:
+        slaves = yield from read_slaves()
+    except NOT_TOLD as exc:
+        exc.add_note(
+            f"the mailbox of slave {address} has to be known, and the master does not tell it: put"
+            f" its sizes into mailboxes[{address}]"
+        )
+        raise
+    return sizes_of(slaves, address)
+
+
+def sizes_of(slaves: Sequence[MasterSlave], address: int) -> MailboxSizes:
+    """Return the mailboxes of a slave; raise BusError if it has none, or nobody knows it."""
     for slave in slaves:
         if slave.station in {address, address & ~VIRTUAL_BIT}:
             if not slave.to_slave:
