@@ -11,7 +11,6 @@ from types import TracebackType
 from typing import Self, TypeVar, cast
 
 from devicebus.drive import drive_async
-
 from devicebus.mailbox import (
     coe_client,
     coeinfo_client,
@@ -20,7 +19,12 @@ from devicebus.mailbox import (
     soe_client,
     voe_client,
 )
-from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+    Progress,
+)
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_browse import IdnDescription
 from eap.codec.sdo import EXPEDITED_SIZE
@@ -183,7 +187,9 @@ class AsyncGatewayClient:
 
     async def sizes_of(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave; raises as :meth:`GatewayClient.sizes_of`."""
-        return self.mailboxes.get(address) or await self.converse(0, read_sizes(address))
+        if known := self.mailboxes.get(address):
+            return known
+        return await self.converse(0, read_sizes(address))
 
     async def _sizes_or_default(self, address: int) -> MailboxSizes:
         """Return the mailboxes of a slave, for messages that may as well be shorter."""
@@ -221,7 +227,7 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._conversations.receive_frame(data, monotonic_ns())
         self._go_on()
 
-    async def exchange(self, place: GatewayConversation, ask: Ask) -> Message:
+    async def exchange(self, place: GatewayConversation, ask: MailboxRequest) -> MailboxMessage:
         """Make a request, and wait for its result."""
         request = self._conversations.request(place, ask, monotonic_ns())
         self._results[request] = result = asyncio.get_running_loop().create_future()

@@ -21,7 +21,6 @@ from time import monotonic_ns
 from typing import TypeVar
 
 from devicebus.drive import drive
-
 from devicebus.errors import BusError
 from devicebus.mailbox import (
     coe_client,
@@ -31,7 +30,12 @@ from devicebus.mailbox import (
     soe_client,
     voe_client,
 )
-from devicebus.mailbox.conversation import Ask, Conversation, Message, Progress
+from devicebus.mailbox.conversation import (
+    Conversation,
+    MailboxMessage,
+    MailboxRequest,
+    Progress,
+)
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.soe_browse import IdnDescription
 from eap.closing import Closing
@@ -236,8 +240,8 @@ class GatewayClient(Closing):
                 self._send_frames()
 
     def _exchange(
-        self, place: GatewayConversation, meanwhile: Callable[[], None] | None, ask: Ask
-    ) -> Message:
+        self, place: GatewayConversation, meanwhile: Callable[[], None] | None, ask: MailboxRequest
+    ) -> MailboxMessage:
         core = self._conversations
         while (octets := self._receive(0)) is not None:  # late ones, which must not answer this
             core.receive_frame(octets, monotonic_ns())

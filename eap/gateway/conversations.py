@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 
 from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox.conversation import Ask, Message
+from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
 from devicebus.mailbox.counter import next_counter
 from devicebus.mailbox.farewell import FAREWELLS
 from devicebus.mailbox.match import answers, has_more
@@ -49,7 +49,7 @@ class PendingRequest:
         "sends", "tries",
     )  # fmt: skip
 
-    def __init__(self, ask: Ask, due_ns: int, tries: int) -> None:
+    def __init__(self, ask: MailboxRequest, due_ns: int, tries: int) -> None:
         self.ask = ask
         self.is_done = self.is_taken = False
         self.frame = b""
@@ -60,21 +60,21 @@ class PendingRequest:
         """When to send it, or to give up; None while it may not be sent beside another."""
         self.is_single = False
         """Whether it has to be the only one in flight at its address."""
-        self._outcome: Message | BusError
+        self._outcome: MailboxMessage | BusError
 
     @property
     def is_in_flight(self) -> bool:
         """Whether a reply to it is expected by now."""
         return self.sends > 0 and self.deadline_ns is not None and not self.is_done
 
-    def result(self) -> Message:
+    def result(self) -> MailboxMessage:
         """Return the reply to the conversation, or raise the error in its place."""
         self.is_taken = True
         if isinstance(self._outcome, BusError):
             raise self._outcome
         return self._outcome
 
-    def finish(self, outcome: Message | BusError) -> None:
+    def finish(self, outcome: MailboxMessage | BusError) -> None:
         """Set the result."""
         self._outcome = outcome
         self.is_done = True
@@ -113,7 +113,7 @@ class _Queue:
         self.kind = kind
         self.conversations: deque[GatewayConversation] = deque()
         self.late: list[_LateReplies] = []
-        self.early: deque[Message] = deque(maxlen=_MAX_EARLY)
+        self.early: deque[MailboxMessage] = deque(maxlen=_MAX_EARLY)
         self.has_more = False
 
     @property
@@ -133,7 +133,7 @@ class _Queue:
         held = [late.until_ns for late in self.late if self._fits(late, request.ask)]
         return max(request.deadline_ns, *held) if held else request.deadline_ns
 
-    def _fits(self, late: _LateReplies, ask: Ask) -> bool:
+    def _fits(self, late: _LateReplies, ask: MailboxRequest) -> bool:
         """Say whether a late reply could be taken for the one to *ask*."""
         return late.reply is None or answers(self.kind, ask.request, late.reply)
 
@@ -198,7 +198,7 @@ class GatewayConversations:
         self._events: deque[PendingRequest] = deque()
 
     def request(
-        self, conversation: GatewayConversation, ask: Ask, now_ns: int
+        self, conversation: GatewayConversation, ask: MailboxRequest, now_ns: int
     ) -> PendingRequest:
         """Make the next request of a conversation; it is sent when its turn comes.
 
@@ -222,20 +222,21 @@ class GatewayConversations:
         One that is broken off tells the slave, which may otherwise keep a transfer open.
         """
         address = self._addresses.get(conversation.address)
-        request = conversation.request
+        request, conversation.request = conversation.request, None
         if address is None or request is None:
             return
+        was_sent = request.sends > 0
         for queue in address.queues.values():
             if conversation not in queue.conversations:
                 continue
             if queue.conversations[0] is conversation:
                 queue.early.clear()
                 queue.has_more = False
-            if queue.pending is request and request.sends:
+            if was_sent and not request.is_done and request.ask.type is queue.kind:
                 until_ns = now_ns + self.timeout_ns
                 queue.late.append(_LateReplies(request, None, request.sends, until_ns))
             queue.conversations.remove(conversation)
-        if request.sends and not request.is_taken and request.ask.type in FAREWELLS:
+        if was_sent and not request.is_taken and request.ask.type in FAREWELLS:
             farewell = FAREWELLS[request.ask.type]
             frame = encode_plain_frame(farewell.type, address.number, 0, farewell.request)
             self._frames.append(self._numbered(address.number, frame))
@@ -254,7 +255,9 @@ class GatewayConversations:
         if header.type is MailboxType.ERR:
             self._receive_error(address, data, now_ns)
         elif (queue := address.queues.get(header.type)) is not None:
-            self._receive(address, queue, Message(header.type, data, counter=header.counter), now_ns)
+            self._receive(
+                address, queue, MailboxMessage(header.type, data, counter=header.counter), now_ns
+            )
         self._advance(address, now_ns)
 
     def frames_to_send(self, now_ns: int) -> list[bytes]:
@@ -265,7 +268,9 @@ class GatewayConversations:
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`handle_timeout` must be called."""
-        queues = (queue for address in self._addresses.values() for queue in address.queues.values())
+        queues = (
+            queue for address in self._addresses.values() for queue in address.queues.values()
+        )
         return min((due for queue in queues if (due := queue.due_ns()) is not None), default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
@@ -277,7 +282,9 @@ class GatewayConversations:
         """Return the next request that has a result."""
         return self._events.popleft() if self._events else None
 
-    def _receive(self, address: _Address, queue: _Queue, message: Message, now_ns: int) -> None:
+    def _receive(
+        self, address: _Address, queue: _Queue, message: MailboxMessage, now_ns: int
+    ) -> None:
         request = queue.pending
         if (
             request is not None
@@ -347,9 +354,7 @@ class GatewayConversations:
             return was_in_flight
         return self._send(address, queue, request, now_ns)
 
-    def _send(
-        self, address: _Address, queue: _Queue, request: PendingRequest, now_ns: int
-    ) -> bool:
+    def _send(self, address: _Address, queue: _Queue, request: PendingRequest, now_ns: int) -> bool:
         """Send a request; return whether that was all there is to do for it."""
         if not request.sends:
             request.frame = self._numbered(address.number, request.frame)
@@ -359,7 +364,7 @@ class GatewayConversations:
         self._frames.append(request.frame)
         if request.ask.expects_reply:
             return self._take_early(queue, request, now_ns)
-        request.finish(Message(queue.kind, b""))
+        request.finish(MailboxMessage(queue.kind, b""))
         self._events.append(request)
         return True
 
@@ -387,10 +392,10 @@ class GatewayConversations:
         self,
         queue: _Queue,
         request: PendingRequest,
-        outcome: Message | BusError,
+        outcome: MailboxMessage | BusError,
         now_ns: int,
     ) -> None:
-        data = outcome.data if isinstance(outcome, Message) else None
+        data = outcome.data if isinstance(outcome, MailboxMessage) else None
         if isinstance(outcome, MailboxTimeoutError):
             late = _LateReplies(request, None, request.sends, now_ns + self.timeout_ns)
         else:

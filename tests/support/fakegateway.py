@@ -77,6 +77,7 @@ class FakeGateway:
 
     Attributes:
         drop: Requests by UDP that are not heard, from now on.
+        repeats: Number of times that each reply by UDP is sent.
         has_master: Whether address 0 has a dictionary; otherwise it refuses what is asked.
         is_master_silent: Whether address 0 never answers, as with KickCAT.
         addresses: Of the messages that came.
@@ -86,6 +87,7 @@ class FakeGateway:
 
     def __init__(self, *, full: bool = False, sizes: MailboxSizes = SIZES) -> None:
         self.drop = 0
+        self.repeats = 1
         self.heard: list[bytes] = []
         self.has_master = True
         self.is_master_silent = False
@@ -167,7 +169,7 @@ class FakeGateway:
             if self.drop:
                 self.drop -= 1
                 continue
-            for answer in self._answers(frame):
+            for answer in self._answers(frame) * self.repeats:
                 self._udp.sendto(answer, peer)
 
     def _serve_tcp(self) -> None:

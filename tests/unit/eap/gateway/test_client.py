@@ -165,3 +165,22 @@ def test_frames_of_a_stream() -> None:
     assert cut_frame(b"") == (None, b"")
     assert cut_frame(frame[:4]) == (None, frame[:4])
     assert cut_frame(frame + b"x") == (frame, b"x")
+
+
+def test_reply_that_waits_in_the_socket_does_not_answer_the_next_request() -> None:
+    with (
+        FakeGateway() as gateway,
+        GatewayClient("127.0.0.1", gateway.port) as client,
+        GatewayClient("127.0.0.1", gateway.port) as other,
+    ):
+        other.sdo_write(1001, 0x2000, 0, b"old!")
+        gateway.repeats = 2
+        assert client.sdo_read(1001, 0x2000) == b"old!"
+        other.sdo_write(1001, 0x2000, 0, b"new!")
+        assert client.sdo_read(1001, 0x2000) == b"new!"
+
+
+def test_frames_that_come_at_once_by_a_stream_are_taken_one_by_one(gateway) -> None:
+    with GatewayClient("127.0.0.1", gateway.port, tcp=True, timeout_s=1) as client:
+        assert client.idn_describe(1001, MODE).name == "Mode"
+        assert client.od_list(1001) == [0x1008, 0x2000]
