@@ -14,7 +14,7 @@ from eap.codec import datatypes
 from eap.od.model import Access, Entry, ObjectCode
 from eap.od.profiles import eap1000, router9000
 from eap.od.profiles.forms import to_text
-from eap.od.profiles.table import CONFIG, OWN_TYPE, EntryRow, ObjectRange
+from eap.od.profiles.table import CONFIG, OWN_TYPE, EntryRow, ObjectRow
 
 _COLUMNS = (
     "Sub", "Name", "Type", "Bits", "Access", "Content", "Default", "Limits", "Unit", "Description",
@@ -65,7 +65,7 @@ def render() -> str:
     return "".join([_HEAD, *_profile(eap1000.ALL), _ROUTER, *_profile(router9000.ALL)])
 
 
-def _profile(rows: Sequence[ObjectRange]) -> Iterator[str]:
+def _profile(rows: Sequence[ObjectRow]) -> Iterator[str]:
     yield "\n## Overview\n\n"
     yield from _overview(rows)
     for row in rows:
@@ -73,14 +73,14 @@ def _profile(rows: Sequence[ObjectRange]) -> Iterator[str]:
         yield from _object(row)
 
 
-def _overview(rows: Sequence[ObjectRange]) -> Iterator[str]:
+def _overview(rows: Sequence[ObjectRow]) -> Iterator[str]:
     yield "| Index | Object | Kind | Description |\n|---|---|---|---|\n"
     for row in rows:
         kind = f"{row.code.name}{', dynamic' if row.dynamic else ''}"
         yield f"| {_range(row)} | {_title(row)} | {kind} | {_cell(row.description)} |\n"
 
 
-def _object(row: ObjectRange) -> Iterator[str]:
+def _object(row: ObjectRow) -> Iterator[str]:
     yield f"## {_range(row)} {_title(row)}\n\n{row.code.name}"
     yield ", dynamic" if row.dynamic else ""
     yield f". {row.description}\n\n"
@@ -94,7 +94,7 @@ def _object(row: ObjectRange) -> Iterator[str]:
         yield _entry(entry, row.section)
 
 
-def _count_text(row: ObjectRange) -> str:
+def _count_text(row: ObjectRow) -> str:
     texts = []
     if row.list_row:
         texts.append(f"At most {row.last_subindex}.")
@@ -169,12 +169,12 @@ def _limits(row: EntryRow) -> str:
     return f"{row.minimum or 0} to {row.maximum}"
 
 
-def _range(row: ObjectRange) -> str:
+def _range(row: ObjectRow) -> str:
     first = f"0x{row.first:04X}"
     return first if row.first == row.last else f"{first} to 0x{row.last:04X}"
 
 
-def _title(row: ObjectRange) -> str:
+def _title(row: ObjectRow) -> str:
     return row.name.format(n="n")
 
 

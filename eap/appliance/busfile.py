@@ -17,10 +17,10 @@ from devicebus.sim.fault import FaultySegment
 from devicebus.sim.spec import BusSpec, SlaveSpec
 from devicebus.sim.wiring import Side, find_way
 from devicebus.wire import sii
-from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave
+from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus
 from eap.config.convert import convert_to
 from eap.config.document import read
-from eap.config.finding import Finding, Report, one_of
+from eap.config.finding import Finding, FindingReport, one_of
 from eap.errors import ConfigError
 from eap.near import near
 from eap.od.dictionary import ObjectDictionary
@@ -51,7 +51,7 @@ class BusResult(msgspec.Struct, frozen=True):
 
 def load(path: Path) -> BusResult:
     """Read and check the bus file at *path*; never raises for what the file holds."""
-    report = Report(str(path))
+    report = FindingReport(str(path))
     root = read(path, report)
     spec = None if root is None else convert_to(BusSpec, root, report, "bus")
     if spec is None or report.findings():
@@ -82,7 +82,7 @@ def load_or_raise(path: Path) -> Bus:
     return result.bus
 
 
-def describe(path: Path) -> BusDescription | tuple[Finding, ...]:
+def describe(path: Path) -> ExpectedBus | tuple[Finding, ...]:
     """Return what a plant is to know of the bus file at *path*, or all that is wrong with it.
 
     That is what a master finds on such a bus.  What the file leaves open may be anything on a real
@@ -92,7 +92,7 @@ def describe(path: Path) -> BusDescription | tuple[Finding, ...]:
     if result.bus is None:
         return result.findings
     bus = result.bus
-    return BusDescription(tuple(_describe(bus, number) for number in _line(bus.spec)))
+    return ExpectedBus(tuple(_describe(bus, number) for number in _line(bus.spec)))
 
 
 def _line(spec: BusSpec) -> tuple[int, ...]:
@@ -149,7 +149,7 @@ def _files(slave: SlaveSpec) -> Iterator[str]:
             yield channel.csv
 
 
-def _read_resource(bus: Bus, path: Path, name: str, report: Report, at: str) -> None:
+def _read_resource(bus: Bus, path: Path, name: str, report: FindingReport, at: str) -> None:
     try:
         with path.open("rb") as file:
             octets = file.read(MAX_RESOURCE + 1)
@@ -162,7 +162,7 @@ def _read_resource(bus: Bus, path: Path, name: str, report: Report, at: str) -> 
     bus.resources[name] = octets
 
 
-def _check_wiring(spec: BusSpec, number: int, report: Report, at: str) -> None:
+def _check_wiring(spec: BusSpec, number: int, report: FindingReport, at: str) -> None:
     slave = spec.slaves[number]
     before = {each.name: position for position, each in enumerate(spec.slaves[:number])}
     if slave.name in before:
@@ -183,14 +183,14 @@ def _check_wiring(spec: BusSpec, number: int, report: Report, at: str) -> None:
             report.add(at, message, "another port (key port, 1 to 3)")
 
 
-def _check_slave(slave: SlaveSpec, bus: Bus, report: Report, at: str) -> None:
+def _check_slave(slave: SlaveSpec, bus: Bus, report: FindingReport, at: str) -> None:
     try:
         build_slave(slave, bus.resources)
     except ValueError as exc:
         report.add(at, f"{slave.name}: {exc}", "a device that can be built")
 
 
-def _check_faults(bus: Bus, report: Report) -> None:
+def _check_faults(bus: Bus, report: FindingReport) -> None:
     if not bus.spec.faults:
         return
     segment = FaultySegment(build_segment(bus.spec, bus.resources))

@@ -13,7 +13,7 @@ from msgspec import Meta
 from eap.appliance.control import Parameters
 from eap.appliance.device_change import Plan
 from eap.appliance.store import Configuration
-from eap.device.difference import Change
+from eap.device.difference import EntryChange
 from eap.device.eap_state import StateResult
 from eap.device.rollout import without_alternates
 from eap.od.model import Access, Entry, OdObject
@@ -153,7 +153,7 @@ def fault_document(fault: DeviceFault) -> dict[str, Any]:
     }
 
 
-def change_row(port: str, change: Change) -> dict[str, Any]:
+def change_row(port: str, change: EntryChange) -> dict[str, Any]:
     """Return a change of one entry."""
     return {
         "port": port,
@@ -167,7 +167,7 @@ def change_row(port: str, change: Change) -> dict[str, Any]:
     }
 
 
-def _unit(change: Change) -> str:
+def _unit(change: EntryChange) -> str:
     row = profile.row_of(change.index).row(change.subindex)
     return "" if row is None else row.unit
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from eap.appliance.store import Configuration
 from eap.device import stored
-from eap.device.difference import Change, compare
+from eap.device.difference import EntryChange, compare
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
 from eap.device.eap_records import read_back
@@ -26,7 +26,7 @@ class Plan(NamedTuple):
     """What another configuration would change."""
 
     spec: StationSpec
-    changes: list[tuple[str, Change]]
+    changes: list[tuple[str, EntryChange]]
     """Each with its port, in an order in which they could be written."""
     station: list[str]
     """What changes beside the dictionaries."""

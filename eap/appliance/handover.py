@@ -14,7 +14,7 @@ import msgspec
 
 from eap.aoe.spec import DirectoryStation, RoutingSpec
 from eap.pd.device import DeviceState
-from eap.pd.spec import PortSpec, Record, StationSpec
+from eap.pd.spec import PortSpec, SpecRecord, StationSpec
 
 NO_DESCRIPTOR = -1
 
@@ -45,14 +45,14 @@ class SocketKind(StrEnum):
     """One listener for services, likewise."""
 
 
-class PortName(Record, frozen=True, order=True):
+class PortName(SpecRecord, frozen=True, order=True):
     """A port and its station."""
 
     station: str
     port: str
 
 
-class SharedSocket(Record, frozen=True):
+class SharedSocket(SpecRecord, frozen=True):
     """One socket, or one pair, that the supervisor opens once and keeps open.
 
     *address* is an IPv4 address or the name of an Ethernet interface.
@@ -70,7 +70,7 @@ class SharedSocket(Record, frozen=True):
     services_fd: int = NO_DESCRIPTOR
 
 
-class BusSocket(Record, frozen=True):
+class BusSocket(SpecRecord, frozen=True):
     """What belongs to one bus port, opened once like the shared sockets.
 
     The number of a bus in requests is its place in the handover.
@@ -87,7 +87,7 @@ class BusSocket(Record, frozen=True):
     """The other side of that pair, for services."""
 
 
-class Handed(Record, frozen=True):
+class Handed(SpecRecord, frozen=True):
     """What crosses to a child in a descriptor."""
 
     def to_descriptor(self) -> int:
@@ -120,7 +120,7 @@ class SegmentHandover(Handed, frozen=True):
     """As in EngineOptions."""
 
 
-class EngineOptions(Record, frozen=True):
+class EngineOptions(SpecRecord, frozen=True):
     """How hard the engine tries to be on time."""
 
     realtime: bool = True

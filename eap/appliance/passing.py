@@ -12,13 +12,13 @@ import socket
 import msgspec
 
 from eap.appliance.handover import PortName
-from eap.pd.spec import Record
+from eap.pd.spec import SpecRecord
 
 _MAX_MESSAGE = 8192
 _DESCRIPTOR_SPACE = socket.CMSG_SPACE(array.array("i").itemsize)
 
 
-class PassedConnection(Record, frozen=True):
+class PassedConnection(SpecRecord, frozen=True):
     """A type-4 connection: the ports that its frames are for, and its peer."""
 
     owners: tuple[PortName, ...]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from eap.config.bus import BusDescription
+from eap.config.bus import ExpectedBus
 from eap.config.finding import Finding
 from eap.config.load import LoadResult, load
 from eap.errors import ConfigError
@@ -44,7 +44,7 @@ def require_own_buses(stations: Sequence[StationSpec]) -> None:
             (buses if is_bus else others)[uri.host] = label
 
 
-def _describe(path: Path) -> BusDescription | tuple[Finding, ...]:
+def _describe(path: Path) -> ExpectedBus | tuple[Finding, ...]:
     from eap.appliance.busfile import describe  # simulated devices, when a plant has a bus
 
     return describe(path)

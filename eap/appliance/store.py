@@ -28,7 +28,7 @@ from eap.appliance.runtime import folder_name
 from eap.device.rollout import without_alternates
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.device import DeviceState
-from eap.pd.spec import Record, StationSpec
+from eap.pd.spec import SpecRecord, StationSpec
 
 VARIABLE = "EAP_STATE_DIR"
 VERSION = 1
@@ -38,7 +38,7 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 
-class Configuration(Record, frozen=True, kw_only=True):
+class Configuration(SpecRecord, frozen=True, kw_only=True):
     """One whole configuration of a station."""
 
     base: str

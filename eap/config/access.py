@@ -10,7 +10,7 @@ from typing import TypeVar
 from eap.aoe.spec import IP_DOORS, AccessRule, AccessService, AccessTarget, DoorKind, ObjectRange
 from eap.config.brokers import brokers_of, check_file
 from eap.config.check_ports import check_names
-from eap.config.finding import Report, one_of
+from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.routes import WHOLE, MisfitError, net_ids_of, without_prefix
 from eap.config.structs import AccessSection, PortSection, StationSection
@@ -176,7 +176,7 @@ T = TypeVar("T")
 _OBJECT_SERVICES = {AccessService.READ, AccessService.WRITE}
 
 
-def check_access(index: Index, report: Report, folder: Path) -> None:
+def check_access(index: Index, report: FindingReport, folder: Path) -> None:
     """Report every rule and user that cannot be as they are; files are in *folder*."""
     loose = without_prefix(index)
     for station in index.plant.stations:
@@ -191,7 +191,11 @@ def check_access(index: Index, report: Report, folder: Path) -> None:
 
 
 def _check_rule(
-    index: Index, station: StationSection, access: AccessSection, loose: set[str], report: Report
+    index: Index,
+    station: StationSection,
+    access: AccessSection,
+    loose: set[str],
+    report: FindingReport,
 ) -> bool:
     """Report what is wrong with a rule; return whether it can be compared with others."""
     is_fine = True
@@ -238,7 +242,9 @@ def _check_door(text: str, known: list[str]) -> None:
         raise MisfitError("", f"no door {text!r}{near(text, known)}", expected)
 
 
-def _check_order(index: Index, station: StationSection, loose: set[str], report: Report) -> None:
+def _check_order(
+    index: Index, station: StationSection, loose: set[str], report: FindingReport
+) -> None:
     """Report rules that never decide anything."""
     before: list[tuple[AccessSection, AccessRule]] = []
     try:

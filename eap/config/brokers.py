@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from eap.aoe.mqtt_topics import check_network
 from eap.aoe.spec import DoorKind, MqttSpec, TlsSpec
-from eap.config.finding import Finding, Report
+from eap.config.finding import Finding, FindingReport
 from eap.config.index import Index
 from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import parse_host
@@ -97,7 +97,7 @@ _FILE = "a file, its path from the plant file on"
 _MAX_CLIENT_ID = 65_535
 
 
-def check_brokers(index: Index, report: Report, folder: Path) -> None:
+def check_brokers(index: Index, report: FindingReport, folder: Path) -> None:
     """Report every broker that cannot be as it is; files are in *folder*."""
     client_ids: dict[tuple[Broker, str], RouteSection] = {}
     for station in index.plant.stations:
@@ -114,7 +114,7 @@ def check_brokers(index: Index, report: Report, folder: Path) -> None:
                     report.add(f"{route.at}.client_id", message, expected)
 
 
-def _check_url(route: RouteSection, report: Report) -> Broker | None:
+def _check_url(route: RouteSection, report: FindingReport) -> Broker | None:
     path = f"{route.at}.mqtt"
     try:
         broker = parse_url(route.mqtt)
@@ -127,7 +127,7 @@ def _check_url(route: RouteSection, report: Report) -> Broker | None:
     return broker
 
 
-def _check_networks(station: StationSection, report: Report) -> None:
+def _check_networks(station: StationSection, report: FindingReport) -> None:
     first: dict[str, RouteSection] = {}
     for route in brokers_of(station):
         path = f"{route.at}.network"
@@ -151,7 +151,7 @@ def _is_network(name: str) -> bool:
     return not any(each == "/" or each.isspace() for each in name)
 
 
-def _check_secrets(route: RouteSection, report: Report, folder: Path) -> None:
+def _check_secrets(route: RouteSection, report: FindingReport, folder: Path) -> None:
     if route.password_file and not route.user:
         report.add(f"{route.at}.password_file", "a password without a user", "user: as well")
     check_file(f"{route.at}.password_file", route.password_file, report, folder)
@@ -168,7 +168,7 @@ def _check_secrets(route: RouteSection, report: Report, folder: Path) -> None:
         report.add(f"{at}.key", "a key without a certificate", "certificate: as well")
 
 
-def check_file(path: str, file: str, report: Report, folder: Path) -> None:
+def check_file(path: str, file: str, report: FindingReport, folder: Path) -> None:
     """Report *file*, named at *path*, if it is given and cannot be read."""
     if file and (reason := why_unreadable(folder / file)):
         report.add(path, f"{file}: {reason}", _FILE)
@@ -200,7 +200,7 @@ def learn_sources(station: StationSection) -> bool | tuple[str, ...]:
     return tuple(_parse(station, text) for text in station.learn)
 
 
-def check_learning(index: Index, report: Report) -> None:
+def check_learning(index: Index, report: FindingReport) -> None:
     """Report every source of learned routes that is none."""
     for station in index.plant.stations:
         if isinstance(station.learn, bool):
@@ -212,7 +212,7 @@ def check_learning(index: Index, report: Report) -> None:
                 report.add(f"{station.at}.learn[{position}]", f"learn: {exc}", _SOURCES)
 
 
-def warn_of_open_brokers(index: Index, report: Report) -> tuple[Finding, ...]:
+def warn_of_open_brokers(index: Index, report: FindingReport) -> tuple[Finding, ...]:
     """Return a warning for each broker that teaches routes without knowing its clients.
 
     A station that names the network in ``learn`` wants that.

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
-from eap.config.finding import Finding, Report
+from eap.config.finding import Finding, FindingReport
 from eap.config.structs import PlantFile, PortSection, StationSection
 from eap.ids import InterfaceUri, ObjectId
 from eap.pd.spec import BusEntrySpec, BusSlaveSpec, PortKind
@@ -53,13 +53,13 @@ class DescribedSlave(msgspec.Struct, frozen=True, kw_only=True):
     inputs: tuple[DescribedEntry, ...] = ()
 
 
-class BusDescription(msgspec.Struct, frozen=True):
+class ExpectedBus(msgspec.Struct, frozen=True):
     """A bus, in the order of the line."""
 
     slaves: tuple[DescribedSlave, ...] = ()
 
 
-DescribeBus: TypeAlias = Callable[[Path], BusDescription | tuple[Finding, ...]]
+DescribeBus: TypeAlias = Callable[[Path], ExpectedBus | tuple[Finding, ...]]
 """Reads a bus file; returns its findings if it has any, and never raises for what it holds."""
 
 
@@ -78,7 +78,7 @@ class NamedBus(NamedTuple):
     variables: dict[str, BusVariable]
 
 
-def name_bus(port: str, description: BusDescription) -> NamedBus:
+def name_bus(port: str, description: ExpectedBus) -> NamedBus:
     """Give the process data of the bus at *port* its names.
 
     ``PORT.SLAVE.ENTRY``, and beside these the states of bus and slaves.
@@ -161,7 +161,7 @@ _FILE = "a bus file, its path from the plant file on"
 _SLAVE_NAME = "a text without spaces and slashes, by which a plant can address it"
 
 
-def check_bus_port(port: PortSection, uri: InterfaceUri, report: Report) -> None:
+def check_bus_port(port: PortSection, uri: InterfaceUri, report: FindingReport) -> None:
     """Report what no bus port on *uri* can have."""
     path = f"{port.at}.interface"
     if uri.scheme not in SCHEMES:
@@ -179,18 +179,18 @@ def check_bus_port(port: PortSection, uri: InterfaceUri, report: Report) -> None
 
 
 def describe_buses(
-    plant: PlantFile, folder: Path, describe: DescribeBus, report: Report
-) -> dict[tuple[str, str], BusDescription | None]:
+    plant: PlantFile, folder: Path, describe: DescribeBus, report: FindingReport
+) -> dict[tuple[str, str], ExpectedBus | None]:
     """Return what is known of the bus at each (station, port); None where its file is no bus file.
 
     What is wrong with the files goes to *report*.
     """
-    found: dict[tuple[str, str], BusDescription | None] = {}
-    known: dict[Path, BusDescription | None] = {}
+    found: dict[tuple[str, str], ExpectedBus | None] = {}
+    known: dict[Path, ExpectedBus | None] = {}
     for station, port in _bus_ports(plant):
         path, file = bus_file(port, folder)
         if file is None:
-            description: BusDescription | None = BusDescription()
+            description: ExpectedBus | None = ExpectedBus()
         elif reason := _unusable(file):
             report.add(path, f"bus file {file} {reason}", _FILE)
             description = None
@@ -232,15 +232,17 @@ def _bus_ports(plant: PlantFile) -> Iterator[tuple[StationSection, PortSection]]
                 yield station, port
 
 
-def _describe(file: Path, describe: DescribeBus, report: Report) -> BusDescription | None:
+def _describe(file: Path, describe: DescribeBus, report: FindingReport) -> ExpectedBus | None:
     description = describe(file)
-    if isinstance(description, BusDescription):
+    if isinstance(description, ExpectedBus):
         return description
     report.adopt(description)
     return None
 
 
-def _has_names(path: str, port: PortSection, description: BusDescription, report: Report) -> bool:
+def _has_names(
+    path: str, port: PortSection, description: ExpectedBus, report: FindingReport
+) -> bool:
     """Tell whether all slaves can be addressed, after reporting those that cannot."""
     wrong = [
         slave.name

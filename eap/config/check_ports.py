@@ -10,7 +10,7 @@ from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.bus import INTERFACE, check_bus_port
 from eap.config.destination import takes_tcp
-from eap.config.finding import Report
+from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.structs import PortSection, StationSection
 from eap.ids import InterfaceUri, MacAddr, NetId
@@ -29,7 +29,7 @@ _LIMITED = {
 """Keys of a port that only some interfaces have, and what they do."""
 
 
-def check_ports(index: Index, report: Report) -> None:
+def check_ports(index: Index, report: FindingReport) -> None:
     """Report every station and port that cannot be as it is."""
     plant = index.plant
     if not is_name(plant.plant):
@@ -48,7 +48,7 @@ def check_ports(index: Index, report: Report) -> None:
     _check_addresses(index, report)
 
 
-def check_names(names: Iterable[tuple[str, str]], what: str, report: Report) -> None:
+def check_names(names: Iterable[tuple[str, str]], what: str, report: FindingReport) -> None:
     """Report names that are malformed or given twice; *names* are (path of the item, name)."""
     named = []
     for at, name in names:
@@ -62,7 +62,7 @@ def check_names(names: Iterable[tuple[str, str]], what: str, report: Report) -> 
         report.add(path, message, "a name of its own")
 
 
-def _check_net_ids(stations: tuple[StationSection, ...], report: Report) -> None:
+def _check_net_ids(stations: tuple[StationSection, ...], report: FindingReport) -> None:
     first: dict[NetId, str] = {}
     owners: list[StationSection | PortSection] = []
     for station in stations:
@@ -84,7 +84,7 @@ def _check_net_ids(stations: tuple[StationSection, ...], report: Report) -> None
             first[net_id] = path
 
 
-def _check_order(station: StationSection, report: Report) -> None:
+def _check_order(station: StationSection, report: FindingReport) -> None:
     if not station.ports and f"{station.at}.ports[0]" not in report.lines:
         report.add(f"{station.at}.ports", f"station {station.name} has no ports", "an EAP port")
     bus_seen = False
@@ -95,7 +95,7 @@ def _check_order(station: StationSection, report: Report) -> None:
             report.add(port.at, f"EAP port {port.name} after a bus port", "EAP ports first")
 
 
-def _check_port(port: PortSection, report: Report) -> None:
+def _check_port(port: PortSection, report: FindingReport) -> None:
     path = f"{port.at}.interface"
     _check_keys(port, report)
     try:
@@ -121,7 +121,7 @@ def _check_port(port: PortSection, report: Report) -> None:
     _check_options(port, uri, report)
 
 
-def _check_keys(port: PortSection, report: Report) -> None:
+def _check_keys(port: PortSection, report: FindingReport) -> None:
     is_bus = port.kind is PortKind.BUS
     for key in PortSection.EAP_KEYS if is_bus else PortSection.BUS_KEYS:
         if f"{port.at}.{key}" in report.lines:
@@ -143,7 +143,7 @@ def _is_station(mac: str) -> bool:
     return any(address) and not address.is_group
 
 
-def _check_options(port: PortSection, uri: InterfaceUri, report: Report) -> None:
+def _check_options(port: PortSection, uri: InterfaceUri, report: FindingReport) -> None:
     only = f"it only on a port of another kind than {uri.scheme}://"
     for key, does in _LIMITED.items():
         if getattr(port, key) and uri.scheme not in _SCHEMES[key]:
@@ -164,7 +164,7 @@ def _check_options(port: PortSection, uri: InterfaceUri, report: Report) -> None
             report.add(f"{port.at}.join[{position}]", f"{group!r} cannot be joined", expected)
 
 
-def _check_ams(port: PortSection, uri: InterfaceUri, report: Report) -> None:
+def _check_ams(port: PortSection, uri: InterfaceUri, report: FindingReport) -> None:
     path = f"{port.at}.ams"
     if uri.scheme not in {"udp", "tcp"}:
         if path in report.lines:
@@ -175,7 +175,7 @@ def _check_ams(port: PortSection, uri: InterfaceUri, report: Report) -> None:
         report.add(f"{port.at}.interface", message, "another one, or ams: false")
 
 
-def _check_addresses(index: Index, report: Report) -> None:
+def _check_addresses(index: Index, report: FindingReport) -> None:
     first: dict[tuple[str, ...], str] = {}
     for (station, name), uri in index.uris.items():
         port = index.ports[station, name]
@@ -202,7 +202,7 @@ def _own_keys(station: str, port: PortSection, uri: InterfaceUri) -> Iterator[tu
         yield station, port.kind.value, uri.host, str(vid)
 
 
-def _check_segments(index: Index, report: Report) -> None:
+def _check_segments(index: Index, report: FindingReport) -> None:
     """Report EAP ports on the interface that a bus of the same station is wired to."""
     buses = {
         (station, uri.host): index.ports[station, name]

@@ -13,7 +13,7 @@ from eap.codec import pdo
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.config.check_ports import check_names
 from eap.config.destination import EXPECTED, check_address, check_monitoring, resolve
-from eap.config.finding import Report, one_of
+from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import FrameSection, PublishSection, StationSection, SubscribeSection
 from eap.near import near
@@ -22,7 +22,7 @@ from eap.pd.device import FaultCode
 from eap.pd.spec import REQUESTER, PortKind
 
 
-def check_publish(index: Index, report: Report) -> None:
+def check_publish(index: Index, report: FindingReport) -> None:
     """Report every frame and TxPD that cannot be sent as described."""
     for station in index.plant.stations:
         check_names(((f.at, f.name) for f in station.frames), "frame", report)
@@ -36,7 +36,7 @@ def check_publish(index: Index, report: Report) -> None:
 
 
 def check_port_reference(
-    index: Index, report: Report, station: StationSection, at: str, name: str
+    index: Index, report: FindingReport, station: StationSection, at: str, name: str
 ) -> None:
     """Report a *name* at *at* that is no EAP port of *station*."""
     known = [port.name for port in station.ports if port.kind is PortKind.EAP]
@@ -50,7 +50,7 @@ def check_port_reference(
 
 
 def _check_frame(
-    index: Index, report: Report, station: StationSection, frame: FrameSection
+    index: Index, report: FindingReport, station: StationSection, frame: FrameSection
 ) -> None:
     report.add_breaches(frame.at, rules.check_modulo(frame.name, frame.divider, frame.modulo))
     pds = [pd for pd in station.publish if pd.frame == frame.name]
@@ -82,7 +82,9 @@ def _check_frame(
         report.add(frame.at, message, expected)
 
 
-def _check_pd(index: Index, report: Report, station: StationSection, pd: PublishSection) -> None:
+def _check_pd(
+    index: Index, report: FindingReport, station: StationSection, pd: PublishSection
+) -> None:
     known = [frame.name for frame in station.frames]
     if pd.frame not in known and pd.frame not in report.broken:
         message = f"station {station.name} has no frame {pd.frame!r}{near(pd.frame, known)}"
@@ -97,7 +99,7 @@ def _check_pd(index: Index, report: Report, station: StationSection, pd: Publish
     _check_triggers(index, report, station, pd)
 
 
-def is_unread(index: Index, report: Report, station: StationSection, name: str) -> bool:
+def is_unread(index: Index, report: FindingReport, station: StationSection, name: str) -> bool:
     """Tell whether *name* may belong to something that was reported already."""
     if name in report.broken:
         return True
@@ -111,7 +113,7 @@ def is_unread(index: Index, report: Report, station: StationSection, name: str) 
 
 
 def _check_triggers(
-    index: Index, report: Report, station: StationSection, pd: PublishSection
+    index: Index, report: FindingReport, station: StationSection, pd: PublishSection
 ) -> None:
     spec, frame = pd.spec(), index.frames.get((station.name, pd.frame))
     report.add_breaches(pd.at, rules.check_modulo(pd.name, pd.divider, pd.modulo))
@@ -131,7 +133,7 @@ def _check_triggers(
         report.add(f"{pd.at}.{breach.key}", message, breach.expected)
 
 
-def _check_ids(index: Index, report: Report) -> None:
+def _check_ids(index: Index, report: FindingReport) -> None:
     ids = (((sent.port.net_id, sent.pd.id), sent) for sent in index.sent.values())
     for sent, first in rules.doubles(ids):
         message = f"PD id {sent.pd.id} is used twice by publisher {sent.port.net_id}"
@@ -143,7 +145,7 @@ _PUSHED = "a request that is sent by itself"
 _ONE_PORT = "one port for both: an answer goes back as its request came"
 
 
-def check_polls(index: Index, report: Report) -> None:
+def check_polls(index: Index, report: FindingReport) -> None:
     """Report every request and answer that do not find each other."""
     for station in index.plant.stations:
         for frame in station.frames:
@@ -159,7 +161,7 @@ def check_polls(index: Index, report: Report) -> None:
                 _check_unasked(index, report, subscription)
 
 
-def _check_poll_frame(report: Report, station: StationSection, frame: FrameSection) -> None:
+def _check_poll_frame(report: FindingReport, station: StationSection, frame: FrameSection) -> None:
     spec, line = frame.spec(frame.to), report.line_of(f"{frame.at}.to")
     report.add_breaches(frame.at, rules.check_answers(spec))
     for pd in station.publish:
@@ -168,7 +170,7 @@ def _check_poll_frame(report: Report, station: StationSection, frame: FrameSecti
 
 
 def _check_answer(
-    index: Index, report: Report, station: StationSection, pd: PublishSection
+    index: Index, report: FindingReport, station: StationSection, pd: PublishSection
 ) -> None:
     path = f"{pd.at}.poll"
     request = index.subscription(station, pd.poll)
@@ -214,7 +216,7 @@ def _chain(index: Index, sent: SentPd) -> list[SentPd]:
 
 
 def _check_question(
-    index: Index, report: Report, station: StationSection, subscription: SubscribeSection
+    index: Index, report: FindingReport, station: StationSection, subscription: SubscribeSection
 ) -> None:
     path, name = f"{subscription.at}.poll", subscription.poll
     own = index.sent.get((station.name, name))
@@ -238,7 +240,7 @@ def _check_question(
 
 
 def _check_asked(
-    index: Index, report: Report, subscription: SubscribeSection, sent: SentPd, own: SentPd
+    index: Index, report: FindingReport, subscription: SubscribeSection, sent: SentPd, own: SentPd
 ) -> None:
     """Report that *sent*, which *subscription* takes, does not answer *own*."""
     path = f"{subscription.at}.poll"
@@ -254,7 +256,7 @@ def _check_asked(
         report.add(path, message, one_of(asked) if asked else "a PD that is received there")
 
 
-def _check_unasked(index: Index, report: Report, subscription: SubscribeSection) -> None:
+def _check_unasked(index: Index, report: FindingReport, subscription: SubscribeSection) -> None:
     for sent in index.publishers(subscription):
         if sent.pd.poll:
             line = report.line_of(f"{sent.pd.at}.poll")

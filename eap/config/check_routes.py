@@ -11,7 +11,7 @@ from eap.aoe.routes import Route as AmsRoute
 from eap.aoe.spec import DEFAULT_TARGET, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.config.brokers import check_brokers
-from eap.config.finding import Finding, Report, one_of
+from eap.config.finding import Finding, FindingReport, one_of
 from eap.config.index import Index
 from eap.config.routes import MQTT, MisfitError, next_hop, reach, target_of, without_prefix
 from eap.config.structs import RouteSection, StationSection
@@ -21,7 +21,7 @@ from eap.near import near
 _OTHER_NET_ID = "a NetID that no station of the plant has, nor its first four numbers"
 
 
-def check_routes(index: Index, report: Report, folder: Path) -> None:
+def check_routes(index: Index, report: FindingReport, folder: Path) -> None:
     """Report every route and broker that cannot be as it is; files are in *folder*."""
     loose = without_prefix(index)
     for station in index.plant.stations:
@@ -34,7 +34,7 @@ def check_routes(index: Index, report: Report, folder: Path) -> None:
     check_brokers(index, report, folder)
 
 
-def _check_keys(route: RouteSection, report: Report) -> None:
+def _check_keys(route: RouteSection, report: FindingReport) -> None:
     """Report keys of routes at brokers, and the other way round."""
     if f"{route.at}.mqtt" in report.lines:
         what, others, expected = "a broker", RouteSection.ROUTE_KEYS, RouteSection.MQTT_KEYS
@@ -52,7 +52,7 @@ def _check_keys(route: RouteSection, report: Report) -> None:
 
 
 def _check_route(
-    index: Index, station: StationSection, route: RouteSection, report: Report
+    index: Index, station: StationSection, route: RouteSection, report: FindingReport
 ) -> None:
     if route.to == station.name:
         report.add(f"{route.at}.to", f"route of {station.name} to itself", "another station")
@@ -71,7 +71,7 @@ def _check_route(
         pass  # a NetID or an interface that is a finding of its own
 
 
-def _check_net_id(index: Index, route: RouteSection, report: Report) -> None:
+def _check_net_id(index: Index, route: RouteSection, report: FindingReport) -> None:
     is_default, known = route.to == DEFAULT_TARGET, _is_known(index, route)
     path = f"{route.at}.net_id"
     names_router = is_default and route.via.startswith(MQTT)  # the one that takes the rest
@@ -108,7 +108,7 @@ def _check_claims(
     sent: tuple[StationSection, RouteSection],
     claimed: dict[bytes, RouteSection],
     loose: set[str],
-    report: Report,
+    report: FindingReport,
 ) -> None:
     """Report NetIDs that belong to somebody else, or to another route of the station."""
     station, route = sent
@@ -129,7 +129,7 @@ def _check_claims(
         _check_owners(index, station, where, keys, report)
 
 
-def _report_doubled(first: RouteSection, route: RouteSection, report: Report) -> None:
+def _report_doubled(first: RouteSection, route: RouteSection, report: FindingReport) -> None:
     line = report.line_of(first.at)
     if first.to == route.to:
         report.add(route.at, f"a second route to {route.to!r} (first in line {line})", "one")
@@ -140,7 +140,7 @@ def _report_doubled(first: RouteSection, route: RouteSection, report: Report) ->
 
 
 def _check_owners(
-    index: Index, station: StationSection, path: str, keys: list[bytes], report: Report
+    index: Index, station: StationSection, path: str, keys: list[bytes], report: FindingReport
 ) -> None:
     for prefix in keys:
         for owner in index.plant.stations:
@@ -159,7 +159,7 @@ def _begins(text: str, prefix: bytes) -> bool:
 
 
 def follow_routes(
-    index: Index, routing: Mapping[str, RoutingSpec], report: Report
+    index: Index, routing: Mapping[str, RoutingSpec], report: FindingReport
 ) -> tuple[Finding, ...]:
     """Return a warning for each written route that runs in a circle or gets nowhere.
 

@@ -6,7 +6,7 @@ from eap.codec import datatypes
 from eap.config.check_ports import check_names
 from eap.config.check_publish import check_port_reference
 from eap.config.destination import reaches, resolve
-from eap.config.finding import Report, one_of
+from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, SentPd
 from eap.config.structs import ANY_SOURCE, FromSection, StationSection, SubscribeSection
 from eap.ids import NetId
@@ -16,7 +16,7 @@ from eap.pd.address import is_group_source, source_octets
 from eap.pd.spec import REQUESTER
 
 
-def check_subscribe(index: Index, report: Report) -> None:
+def check_subscribe(index: Index, report: FindingReport) -> None:
     """Report every RxPD that would receive nothing, or something else than it expects."""
     for station in index.plant.stations:
         check_names(((s.at, s.name) for s in station.subscribe), "subscription", report)
@@ -35,7 +35,7 @@ def check_subscribe(index: Index, report: Report) -> None:
 
 
 def _check_source(
-    index: Index, report: Report, subscription: SubscribeSection, publishers: list[SentPd]
+    index: Index, report: FindingReport, subscription: SubscribeSection, publishers: list[SentPd]
 ) -> None:
     path, source = f"{subscription.at}.from", subscription.source
     if publishers:
@@ -58,7 +58,7 @@ def _check_source(
 
 
 def _check_sender(
-    index: Index, report: Report, station: StationSection, subscription: SubscribeSection
+    index: Index, report: FindingReport, station: StationSection, subscription: SubscribeSection
 ) -> None:
     """Report a source that no frame of the subscription's port can have."""
     uri = index.uris.get((station.name, subscription.port))
@@ -77,7 +77,9 @@ def _check_sender(
         report.add(f"{subscription.at}.source", message, expected)
 
 
-def _check_numbers(report: Report, subscription: SubscribeSection, source: FromSection) -> None:
+def _check_numbers(
+    report: FindingReport, subscription: SubscribeSection, source: FromSection
+) -> None:
     path = f"{subscription.at}.from"
     if source.publisher != "any":
         try:
@@ -90,7 +92,7 @@ def _check_numbers(report: Report, subscription: SubscribeSection, source: FromS
         report.add(path, message, "a publisher of this plant, or foreign: true")
 
 
-def _check_variables(subscription: SubscribeSection, report: Report) -> None:
+def _check_variables(subscription: SubscribeSection, report: FindingReport) -> None:
     path, name = f"{subscription.at}.variables", subscription.name
     if subscription.variables is None:
         if isinstance(subscription.source, FromSection):
@@ -99,7 +101,9 @@ def _check_variables(subscription: SubscribeSection, report: Report) -> None:
         report.add(path, f"subscription {name!r} has no variables", "at least one")
 
 
-def _check_ends(index: Index, report: Report, subscription: SubscribeSection, sent: SentPd) -> None:
+def _check_ends(
+    index: Index, report: FindingReport, subscription: SubscribeSection, sent: SentPd
+) -> None:
     """Report where *subscription* differs from the PD *sent*, naming both lines."""
     at, label = subscription.at, sent.label
     if not subscription.ignore_version and subscription.version not in (None, sent.pd.version):
@@ -129,7 +133,7 @@ def _check_ends(index: Index, report: Report, subscription: SubscribeSection, se
 
 
 def _check_arrival(
-    index: Index, report: Report, station: StationSection, subscription: SubscribeSection
+    index: Index, report: FindingReport, station: StationSection, subscription: SubscribeSection
 ) -> None:
     receiver = index.eap_port(station, subscription.port)
     uri = index.uris.get((station.name, subscription.port))
@@ -154,7 +158,7 @@ def _check_arrival(
 
 
 def _check_timeout(
-    index: Index, report: Report, station: StationSection, subscription: SubscribeSection
+    index: Index, report: FindingReport, station: StationSection, subscription: SubscribeSection
 ) -> None:
     if not subscription.timeout_ms:
         return
@@ -177,7 +181,7 @@ def _check_once(
     subscription: SubscribeSection,
     publishers: list[SentPd],
     taken: dict[tuple[str, str, int], str],
-    report: Report,
+    report: FindingReport,
 ) -> None:
     source = subscription.source
     keys = [(subscription.port, sent.port.net_id, sent.pd.id) for sent in publishers]

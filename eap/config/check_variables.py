@@ -8,7 +8,7 @@ from pathlib import Path
 from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.config.check_ports import check_names
-from eap.config.finding import Report, one_of
+from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.structs import StationSection, VariableSection
 from eap.near import near
@@ -26,7 +26,7 @@ from eap.pd.spec import (
 )
 
 
-def check_variables(index: Index, report: Report, folder: Path) -> None:
+def check_variables(index: Index, report: FindingReport, folder: Path) -> None:
     """Report variables that cannot exist and sources that cannot fill them."""
     for station in index.plant.stations:
         own = {f"{station.at}.variables.{n}": (n, v) for n, v in station.variables.items()}
@@ -60,7 +60,7 @@ def check_variables(index: Index, report: Report, folder: Path) -> None:
                 _check_source(station, name, source, report, folder)
 
 
-def _check_variable(path: str, name: str, variable: VariableSection, report: Report) -> None:
+def _check_variable(path: str, name: str, variable: VariableSection, report: FindingReport) -> None:
     if name.endswith(MADE_SUFFIXES):
         message = f"variable {name!r}: {' and '.join(MADE_SUFFIXES)} are made by the appliance"
         report.add(path, message, "another name")
@@ -80,7 +80,7 @@ def _check_variable(path: str, name: str, variable: VariableSection, report: Rep
 
 
 def _check_source(
-    station: StationSection, name: str, source: Source, report: Report, folder: Path
+    station: StationSection, name: str, source: Source, report: FindingReport, folder: Path
 ) -> None:
     path = f"{station.at}.sources.{name}"
     if name not in station.variables:
@@ -112,13 +112,13 @@ def _check_source(
             pass  # random octets are values of every type
 
 
-def _check_number(path: str, name: str, kind: DataType, report: Report) -> None:
+def _check_number(path: str, name: str, kind: DataType, report: FindingReport) -> None:
     if kind.scalar_range is None or kind.is_bits:
         message = f"{name} is {kind.text}, this source makes numbers"
         report.add(path, message, "a number such as UDINT or REAL")
 
 
-def _check_measure(path: str, source: HostSource, report: Report) -> None:
+def _check_measure(path: str, source: HostSource, report: FindingReport) -> None:
     if source.measure in INTERFACE_MEASURES:
         if not source.argument:
             report.add(path, f"{source.measure} needs an argument", "argument: an interface as lo")
@@ -127,7 +127,10 @@ def _check_measure(path: str, source: HostSource, report: Report) -> None:
 
 
 def _check_span(
-    path: str, kind: DataType, source: CounterSource | RampSource | SineSource, report: Report
+    path: str,
+    kind: DataType,
+    source: CounterSource | RampSource | SineSource,
+    report: FindingReport,
 ) -> None:
     bounds = kind.scalar_range
     if bounds is None or isinstance(source, CounterSource):
@@ -142,7 +145,9 @@ def _check_span(
         report.add(path, message, f"{bounds[0]:g} to {bounds[1]:g}")
 
 
-def _check_csv(path: str, kind: DataType, source: CsvSource, report: Report, folder: Path) -> None:
+def _check_csv(
+    path: str, kind: DataType, source: CsvSource, report: FindingReport, folder: Path
+) -> None:
     try:
         with (folder / source.file).open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file, strict=True)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from msgspec import inspect
 
 from eap.config.document import Node, ScalarNode
-from eap.config.finding import Report, one_of
+from eap.config.finding import FindingReport, one_of
 from eap.config.structs import PlantFile, Section
 from eap.near import near, nearest
 
@@ -34,12 +34,12 @@ class _BrokenError(Exception):
     """The number if it is only out of range: good enough to go on checking with."""
 
 
-def convert(root: Node, report: Report) -> PlantFile | None:
+def convert(root: Node, report: FindingReport) -> PlantFile | None:
     """Return what *root* describes without the items that were reported; None if it is no plant."""
     return convert_to(PlantFile, root, report, "plant")
 
 
-def convert_to(kind: type[T], root: Node, report: Report, what: str) -> T | None:
+def convert_to(kind: type[T], root: Node, report: FindingReport, what: str) -> T | None:
     """Return what *root* describes as *kind*; None if it is none.  *what* is its name in findings.
 
     Items that were reported are left out.
@@ -60,7 +60,7 @@ def _describe_type(kind: type) -> inspect.Type:
 
 
 class _Converter:
-    def __init__(self, report: Report) -> None:
+    def __init__(self, report: FindingReport) -> None:
         self._report = report
 
     def value(self, node: Node, kind: inspect.Type, path: str, key: str) -> Any:

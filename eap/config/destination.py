@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 from msgspec.structs import replace
 
 from eap.codec.ethercat import EAP_PORT
-from eap.config.finding import Report
+from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.structs import FrameSection, PortSection, StationSection
 from eap.ids import (
@@ -163,7 +163,7 @@ def _vid(port: PortSection) -> int:
 
 def check_address(
     index: Index,
-    report: Report,
+    report: FindingReport,
     sent: tuple[StationSection, FrameSection],
     destination: Destination | None,
 ) -> None:
@@ -218,7 +218,7 @@ def _is_heard(
 
 
 def check_monitoring(
-    report: Report, frame: FrameSection, destination: Destination | None, uri: InterfaceUri
+    report: FindingReport, frame: FrameSection, destination: Destination | None, uri: InterfaceUri
 ) -> None:
     """Report monitoring of what cannot be monitored, and addresses that are none.
 

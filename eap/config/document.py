@@ -15,7 +15,7 @@ import yaml
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from eap.config.finding import Report
+    from eap.config.finding import FindingReport
 
 MAX_FILE = 4 << 20
 """Octets of the largest plant file."""
@@ -59,7 +59,7 @@ class _UnreadableError(Exception):
         self.expected = expected
 
 
-def read(path: Path, report: Report) -> Node | None:
+def read(path: Path, report: FindingReport) -> Node | None:
     """Return the tree of the file at *path*; None, with findings, if it has none."""
     text = ""
     try:
@@ -126,7 +126,7 @@ class _Open:
 
 
 class _Builder:
-    def __init__(self, report: Report) -> None:
+    def __init__(self, report: FindingReport) -> None:
         self._report = report
         self._anchors: dict[str | None, Node] = {}
         self._stack: list[_Open] = []

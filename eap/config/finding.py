@@ -33,7 +33,7 @@ class Finding(msgspec.Struct, frozen=True):
         return f"{place}: {self.message}; expected {self.expected}"
 
 
-class Report:
+class FindingReport:
     """Collects findings and knows the line of every path of the file.
 
     *broken* holds the names of items that could not be read: whoever refers to one of them is not

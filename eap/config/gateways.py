@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from eap.codec.amstcp import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
-from eap.config.finding import Report
+from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.routes import MisfitError
 from eap.config.structs import Plain, PortSection, StationSection
@@ -159,7 +159,7 @@ _ANY = "0.0.0.0"  # noqa: S104  what a plant file may say
 _BIT_15 = 0x8000
 
 
-def check_gateways(index: Index, report: Report) -> None:
+def check_gateways(index: Index, report: FindingReport) -> None:
     """Report every gateway that cannot be as it is."""
     taken = list(_taken(index))
     for station in index.plant.stations:
@@ -170,7 +170,7 @@ def check_gateways(index: Index, report: Report) -> None:
 
 
 def _check_addresses(
-    index: Index, station: StationSection, port: PortSection, report: Report
+    index: Index, station: StationSection, port: PortSection, report: FindingReport
 ) -> None:
     path = f"{port.at}.gateway.addresses"
     first: dict[int, str] = {}
@@ -201,7 +201,7 @@ def _check_place(
     station: StationSection,
     port: PortSection,
     taken: list[tuple[str, int, str, str]],
-    report: Report,
+    report: FindingReport,
 ) -> None:
     number = gateway_port(station, port)
     if not number:

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 
 from eap.codec import datatypes
 from eap.codec.values import DataType
-from eap.config.bus import BusDescription, BusVariable, name_bus
+from eap.config.bus import BusVariable, ExpectedBus, name_bus
 from eap.config.structs import (
     FrameSection,
     FromSection,
@@ -54,7 +54,7 @@ class Index:
     def __init__(
         self,
         plant: PlantFile,
-        buses: Mapping[tuple[str, str], BusDescription | None] = MappingProxyType({}),
+        buses: Mapping[tuple[str, str], ExpectedBus | None] = MappingProxyType({}),
     ) -> None:
         self.plant = plant
         self.buses = {

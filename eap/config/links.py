@@ -14,7 +14,7 @@ from typing import NamedTuple
 from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.config.check_publish import is_unread
-from eap.config.finding import Report, one_of
+from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.structs import LinkSection, StationSection
 from eap.near import near
@@ -134,7 +134,7 @@ _TARGET = "a variable of the station's own, or an output of a bus"
 _KEYS = ("from_bit", "to_bit", "bits", "scale", "offset", "swap")
 
 
-def check_links(index: Index, report: Report) -> None:
+def check_links(index: Index, report: FindingReport) -> None:
     """Report every link that cannot run, or that would write what somebody else writes."""
     for station in index.plant.stations:
         known: list[tuple[LinkSection, Ends]] = []
@@ -151,7 +151,7 @@ def check_links(index: Index, report: Report) -> None:
 
 
 def _kind(
-    index: Index, report: Report, station: StationSection, path: str, name: str
+    index: Index, report: FindingReport, station: StationSection, path: str, name: str
 ) -> DataType | None:
     """Return the type of a variable; None, with a finding, if there is none."""
     text = index.type_text(station, name)
@@ -167,7 +167,9 @@ def _kind(
         return None  # reported with the variable
 
 
-def _check_writer(index: Index, report: Report, station: StationSection, link: LinkSection) -> None:
+def _check_writer(
+    index: Index, report: FindingReport, station: StationSection, link: LinkSection
+) -> None:
     name = link.target
     on_bus = index.bus_variables(station).get(name)
     if name in station.variables:
@@ -184,7 +186,7 @@ def _check_writer(index: Index, report: Report, station: StationSection, link: L
     report.add(f"{link.at}.to", f"{name!r} {reason}, so no link can write it", _TARGET)
 
 
-def _fits(link: LinkSection, source: DataType, target: DataType, report: Report) -> bool:
+def _fits(link: LinkSection, source: DataType, target: DataType, report: FindingReport) -> bool:
     """Tell whether a link can be between these types, after reporting why not."""
     if any(report.has(f"{link.at}.{key}") for key in _KEYS):
         return False
@@ -197,7 +199,7 @@ def _fits(link: LinkSection, source: DataType, target: DataType, report: Report)
 
 
 def _fits_whole(
-    link: LinkSection, source: DataType, target: DataType, shown: str, report: Report
+    link: LinkSection, source: DataType, target: DataType, shown: str, report: FindingReport
 ) -> bool:
     if link.swap:
         if source.size == target.size > 1 and not (source.is_bits or target.is_bits):
@@ -213,7 +215,9 @@ def _fits_whole(
     return True
 
 
-def _fits_bitwise(link: LinkSection, source: DataType, target: DataType, report: Report) -> bool:
+def _fits_bitwise(
+    link: LinkSection, source: DataType, target: DataType, report: FindingReport
+) -> bool:
     for key in ("scale", "offset", "swap"):
         if getattr(link, key):
             report.add(
@@ -236,7 +240,7 @@ def _fits_bitwise(link: LinkSection, source: DataType, target: DataType, report:
 
 
 def _fits_scaled(
-    link: LinkSection, source: DataType, target: DataType, shown: str, report: Report
+    link: LinkSection, source: DataType, target: DataType, shown: str, report: FindingReport
 ) -> bool:
     key = "scale" if link.scale is not None else "offset"
     if link.scale == 0:
@@ -261,7 +265,7 @@ def _is_number(kind: DataType) -> bool:
     return kind.scalar_range is not None and kind.text != "BOOL"
 
 
-def _check_once(links: list[tuple[LinkSection, Ends]], report: Report) -> None:
+def _check_once(links: list[tuple[LinkSection, Ends]], report: FindingReport) -> None:
     first: dict[str, list[tuple[LinkSection, Ends]]] = {}
     for link, both in links:
         others = first.setdefault(link.target, [])
@@ -275,7 +279,7 @@ def _check_once(links: list[tuple[LinkSection, Ends]], report: Report) -> None:
             )
 
 
-def _check_circles(links: list[tuple[LinkSection, Ends]], report: Report) -> None:
+def _check_circles(links: list[tuple[LinkSection, Ends]], report: FindingReport) -> None:
     for circle in find_circles([both for _, both in links]):
         members = [links[position][0] for position in circle]
         way = " → ".join([members[0].source, *(link.target for link in members)])

@@ -19,7 +19,7 @@ from eap.config.check_variables import check_variables
 from eap.config.convert import convert
 from eap.config.derive import derive, derive_directory, derive_routing
 from eap.config.document import read
-from eap.config.finding import Finding, Report
+from eap.config.finding import Finding, FindingReport
 from eap.config.gateways import check_gateways
 from eap.config.index import Index
 from eap.config.links import check_links
@@ -57,7 +57,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
 
     *describe_bus* reads the bus files that it names; their findings are told after its own.
     """
-    report = Report(str(path))
+    report = FindingReport(str(path))
     root = read(path, report)
     plant_file = None if root is None else convert(root, report)
     if plant_file is None:
@@ -111,7 +111,7 @@ def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
         at=_ROUTER, name=name, net_id=_router(net_id), ports=(port,), cycle_us=cycle_us
     )
     index = Index(PlantFile(plant="blank", stations=(station,)))
-    report = Report("")
+    report = FindingReport("")
     check_ports(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)

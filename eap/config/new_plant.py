@@ -40,7 +40,7 @@ class Shape(StrEnum):
     """The first station all others, and they the first."""
 
 
-class _Place(NamedTuple):
+class _PortPlace(NamedTuple):
     """One station's name and addresses."""
 
     number: int
@@ -96,7 +96,7 @@ def plant_text(
     )
 
 
-def _place(number: int, address: str, count: int) -> _Place:
+def _place(number: int, address: str, count: int) -> _PortPlace:
     text = address.replace(NUMBER, str(number))
     try:
         uri = InterfaceUri.parse(text if "://" in text else f"udp://{text}")
@@ -119,10 +119,10 @@ def _place(number: int, address: str, count: int) -> _Place:
             f" 10.0.0.{NUMBER} or ethernet://eth0"
         )
     width = max(2, len(str(count)))
-    return _Place(number, f"station-{number:0{width}}", str(uri), net_id)
+    return _PortPlace(number, f"station-{number:0{width}}", str(uri), net_id)
 
 
-def _head(name: str, shape: Shape, places: list[_Place]) -> Iterator[str]:
+def _head(name: str, shape: Shape, places: list[_PortPlace]) -> Iterator[str]:
     what = {
         Shape.RING: "each tells the next one its state",
         Shape.STAR: f"{places[0].name} tells all others what to do, and they tell it their states",
@@ -131,21 +131,21 @@ def _head(name: str, shape: Shape, places: list[_Place]) -> Iterator[str]:
     yield "#"
 
 
-def _ring_drawing(places: list[_Place]) -> Iterator[str]:
+def _ring_drawing(places: list[_PortPlace]) -> Iterator[str]:
     names = [place.name for place in places]
     if len(names) > _SHOWN:
         names = [*names[:2], "…", names[-1]]
     yield " ──► ".join([*names, names[0]])
 
 
-def _star_drawing(places: list[_Place]) -> Iterator[str]:
+def _star_drawing(places: list[_PortPlace]) -> Iterator[str]:
     hub, *others = (place.name for place in places)
     shown = others if len(others) <= _SHOWN else [others[0], "…", others[-1]]
     for row, other in enumerate(shown):
         yield f"{hub if row == 0 else '':{len(hub)}} ◄──► {other}"
 
 
-def _usage(places: list[_Place], file: str) -> Iterator[str]:
+def _usage(places: list[_PortPlace], file: str) -> Iterator[str]:
     first, second = places[0], places[1]
     yield "#"
     if first.interface.startswith("ethernet://"):
@@ -191,7 +191,7 @@ def _shared(shape: Shape, timeout_ms: int) -> Iterator[str]:
     yield ""
 
 
-def _ring(places: list[_Place]) -> Iterator[str]:
+def _ring(places: list[_PortPlace]) -> Iterator[str]:
     for place, following in zip(places, [*places[1:], places[0]], strict=True):
         previous = places[place.number - 2]
         yield from _station(place)
@@ -204,7 +204,7 @@ def _ring(places: list[_Place]) -> Iterator[str]:
         yield ""
 
 
-def _star(places: list[_Place]) -> Iterator[str]:
+def _star(places: list[_PortPlace]) -> Iterator[str]:
     hub, *others = places
     yield from _station(hub)
     yield "    frames:"
@@ -229,7 +229,7 @@ def _star(places: list[_Place]) -> Iterator[str]:
         yield ""
 
 
-def _station(place: _Place) -> Iterator[str]:
+def _station(place: _PortPlace) -> Iterator[str]:
     yield "  - <<: *station"
     yield f"    name: {place.name}"
     yield f"    net_id: {place.net_id}.1.1"
@@ -240,10 +240,10 @@ def _station(place: _Place) -> Iterator[str]:
     )
 
 
-def _destination(place: _Place) -> str:
+def _destination(place: _PortPlace) -> str:
     """Return where frames for *place* go; the file does not know MAC addresses."""
     return "multicast" if place.interface.startswith("ethernet://") else f"{place.name}/eap0"
 
 
-def _to(place: _Place) -> str:
+def _to(place: _PortPlace) -> str:
     return f"to-{place.name.removeprefix('station-')}"

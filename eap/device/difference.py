@@ -13,12 +13,12 @@ from enum import StrEnum
 import msgspec
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_mapping import Mapped
+from eap.device.eap_mapping import MappingEntry
 from eap.device.stored import Configuration, configuration
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Frame, Rx, Tx, Var
+from eap.od.profiles.eap1000 import FrameEntry, Rx, Tx, Var
 from eap.od.profiles.forms import Form, to_text
-from eap.od.profiles.table import ObjectRange
+from eap.od.profiles.table import ObjectRow
 
 _NONE = b"\0"
 _REFERENCES = {
@@ -36,7 +36,7 @@ class ChangeKind(StrEnum):
     CHANGED = "changed"
 
 
-class Change(msgspec.Struct, frozen=True):
+class EntryChange(msgspec.Struct, frozen=True):
     """One entry, or with sub-index 0 the length of a list or a whole object, and its download."""
 
     kind: ChangeKind
@@ -53,7 +53,7 @@ class Change(msgspec.Struct, frozen=True):
     """Whether people see no difference: it makes way for others, or repeats what they undo."""
 
 
-def compare(old: EapDictionary, new: EapDictionary) -> list[Change]:
+def compare(old: EapDictionary, new: EapDictionary) -> list[EntryChange]:
     """Return what makes the configuration of *new* out of that of *old*."""
     return list(_Comparison(old, new).run())
 
@@ -64,7 +64,7 @@ class _Comparison:
         self._old, self._new = _kept(old), _kept(new)
         self._blank = new.blank()
 
-    def run(self) -> Iterator[Change]:
+    def run(self) -> Iterator[EntryChange]:
         """Yield all changes in their order."""
         yield from self._static()
         yield from self._removed(profile.TX_FRAME)
@@ -81,7 +81,7 @@ class _Comparison:
         for row in (*_PDS, profile.TX_FRAME):
             yield from self._written(row)
 
-    def _static(self) -> Iterator[Change]:
+    def _static(self) -> Iterator[EntryChange]:
         for row in profile.STATIC:
             before, after = self._old.get(row.first, {}), self._new.get(row.first, {})
             if row.list_row is None:
@@ -94,18 +94,18 @@ class _Comparison:
                 for subindex in sorted(after)[1:]:
                     yield self._change(row.first, subindex)
 
-    def _members(self, row: ObjectRange, kept: Configuration) -> list[int]:
+    def _members(self, row: ObjectRow, kept: Configuration) -> list[int]:
         return [index for index in sorted(kept) if row.first <= index <= row.last]
 
-    def _removed(self, row: ObjectRange) -> Iterator[Change]:
+    def _removed(self, row: ObjectRow) -> Iterator[EntryChange]:
         for index in self._members(row, self._old):
             if index not in self._new:
                 yield self._change(index, 0, _NONE)
 
-    def _both(self, row: ObjectRange) -> list[int]:
+    def _both(self, row: ObjectRow) -> list[int]:
         return [index for index in self._members(row, self._old) if index in self._new]
 
-    def _cut_lists(self) -> Iterator[Change]:
+    def _cut_lists(self) -> Iterator[EntryChange]:
         """Shorten the lists of frames that lose a PD or change its place."""
         row = profile.TX_FRAME
         for index in self._both(row):
@@ -116,7 +116,7 @@ class _Comparison:
     def _is_rewritten(self, index: int) -> bool:
         """Tell whether the list of a frame is more than continued."""
         before, after = self._old[index], self._new[index]
-        return any(after.get(sub) != before[sub] for sub in before if sub >= Frame.TXPD)
+        return any(after.get(sub) != before[sub] for sub in before if sub >= FrameEntry.TXPD)
 
     def _mappings_to_write(self) -> list[int]:
         """Return the mappings that change, or map variables whose type does or that go."""
@@ -132,18 +132,18 @@ class _Comparison:
             for index in sorted({*self._members(row, self._old), *self._members(row, self._new)})
             if self._old.get(index) != self._new.get(index)
             or any(
-                Mapped.decode(int.from_bytes(word, "little")).target in moved
+                MappingEntry.decode(int.from_bytes(word, "little")).target in moved
                 for subindex, word in self._old[index].items()
                 if subindex
             )
         ]
 
-    def _emptied(self, rewritten: Iterable[int]) -> Iterator[Change]:
+    def _emptied(self, rewritten: Iterable[int]) -> Iterator[EntryChange]:
         for index in rewritten:
             if index in self._old:
                 yield self._change(index, 0, _NONE, interim=index in self._new)
 
-    def _detached(self) -> Iterator[Change]:
+    def _detached(self) -> Iterator[EntryChange]:
         """Let go references that change, and those between PDs that all go."""
         for row in _PDS:
             for index in self._members(row, self._old):
@@ -154,7 +154,7 @@ class _Comparison:
                     if any(before) and (before != after or (goes and subindex != Tx.PDO_INDEX)):
                         yield self._change(index, subindex, bytes(2), interim=goes or any(after))
 
-    def _written(self, row: ObjectRange) -> Iterator[Change]:
+    def _written(self, row: ObjectRow) -> Iterator[EntryChange]:
         for index in self._members(row, self._new):
             after = self._new[index]
             before = self._before(row, index)
@@ -162,7 +162,7 @@ class _Comparison:
             for subindex in changed or ([] if index in self._old else [min(after, key=bool)]):
                 yield self._change(index, subindex)
 
-    def _before(self, row: ObjectRange, index: int) -> dict[int, bytes]:
+    def _before(self, row: ObjectRow, index: int) -> dict[int, bytes]:
         """Return what the object at *index* holds when its turn to be written comes."""
         after = self._new[index]
         if index in self._old:
@@ -174,7 +174,7 @@ class _Comparison:
             entry = self._new_dictionary[index].entries[Var.DEFAULT]
             before |= {Var.DEFAULT_GIVEN: _NONE, Var.DEFAULT: entry.default}
         if row is profile.TX_FRAME and index in self._old and self._is_rewritten(index):
-            before = {sub: octets for sub, octets in before.items() if sub < Frame.TXPD}
+            before = {sub: octets for sub, octets in before.items() if sub < FrameEntry.TXPD}
         if row is profile.RX_PD and before[Rx.PUBLISHER] != after[Rx.PUBLISHER]:
             before[Rx.SOURCE] = b""  # as writing the publisher does
         for subindex in _REFERENCES.get(row.first, ()):
@@ -182,7 +182,7 @@ class _Comparison:
                 before[subindex] = bytes(2)
         return before
 
-    def _mapping(self, index: int) -> Iterator[Change]:
+    def _mapping(self, index: int) -> Iterator[EntryChange]:
         after = self._new.get(index, {})
         for subindex in sorted(after)[1:]:
             if not any(after[subindex]):
@@ -194,7 +194,7 @@ class _Comparison:
 
     def _change(
         self, index: int, subindex: int, data: bytes | None = None, *, interim: bool = False
-    ) -> Change:
+    ) -> EntryChange:
         """Make the change that writes *data*, or what the new dictionary has."""
         before = self._old.get(index, {}).get(subindex)
         after = self._new.get(index, {}).get(subindex)
@@ -208,7 +208,7 @@ class _Comparison:
         old_text = _text(self._old_dictionary, index, subindex, before)
         new_text = "" if goes else _text(later, index, subindex, shown)
         is_again = kind is ChangeKind.CHANGED and old_text == new_text  # of a variable's other type
-        return Change(
+        return EntryChange(
             kind,
             index,
             subindex,

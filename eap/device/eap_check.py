@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from eap.ids import Destination, InterfaceUri
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Frame, Rx, Tx
+from eap.od.profiles.eap1000 import FrameEntry, Rx, Tx
 from eap.pd import rules
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.rules import Breach
@@ -27,7 +27,7 @@ from eap.pd.spec import (
 )
 
 
-class Found(NamedTuple):
+class FoundRecord(NamedTuple):
     """A record with where it stands; of a TxPD with the Found of its frame."""
 
     port: str
@@ -56,9 +56,9 @@ def fault_of(breach: Breach, index: int, port: str) -> DeviceFault:
 def check_station(
     before: StationSpec,
     spec: StationSpec,
-    frames: list[Found],
-    pds: list[Found],
-    subscriptions: list[Found],
+    frames: list[FoundRecord],
+    pds: list[FoundRecord],
+    subscriptions: list[FoundRecord],
 ) -> None:
     """Refuse what cannot run.
 
@@ -72,7 +72,7 @@ def check_station(
     Raises:
         DeviceFault: for the first object that is wrong.
     """
-    _check_unique(frames, Frame.NAME, "frame")
+    _check_unique(frames, FrameEntry.NAME, "frame")
     _check_unique(pds, Tx.NAME, "sent PD")
     _check_unique(subscriptions, Rx.NAME, "received PD")
     uris = {port.name: InterfaceUri.parse(port.interface) for port in spec.ports}
@@ -88,7 +88,7 @@ def check_station(
     _check_station_needs(before, spec, subscriptions)
 
 
-def _check_unique(found: Iterable[Found], subindex: int, what: str) -> None:
+def _check_unique(found: Iterable[FoundRecord], subindex: int, what: str) -> None:
     for second, first in rules.doubles((each.record.name, each) for each in found):
         detail = f"{what} {first.record.name} is 0x{first.at:04X} of {first.port} already"
         raise second.fault(FaultCode.NAME_TWICE, detail, subindex)
@@ -115,7 +115,7 @@ def _breaches_of_pd(pd: TxPdSpec, frame: TxFrameSpec, cycle_us: int) -> Iterator
     )
 
 
-def _check_received(spec: StationSpec, subscriptions: Iterable[Found]) -> None:
+def _check_received(spec: StationSpec, subscriptions: Iterable[FoundRecord]) -> None:
     # Not the rule of the plant file: while a sender changes, its old and its new version are taken
     # side by side.
     seen: dict[tuple[str, str, int], list[RxPdSpec]] = {}
@@ -136,7 +136,7 @@ def _check_received(spec: StationSpec, subscriptions: Iterable[Found]) -> None:
         each.refuse(rules.check_time_out(pd.name, pd.timeout_ms, spec.cycle_us))
 
 
-def _check_polls(pds: list[Found], subscriptions: list[Found]) -> None:
+def _check_polls(pds: list[FoundRecord], subscriptions: list[FoundRecord]) -> None:
     """Refuse requests that are not there, and those that are answers themselves."""
     sent = {(each.port, each.record.name): each.record for each in pds}
     received = {(each.port, each.record.name): each.record for each in subscriptions}
@@ -158,7 +158,7 @@ def _check_polls(pds: list[Found], subscriptions: list[Found]) -> None:
 
 
 def _check_station_needs(
-    before: StationSpec, spec: StationSpec, subscriptions: Iterable[Found]
+    before: StationSpec, spec: StationSpec, subscriptions: Iterable[FoundRecord]
 ) -> None:
     """Refuse variables that sources and links of the station do not find as they need them."""
     now = {each.name: each for each in spec.variables}

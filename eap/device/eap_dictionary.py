@@ -15,16 +15,16 @@ from contextlib import contextmanager
 
 from eap.codec import pdo
 from eap.device import eap_rules
-from eap.device.eap_mapping import check_mapped, place
-from eap.device.eap_objects import EapObjects, Identity, LiveValues
+from eap.device.eap_mapping import check_mapped, lay_out_mapping
+from eap.device.eap_objects import DeviceIdentity, EapObjects, LiveValues
 from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary, check_value, take_bits
 from eap.od.model import Access, Entry, OdObject, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, Status, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, Status, Tx, Var
 from eap.od.profiles.maker import DEFAULT_TYPE
-from eap.od.profiles.table import CONFIG, ObjectRange
+from eap.od.profiles.table import CONFIG, ObjectRow
 from eap.pd.device import DeviceFault
 from eap.pd.rules import data_budget, frame_budget
 from eap.pd.spec import StationSpec
@@ -50,7 +50,7 @@ class EapDictionary(EapObjects):
         station: StationSpec,
         port: str,
         live: LiveValues | None = None,
-        identity: Identity = Identity(),  # noqa: B008  immutable
+        identity: DeviceIdentity = DeviceIdentity(),  # noqa: B008  immutable
     ) -> None:
         super().__init__(station, port, live, identity)
         self.on_request: Callable[[int], object] | None = None
@@ -67,8 +67,8 @@ class EapDictionary(EapObjects):
         entries[Status.ERROR_CODE].value = fault.code if fault else 0
         text = fault.text if fault else ""
         entries[Status.ERROR_TEXT].octets = text.encode()[: entries[Status.ERROR_TEXT].kind.size]
-        place = fault.index << 16 | fault.subindex << 8 if fault else 0
-        entries[Status.ERROR_OBJECT].value = place
+        lay_out_mapping = fault.index << 16 | fault.subindex << 8 if fault else 0
+        entries[Status.ERROR_OBJECT].value = lay_out_mapping
 
     def download(self, index: int, subindex: int, data: bytes, state: OdState) -> None:
         """Write one entry; makes and deletes dynamic objects."""
@@ -140,7 +140,7 @@ class EapDictionary(EapObjects):
         return True
 
     def _write_whole(
-        self, row: ObjectRange, index: int, first: int, data: bytes, state: OdState
+        self, row: ObjectRow, index: int, first: int, data: bytes, state: OdState
     ) -> None:
         self._whole(index, first)  # refuses what has no complete access
         item = self[index]
@@ -162,7 +162,7 @@ class EapDictionary(EapObjects):
         if has_count and row.mapping:
             self._write_count(row, item, bytes((count,)), state)
 
-    def _make_room(self, row: ObjectRange, item: OdObject, count: int, state: OdState) -> None:
+    def _make_room(self, row: ObjectRow, item: OdObject, count: int, state: OdState) -> None:
         """Empty what can be emptied and make place for *count* entries; 0 may delete it all."""
         if row.mapping:
             self._write_count(row, item, b"\0", state)
@@ -171,7 +171,7 @@ class EapDictionary(EapObjects):
             self._write_count(row, item, bytes((count,)), state)
 
     def _write(
-        self, row: ObjectRange, index: int, subindex: int, data: bytes, state: OdState
+        self, row: ObjectRow, index: int, subindex: int, data: bytes, state: OdState
     ) -> None:
         item = self[index]
         if subindex == 0 and is_counted(item):
@@ -198,7 +198,7 @@ class EapDictionary(EapObjects):
             self.put(index, Rx.SOURCE, b"")  # it was the address of the publisher before
         self.put(index, subindex, data)
 
-    def _write_count(self, row: ObjectRange, item: OdObject, data: bytes, state: OdState) -> None:
+    def _write_count(self, row: ObjectRow, item: OdObject, data: bytes, state: OdState) -> None:
         """Write sub-index 0: the length of a list or a mapping, or 0 to delete or empty."""
         index = item.index
         ObjectDictionary.check_download(self, index, 0, len(data), state)
@@ -209,7 +209,7 @@ class EapDictionary(EapObjects):
                 raise SdoAbortError(AbortCode.NO_SUBINDEX, index, count, detail)
             for subindex in range(1, count + 1):
                 check_mapped(self, item.entries[subindex].value, _right(row), index, subindex)
-            place(self, index, count, data_budget(self.uri.scheme))
+            lay_out_mapping(self, index, count, data_budget(self.uri.scheme))
         elif count == 0 and row.dynamic:
             self._check_unused(index, 0)
             self.remove(index)
@@ -221,7 +221,7 @@ class EapDictionary(EapObjects):
         self.resize(index, count)
 
     def _check_mapping_entry(
-        self, row: ObjectRange, item: OdObject, subindex: int, data: bytes
+        self, row: ObjectRow, item: OdObject, subindex: int, data: bytes
     ) -> None:
         if item.max_subindex:
             raise SdoAbortError(AbortCode.SUBINDEX_0_NOT_ZERO, item.index, subindex)
@@ -236,7 +236,7 @@ class EapDictionary(EapObjects):
             detail = f"{ObjectId(*user)} refers to it"
             raise SdoAbortError(code, index, subindex, detail)
 
-    def _settle(self, row: ObjectRange, index: int, written: list[int], state: OdState) -> None:
+    def _settle(self, row: ObjectRow, index: int, written: list[int], state: OdState) -> None:
         """Check what written entries mean for frames, and tell those who want to know."""
         if index not in self:
             return
@@ -256,10 +256,14 @@ class EapDictionary(EapObjects):
             except DeviceFault as exc:
                 raise SdoAbortError(AbortCode.PARAMETER, index, written[0], str(exc)) from None
 
-    def _frames_to_check(self, row: ObjectRange, index: int, subindex: int) -> list[int]:
+    def _frames_to_check(self, row: ObjectRow, index: int, subindex: int) -> list[int]:
         """Return the frames whose length or budget the entry has a part in."""
         if row is profile.TX_FRAME:
-            return [index] if subindex >= Frame.TXPD or subindex == Frame.ADDRESS_MODE else []
+            return (
+                [index]
+                if subindex >= FrameEntry.TXPD or subindex == FrameEntry.ADDRESS_MODE
+                else []
+            )
         if row is profile.TX_PD and subindex == Tx.PDO_INDEX:
             wanted = {index}
         elif row in {profile.TX_PDO, profile.MORE_TX_PDO} and subindex == 0:
@@ -275,7 +279,7 @@ class EapDictionary(EapObjects):
 
     def _check_budget(self, frame: int, index: int, subindex: int) -> None:
         length = self.frame_length(frame)
-        mode = AddressMode(self[frame].entries[Frame.ADDRESS_MODE].value)
+        mode = AddressMode(self[frame].entries[FrameEntry.ADDRESS_MODE].value)
         budget = frame_budget(self.uri.scheme, mode.kind)
         if length > budget:
             detail = f"{self.name_of(frame)} would have {length} octets, at most {budget} go there"
@@ -287,7 +291,7 @@ def is_counted(item: OdObject) -> bool:
     return item.entries[0].access == CONFIG
 
 
-def _right(row: ObjectRange) -> Access:
+def _right(row: ObjectRow) -> Access:
     is_sent = row in {profile.TX_PDO, profile.MORE_TX_PDO}
     return Access.TX_MAPPABLE if is_sent else Access.RX_MAPPABLE
 

@@ -18,7 +18,7 @@ from eap.od.model import Access, OdObject
 from eap.od.profiles.eap1000 import MAX_ENTRIES, WHOLE
 
 
-class Mapped(NamedTuple):
+class MappingEntry(NamedTuple):
     """One mapping entry."""
 
     target: int
@@ -27,7 +27,7 @@ class Mapped(NamedTuple):
     bits: int
 
     @classmethod
-    def decode(cls, word: int) -> Mapped:
+    def decode(cls, word: int) -> MappingEntry:
         """Take an entry's 32 bits apart."""
         return cls(word >> 16, word >> 8 & 0xFF, word & 0xFF)
 
@@ -36,7 +36,7 @@ class Mapped(NamedTuple):
         return self.target << 16 | self.subindex << 8 | self.bits
 
 
-class Placed(NamedTuple):
+class MappingLayout(NamedTuple):
     """What a whole mapping amounts to."""
 
     indexes: tuple[int, ...]
@@ -55,9 +55,9 @@ def encode_mapping(variables: Iterable[tuple[int, DataType]]) -> list[int]:
     for index, kind in variables:
         if not kind.is_bits and end % 8:
             gap = -end % 8
-            words.append(Mapped(0, 0, gap).encode())
+            words.append(MappingEntry(0, 0, gap).encode())
             end += gap
-        words.append(Mapped(index, 1, min(kind.bit_length, WHOLE)).encode())
+        words.append(MappingEntry(index, 1, min(kind.bit_length, WHOLE)).encode())
         end += kind.bit_length
     if len(words) > MAX_ENTRIES:
         raise ValueError(
@@ -75,7 +75,7 @@ def check_mapped(
     Raises:
         SdoAbortError: NO_OBJECT, NO_SUBINDEX, NOT_STORED, NOT_MAPPABLE or LENGTH.
     """
-    mapped = Mapped.decode(word)
+    mapped = MappingEntry.decode(word)
     if not mapped.target:
         if mapped.subindex or not 0 < mapped.bits < 8:
             detail = f"padding of sub-index {mapped.subindex} and {mapped.bits} bits"
@@ -96,7 +96,9 @@ def check_mapped(
         raise SdoAbortError(AbortCode.LENGTH, index, subindex, detail)
 
 
-def place(dictionary: ObjectDictionary, index: int, count: int, limit: int) -> Placed:
+def lay_out_mapping(
+    dictionary: ObjectDictionary, index: int, count: int, limit: int
+) -> MappingLayout:
     """Return what the first *count* entries of the mapping at *index* amount to.
 
     Raises:
@@ -107,7 +109,7 @@ def place(dictionary: ObjectDictionary, index: int, count: int, limit: int) -> P
     indexes = []
     end = 0
     for subindex in range(1, count + 1):
-        mapped = Mapped.decode(entries[subindex].value)
+        mapped = MappingEntry.decode(entries[subindex].value)
         if not mapped.target:
             follows = subindex < count and _is_whole(dictionary, entries[subindex + 1].value)
             if end % 8 + mapped.bits != 8 or not (follows or subindex == count):
@@ -125,14 +127,14 @@ def place(dictionary: ObjectDictionary, index: int, count: int, limit: int) -> P
     if octets > limit:
         detail = f"{octets} octets, the largest frame of this port has room for {limit}"
         raise SdoAbortError(AbortCode.PDO_LENGTH, index, 0, detail)
-    return Placed(tuple(indexes), octets)
+    return MappingLayout(tuple(indexes), octets)
 
 
 def mapped_bits(dictionary: ObjectDictionary, item: OdObject) -> int:
     """Return the bits of the entries in force of a mapping, as far as what they map exists."""
     bits = 0
     for subindex in range(1, item.max_subindex + 1):
-        mapped = Mapped.decode(item.entries[subindex].value)
+        mapped = MappingEntry.decode(item.entries[subindex].value)
         if mapped.target in dictionary:
             bits += dictionary[mapped.target].entries[mapped.subindex].kind.bit_length
         elif not mapped.target:
@@ -141,5 +143,5 @@ def mapped_bits(dictionary: ObjectDictionary, item: OdObject) -> int:
 
 
 def _is_whole(dictionary: ObjectDictionary, word: int) -> bool:
-    mapped = Mapped.decode(word)
+    mapped = MappingEntry.decode(word)
     return bool(mapped.target) and not dictionary.entry(mapped.target, mapped.subindex).kind.is_bits

@@ -13,15 +13,15 @@ from typing import NamedTuple, Protocol
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.pd import FIRST_PD, PdHeader
-from eap.device.eap_mapping import Mapped, mapped_bits
+from eap.device.eap_mapping import MappingEntry, mapped_bits
 from eap.ids import InterfaceUri, NetId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import WO, OdObject, ReadHook
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Configured, Frame, Port, Rx, Tx, Var
+from eap.od.profiles.eap1000 import Configured, FrameEntry, PortEntry, Rx, Tx, Var
 from eap.od.profiles.maker import DEFAULT_TYPE, make_entry, make_object
-from eap.od.profiles.table import OWN_TYPE, EntryRow, ObjectRange
+from eap.od.profiles.table import OWN_TYPE, EntryRow, ObjectRow
 from eap.pd.spec import PortSpec, StationSpec
 
 TRANSPORTS = ("udp", "ethernet", "tcp", "loop")
@@ -29,8 +29,8 @@ TRANSPORTS = ("udp", "ethernet", "tcp", "loop")
 NAME_AT = {
     0x6: (0x6000, Var.NAME),
     0x7: (0x7000, Var.NAME),
-    0x8: (0x8000, Frame.NAME),
-    0xA: (0x8000, Frame.NAME),
+    0x8: (0x8000, FrameEntry.NAME),
+    0xA: (0x8000, FrameEntry.NAME),
     0xB: (0xD000, Tx.NAME),
     0xC: (0xE000, Rx.NAME),
     0xD: (0xD000, Tx.NAME),
@@ -40,7 +40,7 @@ NAME_AT = {
 _STEMS = {0x6: "tx-variable", 0x7: "rx-variable", 0x8: "frame", 0xD: "txpd", 0xE: "rxpd"}
 """Names of new objects, without their number."""
 _CHANGEABLE = {
-    profile.TX_FRAME.first: Frame.CHANGEABLE,
+    profile.TX_FRAME.first: FrameEntry.CHANGEABLE,
     profile.TX_PD.first: Tx.CHANGEABLE,
     profile.RX_PD.first: Rx.CHANGEABLE,
 }
@@ -73,7 +73,7 @@ class NothingRuns:
         return nullcontext()
 
 
-class Identity(NamedTuple):
+class DeviceIdentity(NamedTuple):
     """What a device says of itself."""
 
     module_profile: int = profile.MODULE_PROFILE
@@ -113,7 +113,7 @@ class EapObjects(ObjectDictionary):
         station: StationSpec,
         port: str,
         live: LiveValues | None = None,
-        identity: Identity = Identity(),  # noqa: B008  immutable
+        identity: DeviceIdentity = DeviceIdentity(),  # noqa: B008  immutable
     ) -> None:
         super().__init__()
         self.station = station
@@ -132,10 +132,10 @@ class EapObjects(ObjectDictionary):
         fixed = {
             (0x1000, 0): identity.module_profile << 16 | (self.port.profile or profile.PROFILE),
             **identity.entries(),
-            (profile.PORT, Port.NAME): self.port.name,
-            (profile.PORT, Port.TRANSPORT): TRANSPORTS.index(uri.scheme),
-            (profile.PORT, Port.INTERFACE): self.port.interface,
-            (profile.PORT, Port.PORT_NUMBER): uri.port,
+            (profile.PORT, PortEntry.NAME): self.port.name,
+            (profile.PORT, PortEntry.TRANSPORT): TRANSPORTS.index(uri.scheme),
+            (profile.PORT, PortEntry.INTERFACE): self.port.interface,
+            (profile.PORT, PortEntry.PORT_NUMBER): uri.port,
             (profile.NET_ID, 1): self._net_id,
         }
         for (index, subindex), value in fixed.items():
@@ -158,11 +158,11 @@ class EapObjects(ObjectDictionary):
             if row.companion:
                 self.remove(index - row.first + row.companion)
 
-    def members(self, *rows: ObjectRange) -> list[int]:
+    def members(self, *rows: ObjectRow) -> list[int]:
         """Return the indexes of the objects that *rows* describe, in order."""
         return [index for row in rows for index in sorted(self._members[row.first])]
 
-    def make(self, row: ObjectRange, index: int) -> OdObject:
+    def make(self, row: ObjectRow, index: int) -> OdObject:
         """Add an object of a dynamic range, and the one that shows what becomes of it."""
         item = self.make_object(row, index)
         self.add(item)
@@ -177,7 +177,7 @@ class EapObjects(ObjectDictionary):
         return item
 
     def make_object(
-        self, row: ObjectRange, index: int, kind: DataType = DEFAULT_TYPE, last: int = 0
+        self, row: ObjectRow, index: int, kind: DataType = DEFAULT_TYPE, last: int = 0
     ) -> OdObject:
         """Return an object with its defaults, not added yet; arguments as for ``make_object``."""
         return make_object(row, index, partial(self._source, index), kind=kind, last=last)
@@ -215,7 +215,7 @@ class EapObjects(ObjectDictionary):
                     more = WO if any(octets) else each.access
                     item.entries[each.subindex].access = each.access | more
 
-    def _retype(self, item: OdObject, row: ObjectRange, kind: DataType) -> None:
+    def _retype(self, item: OdObject, row: ObjectRow, kind: DataType) -> None:
         """Give a variable another type; its default is forgotten."""
         if item.entries[Var.DEFAULT].kind == kind:
             return
@@ -245,10 +245,10 @@ class EapObjects(ObjectDictionary):
     def listed_pds(self, index: int) -> Iterator[tuple[int, int]]:
         """Yield sub-index and TxPD of the list of the frame at *index*, without its blanks."""
         for subindex, entry in self[index].entries.items():
-            if subindex >= Frame.TXPD and (pd := int.from_bytes(entry.octets, "little")):
+            if subindex >= FrameEntry.TXPD and (pd := int.from_bytes(entry.octets, "little")):
                 yield subindex, pd
 
-    def next_free(self, rows: tuple[ObjectRange, ...]) -> int:
+    def next_free(self, rows: tuple[ObjectRow, ...]) -> int:
         """Return the first index of *rows* that is free, 0 if none is."""
         for row in rows:
             taken = self._members[row.first]
@@ -276,10 +276,10 @@ class EapObjects(ObjectDictionary):
         for row in profile.MAPPINGS:
             for item in self._members[row.first].values():
                 for subindex, entry in item.entries.items():
-                    if subindex and Mapped.decode(entry.value).target == index:
+                    if subindex and MappingEntry.decode(entry.value).target == index:
                         yield item.index, subindex
 
-    def _poll_of(self, index: int, row: ObjectRange, subindex: int) -> tuple[int, int] | None:
+    def _poll_of(self, index: int, row: ObjectRow, subindex: int) -> tuple[int, int] | None:
         for item in self._members[row.first].values():
             if item.entries[subindex].value == index:
                 return item.index, subindex
@@ -299,7 +299,7 @@ class EapObjects(ObjectDictionary):
         entry = self[index].entries[subindex]
         return entry.kind.encode(self._compute(profile.row_of(index), index, subindex))
 
-    def _compute(self, row: ObjectRange, index: int, subindex: int) -> int:
+    def _compute(self, row: ObjectRow, index: int, subindex: int) -> int:
         if row is profile.TX_FRAME:
             return self.frame_length(index)
         if row in {profile.TX_PD, profile.RX_PD}:

@@ -16,14 +16,23 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from eap.device.eap_check import Found, check_station, fault_of
+from eap.device.eap_check import FoundRecord, check_station, fault_of
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_mapping import place
+from eap.device.eap_mapping import lay_out_mapping
 from eap.device.pdlayout import bus_variables, types_of
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import AddressMode, Configured, Frame, Port, Rx, RxFlag, Tx, Var
+from eap.od.profiles.eap1000 import (
+    AddressMode,
+    Configured,
+    FrameEntry,
+    PortEntry,
+    Rx,
+    RxFlag,
+    Tx,
+    Var,
+)
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.rules import DESTINATIONS, check_phase, data_budget, frame_budget, is_group
 from eap.pd.spec import (
@@ -89,7 +98,7 @@ def _expected(pd: RxPdSpec, types: Mapping[str, str]) -> tuple[object, ...]:
 
 
 def _in_order(records: list[Any], before: tuple[Any, ...]) -> tuple[Any, ...]:
-    places = {each.name: place for place, each in enumerate(before)}
+    places = {each.name: lay_out_mapping for lay_out_mapping, each in enumerate(before)}
     return tuple(sorted(records, key=lambda each: places.get(each.name, len(places))))
 
 
@@ -134,7 +143,7 @@ class PortReader:
         self._dictionary = dictionary
         self.name = dictionary.port.name
         self._scheme = dictionary.uri.scheme
-        self.sent: list[Found] = []
+        self.sent: list[FoundRecord] = []
 
     def fault(self, code: FaultCode, detail: str, index: int, subindex: int = 0) -> DeviceFault:
         """Make a fault about an object of this port."""
@@ -181,9 +190,9 @@ class PortReader:
             if each.schemes and value(each.subindex) and self._scheme not in each.schemes:
                 detail = f"only on {' and '.join(each.schemes)}, this is {self._scheme}"
                 raise self.fault(FaultCode.PORT, detail, profile.PORT, each.subindex)
-        if value(Port.VLAN_PRIORITY) and not value(Port.VLAN_ID):
+        if value(PortEntry.VLAN_PRIORITY) and not value(PortEntry.VLAN_ID):
             detail = "a priority needs a VLAN"
-            raise self.fault(FaultCode.PORT, detail, profile.PORT, Port.VLAN_PRIORITY)
+            raise self.fault(FaultCode.PORT, detail, profile.PORT, PortEntry.VLAN_PRIORITY)
         fields = {**msgspec.to_builtins(self._dictionary.port), **self._fields(profile.PORT)}
         return msgspec.convert({**fields, "join": list(self._groups())}, PortSpec)
 
@@ -205,7 +214,7 @@ class PortReader:
             fields.setdefault("writer", Writer.ENGINE)
             yield index, msgspec.convert(fields, VariableSpec)
 
-    def frames(self) -> Iterator[Found]:
+    def frames(self) -> Iterator[FoundRecord]:
         """Yield each frame that is enabled, with the PDs that are."""
         seen: dict[int, int] = {}
         for index in self._dictionary.members(profile.TX_FRAME):
@@ -218,33 +227,35 @@ class PortReader:
                     detail = f"TxPD 0x{pd:04X}"
                     raise self.fault(FaultCode.MISSING_OBJECT, detail, index, subindex)
                 seen[pd] = index
-            if self._values(index)(Frame.ENABLED):
+            if self._values(index)(FrameEntry.ENABLED):
                 yield self._frame(index, [pd for _, pd in listed])
         for pd in self._dictionary.members(profile.TX_PD):
             if pd not in seen and self._values(pd)(Tx.ENABLED):
                 raise self.fault(FaultCode.PD_WITHOUT_FRAME, self._dictionary.name_of(pd), pd)
 
-    def _frame(self, index: int, listed: list[int]) -> Found:
+    def _frame(self, index: int, listed: list[int]) -> FoundRecord:
         value = self._values(index)
         enabled = [pd for pd in listed if self._values(pd)(Tx.ENABLED)]
         pds = tuple(self._tx(pd) for pd in enabled)
         if not pds:
-            raise self.fault(FaultCode.EMPTY_FRAME, value(Frame.NAME), index, Frame.TXPD)
-        mode = AddressMode(value(Frame.ADDRESS_MODE))
+            raise self.fault(FaultCode.EMPTY_FRAME, value(FrameEntry.NAME), index, FrameEntry.TXPD)
+        mode = AddressMode(value(FrameEntry.ADDRESS_MODE))
         length = self._dictionary.frame_length(index)
         budget = frame_budget(self._scheme, mode.kind)
         if length > budget:
             detail = f"{length} octets, at most {budget} go there"
-            raise self.fault(FaultCode.FRAME_TOO_LONG, detail, index, Frame.FRAME_LENGTH)
+            raise self.fault(FaultCode.FRAME_TOO_LONG, detail, index, FrameEntry.FRAME_LENGTH)
         record = TxFrameSpec(
             **self._fields(index),
             port=self.name,
             destination=self._destination(index, mode),
             pds=pds,
-            mac=_known_mac(value(Frame.DESTINATION_MAC)) if mode is AddressMode.NET_ID else "",
+            mac=_known_mac(value(FrameEntry.DESTINATION_MAC)) if mode is AddressMode.NET_ID else "",
         )
-        frame = Found(self.name, index, record)
-        self.sent += [Found(self.name, at, pd, frame) for at, pd in zip(enabled, pds, strict=True)]
+        frame = FoundRecord(self.name, index, record)
+        self.sent += [
+            FoundRecord(self.name, at, pd, frame) for at, pd in zip(enabled, pds, strict=True)
+        ]
         return frame
 
     def _destination(self, index: int, mode: AddressMode) -> str:
@@ -253,15 +264,24 @@ class PortReader:
             return REQUESTER
         if kind not in DESTINATIONS[self._scheme]:
             detail = f"{mode.name} is no way to address from {self._scheme}"
-            raise self.fault(FaultCode.NO_DESTINATION, detail, index, Frame.ADDRESS_MODE)
+            raise self.fault(FaultCode.NO_DESTINATION, detail, index, FrameEntry.ADDRESS_MODE)
         number = 0
         if kind is DestinationKind.MAC:
-            subindex, host = Frame.DESTINATION_MAC, str(MacAddr(value(Frame.DESTINATION_MAC)))
+            subindex, host = (
+                FrameEntry.DESTINATION_MAC,
+                str(MacAddr(value(FrameEntry.DESTINATION_MAC))),
+            )
         elif kind is DestinationKind.NET_ID:
-            subindex, host = Frame.DESTINATION_NETID, str(NetId(value(Frame.DESTINATION_NETID)))
+            subindex, host = (
+                FrameEntry.DESTINATION_NETID,
+                str(NetId(value(FrameEntry.DESTINATION_NETID))),
+            )
         else:
-            subindex, host = Frame.DESTINATION_IP, str(IPv4Address(value(Frame.DESTINATION_IP)))
-            number = value(Frame.PORT_NUMBER)
+            subindex, host = (
+                FrameEntry.DESTINATION_IP,
+                str(IPv4Address(value(FrameEntry.DESTINATION_IP))),
+            )
+            number = value(FrameEntry.PORT_NUMBER)
         destination = Destination(kind, host, number)
         is_tcp_group = kind is DestinationKind.TCP and destination.is_group
         if not any(value(subindex)) or is_tcp_group:
@@ -276,7 +296,7 @@ class PortReader:
             trigger["on_change"] = None
         return msgspec.convert({**fields, "variables": self._mapped(index)}, TxPdSpec)
 
-    def subscriptions(self) -> Iterator[Found]:
+    def subscriptions(self) -> Iterator[FoundRecord]:
         """Yield each RxPD that is enabled."""
         for index in self._dictionary.members(profile.RX_PD):
             flags = self._values(index)(Rx.FLAGS)
@@ -287,7 +307,7 @@ class PortReader:
                 fields["publisher"] = ""
             fields["ignore_version"] = bool(flags & RxFlag.IGNORE_VERSION)
             mapped = {"port": self.name, "variables": self._mapped(index)}
-            yield Found(self.name, index, msgspec.convert({**fields, **mapped}, RxPdSpec))
+            yield FoundRecord(self.name, index, msgspec.convert({**fields, **mapped}, RxPdSpec))
 
     def _mapped(self, index: int) -> tuple[str, ...]:
         """Return the names of a PD's variables; its PDO has to be there and whole."""
@@ -300,7 +320,7 @@ class PortReader:
             raise self.fault(FaultCode.MISSING_OBJECT, detail, index, Tx.PDO_INDEX)
         try:
             count = dictionary[pdo].max_subindex
-            placed = place(dictionary, pdo, count, data_budget(self._scheme))
+            placed = lay_out_mapping(dictionary, pdo, count, data_budget(self._scheme))
         except SdoAbortError as exc:
             is_long = exc.code == AbortCode.PDO_LENGTH
             code = FaultCode.FRAME_TOO_LONG if is_long else FaultCode.BAD_MAPPING

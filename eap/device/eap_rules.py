@@ -15,7 +15,7 @@ from eap.od.model import Entry
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import RxFlag
 from eap.od.profiles.forms import Rule
-from eap.od.profiles.table import ObjectRange
+from eap.od.profiles.table import ObjectRow
 from eap.pd.address import address_text, source_octets
 from eap.pd.rules import MADE_SUFFIXES, NAME, is_group, is_name
 
@@ -24,7 +24,7 @@ REQUESTED = frozenset({2, 4, 8})
 _BOOL = 0x01
 
 
-def checked(row: ObjectRange, subindex: int, entry: Entry, data: bytes) -> bytes:
+def checked(row: ObjectRow, subindex: int, entry: Entry, data: bytes) -> bytes:
     """Return *data* as *entry* at *subindex* of one of *row*'s objects stores it."""
     if entry.is_text:
         data = _text(data)

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 from eap.device.eap_dictionary import EapDictionary
 from eap.od.model import OdState
-from eap.pd.device import Device, DeviceFault, DeviceState, FaultCode, Request
+from eap.pd.device import DeviceFault, DeviceState, EapDevice, FaultCode, StateRequest
 from eap.pd.spec import StationSpec
 
 ERROR_BIT = 0x10
@@ -25,9 +25,9 @@ _OD_STATES = {
     DeviceState.OP: OdState.OP,
 }
 _REQUESTS = {
-    DeviceState.PREOP: Request.PREOP,
-    DeviceState.SAFEOP: Request.SAFEOP,
-    DeviceState.OP: Request.OP,
+    DeviceState.PREOP: StateRequest.PREOP,
+    DeviceState.SAFEOP: StateRequest.SAFEOP,
+    DeviceState.OP: StateRequest.OP,
 }
 
 
@@ -70,7 +70,7 @@ class EapStateMachine:
     def __init__(self, check: Callable[[], StationSpec], actions: StateActions) -> None:
         self._check = check
         self._actions = actions
-        self._device = Device()
+        self._device = EapDevice()
         self._fault: DeviceFault | None = None
         self._dictionaries: list[EapDictionary] = []
 
@@ -94,7 +94,7 @@ class EapStateMachine:
         """Go from Init to PreOp, once clients can reach the dictionaries."""
         if self._device.state is DeviceState.INIT:
             if has_mailbox:
-                self._device.request(Request.START)
+                self._device.request(StateRequest.START)
                 self._fault = None
             else:
                 self._fault = DeviceFault(FaultCode.NO_MAILBOX)
@@ -117,10 +117,10 @@ class EapStateMachine:
         while device.state < wanted:
             if device.state is DeviceState.PREOP:
                 actions.start_sending(self._check())
-                device.request(Request.SAFEOP)
+                device.request(StateRequest.SAFEOP)
             else:
                 actions.start_receiving()
-                device.request(Request.OP)
+                device.request(StateRequest.OP)
         if device.state is DeviceState.OP and wanted < DeviceState.OP:
             actions.stop_receiving()
         if device.state.sends and not wanted.sends:

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject, OdState
 from eap.od.profiles import master1100 as profile
 from eap.od.profiles.maker import live_source, make_object
-from eap.od.profiles.master1100 import Live
-from eap.od.profiles.table import ObjectRange
+from eap.od.profiles.master1100 import MasterLive
+from eap.od.profiles.table import ObjectRow
 
 _DETECT = 0xF002
 
@@ -29,22 +29,22 @@ class MasterValues(Protocol):
     def detected(self) -> Sequence[int]:
         """Return those that the last scan has found."""
 
-    def of_configured(self, station: int, key: Live) -> Any:
+    def of_configured(self, station: int, key: MasterLive) -> Any:
         """Return what *key* stands for, of a configured slave."""
 
-    def of_detected(self, station: int, key: Live) -> Any:
+    def of_detected(self, station: int, key: MasterLive) -> Any:
         """Return what *key* stands for, of a slave that was found."""
 
-    def of_diagnosis(self, station: int, key: Live) -> Any:
+    def of_diagnosis(self, station: int, key: MasterLive) -> Any:
         """Return what *key* stands for, of how a configured slave is."""
 
-    def of_master(self, key: Live) -> Any:
+    def of_master(self, key: MasterLive) -> Any:
         """Return what *key* stands for, of the master itself."""
 
-    def write_slave(self, station: int, key: Live, value: int) -> None:
+    def write_slave(self, station: int, key: MasterLive, value: int) -> None:
         """Do what a download asks for, or raise SdoAbortError."""
 
-    def write_master(self, key: Live, data: bytes) -> None:
+    def write_master(self, key: MasterLive, data: bytes) -> None:
         """Do what a download asks for, or raise SdoAbortError."""
 
 
@@ -64,7 +64,7 @@ class MasterDictionary(ObjectDictionary):
     def __init__(
         self,
         values: MasterValues,
-        identity: Identity,
+        identity: DeviceIdentity,
         *,
         full: bool = False,
         padded: bool = False,
@@ -125,12 +125,12 @@ class MasterDictionary(ObjectDictionary):
             found.update(range(row.first, row.first + lists))
         return found
 
-    def _stations(self, row: ObjectRange) -> Sequence[int]:
+    def _stations(self, row: ObjectRow) -> Sequence[int]:
         is_found = row in {profile.DETECTED, profile.DETECTED_LIST}
         stations = self._values.detected() if is_found else self._values.configured()
         return stations[: profile.MAX_SLAVES]
 
-    def _make(self, row: ObjectRange, index: int) -> OdObject:
+    def _make(self, row: ObjectRow, index: int) -> OdObject:
         stations, number = self._stations(row), index - row.first
         if row in profile.LISTS:
             return self._make_list(row, index, stations)
@@ -145,12 +145,12 @@ class MasterDictionary(ObjectDictionary):
         }[row.first]
 
         def write(key: str, data: bytes) -> None:
-            self._values.write_slave(station, Live(key), int.from_bytes(data, "little"))
+            self._values.write_slave(station, MasterLive(key), int.from_bytes(data, "little"))
 
-        source = live_source(lambda key: read(station, Live(key)))
+        source = live_source(lambda key: read(station, MasterLive(key)))
         return make_object(row, index, source, write=write, extent=extent)
 
-    def _make_list(self, row: ObjectRange, index: int, stations: Sequence[int]) -> OdObject:
+    def _make_list(self, row: ObjectRow, index: int, stations: Sequence[int]) -> OdObject:
         start = (index - row.first) * profile.PER_LIST
         part = stations[start : start + profile.PER_LIST]
         if start and not part:
@@ -161,7 +161,7 @@ class MasterDictionary(ObjectDictionary):
         return item
 
     def _read(self, key: str) -> Any:
-        return self._values.of_master(Live(key))
+        return self._values.of_master(MasterLive(key))
 
     def _write(self, key: str, data: bytes) -> None:
-        self._values.write_master(Live(key), data)
+        self._values.write_master(MasterLive(key), data)

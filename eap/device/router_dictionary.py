@@ -13,15 +13,15 @@ from ipaddress import IPv4Address
 from itertools import starmap
 from typing import Any, Protocol
 
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.ids import InterfaceUri, NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject
 from eap.od.profiles import eap1000
 from eap.od.profiles import router9000 as profile
 from eap.od.profiles.maker import live_source, make_object
-from eap.od.profiles.router9000 import Live
-from eap.od.profiles.table import ObjectRange
+from eap.od.profiles.router9000 import RouterLive
+from eap.od.profiles.table import ObjectRow
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 _IP_SCHEMES = ("udp", "tcp")
@@ -31,7 +31,7 @@ _MAX_ROUTES = profile.ROUTE.last - profile.ROUTE.first + 1
 class RouterValues(Protocol):
     """The running router; values are numbers, octets or texts, as the profile's types say."""
 
-    def number(self, key: Live) -> int:
+    def number(self, key: RouterLive) -> int:
         """Return what *key* stands for, of the router as a whole."""
 
     def state_of(self, port: str) -> int:
@@ -43,7 +43,7 @@ class RouterValues(Protocol):
     def routes(self) -> Sequence[object]:
         """Return all routes in their order."""
 
-    def of_route(self, key: Live, route: object) -> Any:
+    def of_route(self, key: RouterLive, route: object) -> Any:
         """Return what *key* stands for, of one of the routes."""
 
 
@@ -56,7 +56,9 @@ class RouterDictionary(ObjectDictionary):
         identity: What 0x1008 to 0x1018 show.
     """
 
-    def __init__(self, station: StationSpec, values: RouterValues, identity: Identity) -> None:
+    def __init__(
+        self, station: StationSpec, values: RouterValues, identity: DeviceIdentity
+    ) -> None:
         super().__init__()
         self._values = values
         self._names = {
@@ -100,15 +102,15 @@ class RouterDictionary(ObjectDictionary):
     def _make_route(self, index: int, route: object) -> OdObject:
         return _make(profile.ROUTE, index, lambda key: self._values.of_route(key, route))
 
-    def _read(self, key: Live) -> int:
+    def _read(self, key: RouterLive) -> int:
         return self._values.number(key)
 
-    def _read_device(self, port: str, key: Live) -> int | bytes:
-        if key is Live.DEVICE_STATE:
+    def _read_device(self, port: str, key: RouterLive) -> int | bytes:
+        if key is RouterLive.DEVICE_STATE:
             return self._values.state_of(port)
         return self._values.mac_of(port)
 
-    def _set_fixed(self, station: StationSpec, identity: Identity) -> None:
+    def _set_fixed(self, station: StationSpec, identity: DeviceIdentity) -> None:
         fixed: dict[tuple[int, int], Any] = {
             **identity.entries(),
             (0xF920, 1): NetId.parse(station.net_id),
@@ -131,8 +133,10 @@ class RouterDictionary(ObjectDictionary):
 _PROFILES = {PortKind.EAP: eap1000.MODULE_PROFILE, PortKind.BUS: profile.MASTER_PROFILE}
 
 
-def _make(row: ObjectRange, index: int, read: Callable[[Live], Any], *, last: int = 0) -> OdObject:
-    return make_object(row, index, live_source(lambda key: read(Live(key))), last=last)
+def _make(
+    row: ObjectRow, index: int, read: Callable[[RouterLive], Any], *, last: int = 0
+) -> OdObject:
+    return make_object(row, index, live_source(lambda key: read(RouterLive(key))), last=last)
 
 
 def _is_route(index: int) -> bool:

@@ -1,7 +1,7 @@
 """Addresses at run time: destinations and sources as words of the image, learned and watched.
 
-A word is the kind, then a MAC address, or an IPv4 address and the port.  A :class:`Learner` tells
-which MAC address a NetID stands for, from the frames of the port that has it.  A
+A word is the kind, then a MAC address, or an IPv4 address and the port.  A :class:`NetIdLearner`
+tells which MAC address a NetID stands for, from the frames of the port that has it.  A
 :class:`SourceWatch` notes the addresses that the frames of one publisher come from: a publisher ID
 is no proof of identity, as any host can put it into a frame.  Where the publisher's address is
 known, its frames are told from those of all other hosts by that address.  Where it is not, two
@@ -15,7 +15,7 @@ from ipaddress import IPv4Address
 
 from eap.codec.ethercat import FrameType
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
-from eap.pd.link import Origin, Taker
+from eap.pd.link import FrameOrigin, Taker
 from eap.pd.words import RxWord
 
 _KIND_SHIFT = 48
@@ -177,7 +177,7 @@ LOOK_NS = 100_000_000
 _PUBLISHER = slice(2, 8)
 
 
-class Learner:
+class NetIdLearner:
     """Looks at the frames of a port on their way to *taker*.
 
     Attributes:
@@ -191,7 +191,7 @@ class Learner:
         self._taker = taker
         self._looked_at_ns: dict[bytes, int] = {}
 
-    def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
+    def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Note who sent a frame, and hand it over."""
         if self.sought and size >= _PUBLISHER.stop and data[1] >> 4 == FrameType.PROCESS_DATA:
             publisher = bytes(data[_PUBLISHER])
@@ -199,7 +199,7 @@ class Learner:
                 self._look(publisher, data, at_ns, origin)
         self._taker(data, size, at_ns, origin)
 
-    def _look(self, publisher: bytes, data: memoryview, at_ns: int, origin: Origin) -> None:
+    def _look(self, publisher: bytes, data: memoryview, at_ns: int, origin: FrameOrigin) -> None:
         looked_at_ns = self._looked_at_ns.get(publisher)
         if looked_at_ns is None or not 0 <= at_ns - looked_at_ns < LOOK_NS:
             self._looked_at_ns[publisher] = at_ns

@@ -33,7 +33,7 @@ class DeviceState(IntEnum):
         return self is DeviceState.OP
 
 
-class Request(Enum):
+class StateRequest(Enum):
     """What can be asked of a device."""
 
     START = auto()
@@ -43,34 +43,34 @@ class Request(Enum):
     OP = auto()
 
 
-TRANSITIONS: dict[tuple[DeviceState, Request], DeviceState] = {
-    (DeviceState.INIT, Request.START): DeviceState.PREOP,
-    (DeviceState.PREOP, Request.PREOP): DeviceState.PREOP,
-    (DeviceState.PREOP, Request.SAFEOP): DeviceState.SAFEOP,
-    (DeviceState.SAFEOP, Request.PREOP): DeviceState.PREOP,
-    (DeviceState.SAFEOP, Request.SAFEOP): DeviceState.SAFEOP,
-    (DeviceState.SAFEOP, Request.OP): DeviceState.OP,
-    (DeviceState.OP, Request.PREOP): DeviceState.PREOP,
-    (DeviceState.OP, Request.SAFEOP): DeviceState.SAFEOP,
-    (DeviceState.OP, Request.OP): DeviceState.OP,
+TRANSITIONS: dict[tuple[DeviceState, StateRequest], DeviceState] = {
+    (DeviceState.INIT, StateRequest.START): DeviceState.PREOP,
+    (DeviceState.PREOP, StateRequest.PREOP): DeviceState.PREOP,
+    (DeviceState.PREOP, StateRequest.SAFEOP): DeviceState.SAFEOP,
+    (DeviceState.SAFEOP, StateRequest.PREOP): DeviceState.PREOP,
+    (DeviceState.SAFEOP, StateRequest.SAFEOP): DeviceState.SAFEOP,
+    (DeviceState.SAFEOP, StateRequest.OP): DeviceState.OP,
+    (DeviceState.OP, StateRequest.PREOP): DeviceState.PREOP,
+    (DeviceState.OP, StateRequest.SAFEOP): DeviceState.SAFEOP,
+    (DeviceState.OP, StateRequest.OP): DeviceState.OP,
 }
 
 
 _UP = {
-    DeviceState.INIT: Request.START,
-    DeviceState.PREOP: Request.SAFEOP,
-    DeviceState.SAFEOP: Request.OP,
+    DeviceState.INIT: StateRequest.START,
+    DeviceState.PREOP: StateRequest.SAFEOP,
+    DeviceState.SAFEOP: StateRequest.OP,
 }
-_DOWN = {DeviceState.PREOP: Request.PREOP, DeviceState.SAFEOP: Request.SAFEOP}
+_DOWN = {DeviceState.PREOP: StateRequest.PREOP, DeviceState.SAFEOP: StateRequest.SAFEOP}
 
 
-class Device:
+class EapDevice:
     """The state of one station's EAP device."""
 
     def __init__(self) -> None:
         self.state = DeviceState.INIT
 
-    def request(self, what: Request) -> DeviceState:
+    def request(self, what: StateRequest) -> DeviceState:
         """Go to another state and return it; raise LocalProtocolError if there is no way."""
         try:
             self.state = TRANSITIONS[self.state, what]

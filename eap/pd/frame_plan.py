@@ -16,7 +16,7 @@ from eap.errors import TruncatedError
 from eap.ids import NetId
 from eap.pd.address import SourceWatch
 from eap.pd.copyplan import CopyPlan
-from eap.pd.poll import Answer
+from eap.pd.poll import PollAnswer
 from eap.pd.sequence import SequenceTracker
 from eap.pd.words import Discard
 
@@ -24,7 +24,7 @@ Copy: TypeAlias = tuple[slice, slice]
 """Octets of the frame and where they go in the image."""
 
 
-class Taken(NamedTuple):
+class TakenPd(NamedTuple):
     """A PD of the frame that a subscription takes: offsets of its header here and there."""
 
     tracker: SequenceTracker
@@ -38,7 +38,7 @@ class Taken(NamedTuple):
     """What copies it, header included, if it is laid out otherwise than in the image."""
 
 
-class Refused(NamedTuple):
+class RefusedPd(NamedTuple):
     """A PD that nobody takes: the counters to add one to, and the VarState words to set."""
 
     counters: tuple[int, ...]
@@ -89,12 +89,12 @@ class FramePlan:
         self,
         end: int,
         pds: Iterable[tuple[bytes, int]],
-        taken: Iterable[Taken],
-        refused: Iterable[Refused],
+        taken: Iterable[TakenPd],
+        refused: Iterable[RefusedPd],
         *,
         watch: SourceWatch,
         requests: Iterable[tuple[SequenceTracker, str]] = (),
-        answers: Iterable[tuple[SequenceTracker, Answer]] = (),
+        answers: Iterable[tuple[SequenceTracker, PollAnswer]] = (),
         roaming: Iterable[SequenceTracker] = (),
         publisher: bytes = b"",
     ) -> None:
@@ -136,8 +136,8 @@ class FramePlan:
         return memoryview(frame.ljust(self.end, b"\0"))
 
 
-def _parts(taken: Iterable[Taken]) -> tuple[tuple[SequenceTracker, tuple[Copy, ...]], ...]:
-    runs: dict[SequenceTracker, list[Taken]] = {}
+def _parts(taken: Iterable[TakenPd]) -> tuple[tuple[SequenceTracker, tuple[Copy, ...]], ...]:
+    runs: dict[SequenceTracker, list[TakenPd]] = {}
     for pd in taken:
         pieces = runs.setdefault(pd.tracker, [])
         if pd.alternate is not None:
@@ -158,7 +158,7 @@ def _parts(taken: Iterable[Taken]) -> tuple[tuple[SequenceTracker, tuple[Copy, .
     )
 
 
-def _continues(run: Taken, pd: Taken) -> bool:
+def _continues(run: TakenPd, pd: TakenPd) -> bool:
     return run.source + run.size == pd.source and run.target + run.size == pd.target
 
 

@@ -13,7 +13,7 @@ from eap.pd.address import from_word
 from eap.pd.image import Image
 from eap.pd.layout import FramePlace, TxPlace
 from eap.pd.link import OutFrame
-from eap.pd.monitor import Presence
+from eap.pd.monitor import SubscriberPresence
 from eap.pd.words import FrameState, FrameWord, TxWord
 
 
@@ -68,14 +68,14 @@ def _enter_unsent(words: memoryview, frame: FramePlace, state: FrameState, now_n
 
 def frame_state(image: Image, first_word: int) -> int:
     """Return the FrameState of the frame whose first word is at index *first_word*."""
-    is_missing = image.words[first_word + FrameWord.PRESENCE] == Presence.MISSING
+    is_missing = image.words[first_word + FrameWord.PRESENCE] == SubscriberPresence.MISSING
     missing = FrameState.SUBSCRIBER_MISSING if is_missing else 0
     return int(unsent_state(image.words, first_word) | missing)
 
 
 def presence(image: Image, first_word: int) -> str:
     """Return whether the subscriber of that frame is there; ``unknown`` too if nobody looks."""
-    return Presence(image.words[first_word + FrameWord.PRESENCE]).name.lower()
+    return SubscriberPresence(image.words[first_word + FrameWord.PRESENCE]).name.lower()
 
 
 def frame_status(image: Image, place: FramePlace) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from eap.codec.pd import PdHeader
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxPlace
-from eap.pd.monitor import Presence
+from eap.pd.monitor import SubscriberPresence
 from eap.pd.spec import PortSpec, StationSpec, Writer
 from eap.pd.words import (
     REASON_INDEX,
@@ -56,7 +56,7 @@ _SOURCE_WORDS = (
 )
 
 
-class _Run(NamedTuple):
+class _WordRun(NamedTuple):
     """Words that are copied in one piece."""
 
     source: int
@@ -75,7 +75,7 @@ class ImageHandover:
     def __init__(self, old: Image, new: Image) -> None:
         self._old, self._new = old, new
         station = [index for index in range(StationWord.SIZE) if index not in _OWN_WORDS]
-        self._runs = _joined(_Run(index, index, 1) for index in station)
+        self._runs = _joined(_WordRun(index, index, 1) for index in station)
         self._sent = _Sent(old.layout, new.layout)
         self._received = _Received(old, new)
         self._from_engine, self._from_others = _plan_values(old, new)
@@ -131,8 +131,8 @@ class _Sent:
             if was.by_schedule and not (was.frame == pd.frame and pd.frame in whole)
         ]
         self._runs = _joined(
-            [_Run(was.words, frame.words, FrameWord.SIZE) for was, frame in kept]
-            + [_Run(was.words, pd.words, TxWord.SIZE) for was, pd in pds]
+            [_WordRun(was.words, frame.words, FrameWord.SIZE) for was, frame in kept]
+            + [_WordRun(was.words, pd.words, TxWord.SIZE) for was, pd in pds]
         )
 
     def carry(self, old: memoryview, new: memoryview) -> None:
@@ -141,7 +141,7 @@ class _Sent:
         for first in self._moved:
             new[first + FrameWord.ADDRESS] = 0
         for first in self._unseen:
-            new[first + FrameWord.PRESENCE] = Presence.UNKNOWN
+            new[first + FrameWord.PRESENCE] = SubscriberPresence.UNKNOWN
         for first in self._changed:
             new[first + FrameWord.PARTIAL] += new[first + FrameWord.WHOLE]
             new[first + FrameWord.WHOLE] = 0
@@ -173,7 +173,7 @@ class _Received:
             if place.name in before
         ]
         self._runs = _joined(
-            _Run(was.words, place.words, RxWord.SIZE) for _, was, _, place in self._heirs
+            _WordRun(was.words, place.words, RxWord.SIZE) for _, was, _, place in self._heirs
         )
         self._owners = array("q", [0] * len(new.layout.rx))
         """By RxPD of the new image: where its tracker is, as in RxWord.TRACKER."""
@@ -219,7 +219,7 @@ class _Received:
                 self._strangers.add(owner)
         size = RxWord.SIZE - TRACKER_START
         self._trackers = [
-            _Run(tracker + TRACKER_START, owner + TRACKER_START, size)
+            _WordRun(tracker + TRACKER_START, owner + TRACKER_START, size)
             for owner, tracker in sources.items()
         ]
 
@@ -277,9 +277,9 @@ def _plan_values(old: Image, new: Image) -> tuple[CopyPlan, CopyPlan]:
     return CopyPlan(engine), CopyPlan(others)
 
 
-def _joined(runs: Iterable[_Run]) -> list[_Run]:
+def _joined(runs: Iterable[_WordRun]) -> list[_WordRun]:
     """Join what lies side by side on both sides."""
-    joined: list[_Run] = []
+    joined: list[_WordRun] = []
     for run in runs:
         if joined:
             last = joined[-1]
@@ -290,7 +290,7 @@ def _joined(runs: Iterable[_Run]) -> list[_Run]:
     return joined
 
 
-def _copy(runs: Iterable[_Run], old: memoryview, new: memoryview) -> None:
+def _copy(runs: Iterable[_WordRun], old: memoryview, new: memoryview) -> None:
     for source, target, size in runs:
         new[target : target + size] = old[source : source + size]
 

@@ -29,9 +29,9 @@ from eap.pd import pieces
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.spec import (
     BusEntrySpec,
-    Record,
     RxAlternateSpec,
     RxPdSpec,
+    SpecRecord,
     StationSpec,
     Substitute,
     TxFrameSpec,
@@ -59,7 +59,7 @@ FRAME_CTRL = ".FrameCtrl"
 """Suffix of the control variable of a TxFrame: bit 0 suppresses it."""
 
 
-class VariablePlace(Record, frozen=True):
+class VariablePlace(SpecRecord, frozen=True):
     """One variable: *bit_offset* counts from the start of the image."""
 
     name: str
@@ -71,7 +71,7 @@ class VariablePlace(Record, frozen=True):
     default: bool | int | float | str | list[bool | int | float] | None = None
 
 
-class RegionPlace(Record, frozen=True):
+class RegionPlace(SpecRecord, frozen=True):
     """The variables of one writer, and the word that guards them; offsets in octets."""
 
     offset: int
@@ -79,7 +79,7 @@ class RegionPlace(Record, frozen=True):
     sequence: int
 
 
-class SamplePlace(Record, frozen=True):
+class SamplePlace(SpecRecord, frozen=True):
     """Samples of all regions, one a cycle; offsets and sizes in octets.
 
     The sample of a cycle lies at ``offset + cycle % count * size``: the cycle and its time, which
@@ -93,7 +93,7 @@ class SamplePlace(Record, frozen=True):
     last: int
 
 
-class PortPlace(Record, frozen=True):
+class PortPlace(SpecRecord, frozen=True):
     """What a reader wants to know of a port."""
 
     name: str
@@ -102,7 +102,7 @@ class PortPlace(Record, frozen=True):
     interface: str
 
 
-class FramePlace(Record, frozen=True):
+class FramePlace(SpecRecord, frozen=True):
     """A TxFrame: *words* is the index of its first word."""
 
     name: str
@@ -118,7 +118,7 @@ class FramePlace(Record, frozen=True):
         return self.port, self.destination, self.monitor_interval_ms, self.monitor_ip
 
 
-class TxPlace(Record, frozen=True):
+class TxPlace(SpecRecord, frozen=True):
     """A TxPD; *frame_words* is the index of its frame's first word, *size* the data's octets."""
 
     name: str
@@ -140,7 +140,7 @@ class TxPlace(Record, frozen=True):
     """The RxPD that asks for it."""
 
 
-class RxPlace(Record, frozen=True):
+class RxPlace(SpecRecord, frozen=True):
     """An RxPD: its PD header lies at octet *offset*, its data behind it."""
 
     name: str
@@ -163,7 +163,7 @@ class RxPlace(Record, frozen=True):
     """Address that its frames must come from; empty takes any."""
 
 
-class ImageLayout(Record, frozen=True):
+class ImageLayout(SpecRecord, frozen=True):
     """The directory of one station's image."""
 
     station: str
@@ -389,7 +389,7 @@ _QUALITY_BITS = 16
 _QUALITY = 8 * PdHeader.SIZE - _QUALITY_BITS
 
 
-class AlternatePlace(Record, frozen=True):
+class AlternatePlace(SpecRecord, frozen=True):
     """Another layout: *size* octets of data."""
 
     version: int

@@ -9,7 +9,7 @@ from eap.codec.pd import EAP_SM_OFFSET
 from eap.pd.words import StationWord
 
 
-class Origin(Protocol):
+class FrameOrigin(Protocol):
     """Driver that hands a frame to a taker, and knows the sender of the frame."""
 
     def source_of(self, data: memoryview) -> bytes:
@@ -26,7 +26,7 @@ class Origin(Protocol):
         """
 
 
-Taker: TypeAlias = Callable[[memoryview, int, int, Origin], None]
+Taker: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], None]
 """Takes one frame: ``take(data, size, at_ns, origin)``.
 
 *data* starts at the EtherCAT header and may be longer than the frame; *size* octets of it arrived.

@@ -22,7 +22,7 @@ from eap.ids import MacAddr
 _SECOND_NS = 1_000_000_000
 
 
-class Presence(IntEnum):
+class SubscriberPresence(IntEnum):
     """Whether the subscriber of a frame is there; the word of a frame in the process image."""
 
     UNKNOWN = 0
@@ -68,7 +68,7 @@ class PresenceTracker:
     def __init__(
         self, interval_ns: int, now_ns: int, policy: PresencePolicy = DEFAULT_POLICY
     ) -> None:
-        self.presence = Presence.UNKNOWN
+        self.presence = SubscriberPresence.UNKNOWN
         self._policy = policy
         self._patience_ns = max(policy.trust_ns, policy.misses * interval_ns)
         self._told_at_ns = now_ns
@@ -82,9 +82,9 @@ class PresenceTracker:
     @property
     def in_doubt(self) -> bool:
         """Whether the next round may change something: it had better come soon."""
-        return bool(self._hits if self.presence is Presence.MISSING else self._misses)
+        return bool(self._hits if self.presence is SubscriberPresence.MISSING else self._misses)
 
-    def take(self, evidence: Evidence, now_ns: int) -> Presence:
+    def take(self, evidence: Evidence, now_ns: int) -> SubscriberPresence:
         """Count *evidence* and return the presence that follows."""
         before = self.presence
         match evidence:
@@ -96,7 +96,7 @@ class PresenceTracker:
                 self._look_in_vain()
             case Evidence.PENDING:
                 if now_ns - self._told_at_ns > self._patience_ns:
-                    self.presence = Presence.UNKNOWN
+                    self.presence = SubscriberPresence.UNKNOWN
         if self.presence is not before:
             self._hits = self._misses = self._blind = 0
         return self.presence
@@ -107,8 +107,8 @@ class PresenceTracker:
         if self._verdict is not Evidence.SEEN:
             self._verdict = Evidence.SEEN
             self._hits += 1
-        if self.presence is not Presence.MISSING or self._hits >= self._policy.hits:
-            self.presence = Presence.PRESENT
+        if self.presence is not SubscriberPresence.MISSING or self._hits >= self._policy.hits:
+            self.presence = SubscriberPresence.PRESENT
 
     def _miss(self, evidence: Evidence, now_ns: int) -> None:
         if evidence is Evidence.MISSED and self._verdict is Evidence.SEEN:
@@ -119,14 +119,14 @@ class PresenceTracker:
             self._verdict = Evidence.MISSED
             self._misses += 1
         if evidence is Evidence.ABSENT or self._misses >= self._policy.misses:
-            self.presence = Presence.MISSING
+            self.presence = SubscriberPresence.MISSING
 
     def _look_in_vain(self) -> None:
         if self._verdict is None:
             self._verdict = Evidence.BLIND
             self._blind += 1
         if self._blind >= self._policy.misses:
-            self.presence = Presence.UNKNOWN
+            self.presence = SubscriberPresence.UNKNOWN
 
 
 _CLAIMANTS_KEPT = 64
@@ -170,8 +170,8 @@ class PresenceChanged(NamedTuple):
     """A target came, went or was lost from sight."""
 
     name: str
-    old: Presence
-    new: Presence
+    old: SubscriberPresence
+    new: SubscriberPresence
     cause: Evidence
     answered_by: MacAddr | None
     """Who answered last for its address; not where the frames go if it is missing all the same."""
@@ -246,10 +246,10 @@ class SubscriberMonitor:
         """Forget target *name*; one that is not there is no error."""
         self._watches.pop(name, None)
 
-    def presence(self, name: str) -> Presence:
+    def presence(self, name: str) -> SubscriberPresence:
         """Return what is known of target *name*; unknown for one that is not watched."""
         watch = self._watches.get(name)
-        return Presence.UNKNOWN if watch is None else watch.tracker.presence
+        return SubscriberPresence.UNKNOWN if watch is None else watch.tracker.presence
 
     def next_timeout(self) -> int | None:
         """Return when :meth:`probes_to_send` must be called again; None if never."""

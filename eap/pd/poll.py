@@ -54,7 +54,7 @@ class Requests:
                 self.add(sender, known)
 
 
-class Question:
+class PollQuestion:
     """One TxPD of this station that asks others.
 
     Args:
@@ -74,7 +74,7 @@ class Question:
         self._waiting: dict[str, int] = {}
         self._state = self._read_state()
 
-    def follow(self, before: Question) -> None:
+    def follow(self, before: PollQuestion) -> None:
         """Go on where *before* was; the words of the image have been carried over."""
         self._sent_at_ns, self._before_ns = before._sent_at_ns, before._before_ns
         self._waiting = {
@@ -116,11 +116,11 @@ class Question:
         return whole, words[place.words + TxWord.SENT_AT_NS]
 
 
-class Answer(NamedTuple):
+class PollAnswer(NamedTuple):
     """An RxPD that answers a question."""
 
     name: str
-    question: Question
+    question: PollQuestion
     words: int
     """Index of its first word."""
 
@@ -131,14 +131,14 @@ def requests_at(spec: StationSpec, port: str) -> Requests:
     return Requests(pd.poll_request for frame in frames for pd in frame.pds if pd.poll_request)
 
 
-def questions_of(image: Image) -> dict[str, Question]:
+def questions_of(image: Image) -> dict[str, PollQuestion]:
     """Return what a station asks, by the TxPD that does it."""
     answers: dict[str, list[str]] = {}
     for place in image.layout.rx:
         if place.poll_request:
             answers.setdefault(place.poll_request, []).append(place.name)
     return {
-        place.name: Question(image.words, place, answers[place.name])
+        place.name: PollQuestion(image.words, place, answers[place.name])
         for place in image.layout.tx
         if place.name in answers
     }

@@ -56,7 +56,7 @@ class Sampler:
         self._heads[head] = cycle
 
 
-class Samples:
+class ImageSamples:
     """The side of those who read them; one in all may say what is wanted.
 
     Args:

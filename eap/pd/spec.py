@@ -31,11 +31,11 @@ class Substitute(StrEnum):
     DEFAULT = "default"
 
 
-class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SpecRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all specifications."""
 
 
-class VariableSpec(Record, frozen=True):
+class VariableSpec(SpecRecord, frozen=True):
     """One variable; *type* as ``eap.codec.datatypes.parse`` reads it."""
 
     name: str
@@ -50,14 +50,14 @@ class VariableSpec(Record, frozen=True):
     comment: str = ""
 
 
-class CounterSource(Record, frozen=True, tag="counter", tag_field="kind"):
+class CounterSource(SpecRecord, frozen=True, tag="counter", tag_field="kind"):
     """One *step* up in each device cycle, wrapping with the type."""
 
     variable: str
     step: int = 1
 
 
-class RampSource(Record, frozen=True, tag="ramp", tag_field="kind"):
+class RampSource(SpecRecord, frozen=True, tag="ramp", tag_field="kind"):
     """From *low* to *high* in *period_ms*, then again."""
 
     variable: str
@@ -66,7 +66,7 @@ class RampSource(Record, frozen=True, tag="ramp", tag_field="kind"):
     period_ms: float
 
 
-class SineSource(Record, frozen=True, tag="sine", tag_field="kind"):
+class SineSource(SpecRecord, frozen=True, tag="sine", tag_field="kind"):
     """*offset* plus *amplitude* times the sine of a full turn in *period_ms*."""
 
     variable: str
@@ -75,7 +75,7 @@ class SineSource(Record, frozen=True, tag="sine", tag_field="kind"):
     offset: float = 0.0
 
 
-class RandomSource(Record, frozen=True, tag="random", tag_field="kind"):
+class RandomSource(SpecRecord, frozen=True, tag="random", tag_field="kind"):
     """Random octets in each device cycle in which the variable is sent."""
 
     variable: str
@@ -110,7 +110,7 @@ INTERFACE_MEASURES = frozenset(
 """Measures whose argument is the name of a network interface."""
 
 
-class HostSource(Record, frozen=True, tag="host", tag_field="kind"):
+class HostSource(SpecRecord, frozen=True, tag="host", tag_field="kind"):
     """A measurement of this host, read from /proc; *argument* as the measure needs one."""
 
     variable: str
@@ -119,7 +119,7 @@ class HostSource(Record, frozen=True, tag="host", tag_field="kind"):
     period_ms: int = 500
 
 
-class CsvSource(Record, frozen=True, tag="csv", tag_field="kind"):
+class CsvSource(SpecRecord, frozen=True, tag="csv", tag_field="kind"):
     """One *column* of *file*, a row every *period_ms*, from the start again at the end."""
 
     variable: str
@@ -133,7 +133,7 @@ ServicesSource = HostSource | CsvSource
 Source = EngineSource | ServicesSource
 
 
-class OnChangeSpec(Record, frozen=True):
+class OnChangeSpec(SpecRecord, frozen=True):
     """Send when the data differs from what was sent last."""
 
     timeout_ms: int = 0
@@ -142,7 +142,7 @@ class OnChangeSpec(Record, frozen=True):
     """Shortest gap between two frames sent for a change; 0 none."""
 
 
-class TriggerSpec(Record, frozen=True):
+class TriggerSpec(SpecRecord, frozen=True):
     """When a TxPD is sent; docs/triggers.md has the truth table.  All off: each device cycle."""
 
     cycle_us: int = 0
@@ -157,7 +157,7 @@ REQUESTER = "requester"
 """Destination of a frame that only answers: whoever asked."""
 
 
-class TxPdSpec(Record, frozen=True):
+class TxPdSpec(SpecRecord, frozen=True):
     """One PD to send: *variables* of this station, in PDO order."""
 
     name: str
@@ -171,7 +171,7 @@ class TxPdSpec(Record, frozen=True):
     """Whether its ID and poll request may be written in SafeOp and Op."""
 
 
-class TxFrameSpec(Record, frozen=True):
+class TxFrameSpec(SpecRecord, frozen=True):
     """One frame to send from *port* to *destination*.
 
     *destination* is a MAC address, an IPv4 address (``address[:port]``), ``tcp://address[:port]``
@@ -195,14 +195,14 @@ class TxFrameSpec(Record, frozen=True):
     """Ethernet: IPv4 address of the subscriber, to probe for by ARP; empty leaves it unknown."""
 
 
-class TakenVariableSpec(Record, frozen=True):
+class TakenVariableSpec(SpecRecord, frozen=True):
     """One variable as it is sent; *name* is that of the RxPD's variable, empty if it has none."""
 
     name: str
     type: str
 
 
-class RxAlternateSpec(Record, frozen=True):
+class RxAlternateSpec(SpecRecord, frozen=True):
     """Another layout of a PD that is taken as well, while its sender changes from one to the other.
 
     What it has in common with the RxPD goes to the same variables; all others keep their values.
@@ -213,7 +213,7 @@ class RxAlternateSpec(Record, frozen=True):
     """Everything that is sent, in PDO order."""
 
 
-class RxPdSpec(Record, frozen=True):
+class RxPdSpec(SpecRecord, frozen=True):
     """One PD to receive into *variables* of this station, in PDO order."""
 
     name: str
@@ -261,7 +261,7 @@ class Wake(StrEnum):
     """As they arrive: the shortest latency, at the price of a wake-up a frame."""
 
 
-class BusEntrySpec(Record, frozen=True):
+class BusEntrySpec(SpecRecord, frozen=True):
     """One entry of a slave's process data, in the order of its PDOs.
 
     *variable* is its name in the process image, empty for padding and for what has no type of ours.
@@ -273,7 +273,7 @@ class BusEntrySpec(Record, frozen=True):
     bit_length: int
 
 
-class BusSlaveSpec(Record, frozen=True):
+class BusSlaveSpec(SpecRecord, frozen=True):
     """One slave that a bus is expected to have; what is None may be anything."""
 
     name: str
@@ -297,7 +297,7 @@ class BusTarget(StrEnum):
     OP = "OP"
 
 
-class BusPortSpec(Record, frozen=True):
+class BusPortSpec(SpecRecord, frozen=True):
     """What a bus port has beside an interface."""
 
     file: str = ""
@@ -313,7 +313,7 @@ class BusPortSpec(Record, frozen=True):
     """Times that a frame that is overdue is sent again."""
 
 
-class LinkSpec(Record, frozen=True):
+class LinkSpec(SpecRecord, frozen=True):
     """In each cycle *target* gets the value of *source*, both variables of one station.
 
     Without scale, offset and swap bits are copied: *bits* of them (0: all of the source) from bit
@@ -333,7 +333,7 @@ class LinkSpec(Record, frozen=True):
     """Whether the octets are reversed on the way."""
 
 
-class GatewayAddress(Record, frozen=True):
+class GatewayAddress(SpecRecord, frozen=True):
     """Whom a virtual mailbox address stands for: one of the three."""
 
     address: int
@@ -346,7 +346,7 @@ class GatewayAddress(Record, frozen=True):
     """Of a group: station addresses, or virtual ones that are no groups."""
 
 
-class GatewaySpec(Record, frozen=True):
+class GatewaySpec(SpecRecord, frozen=True):
     """The mailbox gateway of a bus port (ETG.8200)."""
 
     enabled: bool = True
@@ -368,7 +368,7 @@ class GatewaySpec(Record, frozen=True):
     clients: int = 256
 
 
-class PortSpec(Record, frozen=True):
+class PortSpec(SpecRecord, frozen=True):
     """One port; *interface* is a URI such as ``udp://127.0.1.1`` or ``ethernet://eth0``."""
 
     name: str
@@ -396,7 +396,7 @@ class PortSpec(Record, frozen=True):
     gateway: GatewaySpec | None = None
 
 
-class StationSpec(Record, frozen=True):
+class StationSpec(SpecRecord, frozen=True):
     """One station, complete."""
 
     name: str

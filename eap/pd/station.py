@@ -17,8 +17,8 @@ from types import MappingProxyType
 import msgspec
 
 from eap.ids import InterfaceUri, NetId
-from eap.pd.address import Learner, forget
-from eap.pd.device import Device, DeviceState
+from eap.pd.address import NetIdLearner, forget
+from eap.pd.device import DeviceState, EapDevice
 from eap.pd.generator import Generators
 from eap.pd.image import Image, Inputs
 from eap.pd.link import Channel, CyclicBus, StateChannel, Taker
@@ -68,7 +68,7 @@ class Station:
         self.spec = spec
         self.image = image
         self.cycle_ns = spec.cycle_us * 1000
-        self.device = Device()
+        self.device = EapDevice()
         self._words = image.words
         self._wake = wake
         self._inputs = Inputs(image)
@@ -105,7 +105,7 @@ class Station:
         self.takers: dict[str, Taker] = {
             name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
         }
-        self._learners = {port: Learner(self.takers[port]) for port in _learning_ports(spec)}
+        self._learners = {port: NetIdLearner(self.takers[port]) for port in _learning_ports(spec)}
         self.takers.update((port, learner.take) for port, learner in self._learners.items())
 
     def _subscriber(self, port: str) -> Subscriber:

@@ -14,14 +14,14 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
 from eap.pd.address import SourceWatch
-from eap.pd.frame_plan import FramePlan, Refused, Taken, walk
+from eap.pd.frame_plan import FramePlan, RefusedPd, TakenPd, walk
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace
-from eap.pd.link import Origin
-from eap.pd.poll import Question, Requests
+from eap.pd.link import FrameOrigin
+from eap.pd.poll import PollQuestion, Requests
 from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import RxPdSpec
-from eap.pd.subscription import Subscription, SubstituteValue
+from eap.pd.subscription import RxSubscription, SubstituteValue
 from eap.pd.words import DISCARD_INDEX, Discard, RxState, RxWord, StationWord
 
 _KEY = struct.Struct("<10s4x6s").unpack_from
@@ -62,7 +62,7 @@ class Subscriber:
         subscriptions: Iterable[tuple[RxPdSpec, RxPlace]],
         own_cycle_ns: int,
         requests: Requests,
-        questions: Mapping[str, Question] = MappingProxyType({}),
+        questions: Mapping[str, PollQuestion] = MappingProxyType({}),
     ) -> None:
         self._table = SubscriptionTable(image, subscriptions, own_cycle_ns, requests, questions)
         self._open_from_ns = _NEVER
@@ -106,7 +106,7 @@ class Subscriber:
         """Let go of all subscriptions bit by bit."""
         self._table.release()
 
-    def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
+    def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Take one EtherCAT frame of *size* octets that arrived at *at_ns* from *origin*."""
         source = origin.source_of(data)
         table = self._table
@@ -154,7 +154,7 @@ class Subscriber:
         if now_ns < self._next_timeout_ns:
             return
         following = _NEVER
-        expired: dict[SequenceTracker, list[Subscription]] = {}
+        expired: dict[SequenceTracker, list[RxSubscription]] = {}
         for subscription in self._table.subscriptions:
             timeout_ns, tracker = subscription.timeout_ns, subscription.tracker
             if not timeout_ns:
@@ -196,19 +196,19 @@ class SubscriptionTable:
         subscriptions: Iterable[tuple[RxPdSpec, RxPlace]],
         own_cycle_ns: int,
         requests: Requests,
-        questions: Mapping[str, Question],
+        questions: Mapping[str, PollQuestion],
     ) -> None:
         self._requests = requests
         self.memory = image.memory
         self.words = image.words
         self.subscriptions = [
-            Subscription(
+            RxSubscription(
                 spec, place, SubstituteValue(image, place), questions.get(spec.poll_request)
             )
             for spec, place in subscriptions
         ]
-        self._by_key: dict[tuple[bytes, int], list[Subscription]] = {}
-        self._by_id: dict[int, list[Subscription]] = {}
+        self._by_key: dict[tuple[bytes, int], list[RxSubscription]] = {}
+        self._by_id: dict[int, list[RxSubscription]] = {}
         for subscription in self.subscriptions:
             place = subscription.place
             publisher = NetId.parse(place.publisher) if place.publisher else b""
@@ -257,11 +257,11 @@ class SubscriptionTable:
         if not pds:
             return None  # nothing to take: what is kept is bounded by the PDs of all layouts
         publisher = bytes(data[PD_FRAME_START : PD_FRAME_START + 6])
-        chosen: list[tuple[Subscription, PdHeader, int]] = []
+        chosen: list[tuple[RxSubscription, PdHeader, int]] = []
         refused = []
         for header, offset in pds:
             match = self._match(publisher, header, source)
-            if isinstance(match, Refused):
+            if isinstance(match, RefusedPd):
                 refused.append(match)
             else:
                 chosen += [(subscription, header, offset) for subscription in match]
@@ -295,8 +295,8 @@ class SubscriptionTable:
         publisher: bytes,
         source: bytes,
         at_ns: int,
-        taking: Iterable[Subscription],
-        refused: Iterable[Refused],
+        taking: Iterable[RxSubscription],
+        refused: Iterable[RefusedPd],
     ) -> SourceWatch:
         """Return the watch over the frames of *publisher* that are judged as those of *source*."""
         expected = source if source in self._sources else b""
@@ -319,7 +319,7 @@ class SubscriptionTable:
 
     def _match(
         self, publisher: bytes, header: PdHeader, source: bytes
-    ) -> list[Subscription] | Refused:
+    ) -> list[RxSubscription] | RefusedPd:
         """Find the subscriptions that take a PD, or what to count instead."""
         pd_id = header.pd_id
         candidates = self._by_key.get((publisher, pd_id), []) + self._by_key.get((b"", pd_id), [])
@@ -361,7 +361,9 @@ class SubscriptionTable:
                 entered.add(tracker)
                 tracker.enter_response(response_ns)
 
-    def note_requests(self, plan: FramePlan, cycle: int, data: memoryview, origin: Origin) -> None:
+    def note_requests(
+        self, plan: FramePlan, cycle: int, data: memoryview, origin: FrameOrigin
+    ) -> None:
         """Note who asks with a frame."""
         names = [name for tracker, name in plan.requests if tracker.has_taken(cycle)]
         if not names:
@@ -400,11 +402,11 @@ class SubscriptionTable:
                 trackers[history] = SequenceTracker(self.words, first_word or place.words, timing)
             self._assign(subscription, trackers[history])
 
-    def _assign(self, subscription: Subscription, tracker: SequenceTracker) -> None:
+    def _assign(self, subscription: RxSubscription, tracker: SequenceTracker) -> None:
         subscription.tracker = tracker
         self.words[subscription.place.words + RxWord.TRACKER] = tracker.first_word
 
-    def _part_trackers(self, arriving: set[Subscription]) -> bool:
+    def _part_trackers(self, arriving: set[RxSubscription]) -> bool:
         """Give PDs that arrive without the others of their tracker one of their own."""
         parted = False
         for tracker in {subscription.tracker for subscription in arriving}:
@@ -422,19 +424,19 @@ class SubscriptionTable:
         return parted
 
 
-_UNKNOWN_ID = Refused((StationWord.DISCARDED + DISCARD_INDEX[Discard.UNKNOWN_ID],))
+_UNKNOWN_ID = RefusedPd((StationWord.DISCARDED + DISCARD_INDEX[Discard.UNKNOWN_ID],))
 _VAR_STATE = {Discard.VERSION: 1, Discard.LENGTH: 2}
 
 
-def _take(subscription: Subscription, header: PdHeader, offset: int) -> Taken:
+def _take(subscription: RxSubscription, header: PdHeader, offset: int) -> TakenPd:
     """Return how *subscription* takes the PD with *header* at *offset* of the frame."""
     place = subscription.place
     alternate = subscription.alternates.get((header.version, header.length))
     size = PdHeader.SIZE + place.size
-    return Taken(subscription.tracker, place.words, offset, place.offset, size, alternate)
+    return TakenPd(subscription.tracker, place.words, offset, place.offset, size, alternate)
 
 
-def _refuse_all(reasons: list[tuple[Subscription, Discard]]) -> Refused:
+def _refuse_all(reasons: list[tuple[RxSubscription, Discard]]) -> RefusedPd:
     """Count a PD once for the station, and for each subscription under its own reason."""
     if not reasons:
         return _UNKNOWN_ID
@@ -442,4 +444,4 @@ def _refuse_all(reasons: list[tuple[Subscription, Discard]]) -> Refused:
     counters += [s.place.words + RxWord.DISCARDED + DISCARD_INDEX[why] for s, why in reasons]
     mismatches = [(s.place.words, _VAR_STATE[why]) for s, why in reasons if why in _VAR_STATE]
     wrong_source = [s.place.words for s, why in reasons if why is Discard.WRONG_SOURCE]
-    return Refused(tuple(counters), tuple(mismatches), tuple(wrong_source))
+    return RefusedPd(tuple(counters), tuple(mismatches), tuple(wrong_source))

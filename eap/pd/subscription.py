@@ -7,13 +7,13 @@ from eap.codec.pd import PdHeader
 from eap.pd.address import source_octets
 from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxPlace
-from eap.pd.poll import Answer, Question
+from eap.pd.poll import PollAnswer, PollQuestion
 from eap.pd.sequence import SequenceTracker
 from eap.pd.spec import RxPdSpec, Substitute
 from eap.pd.words import Discard
 
 
-class Subscription:
+class RxSubscription:
     """One RxPD at run time.
 
     Args:
@@ -45,10 +45,10 @@ class Subscription:
         spec: RxPdSpec,
         place: RxPlace,
         substitute: SubstituteValue,
-        question: Question | None = None,
+        question: PollQuestion | None = None,
     ) -> None:
         self.place = place
-        self.answer = None if question is None else Answer(spec.name, question, place.words)
+        self.answer = None if question is None else PollAnswer(spec.name, question, place.words)
         self.alternates = {(each.version, each.size): each.copy_plan() for each in place.alternates}
         self.ignore_version = spec.ignore_version
         self.timeout_ns = spec.timeout_ms * 1_000_000

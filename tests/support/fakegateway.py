@@ -24,13 +24,13 @@ from eap.codec.mailbox import (
     encode_message,
 )
 from eap.codec.soe import SoeAttribute
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.device.master_dictionary import MasterDictionary
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import refuse
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
-from eap.od.profiles.master1100 import Live
+from eap.od.profiles.master1100 import MasterLive
 
 SIZES = MailboxSizes(140, 132)
 FILE = bytes(range(256)) * 4
@@ -47,24 +47,29 @@ class _OneSlave:
 
     detected = configured
 
-    def of_configured(self, station: int, key: Live) -> int | str:
-        texts = {Live.NAME: "drive", Live.TYPE: "D1"}
-        sizes = {Live.MAILBOX_OUT: self._sizes.to_slave, Live.MAILBOX_IN: self._sizes.to_master}
-        numbers = {Live.ADDRESS: 1001, Live.VENDOR: 5, Live.PROTOCOLS: 0x0C}
+    def of_configured(self, station: int, key: MasterLive) -> int | str:
+        texts = {MasterLive.NAME: "drive", MasterLive.TYPE: "D1"}
+        sizes = {
+            MasterLive.MAILBOX_OUT: self._sizes.to_slave,
+            MasterLive.MAILBOX_IN: self._sizes.to_master,
+        }
+        numbers = {MasterLive.ADDRESS: 1001, MasterLive.VENDOR: 5, MasterLive.PROTOCOLS: 0x0C}
         return {**numbers, **sizes, **texts}.get(key, 0)
 
     of_detected = of_configured
 
-    def of_diagnosis(self, station: int, key: Live) -> int:
-        return 8 if key is Live.AL_STATUS else 0
+    def of_diagnosis(self, station: int, key: MasterLive) -> int:
+        return 8 if key is MasterLive.AL_STATUS else 0
 
-    def of_master(self, key: Live) -> int | bytes:
-        return {Live.DETECT_REQUEST: bytes(2), Live.DETECT_RESPONSE: bytes(6)}.get(key, 0)
+    def of_master(self, key: MasterLive) -> int | bytes:
+        return {MasterLive.DETECT_REQUEST: bytes(2), MasterLive.DETECT_RESPONSE: bytes(6)}.get(
+            key, 0
+        )
 
-    def write_slave(self, station: int, key: Live, value: int) -> None:
+    def write_slave(self, station: int, key: MasterLive, value: int) -> None:
         """Nothing."""
 
-    def write_master(self, key: Live, data: bytes) -> None:
+    def write_master(self, key: MasterLive, data: bytes) -> None:
         """Nothing."""
 
 
@@ -109,7 +114,7 @@ class FakeGateway:
             MailboxType.VOE: VoeServer(),
         }
         large = MailboxSizes(1400, 1400)
-        objects = MasterDictionary(_OneSlave(sizes), Identity(device_name="M"), full=full)
+        objects = MasterDictionary(_OneSlave(sizes), DeviceIdentity(device_name="M"), full=full)
         master = CoeServer(objects, _op, large)
         self._boxes = {
             1001: MailboxServer(servers, sizes),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eap.od.profiles.router9000 import Live
+from eap.od.profiles.router9000 import RouterLive
 
 MAC = bytes.fromhex("020000000005")
 STATES = {"eap0": 8, "eap1": 4, "bus0": 2}
@@ -12,10 +12,10 @@ class Values:
     """A router that counts from 1 on, by key; routes are dicts of what they show."""
 
     def __init__(self) -> None:
-        self.all: list[dict[Live, object]] = []
+        self.all: list[dict[RouterLive, object]] = []
 
     def number(self, key):
-        return list(Live).index(key)
+        return list(RouterLive).index(key)
 
     def state_of(self, port):
         return STATES[port]

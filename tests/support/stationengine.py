@@ -7,7 +7,7 @@ import asyncio
 from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.services.device.station_keeper import StationKeeper
 from eap.appliance.store import StationStore
-from eap.device.eap_objects import Identity, NothingRuns
+from eap.device.eap_objects import DeviceIdentity, NothingRuns
 from eap.errors import EapError, EngineGoneError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -64,4 +64,4 @@ def make_device(
     """Return a device of the plant ``demo`` and the engine that it asks."""
     engine = engine or StationEngine(spec, state)
     keeper = StationKeeper(spec, state, StationStore("demo", spec.name).configuration, engine)
-    return StationDevice(keeper, NothingRuns(), Identity(device_name="test")), engine
+    return StationDevice(keeper, NothingRuns(), DeviceIdentity(device_name="test")), engine

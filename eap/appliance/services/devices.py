@@ -22,7 +22,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.startup import Step, no_step
 from eap.appliance.station_image import StationImage
 from eap.appliance.store import StationStore
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.errors import ImageError
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
@@ -110,7 +110,7 @@ class Devices:
         player = SourcePlayer(station, image)
         keeper.on_change = player.change
         self._players.append(player)
-        identity = Identity(
+        identity = DeviceIdentity(
             device_name=f"EAP station {name}",
             hardware_version=os.uname().machine,
             software_version=self._release,

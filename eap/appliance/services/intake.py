@@ -13,7 +13,7 @@ from typing import Protocol, TypeAlias
 
 from eap.appliance.discards import DiscardCounters, Refusal
 from eap.codec.ethercat import EtherCatHeader, FrameType
-from eap.pd.link import Origin
+from eap.pd.link import FrameOrigin
 
 _MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
 
@@ -40,7 +40,7 @@ class DrainedChannel(Protocol):
         """Return the descriptor to watch."""
 
 
-MailboxTaker: TypeAlias = Callable[[memoryview, int, int, Origin], Refusal | None]
+MailboxTaker: TypeAlias = Callable[[memoryview, int, int, FrameOrigin], Refusal | None]
 """Takes a frame of type 5 as a Taker does; returns why not if it does not."""
 
 
@@ -66,7 +66,7 @@ class FrameIntake:
         self._from_ns = from_ns
         self.mailbox = mailbox
 
-    def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> None:
+    def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
         """Take, or count, one frame that arrived at *at_ns* on the monotonic clock."""
         if at_ns < self._from_ns:
             reason: Refusal | None = Refusal.STALE

@@ -22,7 +22,13 @@ from eap.net.arpprobe import ArpProber
 from eap.pd.address import from_word
 from eap.pd.image import Image
 from eap.pd.layout import FramePlace
-from eap.pd.monitor import Evidence, MonitorTarget, Presence, PresenceChanged, SubscriberMonitor
+from eap.pd.monitor import (
+    Evidence,
+    MonitorTarget,
+    PresenceChanged,
+    SubscriberMonitor,
+    SubscriberPresence,
+)
 from eap.pd.words import FrameWord
 
 logger = logging.getLogger(__name__)
@@ -217,15 +223,15 @@ def _ip_of(row: _Row) -> Destination | None:
 
 
 def _log(event: PresenceChanged, row: _Row) -> None:
-    level = logging.WARNING if event.new is Presence.MISSING else logging.INFO
+    level = logging.WARNING if event.new is SubscriberPresence.MISSING else logging.INFO
     other = ""
-    if event.new is Presence.MISSING and event.answered_by not in {None, row.target.mac}:
+    if event.new is SubscriberPresence.MISSING and event.answered_by not in {None, row.target.mac}:
         other = f"; {row.place.monitor_ip} is answered by {event.answered_by} instead"
     logger.log(
         level,
         "%s: subscriber at %s is %s%s",
         event.name,
         row.destination,
-        event.new.name.lower() if event.new is not Presence.UNKNOWN else "out of sight",
+        event.new.name.lower() if event.new is not SubscriberPresence.UNKNOWN else "out of sight",
         other,
     )

@@ -37,7 +37,7 @@ from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
 from eap.net.interface import interface_of
 from eap.net.mmsg import ReceiveBatch
 from eap.net.udp import UdpChannel
-from eap.pd.link import Origin
+from eap.pd.link import FrameOrigin
 from eap.pd.spec import StationSpec
 
 if TYPE_CHECKING:
@@ -335,7 +335,7 @@ def _stations_of(shared: SharedSocket) -> list[str]:
     return list(dict.fromkeys(owner.station for owner in shared.owners))
 
 
-def _not_yet(data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
+def _not_yet(data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
     """Take nothing of an interface whose ports are not all known."""
     del data, size, at_ns, origin
     return Refusal.MAILBOX

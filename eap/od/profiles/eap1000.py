@@ -18,7 +18,7 @@ from eap.od.profiles.forms import Form, Rule
 from eap.od.profiles.table import (
     OWN_TYPE,
     EntryRow,
-    ObjectRange,
+    ObjectRow,
     config,
     derived,
     fixed,
@@ -32,7 +32,7 @@ PROFILE = 5001
 MODULE_PROFILE = 1000
 
 
-class Live(StrEnum):
+class EapLive(StrEnum):
     """What the running device is asked for; the object's name says of which one."""
 
     VALUE = auto()
@@ -111,7 +111,7 @@ class Var(IntEnum):
     WRITER = 10
 
 
-class Frame(IntEnum):
+class FrameEntry(IntEnum):
     """0x8000: a TxFrame."""
 
     ENABLED = 1
@@ -201,7 +201,7 @@ class Configured(IntEnum):
     PHASE = 9
 
 
-class Port(IntEnum):
+class PortEntry(IntEnum):
     """0xF810: the port itself."""
 
     NAME = 1
@@ -285,9 +285,9 @@ _VARIABLE = (
            key="default", rule=Rule.DEFAULT),
 )  # fmt: skip
 _VALUE = EntryRow(
-    1, "Value", OWN_TYPE, RO, "As it lies in the process image.", live=Live.VALUE.value
+    1, "Value", OWN_TYPE, RO, "As it lies in the process image.", live=EapLive.VALUE.value
 )
-TX_VARIABLE = ObjectRange(
+TX_VARIABLE = ObjectRow(
     0x6000, 0x6FFF, "Tx variable {n}", _RECORD,
     (
         _VALUE._replace(access=RO | Access.TX_MAPPABLE),
@@ -300,7 +300,7 @@ TX_VARIABLE = ObjectRange(
     "port or a bus of the station has by the same name is that one, and described alike.",
     dynamic=True, section="variables",
 )  # fmt: skip
-RX_VARIABLE = ObjectRange(
+RX_VARIABLE = ObjectRow(
     0x7000, 0x7FFF, "Rx variable {n}", _RECORD,
     (_VALUE._replace(access=RO | Access.TX_MAPPABLE | Access.RX_MAPPABLE), *_VARIABLE),
     "A variable that is received; it may be sent on.", dynamic=True,
@@ -312,11 +312,11 @@ _MAPPED = (
            "is padding, bit length 255 the whole of a longer variable.", last=MAX_ENTRIES,
            form=Form.MAPPING, key="variables"),
 )  # fmt: skip
-RX_PDO = ObjectRange(
+RX_PDO = ObjectRow(
     0x1600, 0x17FF, "RxPDO mapping {n}", _ARRAY, _MAPPED,
     "Variables of a received PD in their order.", dynamic=True, mapping=True, section="subscribe",
 )  # fmt: skip
-TX_PDO = ObjectRange(
+TX_PDO = ObjectRow(
     0x1A00, 0x1BFF, "TxPDO mapping {n}", _ARRAY, _MAPPED,
     "Variables of a sent PD in their order.", dynamic=True, mapping=True, section="publish",
 )  # fmt: skip
@@ -329,59 +329,61 @@ MORE_TX_PDO = TX_PDO._replace(
     description="As 0x1A00, for ports that send more than 512 different PDOs.",
 )  # fmt: skip
 
-TX_FRAME = ObjectRange(
+TX_FRAME = ObjectRow(
     0x8000, 0x8FFF, "TxFrame {n}", _RECORD,
     (
-        config(Frame.ENABLED, "Enabled", "BOOL", "A frame that is not is left alone altogether."),
-        config(Frame.ADDRESS_MODE, "Address mode", "USINT",
+        config(FrameEntry.ENABLED, "Enabled", "BOOL",
+               "A frame that is not is left alone altogether."),
+        config(FrameEntry.ADDRESS_MODE, "Address mode", "USINT",
                "0 MAC, 1 NetID, 2 IP by UDP, 3 IP by TCP, 4 whoever asked for its PDs.",
                maximum=4, changeable=True, key="to"),
-        config(Frame.DESTINATION_MAC, "Destination MAC", "BLOCK(6)",
+        config(FrameEntry.DESTINATION_MAC, "Destination MAC", "BLOCK(6)",
                "Address mode 0; in mode 1 that of the NetID, and all zero or a group if it is to "
                "be learned.", default=bytes.fromhex("010105040000"), form=Form.MAC,
                changeable=True, key="to"),
-        config(Frame.DESTINATION_NETID, "Destination NetID", "BLOCK(6)", "Address mode 1.",
+        config(FrameEntry.DESTINATION_NETID, "Destination NetID", "BLOCK(6)", "Address mode 1.",
                form=Form.NET_ID, changeable=True, key="to"),
-        config(Frame.DESTINATION_IP, "Destination IP", "BLOCK(4)",
+        config(FrameEntry.DESTINATION_IP, "Destination IP", "BLOCK(4)",
                "Address modes 2 and 3, first octet first.", form=Form.IP, changeable=True,
                key="to"),
-        config(Frame.PORT_NUMBER, "Port number", "UINT", "UDP or TCP; 0 is 34980.",
+        config(FrameEntry.PORT_NUMBER, "Port number", "UINT", "UDP or TCP; 0 is 34980.",
                changeable=True, key="to"),
-        setting(Frame.MONITORING_INTERVAL, "Monitoring interval", "UDINT",
+        setting(FrameEntry.MONITORING_INTERVAL, "Monitoring interval", "UDINT",
                 "How often to look whether the subscriber is there; 0 never.", unit="ms",
                 key="monitor_interval_ms"),
-        live(Frame.FRAME_STATE, "Frame state", "UINT", Live.FRAME_STATE,
+        live(FrameEntry.FRAME_STATE, "Frame state", "UINT", EapLive.FRAME_STATE,
              "Bit 0 not sent, bit 1 too long, bit 2 subscriber missing."),
-        setting(Frame.NAME, "Name", NAME, "Unique among the station's frames.", key="name",
+        setting(FrameEntry.NAME, "Name", NAME, "Unique among the station's frames.", key="name",
                 rule=Rule.NAME),
-        setting(Frame.DIVIDER, "Divider", "UINT",
+        setting(FrameEntry.DIVIDER, "Divider", "UINT",
                 "Leaves only in cycles whose number, divided by this, leaves the modulo; 0 off.",
                 key="divider"),
-        setting(Frame.MODULO, "Modulo", "UINT", "Less than the divider.", key="modulo"),
-        setting(Frame.MONITOR_IP, "Monitor IP", "BLOCK(4)",
+        setting(FrameEntry.MODULO, "Modulo", "UINT", "Less than the divider.", key="modulo"),
+        setting(FrameEntry.MONITOR_IP, "Monitor IP", "BLOCK(4)",
                 "Whom to probe for on Ethernet; all zero nobody.", form=Form.IP, key="monitor_ip"),
-        setting(Frame.CHANGEABLE, "Changeable", "BOOL",
+        setting(FrameEntry.CHANGEABLE, "Changeable", "BOOL",
                 "Whether the destination may be written in SafeOp and Op.", key="changeable"),
-        live(Frame.FRAME_CONTROL, "Frame control", "UINT", Live.FRAME_CTRL,
+        live(FrameEntry.FRAME_CONTROL, "Frame control", "UINT", EapLive.FRAME_CTRL,
              "Bit 0 suppresses the frame."),
-        derived(Frame.FRAME_LENGTH, "Frame length", "UINT", Derived.FRAME_LENGTH,
+        derived(FrameEntry.FRAME_LENGTH, "Frame length", "UINT", Derived.FRAME_LENGTH,
                 "Octets with all its PDs."),
-        config(Frame.TXPD, "TxPD {n}", "UINT", "Index of a PD that it carries; 0 none.",
+        config(FrameEntry.TXPD, "TxPD {n}", "UINT", "Index of a PD that it carries; 0 none.",
                last=MAX_ENTRIES, form=Form.INDEX, refers=(0xD000,)),
     ),
     "One frame to send: where it goes and what is in it.", dynamic=True, companion=0xA000,
     section="frames",
 )  # fmt: skip
-FRAME_DIAGNOSIS = ObjectRange(
+FRAME_DIAGNOSIS = ObjectRow(
     0xA000, 0xAFFF, "TxFrame diagnosis {n}", _RECORD,
     (
-        live(1, "Sent whole", "ULINT", Live.FRAME_WHOLE, "With all PDs by the same schedule."),
-        live(2, "Sent otherwise", "ULINT", Live.FRAME_PARTIAL, "With some of its PDs."),
-        live(3, "Skipped", "ULINT", Live.FRAME_SKIPPED, "Suppressed, or refused by the network."),
+        live(1, "Sent whole", "ULINT", EapLive.FRAME_WHOLE, "With all PDs by the same schedule."),
+        live(2, "Sent otherwise", "ULINT", EapLive.FRAME_PARTIAL, "With some of its PDs."),
+        live(3, "Skipped", "ULINT", EapLive.FRAME_SKIPPED,
+             "Suppressed, or refused by the network."),
     ),
     "What became of the TxFrame of the same number.",
 )  # fmt: skip
-TX_PD = ObjectRange(
+TX_PD = ObjectRow(
     0xD000, 0xDFFF, "TxPD {n}", _RECORD,
     (
         config(Tx.PDO_INDEX, "PDO index", "UINT",
@@ -413,7 +415,7 @@ TX_PD = ObjectRange(
                 "Shortest gap between two changes; 0 none. Other than 0 it switches sending on "
                 "change on.", unit="us", key="on_change.inhibit_us",
                 field="trigger.on_change.inhibit_us"),
-        live(Tx.VARSTATE, "VarState", "UINT", Live.TX_VAR_STATE, "Bit 0 not sent."),
+        live(Tx.VARSTATE, "VarState", "UINT", EapLive.TX_VAR_STATE, "Bit 0 not sent."),
         setting(Tx.NAME, "Name", NAME, "Unique among the station's sent PDs.", key="name",
                 rule=Rule.NAME),
         config(Tx.ON_CHANGE, "On change", "BOOL",
@@ -423,26 +425,27 @@ TX_PD = ObjectRange(
         setting(Tx.CHANGEABLE, "Changeable", "BOOL",
                 "Whether PD ID and poll request may be written in SafeOp and Op.",
                 key="changeable"),
-        live(Tx.VARCTRL, "VarCtrl", "UINT", Live.TX_VAR_CTRL,
+        live(Tx.VARCTRL, "VarCtrl", "UINT", EapLive.TX_VAR_CTRL,
              "Bit 0 suppresses the PD, bit 1 sends it."),
     ),
     "One PD to send: which PDO, and when.", dynamic=True, companion=0xB000, section="publish",
 )  # fmt: skip
-TX_DIAGNOSIS = ObjectRange(
+TX_DIAGNOSIS = ObjectRow(
     0xB000, 0xBFFF, "TxPD diagnosis {n}", _RECORD,
     (
-        live(1, "Last reason", "USINT", Live.TX_LAST_REASON, "Of the entries 3 to 8: 0 the first."),
-        live(2, "Skipped", "ULINT", Live.TX_SKIPPED, "Due, but suppressed."),
-        live(3, "Sent by cycle", "ULINT", Live.TX_SENT_CYCLE, "In its own rhythm."),
-        live(4, "Sent by divider", "ULINT", Live.TX_SENT_DIVIDER, "Its own, or its frame's."),
-        live(5, "Sent on change", "ULINT", Live.TX_SENT_CHANGE, "Since the start."),
-        live(6, "Sent unchanged", "ULINT", Live.TX_SENT_CHANGE_TIMEOUT, "After the timeout."),
-        live(7, "Sent on event", "ULINT", Live.TX_SENT_EVENT, "Since the start."),
-        live(8, "Sent on request", "ULINT", Live.TX_SENT_POLL, "As an answer."),
+        live(1, "Last reason", "USINT", EapLive.TX_LAST_REASON,
+             "Of the entries 3 to 8: 0 the first."),
+        live(2, "Skipped", "ULINT", EapLive.TX_SKIPPED, "Due, but suppressed."),
+        live(3, "Sent by cycle", "ULINT", EapLive.TX_SENT_CYCLE, "In its own rhythm."),
+        live(4, "Sent by divider", "ULINT", EapLive.TX_SENT_DIVIDER, "Its own, or its frame's."),
+        live(5, "Sent on change", "ULINT", EapLive.TX_SENT_CHANGE, "Since the start."),
+        live(6, "Sent unchanged", "ULINT", EapLive.TX_SENT_CHANGE_TIMEOUT, "After the timeout."),
+        live(7, "Sent on event", "ULINT", EapLive.TX_SENT_EVENT, "Since the start."),
+        live(8, "Sent on request", "ULINT", EapLive.TX_SENT_POLL, "As an answer."),
     ),
     "Why the TxPD of the same number was sent.",
 )  # fmt: skip
-RX_PD = ObjectRange(
+RX_PD = ObjectRow(
     0xE000, 0xEFFF, "RxPD {n}", _RECORD,
     (
         config(Rx.PDO_INDEX, "PDO index", "UINT",
@@ -460,10 +463,10 @@ RX_PD = ObjectRange(
         setting(Rx.POLL_REQUEST_TXPD, "Poll request TxPD", "UINT",
                 "The TxPD that this one answers; 0 none.", form=Form.INDEX, changeable=True,
                 key="poll", field="poll_request", refers=(0xD000,)),
-        live(Rx.QUALITY, "Quality", "UINT", Live.RX_QUALITY, "Age of the data.", unit="100 us"),
-        live(Rx.CYCLE_INDEX, "Cycle index", "UINT", Live.RX_CYCLE_INDEX,
+        live(Rx.QUALITY, "Quality", "UINT", EapLive.RX_QUALITY, "Age of the data.", unit="100 us"),
+        live(Rx.CYCLE_INDEX, "Cycle index", "UINT", EapLive.RX_CYCLE_INDEX,
              "Cycle counter of the sender."),
-        live(Rx.VARSTATE, "VarState", "UINT", Live.RX_VAR_STATE,
+        live(Rx.VARSTATE, "VarState", "UINT", EapLive.RX_VAR_STATE,
              "Last one refused for: bit 0 version, bit 1 length."),
         setting(Rx.NAME, "Name", NAME, "Unique among the station's received PDs.", key="name",
                 rule=Rule.NAME),
@@ -481,7 +484,7 @@ RX_PD = ObjectRange(
         setting(Rx.CHANGEABLE, "Changeable", "BOOL",
                 "Whether PD ID, NetID and poll request may be written in SafeOp and Op.",
                 key="changeable"),
-        live(Rx.STATE, "State", "USINT", Live.RX_STATE, "0 waiting, 1 running, 2 stale."),
+        live(Rx.STATE, "State", "USINT", EapLive.RX_STATE, "0 waiting, 1 running, 2 stale."),
         setting(Rx.SOURCE, "Source", "STRING(40)",
                 "Address that its frames must come from: MAC on Ethernet, else IPv4; empty any. "
                 "Writing another publisher empties it.", changeable=True, key="source",
@@ -490,21 +493,22 @@ RX_PD = ObjectRange(
     "One PD to receive: from whom, and into which PDO.", dynamic=True, companion=0xC000,
     section="subscribe",
 )  # fmt: skip
-RX_DIAGNOSIS = ObjectRange(
+RX_DIAGNOSIS = ObjectRow(
     0xC000, 0xCFFF, "RxPD diagnosis {n}", _RECORD,
     (
-        live(1, "Received", "ULINT", Live.RX_RECEIVED, "PDs taken."),
-        live(2, "Lost", "ULINT", Live.RX_LOST, "Told from the cycle counter."),
-        live(3, "Duplicated", "ULINT", Live.RX_DUPLICATED, "Came twice."),
-        live(4, "Reordered", "ULINT", Live.RX_REORDERED, "Came behind a later one."),
-        live(5, "Late", "ULINT", Live.RX_LATE, "Came, but not in time."),
-        live(6, "Time-outs", "ULINT", Live.RX_TIMEOUTS, "How often the substitute applied."),
-        live(7, "Largest jitter", "UDINT", Live.RX_JITTER_MAX, "Since the start.", unit="us"),
-        live(8, "Wrong version", "ULINT", Live.RX_DISCARDED_VERSION, "Discarded for it."),
-        live(9, "Wrong length", "ULINT", Live.RX_DISCARDED_LENGTH, "Discarded for it."),
-        live(10, "Not in Op", "ULINT", Live.RX_DISCARDED_SUPPRESSED, "Discarded for it."),
-        live(11, "Stale", "ULINT", Live.RX_DISCARDED_STALE, "Had waited since before the start."),
-        live(12, "Wrong source", "ULINT", Live.RX_DISCARDED_WRONG_SOURCE,
+        live(1, "Received", "ULINT", EapLive.RX_RECEIVED, "PDs taken."),
+        live(2, "Lost", "ULINT", EapLive.RX_LOST, "Told from the cycle counter."),
+        live(3, "Duplicated", "ULINT", EapLive.RX_DUPLICATED, "Came twice."),
+        live(4, "Reordered", "ULINT", EapLive.RX_REORDERED, "Came behind a later one."),
+        live(5, "Late", "ULINT", EapLive.RX_LATE, "Came, but not in time."),
+        live(6, "Time-outs", "ULINT", EapLive.RX_TIMEOUTS, "How often the substitute applied."),
+        live(7, "Largest jitter", "UDINT", EapLive.RX_JITTER_MAX, "Since the start.", unit="us"),
+        live(8, "Wrong version", "ULINT", EapLive.RX_DISCARDED_VERSION, "Discarded for it."),
+        live(9, "Wrong length", "ULINT", EapLive.RX_DISCARDED_LENGTH, "Discarded for it."),
+        live(10, "Not in Op", "ULINT", EapLive.RX_DISCARDED_SUPPRESSED, "Discarded for it."),
+        live(11, "Stale", "ULINT", EapLive.RX_DISCARDED_STALE,
+             "Had waited since before the start."),
+        live(12, "Wrong source", "ULINT", EapLive.RX_DISCARDED_WRONG_SOURCE,
              "Discarded for it: came from another address."),
     ),
     "What became of the RxPD of the same number.",
@@ -516,7 +520,7 @@ COUNTED = ((TX_FRAME,), (TX_PD,), (RX_PD,), (TX_PDO, MORE_TX_PDO), (RX_PDO, MORE
 """The ranges behind sub-indexes 1 to 7 of 0xF800 and 0xF801."""
 
 
-def identity(module_profile: int) -> tuple[ObjectRange, ...]:
+def identity(module_profile: int) -> tuple[ObjectRow, ...]:
     """Return the objects that name a device of *module_profile*."""
     return (
         single(0x1000, "Device type", "Profile in the low word, module profile in the high one.",
@@ -546,25 +550,26 @@ DEVICE = (
            fixed(4, "Error object", "UDINT", "Index and sub-index (16, 8 bits, then zero) that "
                  "the error is about; 0 none.", form=Form.HEX)),
     single(0xF110, "Device diagnosis", "Counters of the whole station.",
-           live(1, "Cycle", "ULINT", Live.STATION_CYCLE, "Device cycles run."),
-           live(2, "Overruns", "ULINT", Live.STATION_OVERRUNS, "Cycles left out, being too late."),
-           live(3, "Restarts", "ULINT", Live.STATION_RESTARTS, "Of the engine."),
-           live(4, "Torn", "ULINT", Live.STATION_TORN, "Cycles with half-written variables."),
-           live(5, "Largest lateness", "ULINT", Live.STATION_LATENESS_MAX, "In nanoseconds."),
-           live(6, "Links held", "ULINT", Live.STATION_LINKS_HELD, "Values no link could pass."),
-           live(7, "Wrong publisher", "ULINT", Live.STATION_DISCARDED_WRONG_PUBLISHER,
+           live(1, "Cycle", "ULINT", EapLive.STATION_CYCLE, "Device cycles run."),
+           live(2, "Overruns", "ULINT", EapLive.STATION_OVERRUNS,
+                "Cycles left out, being too late."),
+           live(3, "Restarts", "ULINT", EapLive.STATION_RESTARTS, "Of the engine."),
+           live(4, "Torn", "ULINT", EapLive.STATION_TORN, "Cycles with half-written variables."),
+           live(5, "Largest lateness", "ULINT", EapLive.STATION_LATENESS_MAX, "In nanoseconds."),
+           live(6, "Links held", "ULINT", EapLive.STATION_LINKS_HELD, "Values no link could pass."),
+           live(7, "Wrong publisher", "ULINT", EapLive.STATION_DISCARDED_WRONG_PUBLISHER,
                  "PDs discarded for it."),
-           live(8, "Unknown ID", "ULINT", Live.STATION_DISCARDED_UNKNOWN_ID,
+           live(8, "Unknown ID", "ULINT", EapLive.STATION_DISCARDED_UNKNOWN_ID,
                  "PDs discarded for it."),
-           live(9, "Truncated", "ULINT", Live.STATION_DISCARDED_TRUNCATED,
+           live(9, "Truncated", "ULINT", EapLive.STATION_DISCARDED_TRUNCATED,
                  "Frames discarded for it."),
-           live(10, "Count too large", "ULINT", Live.STATION_DISCARDED_COUNT_TOO_LARGE,
+           live(10, "Count too large", "ULINT", EapLive.STATION_DISCARDED_COUNT_TOO_LARGE,
                  "Frames discarded for it."),
-           live(11, "Wrong type", "ULINT", Live.STATION_DISCARDED_WRONG_TYPE,
+           live(11, "Wrong type", "ULINT", EapLive.STATION_DISCARDED_WRONG_TYPE,
                  "Frames discarded for it."),
-           live(12, "Too many requests", "ULINT", Live.STATION_DISCARDED_TOO_MANY_REQUESTS,
+           live(12, "Too many requests", "ULINT", EapLive.STATION_DISCARDED_TOO_MANY_REQUESTS,
                  "Requests left without an answer."),
-           live(13, "No sender", "ULINT", Live.STATION_DISCARDED_NO_SENDER,
+           live(13, "No sender", "ULINT", EapLive.STATION_DISCARDED_NO_SENDER,
                  "Requests that do not tell whom to answer.")),
     single(0xF200, "EAP control", "What the device is asked to do.",
            EntryRow(1, "Requested state", "UINT", RW, "2 PreOp, 4 SafeOp, 8 Op; the status says "
@@ -583,26 +588,27 @@ DEVICE = (
                      form=Form.INDEX)
              for sub, name in enumerate(_KINDS, 1))),
     single(0xF810, "EAP port", "How the port reaches others.",
-           fixed(Port.NAME, "Name", NAME, "In the plant file.", key="name"),
-           fixed(Port.TRANSPORT, "Transport", "USINT",
+           fixed(PortEntry.NAME, "Name", NAME, "In the plant file.", key="name"),
+           fixed(PortEntry.TRANSPORT, "Transport", "USINT",
                  "0 UDP, 1 Ethernet, 2 TCP, 3 loop within the process.", key="interface"),
-           fixed(Port.INTERFACE, "Interface", TEXT, "Such as udp://10.0.0.1 or ethernet://eth0.",
+           fixed(PortEntry.INTERFACE, "Interface", TEXT,
+                 "Such as udp://10.0.0.1 or ethernet://eth0.",
                  key="interface"),
-           fixed(Port.PORT_NUMBER, "Port number", "UINT",
+           fixed(PortEntry.PORT_NUMBER, "Port number", "UINT",
                  "UDP or TCP; 0 is 34980, or there is none.", key="interface"),
-           setting(Port.VLAN_ID, "VLAN ID", "UINT", "Ethernet: tag of its frames; 0 untagged.",
+           setting(PortEntry.VLAN_ID, "VLAN ID", "UINT", "Ethernet: tag of its frames; 0 untagged.",
                    maximum=4094, key="vlan.id", field="vlan_id", schemes=("ethernet",)),
-           setting(Port.VLAN_PRIORITY, "VLAN priority", "USINT", "Of the tag.", maximum=7,
+           setting(PortEntry.VLAN_PRIORITY, "VLAN priority", "USINT", "Of the tag.", maximum=7,
                    key="vlan.priority", field="vlan_priority", schemes=("ethernet",)),
-           setting(Port.TCP, "TCP", "BOOL",
+           setting(PortEntry.TCP, "TCP", "BOOL",
                    "Whether process data is taken from TCP connections too.", key="tcp",
                    schemes=("tcp", "udp")),
-           setting(Port.BROADCAST, "Broadcast", "BOOL",
+           setting(PortEntry.BROADCAST, "Broadcast", "BOOL",
                    "UDP: whether broadcasts are listened to.", key="broadcast", schemes=("udp",)),
-           setting(Port.WAKE, "Wake", "USINT",
+           setting(PortEntry.WAKE, "Wake", "USINT",
                    "Frames are taken 0 in each cycle, 1 as they arrive.", maximum=1, key="wake",
                    words=Waking),
-           setting(Port.EAP_SM, "EAP SM", "BOOL",
+           setting(PortEntry.EAP_SM, "EAP SM", "BOOL",
                    "Whether the frames it sends carry the device's state.", key="eap_sm"),
            section="ports"),
     single(0xF811, "Multicast groups", "Groups to listen to besides the EAP default.",
@@ -633,7 +639,7 @@ _BY_PAGE = {
 }
 
 
-def find(index: int) -> ObjectRange | None:
+def find(index: int) -> ObjectRow | None:
     """Return what the profile has at *index*, None if nothing."""
     for row in _BY_PAGE[index >> 8]:
         if row.first <= index <= row.last:
@@ -641,7 +647,7 @@ def find(index: int) -> ObjectRange | None:
     return None
 
 
-def row_of(index: int) -> ObjectRange:
+def row_of(index: int) -> ObjectRow:
     """Return what the profile has at *index*, of an object that exists."""
     row = find(index)
     if row is None:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.od.model import RO, Entry, ObjectCode, OdObject, ReadHook
-from eap.od.profiles.table import OWN_TYPE, UNITS, EntryRow, ObjectRange
+from eap.od.profiles.table import OWN_TYPE, UNITS, EntryRow, ObjectRow
 
 DEFAULT_TYPE = datatypes.parse("UINT")
 
@@ -22,7 +22,7 @@ LiveWrite: TypeAlias = Callable[[str, bytes], None]
 
 
 def make_object(
-    row: ObjectRange,
+    row: ObjectRow,
     index: int,
     source: Source,
     *,

@@ -12,7 +12,7 @@ from enum import StrEnum, auto
 from eap.od.model import ObjectCode
 from eap.od.profiles.eap1000 import MAX_ENTRIES, NAME, TEXT, identity
 from eap.od.profiles.forms import Form
-from eap.od.profiles.table import ObjectRange, fixed, live, single
+from eap.od.profiles.table import ObjectRow, fixed, live, single
 
 MODULE_PROFILE = 9000
 ROUTER = "router"
@@ -23,7 +23,7 @@ MASTER_PROFILE = 1100
 _RECORD, _ARRAY = ObjectCode.RECORD, ObjectCode.ARRAY
 
 
-class Live(StrEnum):
+class RouterLive(StrEnum):
     """What the running router is asked for."""
 
     DEVICE_STATE = auto()
@@ -52,40 +52,46 @@ class Live(StrEnum):
     ROUTE_LAST_ERROR = auto()
 
 
-DEVICE = ObjectRange(
+DEVICE = ObjectRow(
     0x8000, 0x8FFF, "AoE device {n}", _RECORD,
     (
         fixed(1, "NetID", "BLOCK(6)", "Of the port.", form=Form.NET_ID),
         fixed(2, "Sub-profile", "UINT", "1000 an EAP port, 1100 a bus port."),
         fixed(3, "Interface", TEXT, "Such as udp://10.0.0.1 or ethernet://eth0."),
-        live(4, "MAC address", "BLOCK(6)", Live.DEVICE_MAC, "Of the Ethernet interface; all zero "
+        live(4, "MAC address", "BLOCK(6)", RouterLive.DEVICE_MAC,
+             "Of the Ethernet interface; all zero "
              "where the port is not bound to one.", form=Form.MAC),
         fixed(5, "IP address", "BLOCK(4)", "First octet first; all zero where there is none.",
               form=Form.IP),
-        live(6, "State", "UINT", Live.DEVICE_STATE, "1 Init, 2 PreOp, 4 SafeOp, 8 Op; of a bus "
+        live(6, "State", "UINT", RouterLive.DEVICE_STATE,
+             "1 Init, 2 PreOp, 4 SafeOp, 8 Op; of a bus "
              "that of the slave that is least far; 0 unknown."),
         fixed(7, "Name", NAME, "Of the port, in the plant file."),
     ),
     "A port of the station, in the order of the plant file.",
 )  # fmt: skip
-ROUTE = ObjectRange(
+ROUTE = ObjectRow(
     0x9000, 0x93FF, "Route {n}", _RECORD,
     (
-        live(1, "NetID", "BLOCK(6)", Live.ROUTE_NET_ID, "Whoever has it, or one that begins alike, "
+        live(1, "NetID", "BLOCK(6)", RouterLive.ROUTE_NET_ID,
+             "Whoever has it, or one that begins alike, "
              "is reached by this route.", form=Form.NET_ID),
-        live(2, "Octets", "USINT", Live.ROUTE_OCTETS, "How many octets of it have to match: 6, 5 "
+        live(2, "Octets", "USINT", RouterLive.ROUTE_OCTETS,
+             "How many octets of it have to match: 6, 5 "
              "or 4; 0 a default route."),
-        live(3, "Name", NAME, Live.ROUTE_NAME, "For people."),
-        live(4, "Door", NAME, Live.ROUTE_DOOR, "By which packets leave."),
-        live(5, "Address", NAME, Live.ROUTE_ADDRESS, "Where they go from there."),
-        live(6, "Origin", "USINT", Live.ROUTE_ORIGIN, "0 the plant file, 1 added at run time, 2 "
+        live(3, "Name", NAME, RouterLive.ROUTE_NAME, "For people."),
+        live(4, "Door", NAME, RouterLive.ROUTE_DOOR, "By which packets leave."),
+        live(5, "Address", NAME, RouterLive.ROUTE_ADDRESS, "Where they go from there."),
+        live(6, "Origin", "USINT", RouterLive.ROUTE_ORIGIN,
+             "0 the plant file, 1 added at run time, 2 "
              "learned."),
-        live(7, "State", "USINT", Live.ROUTE_STATE, "0 unknown, 1 up, 2 down, 3 client."),
-        live(8, "Round trip", "UDINT", Live.ROUTE_ROUND_TRIP, "To the next hop and back, at the "
+        live(7, "State", "USINT", RouterLive.ROUTE_STATE, "0 unknown, 1 up, 2 down, 3 client."),
+        live(8, "Round trip", "UDINT", RouterLive.ROUTE_ROUND_TRIP,
+             "To the next hop and back, at the "
              "last time; 0 unknown.", unit="us"),
-        live(9, "Requests", "ULINT", Live.ROUTE_REQUESTS, "That went there."),
-        live(10, "Errors", "ULINT", Live.ROUTE_ERRORS, "Of those, that did not get there."),
-        live(11, "Last error", TEXT, Live.ROUTE_LAST_ERROR, "In words."),
+        live(9, "Requests", "ULINT", RouterLive.ROUTE_REQUESTS, "That went there."),
+        live(10, "Errors", "ULINT", RouterLive.ROUTE_ERRORS, "Of those, that did not get there."),
+        live(11, "Last error", TEXT, RouterLive.ROUTE_LAST_ERROR, "In words."),
     ),
     "A route, of the first 1024 in the order of the table: objects come and go with the routes.",
 )  # fmt: skip
@@ -96,16 +102,20 @@ MODULES = single(
 )  # fmt: skip
 DIAGNOSIS = single(
     0xF110, "Router diagnosis", "Packets by what became of them, and what there is now.",
-    live(1, "Answered", "ULINT", Live.ANSWERED, "Requests that were answered by their target."),
-    live(2, "Failed", "ULINT", Live.FAILED, "Requests that the router answered with an error."),
-    live(3, "Denied", "ULINT", Live.DENIED, "Requests that access rules refused, in part or all."),
-    live(4, "Loops", "ULINT", Live.LOOPS, "Packets that ran in a circle."),
-    live(5, "Late", "ULINT", Live.LATE, "Answers that nobody waited for any more."),
-    live(6, "Dropped", "ULINT", Live.DROPPED, "Packets that were left without an answer."),
-    live(7, "Waiting", "UDINT", Live.WAITING, "Requests that wait for their answers."),
-    live(8, "Routes", "UDINT", Live.ROUTES, "That there are."),
-    live(9, "Connections", "UDINT", Live.CONNECTIONS, "Clients by connection or address."),
-    live(10, "Notifications", "UDINT", Live.SUBSCRIPTIONS, "That pass on their way to clients."),
+    live(1, "Answered", "ULINT", RouterLive.ANSWERED,
+         "Requests that were answered by their target."),
+    live(2, "Failed", "ULINT", RouterLive.FAILED,
+         "Requests that the router answered with an error."),
+    live(3, "Denied", "ULINT", RouterLive.DENIED,
+         "Requests that access rules refused, in part or all."),
+    live(4, "Loops", "ULINT", RouterLive.LOOPS, "Packets that ran in a circle."),
+    live(5, "Late", "ULINT", RouterLive.LATE, "Answers that nobody waited for any more."),
+    live(6, "Dropped", "ULINT", RouterLive.DROPPED, "Packets that were left without an answer."),
+    live(7, "Waiting", "UDINT", RouterLive.WAITING, "Requests that wait for their answers."),
+    live(8, "Routes", "UDINT", RouterLive.ROUTES, "That there are."),
+    live(9, "Connections", "UDINT", RouterLive.CONNECTIONS, "Clients by connection or address."),
+    live(10, "Notifications", "UDINT", RouterLive.SUBSCRIPTIONS,
+         "That pass on their way to clients."),
 )  # fmt: skip
 STATIC = (
     *identity(MODULE_PROFILE),
@@ -114,7 +124,7 @@ STATIC = (
            fixed(2, "Maximum number", "UINT", "Of AoE devices.", default=MAX_ENTRIES)),
     MODULES,
     single(0xF100, "Router status", "Where the station stands.",
-           live(1, "State", "UINT", Live.STATE, "1 Init, 2 PreOp, 4 SafeOp, 8 Op.")),
+           live(1, "State", "UINT", RouterLive.STATE, "1 Init, 2 PreOp, 4 SafeOp, 8 Op.")),
     DIAGNOSIS,
     single(0xF920, "AoE NetID", "Of the router.",
            fixed(1, "NetID", "BLOCK(6)", "By which all of the station is reached.",

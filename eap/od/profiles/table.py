@@ -85,7 +85,7 @@ class EntryRow(NamedTuple):
         return self.name.format(n=subindex - self.subindex) if self.last else self.name
 
 
-class ObjectRange(NamedTuple):
+class ObjectRow(NamedTuple):
     """Objects of one kind: one object, or as many as were made from *first* to *last*.
 
     *name* holds ``{n}`` where the number of the object within its range goes.
@@ -148,14 +148,14 @@ class ObjectRange(NamedTuple):
 
 def single(
     index: int, name: str, description: str, *entries: EntryRow, section: str = ""
-) -> ObjectRange:
+) -> ObjectRow:
     """Write the row of one object; an entry without a description has that of the object."""
     first = entries[0]
     code = ObjectCode.ARRAY if first.last else ObjectCode.RECORD
     described = tuple(
         each._replace(description=each.description or description) for each in entries
     )
-    return ObjectRange(
+    return ObjectRow(
         index, index, name, code if first.subindex else ObjectCode.VAR, described, description,
         section=section,
     )  # fmt: skip

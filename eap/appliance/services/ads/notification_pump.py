@@ -21,7 +21,7 @@ from eap.aoe.way import Way
 from eap.appliance.services.ads.image_variables import StationSymbols
 from eap.codec.adsnotification import to_filetime
 from eap.ids import NetId
-from eap.pd.samples import Samples
+from eap.pd.samples import ImageSamples
 from eap.pd.words import StationWord
 
 Send: TypeAlias = Callable[[Way, bytes], object]
@@ -61,7 +61,7 @@ class NotificationPump:
         self._send = send
         self._devices: list[_Device] = []
         self._wake = asyncio.Event()
-        self._samples: Samples | None = None
+        self._samples: ImageSamples | None = None
         self._told = 0
         """The last cycle that was looked at."""
 
@@ -106,12 +106,12 @@ class NotificationPump:
         if self._samples is None:
             self._told = image.words[StationWord.CYCLE]
         if self._samples is None or self._samples.image is not image:
-            self._samples = Samples(image)
+            self._samples = ImageSamples(image)
         is_done = self._tell(self._samples, unix_ns - now_ns)
         self._samples.want(2 + _WANTED_NS // (1000 * image.layout.cycle_us))
         return self._delay_ns(now_ns) if is_done else _SOON_NS
 
-    def _tell(self, samples: Samples, unix_at_0_ns: int) -> bool:
+    def _tell(self, samples: ImageSamples, unix_at_0_ns: int) -> bool:
         """Go through the cycles since the last look; return whether that was all of them."""
         room = _AT_ONCE
         for cycle in samples.since(self._told):

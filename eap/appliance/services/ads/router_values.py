@@ -15,7 +15,7 @@ from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.station_image import StationImage
 from eap.errors import ImageError
 from eap.ids import InterfaceUri, MacAddr
-from eap.od.profiles.router9000 import Live
+from eap.od.profiles.router9000 import RouterLive
 from eap.pd.spec import PortKind, PortSpec
 
 _INTERFACES = Path("/sys/class/net")
@@ -64,11 +64,11 @@ class LiveRouter:
         self._routes: tuple[Route, ...] = ()
         self._version = -1
 
-    def number(self, key: Live) -> int:
+    def number(self, key: RouterLive) -> int:
         """Return what *key* stands for, of the router as a whole."""
-        if key is Live.STATE:
+        if key is RouterLive.STATE:
             return int(self._device.status.state)
-        if key is Live.CONNECTIONS:
+        if key is RouterLive.CONNECTIONS:
             return len(self._router.connections())
         stats = self._router.stats()
         if key in _OUTCOMES:
@@ -100,7 +100,7 @@ class LiveRouter:
             self._routes = tuple(table)
         return self._routes
 
-    def of_route(self, key: Live, route: object) -> Any:
+    def of_route(self, key: RouterLive, route: object) -> Any:
         """Return what *key* stands for, of one of the routes."""
         assert isinstance(route, Route)  # noqa: S101  they come from here
         reader = _OF_ROUTE.get(key)
@@ -108,17 +108,17 @@ class LiveRouter:
 
 
 _OUTCOMES = {
-    Live.ANSWERED: Outcome.ANSWERED,
-    Live.FAILED: Outcome.FAILED,
-    Live.DENIED: Outcome.DENIED,
-    Live.LOOPS: Outcome.LOOP,
-    Live.LATE: Outcome.LATE,
-    Live.DROPPED: Outcome.DROPPED,
+    RouterLive.ANSWERED: Outcome.ANSWERED,
+    RouterLive.FAILED: Outcome.FAILED,
+    RouterLive.DENIED: Outcome.DENIED,
+    RouterLive.LOOPS: Outcome.LOOP,
+    RouterLive.LATE: Outcome.LATE,
+    RouterLive.DROPPED: Outcome.DROPPED,
 }
-_FIGURES: dict[Live, Callable[[Stats], int]] = {
-    Live.WAITING: lambda stats: stats.in_flight,
-    Live.ROUTES: lambda stats: stats.routes,
-    Live.SUBSCRIPTIONS: lambda stats: stats.subscriptions,
+_FIGURES: dict[RouterLive, Callable[[Stats], int]] = {
+    RouterLive.WAITING: lambda stats: stats.in_flight,
+    RouterLive.ROUTES: lambda stats: stats.routes,
+    RouterLive.SUBSCRIPTIONS: lambda stats: stats.subscriptions,
 }
 _STATES = {
     RouteState.UNKNOWN: 0,
@@ -126,18 +126,18 @@ _STATES = {
     RouteState.DOWN: 2,
     RouteState.CLIENT: 3,
 }
-_OF_ROUTE: dict[Live, Callable[[Route], Any]] = {
-    Live.ROUTE_NET_ID: lambda route: route.net_id,
-    Live.ROUTE_OCTETS: lambda route: route.octets,
-    Live.ROUTE_NAME: lambda route: route.name,
-    Live.ROUTE_DOOR: lambda route: route.hop.door,
-    Live.ROUTE_ADDRESS: lambda route: route.hop.connection,
-    Live.ROUTE_ORIGIN: lambda route: int(route.origin),
+_OF_ROUTE: dict[RouterLive, Callable[[Route], Any]] = {
+    RouterLive.ROUTE_NET_ID: lambda route: route.net_id,
+    RouterLive.ROUTE_OCTETS: lambda route: route.octets,
+    RouterLive.ROUTE_NAME: lambda route: route.name,
+    RouterLive.ROUTE_DOOR: lambda route: route.hop.door,
+    RouterLive.ROUTE_ADDRESS: lambda route: route.hop.connection,
+    RouterLive.ROUTE_ORIGIN: lambda route: int(route.origin),
 }
-_OF_REPORT: dict[Live, Callable[[RouteReport], Any]] = {
-    Live.ROUTE_STATE: lambda report: _STATES[report.state],
-    Live.ROUTE_ROUND_TRIP: lambda report: (report.round_trip_ns or 0) // 1000,
-    Live.ROUTE_REQUESTS: lambda report: report.traffic.requests,
-    Live.ROUTE_ERRORS: lambda report: report.traffic.errors,
-    Live.ROUTE_LAST_ERROR: lambda report: report.why or report.traffic.last_error,
+_OF_REPORT: dict[RouterLive, Callable[[RouteReport], Any]] = {
+    RouterLive.ROUTE_STATE: lambda report: _STATES[report.state],
+    RouterLive.ROUTE_ROUND_TRIP: lambda report: (report.round_trip_ns or 0) // 1000,
+    RouterLive.ROUTE_REQUESTS: lambda report: report.traffic.requests,
+    RouterLive.ROUTE_ERRORS: lambda report: report.traffic.errors,
+    RouterLive.ROUTE_LAST_ERROR: lambda report: report.why or report.traffic.last_error,
 }

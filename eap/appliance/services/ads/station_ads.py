@@ -13,7 +13,7 @@ from eap.appliance.services.device.station_device import StationDevice
 from eap.appliance.services.routes.whereabouts import Whereabouts
 from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.station_image import StationImage
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.pd.spec import StationSpec
@@ -40,7 +40,7 @@ class StationAds:
         device: StationDevice,
         image: StationImage,
         router: StationRouter,
-        identity: Identity,
+        identity: DeviceIdentity,
     ) -> None:
         symbols = StationSymbols(image)
         self.pump = NotificationPump(symbols, router.send_notification)

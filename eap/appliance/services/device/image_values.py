@@ -15,7 +15,7 @@ from eap.codec import datatypes
 from eap.codec.values import DataType
 from eap.errors import ImageError
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Live
+from eap.od.profiles.eap1000 import EapLive
 from eap.pd.frame_status import frame_state, tx_var_state
 from eap.pd.image import Image
 from eap.pd.layout import (
@@ -61,7 +61,7 @@ class ImageValues:
         """Return what *key* shows of the object called *name*, None if that does not run."""
         try:
             image = self._station.image
-            if key == Live.VALUE:
+            if key == EapLive.VALUE:
                 return _value(image, name)
             # What programs write has no place in a snapshot: it may be cut in two there.
             source = image if key in _CONTROLS else self._moment or image
@@ -166,42 +166,42 @@ def _cycle_index(image: Image, place: RxPlace) -> int:
     return last & 0xFFFF if _tracked(RxWord.RECEIVED)(image, place) else 0
 
 
-_CONTROLS = frozenset((Live.FRAME_CTRL, Live.TX_VAR_CTRL))
+_CONTROLS = frozenset((EapLive.FRAME_CTRL, EapLive.TX_VAR_CTRL))
 _OF_STATION: dict[str, int] = {
-    Live.STATION_CYCLE: StationWord.CYCLE,
-    Live.STATION_OVERRUNS: StationWord.OVERRUNS,
-    Live.STATION_RESTARTS: StationWord.RESTARTS,
-    Live.STATION_TORN: StationWord.TORN,
-    Live.STATION_LATENESS_MAX: StationWord.LATENESS_MAX_NS,
-    Live.STATION_LINKS_HELD: StationWord.LINKS_HELD,
+    EapLive.STATION_CYCLE: StationWord.CYCLE,
+    EapLive.STATION_OVERRUNS: StationWord.OVERRUNS,
+    EapLive.STATION_RESTARTS: StationWord.RESTARTS,
+    EapLive.STATION_TORN: StationWord.TORN,
+    EapLive.STATION_LATENESS_MAX: StationWord.LATENESS_MAX_NS,
+    EapLive.STATION_LINKS_HELD: StationWord.LINKS_HELD,
 } | {
     key: StationWord.DISCARDED + DISCARD_INDEX[reason]
     for reason in Discard
     if (key := f"station_discarded_{reason}") in _KINDS
 }
 _OF_FRAME: dict[str, Callable[[Image, FramePlace], int]] = {
-    Live.FRAME_STATE: lambda image, place: frame_state(image, place.words),
-    Live.FRAME_CTRL: _control(FRAME_CTRL),
-    Live.FRAME_WHOLE: _frame_word(FrameWord.WHOLE),
-    Live.FRAME_PARTIAL: _frame_word(FrameWord.PARTIAL),
-    Live.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
+    EapLive.FRAME_STATE: lambda image, place: frame_state(image, place.words),
+    EapLive.FRAME_CTRL: _control(FRAME_CTRL),
+    EapLive.FRAME_WHOLE: _frame_word(FrameWord.WHOLE),
+    EapLive.FRAME_PARTIAL: _frame_word(FrameWord.PARTIAL),
+    EapLive.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
 }
 _OF_TX: dict[str, Callable[[Image, TxPlace], int]] = {
-    Live.TX_VAR_STATE: lambda image, place: tx_var_state(image.words, place),
-    Live.TX_VAR_CTRL: _control(VAR_CTRL),
-    Live.TX_LAST_REASON: _last_reason,
-    Live.TX_SKIPPED: _tx_word(TxWord.SKIPPED),
+    EapLive.TX_VAR_STATE: lambda image, place: tx_var_state(image.words, place),
+    EapLive.TX_VAR_CTRL: _control(VAR_CTRL),
+    EapLive.TX_LAST_REASON: _last_reason,
+    EapLive.TX_SKIPPED: _tx_word(TxWord.SKIPPED),
 } | {key: _sent(reason) for reason in Reason if (key := f"tx_sent_{reason}") in _KINDS}
 _OF_RX: dict[str, Callable[[Image, RxPlace], int]] = {
-    Live.RX_QUALITY: _quality,
-    Live.RX_CYCLE_INDEX: _cycle_index,
-    Live.RX_VAR_STATE: var_state,
-    Live.RX_STATE: _tracked(RxWord.STATE),
-    Live.RX_RECEIVED: _tracked(RxWord.RECEIVED),
-    Live.RX_LOST: _tracked(RxWord.LOST),
-    Live.RX_DUPLICATED: _tracked(RxWord.DUPLICATED),
-    Live.RX_REORDERED: _tracked(RxWord.REORDERED),
-    Live.RX_LATE: _tracked(RxWord.LATE),
-    Live.RX_TIMEOUTS: _tracked(RxWord.TIMEOUTS),
-    Live.RX_JITTER_MAX: _tracked(RxWord.JITTER_MAX_US),
+    EapLive.RX_QUALITY: _quality,
+    EapLive.RX_CYCLE_INDEX: _cycle_index,
+    EapLive.RX_VAR_STATE: var_state,
+    EapLive.RX_STATE: _tracked(RxWord.STATE),
+    EapLive.RX_RECEIVED: _tracked(RxWord.RECEIVED),
+    EapLive.RX_LOST: _tracked(RxWord.LOST),
+    EapLive.RX_DUPLICATED: _tracked(RxWord.DUPLICATED),
+    EapLive.RX_REORDERED: _tracked(RxWord.REORDERED),
+    EapLive.RX_LATE: _tracked(RxWord.LATE),
+    EapLive.RX_TIMEOUTS: _tracked(RxWord.TIMEOUTS),
+    EapLive.RX_JITTER_MAX: _tracked(RxWord.JITTER_MAX_US),
 } | {key: _discarded(reason) for reason in Discard if (key := f"rx_discarded_{reason}") in _KINDS}

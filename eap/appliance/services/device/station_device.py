@@ -27,7 +27,7 @@ from eap.appliance.services.jobs import Jobs
 from eap.appliance.store import Configuration
 from eap.device import stored
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_objects import Identity, LiveValues
+from eap.device.eap_objects import DeviceIdentity, LiveValues
 from eap.device.eap_records import read_back
 from eap.device.eap_state import EapStateMachine, StateResult
 from eap.od.abort import AbortCode, SdoAbortError
@@ -56,7 +56,7 @@ class StationDevice:
         dictionaries: By name of the EAP port.
     """
 
-    def __init__(self, keeper: StationKeeper, values: LiveValues, identity: Identity) -> None:
+    def __init__(self, keeper: StationKeeper, values: LiveValues, identity: DeviceIdentity) -> None:
         self.name = keeper.spec.name
         self._keeper = keeper
         self._jobs = Jobs(f"station {self.name}")

@@ -36,11 +36,11 @@ from eap.appliance.services.master.master_registers import (
     neighbour,
     read_registers,
 )
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.device.master_dictionary import MasterDictionary
 from eap.errors import EapError
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.profiles.master1100 import CONFIGURED, DIAGNOSIS, Live
+from eap.od.profiles.master1100 import CONFIGURED, DIAGNOSIS, MasterLive
 
 T = TypeVar("T")
 
@@ -61,11 +61,16 @@ _RATE_S = 1.0
 """Frames in a second are counted over this time at least."""
 _BUSY, _DONE, _FAILED = 255, 1, 3
 """Of a command that has a response; 0 is one that has none (ETG.1000.6, type COMMAND_PAR)."""
-_NEIGHBOURS = (Live.NEIGHBOUR_0, Live.NEIGHBOUR_1, Live.NEIGHBOUR_2, Live.NEIGHBOUR_3)
-_CRCS = (Live.CRC_0, Live.CRC_1, Live.CRC_2, Live.CRC_3)
-_COUNTED = (*_CRCS, Live.ABSENCES, Live.ABNORMAL_CHANGES)
+_NEIGHBOURS = (
+    MasterLive.NEIGHBOUR_0,
+    MasterLive.NEIGHBOUR_1,
+    MasterLive.NEIGHBOUR_2,
+    MasterLive.NEIGHBOUR_3,
+)
+_CRCS = (MasterLive.CRC_0, MasterLive.CRC_1, MasterLive.CRC_2, MasterLive.CRC_3)
+_COUNTED = (*_CRCS, MasterLive.ABSENCES, MasterLive.ABNORMAL_CHANGES)
 """Counters of each slave."""
-_TEXTS = frozenset((Live.TYPE, Live.NAME))
+_TEXTS = frozenset((MasterLive.TYPE, MasterLive.NAME))
 _NO_LINK, _NO_COMMUNICATION, _LINK_MISSING, _ADDITIONAL_LINK = 1, 2, 4, 8
 _PORT_SHIFT = 4
 _PORTS_TO_OTHERS = (1, 2, 3)
@@ -97,7 +102,7 @@ class MasterDictionaryProvider:
         padded: bool = False,
     ) -> None:
         self._values = MasterView(client, port)
-        identity = Identity(
+        identity = DeviceIdentity(
             device_name=f"EtherCAT master {port.station}/{port.port}",
             hardware_version=os.uname().machine,
             software_version=release,
@@ -190,7 +195,7 @@ class MasterView:
         """AL control as it was written last."""
         self._fixed: set[int] = set()
         """Slaves whose loops stay as they are written."""
-        self._base: dict[tuple[int, Live], int] = {}
+        self._base: dict[tuple[int, MasterLive], int] = {}
         """Counters at the last reset."""
         self._lock = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -235,7 +240,7 @@ class MasterView:
             return tuple(each.station for each in self._detection.slaves)
         return tuple(station for station, slave in self.slaves.items() if slave.state)
 
-    def of_configured(self, station: int, key: Live) -> Any:
+    def of_configured(self, station: int, key: MasterLive) -> Any:
         """Return the value of *key* for a configured slave; 0 for one that is not known."""
         slave = self.slaves.get(station)
         if slave is None:
@@ -243,16 +248,16 @@ class MasterView:
         facts = self._facts.get(station, SlaveFacts())
         return configured_value(slave, self._registers_of(station).dl, facts, key)
 
-    def of_detected(self, station: int, key: Live) -> Any:
+    def of_detected(self, station: int, key: MasterLive) -> Any:
         """Return the value of *key* for a slave that was found."""
         for each in self._detection.slaves or ():
             if each.station == station:
                 return _detected_value(each, key)
-        if key is Live.DL_STATUS:
+        if key is MasterLive.DL_STATUS:
             return self._registers_of(station).dl_word
         return self.of_configured(station, key)
 
-    def of_diagnosis(self, station: int, key: Live) -> Any:
+    def of_diagnosis(self, station: int, key: MasterLive) -> Any:
         """Return the value of *key* for the diagnosis of a configured slave."""
         registers = self._registers_of(station)
         if key in _NEIGHBOURS:
@@ -263,41 +268,41 @@ class MasterView:
             return self._since_reset(station, key)
         slave = self.slaves.get(station)
         return {
-            Live.AL_STATUS: int.from_bytes(registers.al.encode()[:2], "little"),
-            Live.AL_CONTROL: self._requested.get(station, slave.target if slave else 0),
-            Live.AL_STATUS_CODE: self._last_code(station),
-            Live.LINK_CONNECTION: registers.dl.link << PORTS | communicating(registers.dl),
-            Live.LINK_CONTROL: registers.loops,
-            Live.WKC_ERRORS: self._since_reset(0, Live.WKC_ERRORS),
-            Live.FIXED_LINKS: station in self._fixed,
-            Live.HAS_NEW_DIAGNOSIS: False,
+            MasterLive.AL_STATUS: int.from_bytes(registers.al.encode()[:2], "little"),
+            MasterLive.AL_CONTROL: self._requested.get(station, slave.target if slave else 0),
+            MasterLive.AL_STATUS_CODE: self._last_code(station),
+            MasterLive.LINK_CONNECTION: registers.dl.link << PORTS | communicating(registers.dl),
+            MasterLive.LINK_CONTROL: registers.loops,
+            MasterLive.WKC_ERRORS: self._since_reset(0, MasterLive.WKC_ERRORS),
+            MasterLive.FIXED_LINKS: station in self._fixed,
+            MasterLive.HAS_NEW_DIAGNOSIS: False,
         }.get(key, 0)
 
-    def of_master(self, key: Live) -> Any:
+    def of_master(self, key: MasterLive) -> Any:
         """Return the value of *key* for the master itself."""
         status, count = self._detection.status, len(self._detection.slaves or ())
         count = count if status == _DONE else 0
         return {
-            Live.DETECT_REQUEST: bytes(2),
-            Live.DETECT_STATUS: status,
-            Live.DETECT_RESPONSE: bytes((status, 0, 0, 0)) + count.to_bytes(2, "little"),
-            Live.LOST_CYCLIC: self._since_reset(0, Live.LOST_CYCLIC),
-            Live.LOST_ACYCLIC: self._since_reset(0, Live.LOST_ACYCLIC),
-            Live.RATE_CYCLIC: self._rates.cyclic,
-            Live.RATE_ACYCLIC: self._rates.acyclic,
-            Live.STATE: max((slave.state for slave in self.slaves.values()), default=1) or 1,
-            Live.RESET: False,
+            MasterLive.DETECT_REQUEST: bytes(2),
+            MasterLive.DETECT_STATUS: status,
+            MasterLive.DETECT_RESPONSE: bytes((status, 0, 0, 0)) + count.to_bytes(2, "little"),
+            MasterLive.LOST_CYCLIC: self._since_reset(0, MasterLive.LOST_CYCLIC),
+            MasterLive.LOST_ACYCLIC: self._since_reset(0, MasterLive.LOST_ACYCLIC),
+            MasterLive.RATE_CYCLIC: self._rates.cyclic,
+            MasterLive.RATE_ACYCLIC: self._rates.acyclic,
+            MasterLive.STATE: max((slave.state for slave in self.slaves.values()), default=1) or 1,
+            MasterLive.RESET: False,
         }.get(key, 0)
 
-    def write_slave(self, station: int, key: Live, value: int) -> None:
+    def write_slave(self, station: int, key: MasterLive, value: int) -> None:
         """Request a state, or set the loops of ports; an error that comes later is logged."""
-        if key is Live.AL_CONTROL:
+        if key is MasterLive.AL_CONTROL:
             target = value & 0x0F
             if target not in _STATES or value >> _AL_CONTROL_BITS:
                 raise SdoAbortError(AbortCode.VALUE, 0xA000, 2, f"{value:#x} asks for no AL state")
             self._requested[station] = value
             self._start(self._bring(station, AlState(target)))
-        elif key is Live.LINK_CONTROL:
+        elif key is MasterLive.LINK_CONTROL:
             access = [fpwr(station, LOOPS, bytes((value,)))]
             self._start(self._client.transfer(self._port, access))
             self._registers.expire()
@@ -306,9 +311,9 @@ class MasterView:
         else:
             self._fixed.discard(station)
 
-    def write_master(self, key: Live, data: bytes) -> None:
+    def write_master(self, key: MasterLive, data: bytes) -> None:
         """Start a scan, or reset counters."""
-        if key is Live.DETECT_REQUEST:
+        if key is MasterLive.DETECT_REQUEST:
             if self._detection.status != _BUSY:
                 self._detection = self._detection._replace(status=_BUSY)
                 self._start(self._detect())
@@ -381,28 +386,31 @@ class MasterView:
             raise
         self._detection = Detection(_DONE, found)
 
-    def _counter(self, station: int, key: Live) -> int:
+    def _counter(self, station: int, key: MasterLive) -> int:
         if key in _CRCS:
             return self._registers_of(station).errors[_CRCS.index(key)]
         slave, counters = self.slaves.get(station), self._counters.value
         if slave is not None:
-            return slave.losses if key is Live.ABSENCES else slave.departures
-        if key is Live.WKC_ERRORS:
+            return slave.losses if key is MasterLive.ABSENCES else slave.departures
+        if key is MasterLive.WKC_ERRORS:
             return counters.wkc_errors
-        return counters.cycles_lost if key is Live.LOST_CYCLIC else counters.frames_lost
+        return counters.cycles_lost if key is MasterLive.LOST_CYCLIC else counters.frames_lost
 
     def _last_code(self, station: int) -> int:
         """Return the AL status code of when a slave last left its state, or that was seen last."""
         slave = self.slaves.get(station)
-        has_left = self._since_reset(station, Live.ABNORMAL_CHANGES)
+        has_left = self._since_reset(station, MasterLive.ABNORMAL_CHANGES)
         return (has_left and slave and slave.al_code) or self._codes.get(station, 0)
 
-    def _since_reset(self, station: int, key: Live) -> int:
+    def _since_reset(self, station: int, key: MasterLive) -> int:
         return max(0, self._counter(station, key) - self._base.get((station, key), 0))
 
     def _reset(self) -> None:
         self._codes.clear()
-        keys = [(0, key) for key in (Live.WKC_ERRORS, Live.LOST_CYCLIC, Live.LOST_ACYCLIC)]
+        keys = [
+            (0, key)
+            for key in (MasterLive.WKC_ERRORS, MasterLive.LOST_CYCLIC, MasterLive.LOST_ACYCLIC)
+        ]
         keys += [(station, key) for station in self.slaves for key in _COUNTED]
         self._base = {key: self._counter(*key) for key in keys}
 
@@ -418,7 +426,9 @@ class MasterView:
             logger.warning("%s/%s: %s", self._port.station, self._port.port, exc)
 
 
-def configured_value(slave: SlaveDescription, dl: DlStatus, facts: SlaveFacts, key: Live) -> Any:
+def configured_value(
+    slave: SlaveDescription, dl: DlStatus, facts: SlaveFacts, key: MasterLive
+) -> Any:
     """Return the value of *key* in the configuration of a slave (0x8nnn); 0 if it is not known.
 
     Args:
@@ -428,22 +438,22 @@ def configured_value(slave: SlaveDescription, dl: DlStatus, facts: SlaveFacts, k
         key: Of a row of the profile.
     """
     return {
-        Live.ADDRESS: slave.station,
-        Live.TYPE: slave.order or slave.name,
-        Live.NAME: slave.name,
-        Live.DEVICE_TYPE: facts.device_type,
-        Live.VENDOR: slave.vendor,
-        Live.PRODUCT: slave.product,
-        Live.REVISION: slave.revision,
-        Live.SERIAL: slave.serial,
+        MasterLive.ADDRESS: slave.station,
+        MasterLive.TYPE: slave.order or slave.name,
+        MasterLive.NAME: slave.name,
+        MasterLive.DEVICE_TYPE: facts.device_type,
+        MasterLive.VENDOR: slave.vendor,
+        MasterLive.PRODUCT: slave.product,
+        MasterLive.REVISION: slave.revision,
+        MasterLive.SERIAL: slave.serial,
         # In BOOT they are other ones than in the EEPROM.
-        Live.MAILBOX_OUT: slave.to_slave or slave.usual_to_slave,
-        Live.MAILBOX_IN: slave.to_master or slave.usual_to_master,
-        Live.LINK_STATUS: link_status(slave, dl),
-        Live.LINK_PRESET: slave.link_preset,
-        Live.PHYSICS: slave.port_physics,
-        Live.PROTOCOLS: slave.protocols,
-        Live.HAS_HISTORY: facts.has_history,
+        MasterLive.MAILBOX_OUT: slave.to_slave or slave.usual_to_slave,
+        MasterLive.MAILBOX_IN: slave.to_master or slave.usual_to_master,
+        MasterLive.LINK_STATUS: link_status(slave, dl),
+        MasterLive.LINK_PRESET: slave.link_preset,
+        MasterLive.PHYSICS: slave.port_physics,
+        MasterLive.PROTOCOLS: slave.protocols,
+        MasterLive.HAS_HISTORY: facts.has_history,
     }.get(key, 0)
 
 
@@ -465,15 +475,15 @@ def link_status(slave: SlaveDescription, dl: DlStatus) -> int:
     return status
 
 
-def _detected_value(found: DetectedSlave, key: Live) -> int:
+def _detected_value(found: DetectedSlave, key: MasterLive) -> int:
     identity = found.identity
     return {
-        Live.ADDRESS: found.station,
-        Live.VENDOR: identity.vendor,
-        Live.PRODUCT: identity.product,
-        Live.REVISION: identity.revision,
-        Live.SERIAL: identity.serial,
-        Live.DL_STATUS: found.dl_word,
+        MasterLive.ADDRESS: found.station,
+        MasterLive.VENDOR: identity.vendor,
+        MasterLive.PRODUCT: identity.product,
+        MasterLive.REVISION: identity.revision,
+        MasterLive.SERIAL: identity.serial,
+        MasterLive.DL_STATUS: found.dl_word,
     }.get(key, 0)
 
 

@@ -13,7 +13,7 @@ from eap.appliance.services.routing.mailbox_frames import (
     aoe_packet,
     refusal_of,
 )
-from eap.pd.link import Channel, Origin, OutFrame
+from eap.pd.link import Channel, FrameOrigin, OutFrame
 
 
 class WayIn(Protocol):
@@ -49,7 +49,7 @@ class MailboxIntake:
         self._is_for_many = is_for_many
         self._is_aoe_here = is_aoe_here
 
-    def take(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
+    def take(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
         """Act on a frame; return why not if it is not taken."""
         del at_ns
         sender = origin.sender_of(data)
@@ -64,7 +64,7 @@ class MailboxIntake:
             return refusal_of(frame)
         return self._gateway.receive(bytes(frame), sender, self._carrier.send_frame)
 
-    def judge(self, data: memoryview, size: int, at_ns: int, origin: Origin) -> Refusal | None:
+    def judge(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> Refusal | None:
         """Return why a frame is not taken that this intake gets too, without acting on it."""
         del at_ns, origin
         if aoe_packet(data[:size]) is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eap.appliance import control_device as words
 from eap.appliance.device_change import Plan
-from eap.device.difference import Change, ChangeKind
+from eap.device.difference import ChangeKind, EntryChange
 from eap.device.eap_state import StateResult
 from eap.od.model import WO, Entry, record
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
@@ -44,8 +44,11 @@ def test_states():
 
 def test_outcomes(stations):
     changes = [
-        ("eap0", Change(ChangeKind.CHANGED, 0xD000, 3, "PD ID", "1", "0", b"\0\0", interim=True)),
-        ("eap0", Change(ChangeKind.CHANGED, 0xD000, 3, "PD ID", "1", "2", b"\2\0")),
+        (
+            "eap0",
+            EntryChange(ChangeKind.CHANGED, 0xD000, 3, "PD ID", "1", "0", b"\0\0", interim=True),
+        ),
+        ("eap0", EntryChange(ChangeKind.CHANGED, 0xD000, 3, "PD ID", "1", "2", b"\2\0")),
     ]
     plan = Plan(stations[0], changes, ["link a to b: added"], [], {})
     shown = words.plan_document(plan)

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave, describe_buses
+from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus, describe_buses
 from eap.config.convert import convert
 from eap.config.document import read
-from eap.config.finding import Finding, Report
+from eap.config.finding import Finding, FindingReport
 from eap.config.index import Index
 from eap.config.load import load
 
@@ -33,7 +33,7 @@ stations:
       - {name: seen, port: eap0, from: left/state, timeout_ms: 50, variables: {a: REAL, b: UDINT}}
 """
 
-BUS = BusDescription(
+BUS = ExpectedBus(
     (
         DescribedSlave(
             name="valves",
@@ -104,7 +104,7 @@ def index(tmp_path):
     def of(*edits):
         path = tmp_path / "plant.yaml"
         path.write_text(edited(*edits))
-        report = Report(str(path))
+        report = FindingReport(str(path))
         plant = convert(read(path, report), report)
         (tmp_path / "line.yaml").touch()
         return Index(plant, describe_buses(plant, tmp_path, describe, report))

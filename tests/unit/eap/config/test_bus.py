@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.config.bus import BusDescription, DescribedEntry, DescribedSlave, name_bus
+from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus, name_bus
 
 
 def slave(*inputs, outputs=(), name="a", **identity):
@@ -18,13 +18,13 @@ def entry(name, subindex=1, kind="BOOL", index=0x6000):
 
 
 def names(*inputs, outputs=()):
-    bus = name_bus("bus0", BusDescription((slave(*inputs, outputs=outputs),)))
+    bus = name_bus("bus0", ExpectedBus((slave(*inputs, outputs=outputs),)))
     [only] = bus.slaves
     return [each.variable.removeprefix("bus0.a.") for each in (*only.outputs, *only.inputs)]
 
 
 def test_an_unknown_bus_has_its_own_state_only():
-    bus = name_bus("bus0", BusDescription())
+    bus = name_bus("bus0", ExpectedBus())
     assert bus.slaves == ()
     assert {name: kind for name, (kind, _, _) in bus.variables.items()} == {
         "bus0.state": "BYTE",
@@ -34,7 +34,7 @@ def test_an_unknown_bus_has_its_own_state_only():
 
 def test_variables_come_with_type_and_direction():
     outputs = [entry("valve", index=0x7000), DescribedEntry("", "", 0, 0, 7)]
-    bus = name_bus("b", BusDescription((slave(entry("level", 3, "INT"), outputs=outputs),)))
+    bus = name_bus("b", ExpectedBus((slave(entry("level", 3, "INT"), outputs=outputs),)))
     assert {name: each[:2] for name, each in bus.variables.items()} == {
         "b.state": ("BYTE", False),
         "b.wkc_ok": ("BOOL", False),
@@ -48,7 +48,7 @@ def test_variables_come_with_type_and_direction():
 
 def test_slaves_keep_identity_order_and_padding():
     first = slave(DescribedEntry("", "", 0, 0, 5), entry("x"), serial=7)
-    bus = name_bus("bus0", BusDescription((first, slave(name="b", revision=3, alias=9))))
+    bus = name_bus("bus0", ExpectedBus((first, slave(name="b", revision=3, alias=9))))
     assert [each.station for each in bus.slaves] == [1001, 1002]
     assert [(each.revision, each.serial, each.alias) for each in bus.slaves] == [
         (None, 7, None),
@@ -100,7 +100,7 @@ ENTRIES = st.lists(
 
 @given(ENTRIES, ENTRIES)
 def test_names_are_unique_and_can_be_typed(outputs, inputs):
-    bus = name_bus("bus0", BusDescription((slave(*inputs, outputs=outputs),)))
+    bus = name_bus("bus0", ExpectedBus((slave(*inputs, outputs=outputs),)))
     [only] = bus.slaves
     found = [each.variable for each in (*only.outputs, *only.inputs) if each.variable]
     assert len(found) == len(set(found)) == sum(bool(e.type) for e in (*outputs, *inputs))

@@ -5,7 +5,7 @@ import pytest
 
 from eap.config.convert import convert_to
 from eap.config.document import read
-from eap.config.finding import Report
+from eap.config.finding import FindingReport
 
 
 @pytest.mark.parametrize(
@@ -121,6 +121,6 @@ class Lamp(msgspec.Struct):
 def test_any_struct_can_be_read(tmp_path, text, lamp, messages):
     path = tmp_path / "lamp.yaml"
     path.write_text(text)
-    report = Report(str(path))
+    report = FindingReport(str(path))
     assert convert_to(Lamp, read(path, report), report, "lamp") == lamp
     assert [finding.message for finding in report.findings()] == messages

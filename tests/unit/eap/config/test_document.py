@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.config.document import MAX_FILE, read
-from eap.config.finding import Report
+from eap.config.finding import FindingReport
 
 
 def plain(node):
@@ -25,7 +25,7 @@ def tree(tmp_path):
     def of(content):
         path = tmp_path / "plant.yaml"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        report = Report("p.yaml")
+        report = FindingReport("p.yaml")
         return read(path, report), [str(finding) for finding in report.findings()]
 
     return of
@@ -127,7 +127,7 @@ def test_a_file_that_is_none_is_a_finding(tmp_path):
         "x" * 300: "cannot be read: File name too long",
         "loop": "",
     }.items():
-        report = Report(name)
+        report = FindingReport(name)
         assert read(tmp_path / name, report) is None
         [finding] = report.findings()
         assert words in finding.message
@@ -137,7 +137,7 @@ def test_a_file_that_is_none_is_a_finding(tmp_path):
 def test_no_content_is_a_traceback(tmp_path_factory, content):
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    report = Report("p.yaml")
+    report = FindingReport("p.yaml")
     assert read(path, report) is not None or report.findings()
 
 

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from eap.config.document import Node
-from eap.config.finding import Finding, Report, one_of
+from eap.config.finding import Finding, FindingReport, one_of
 
 
 def test_a_finding_reads_as_file_line_what_and_what_was_expected():
@@ -14,7 +14,7 @@ def test_a_finding_of_the_whole_file_has_no_line():
 
 
 def test_a_path_without_a_line_of_its_own_has_that_of_what_holds_it():
-    report = Report("p.yaml")
+    report = FindingReport("p.yaml")
     report.lines |= {"": 1, "stations[0]": 4, "stations[0].ports[1]": 9}
     assert report.line_of("stations[0].ports[1].vlan.id") == 9
     assert report.line_of("stations[0].cycle_us") == 4
@@ -22,7 +22,7 @@ def test_a_path_without_a_line_of_its_own_has_that_of_what_holds_it():
 
 
 def test_findings_are_in_the_order_of_the_file_and_told_once():
-    report = Report("p.yaml")
+    report = FindingReport("p.yaml")
     report.add("b", "second", "x", line=5)
     report.add("a", "first", "x", line=2)
     report.add("c", "second", "x", line=5)
@@ -35,7 +35,7 @@ def test_one_of_nothing_says_so():
 
 
 def test_findings_of_other_files_come_last():
-    report = Report("p.yaml")
+    report = FindingReport("p.yaml")
     report.adopt([Finding("bus.yaml", 1, "", "wrong", "right")])
     report.add("a", "first", "x", line=2)
     assert [str(f) for f in report.findings()] == [
@@ -45,7 +45,7 @@ def test_findings_of_other_files_come_last():
 
 
 def test_a_report_knows_where_something_is_wrong():
-    report = Report("p.yaml")
+    report = FindingReport("p.yaml")
     report.add("a.b", "first", "x", line=2)
     assert report.has("a.b")
     assert not report.has("a")
@@ -53,7 +53,7 @@ def test_a_report_knows_where_something_is_wrong():
 
 def shared_report():
     """Return the report of two stations that share a mapping with the keys a and b."""
-    report = Report("p.yaml")
+    report = FindingReport("p.yaml")
     report.stations |= {"oven", "press"}
     a, b = Node(2, 1), Node(2, 2)
     for number in range(2):

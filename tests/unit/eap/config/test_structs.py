@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from eap.config import structs
-from eap.config.bus import BusDescription
+from eap.config.bus import ExpectedBus
 from eap.config.load import load
 from eap.pd import spec
 
@@ -72,7 +72,7 @@ def test_the_examples_of_the_reference_are_right(example, tmp_path):
         touch(tmp_path / "secrets" / name)
     plant = tmp_path / "plant.yaml"
     plant.write_text(LINE + textwrap.indent(example, "    ") + OTHERS)
-    result = load(plant, lambda path: BusDescription())
+    result = load(plant, lambda path: ExpectedBus())
     assert [str(finding) for finding in result.findings] == []
     told = result.plant.routing["mixer"]
     written = [route for route in told.routes if not route.is_derived]

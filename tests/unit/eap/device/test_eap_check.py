@@ -4,7 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from eap.device.eap_records import read_back
-from eap.od.profiles.eap1000 import AddressMode, Frame, Rx, RxFlag, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, RxFlag, Tx, Var
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import CounterSource, HostSource, LinkSpec, Measure, VariableSpec, Writer
 from tests.support.downloads import frame, mapping, receiver, rx_pd, sender, tx_pd, variable, write
@@ -27,11 +27,11 @@ def ports():
 @pytest.mark.parametrize(
     ("writes", "fault"),
     [
-        ([(0x8001, Frame.NAME, "frame0")], (FaultCode.NAME_TWICE, 0x8001, Frame.NAME)),
+        ([(0x8001, FrameEntry.NAME, "frame0")], (FaultCode.NAME_TWICE, 0x8001, FrameEntry.NAME)),
         ([(0xD001, Tx.NAME, "txpd0")], (FaultCode.NAME_TWICE, 0xD001, Tx.NAME)),
         ([(0xE001, Rx.NAME, "rxpd0")], (FaultCode.NAME_TWICE, 0xE001, Rx.NAME)),
         ([(0xD001, Tx.PD_ID, 1)], (FaultCode.PD_ID_TWICE, 0xD001, Tx.PD_ID)),
-        ([(0x8000, Frame.MODULO, 1)], (FaultCode.MODULO, 0x8000, Frame.MODULO)),
+        ([(0x8000, FrameEntry.MODULO, 1)], (FaultCode.MODULO, 0x8000, FrameEntry.MODULO)),
         ([(0xD000, Tx.MODULO, 1)], (FaultCode.MODULO, 0xD000, Tx.MODULO)),
         ([(0xD000, Tx.CYCLE_TIME, 1500)], (FaultCode.CYCLE_TIME, 0xD000, Tx.CYCLE_TIME)),
         (
@@ -47,35 +47,39 @@ def ports():
             (FaultCode.TIME_OUT, 0xD000, Tx.ON_CHANGE_TIMEOUT),
         ),
         (
-            [(0x8000, Frame.DIVIDER, 4), (0xD000, Tx.DIVIDER, 6)],
+            [(0x8000, FrameEntry.DIVIDER, 4), (0xD000, Tx.DIVIDER, 6)],
             (FaultCode.GATE, 0xD000, Tx.DIVIDER),
         ),
         (
-            [(0x8000, Frame.DIVIDER, 4), (0xD000, Tx.CYCLE_TIME, 20000)],
+            [(0x8000, FrameEntry.DIVIDER, 4), (0xD000, Tx.CYCLE_TIME, 20000)],
             (FaultCode.GATE, 0xD000, Tx.CYCLE_TIME),
         ),
         (
-            [(0x8000, Frame.DIVIDER, 2), (0x8000, Frame.MODULO, 1), (0xD000, Tx.DIVIDER, 4)],
+            [
+                (0x8000, FrameEntry.DIVIDER, 2),
+                (0x8000, FrameEntry.MODULO, 1),
+                (0xD000, Tx.DIVIDER, 4),
+            ],
             (FaultCode.GATE, 0xD000, Tx.DIVIDER),
         ),
         (
-            [(0x8000, Frame.MONITOR_IP, b"\x0a\0\0\2")],
-            (FaultCode.MONITORING, 0x8000, Frame.MONITOR_IP),
+            [(0x8000, FrameEntry.MONITOR_IP, b"\x0a\0\0\2")],
+            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITOR_IP),
         ),
         (
-            [(0x8000, Frame.MONITORING_INTERVAL, 99)],
-            (FaultCode.MONITORING, 0x8000, Frame.MONITORING_INTERVAL),
+            [(0x8000, FrameEntry.MONITORING_INTERVAL, 99)],
+            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITORING_INTERVAL),
         ),
         (
-            [(0x8000, Frame.MONITORING_INTERVAL, 100), (0x8000, Frame.ADDRESS_MODE, 3)],
-            (FaultCode.MONITORING, 0x8000, Frame.MONITORING_INTERVAL),
+            [(0x8000, FrameEntry.MONITORING_INTERVAL, 100), (0x8000, FrameEntry.ADDRESS_MODE, 3)],
+            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITORING_INTERVAL),
         ),
         (
             [
-                (0x8000, Frame.MONITORING_INTERVAL, 100),
-                (0x8000, Frame.DESTINATION_IP, b"\xef\1\1\1"),
+                (0x8000, FrameEntry.MONITORING_INTERVAL, 100),
+                (0x8000, FrameEntry.DESTINATION_IP, b"\xef\1\1\1"),
             ],
-            (FaultCode.MONITORING, 0x8000, Frame.MONITORING_INTERVAL),
+            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITORING_INTERVAL),
         ),
         ([(0xE001, Rx.PD_ID, 1)], (FaultCode.RECEIVED_TWICE, 0xE001, Rx.PD_ID)),
         ([(0xE001, Rx.PDO_INDEX, 0x1600)], (FaultCode.RECEIVED_TWICE, 0xE001, Rx.PDO_INDEX)),
@@ -85,23 +89,23 @@ def ports():
         ),
         (
             [(0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)],
-            (FaultCode.POLL, 0x8000, Frame.ADDRESS_MODE),
+            (FaultCode.POLL, 0x8000, FrameEntry.ADDRESS_MODE),
         ),
         (
-            [(0x8000, Frame.ADDRESS_MODE, AddressMode.REQUESTER)],
-            (FaultCode.POLL, 0x8000, Frame.ADDRESS_MODE),
+            [(0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER)],
+            (FaultCode.POLL, 0x8000, FrameEntry.ADDRESS_MODE),
         ),
         (
             [
-                (0x8000, Frame.ADDRESS_MODE, AddressMode.REQUESTER),
-                (0x8000, Frame.DIVIDER, 2),
+                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameEntry.DIVIDER, 2),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
             ],
-            (FaultCode.TRIGGERS, 0x8000, Frame.DIVIDER),
+            (FaultCode.TRIGGERS, 0x8000, FrameEntry.DIVIDER),
         ),
         (
             [
-                (0x8000, Frame.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xD000, Tx.EVENT, 1),
             ],
@@ -109,7 +113,7 @@ def ports():
         ),
         (
             [
-                (0x8000, Frame.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xE000, Rx.FLAGS, 0),
             ],
@@ -117,7 +121,7 @@ def ports():
         ),
         (
             [
-                (0x8000, Frame.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xE000, Rx.POLL_REQUEST_TXPD, 0xD001),
             ],
@@ -125,7 +129,7 @@ def ports():
         ),
         (
             [
-                (0x8000, Frame.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xE001, Rx.POLL_REQUEST_TXPD, 0xD000),
             ],
@@ -153,14 +157,14 @@ def test_names_are_given_once_in_the_station(ports):
     with pytest.raises(DeviceFault, match="frame frame0 is 0x8000 of eap0 already") as caught:
         read_back(BLANK, ports)
     assert caught.value.port == "eap1"
-    write(other, 0x8000, Frame.NAME, "other")
+    write(other, 0x8000, FrameEntry.NAME, "other")
     write(other, 0xD000, Tx.NAME, "other")
     assert len(read_back(BLANK, ports).frames) == 3  # IDs are unique per publisher
 
 
 def test_polls_that_fit_are_taken(ports):
     udp = ports["eap0"]
-    write(udp, 0x8000, Frame.ADDRESS_MODE, AddressMode.REQUESTER)
+    write(udp, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER)
     write(udp, 0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)
     write(udp, 0xE001, Rx.POLL_REQUEST_TXPD, 0xD001)
     spec = read_back(BLANK, ports)

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from eap.codec import datatypes, pdo
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_mapping import (
-    Mapped,
+    MappingEntry,
     check_mapped,
     encode_mapping,
+    lay_out_mapping,
     mapped_bits,
-    place,
 )
 from eap.device.eap_objects import EapObjects
 from eap.od.abort import AbortCode, SdoAbortError
@@ -22,7 +22,7 @@ from tests.support.stations import BLANK, TYPES
 
 @given(st.integers(0, 0xFFFF_FFFF))
 def test_an_entry_is_index_subindex_and_length(word):
-    mapped = Mapped.decode(word)
+    mapped = MappingEntry.decode(word)
     assert mapped.encode() == word
     assert (mapped.target, mapped.subindex, mapped.bits) == (
         word >> 16,
@@ -41,7 +41,7 @@ def test_padding_is_what_the_layout_of_a_pd_leaves_out(texts):
     for subindex, word in enumerate(words, 1):
         write(dictionary, 0x1A00, subindex, word)
     write(dictionary, 0x1A00, 0, len(words))
-    placed = place(dictionary, 0x1A00, len(words), 65535)
+    placed = lay_out_mapping(dictionary, 0x1A00, len(words), 65535)
     assert placed.octets == pdo.layout(kinds).size
     assert placed.indexes == tuple(range(0x6000, 0x6000 + len(texts)))
     assert -(-mapped_bits(dictionary, dictionary[0x1A00]) // 8) == placed.octets
@@ -90,5 +90,5 @@ def test_a_mapping_that_no_longer_holds_counts_what_is_left(udp: EapObjects):
     udp.remove(0x6000)
     assert mapped_bits(udp, udp[0x1A00]) == 0
     with pytest.raises(SdoAbortError) as caught:
-        place(udp, 0x1A00, 1, 100)
+        lay_out_mapping(udp, 0x1A00, 1, 100)
     assert caught.value.code == AbortCode.NO_OBJECT

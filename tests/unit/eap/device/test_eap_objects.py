@@ -9,13 +9,13 @@ from msgspec.structs import replace
 
 from eap.codec import datatypes
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_objects import Identity, NothingRuns
+from eap.device.eap_objects import DeviceIdentity, NothingRuns
 from eap.device.pdlayout import bus_variables
 from eap.od import model
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, ObjectCode, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import MORE_TX_PDO, Frame, Live, Tx, Var
+from eap.od.profiles.eap1000 import MORE_TX_PDO, EapLive, FrameEntry, Tx, Var
 from eap.pd.spec import PortKind, PortSpec, VariableSpec
 from tests.support.downloads import PREOP, frame, mapping, receiver, sender, tx_pd, variable, write
 from tests.support.stations import BLANK
@@ -63,7 +63,7 @@ def test_members_are_listed_in_order_of_their_indexes(udp):
 
 def test_a_longest_list_has_names_for_all_entries(udp):
     item = udp.make_object(profile.TX_FRAME, 0x8000, last=254)
-    assert item.entries[Frame.TXPD].name == "TxPD 0"
+    assert item.entries[FrameEntry.TXPD].name == "TxPD 0"
     assert item.entries[254].name == "TxPD 238"
     assert item.max_subindex == 254
 
@@ -84,11 +84,11 @@ def test_a_type_makes_value_and_default_as_large(udp):
 
 def test_rights_follow_the_entry_that_grants_them(udp):
     item = udp.make(profile.TX_FRAME, 0x8000)
-    udp.put(0x8000, Frame.CHANGEABLE, b"\1")
-    assert item.entries[Frame.DESTINATION_IP].access & Access.WRITE_OP
-    assert not item.entries[Frame.DIVIDER].access & Access.WRITE_OP
-    udp.put(0x8000, Frame.CHANGEABLE, b"\0")
-    assert not item.entries[Frame.DESTINATION_IP].access & Access.WRITE_OP
+    udp.put(0x8000, FrameEntry.CHANGEABLE, b"\1")
+    assert item.entries[FrameEntry.DESTINATION_IP].access & Access.WRITE_OP
+    assert not item.entries[FrameEntry.DIVIDER].access & Access.WRITE_OP
+    udp.put(0x8000, FrameEntry.CHANGEABLE, b"\0")
+    assert not item.entries[FrameEntry.DESTINATION_IP].access & Access.WRITE_OP
 
 
 def _read(dictionary: EapDictionary, index: int, subindex: int) -> int:
@@ -104,7 +104,7 @@ def test_identity_and_port_are_shown(udp, ethernet):
 
 
 def test_identity_can_be_another():
-    identity = Identity(device_name="oven", vendor=2, serial=77)
+    identity = DeviceIdentity(device_name="oven", vendor=2, serial=77)
     station = replace(BLANK, ports=(replace(BLANK.ports[0], profile=5002), *BLANK.ports[1:]))
     dictionary = EapDictionary(station, "eap0", identity=identity)
     assert _read(dictionary, 0x1000, 0) == 1000 << 16 | 5002
@@ -156,7 +156,7 @@ def test_lengths_counts_and_free_indexes_are_computed(udp):
     receiver(udp)
     write(udp, 0x3000, 1, 0x6000_0110)
     assert _read(udp, 0xD000, Tx.PDO_LENGTH) == 2
-    assert _read(udp, 0x8000, Frame.FRAME_LENGTH) == 14 + 8 + 2
+    assert _read(udp, 0x8000, FrameEntry.FRAME_LENGTH) == 14 + 8 + 2
     assert [_read(udp, 0xF800, sub) for sub in range(1, 8)] == [1, 1, 1, 2, 1, 1, 1]
     assert [_read(udp, 0xF801, sub) for sub in (1, 2, 4)] == [0x8001, 0xD001, 0x1A01]
     write(udp, 0xD000, Tx.PDO_INDEX, 0x1A07)
@@ -184,7 +184,7 @@ def test_users_of_an_object_are_found(udp):
     sender(udp)
     frame(udp, 0x8001, 0xD005)
     assert udp.user_of(0x6000) == (0x1A00, 1)
-    assert udp.user_of(0xD000) == (0x8000, Frame.TXPD)
+    assert udp.user_of(0xD000) == (0x8000, FrameEntry.TXPD)
     assert udp.user_of(0x8000) is None
     assert udp.user_of(0x1A00) is None
 
@@ -208,4 +208,4 @@ def test_variables_of_buses_belong_to_no_dictionary():
 
 
 def test_nothing_is_shown_of_what_does_not_run():
-    assert {NothingRuns().octets(key, "any") for key in Live} == {None}
+    assert {NothingRuns().octets(key, "any") for key in EapLive} == {None}

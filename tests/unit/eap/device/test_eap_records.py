@@ -9,7 +9,16 @@ from msgspec.structs import replace
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_records import PortReader, read_back
 from eap.od.abort import SdoAbortError
-from eap.od.profiles.eap1000 import AddressMode, Configured, Frame, Port, Rx, RxFlag, Tx, Var
+from eap.od.profiles.eap1000 import (
+    AddressMode,
+    Configured,
+    FrameEntry,
+    PortEntry,
+    Rx,
+    RxFlag,
+    Tx,
+    Var,
+)
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import (
     OnChangeSpec,
@@ -85,7 +94,7 @@ def _change(dictionary: EapDictionary, *writes: tuple[int, int, object]) -> EapD
             (FaultCode.MISSING_OBJECT, 0xE000, Rx.POLL_REQUEST_TXPD),
         ),
         ([(0xE000, Rx.PDO_INDEX, 0)], (FaultCode.NO_PDO, 0xE000, Rx.PDO_INDEX)),
-        ([(0xF810, Port.VLAN_ID, 5)], (FaultCode.PORT, 0xF810, Port.VLAN_ID)),
+        ([(0xF810, PortEntry.VLAN_ID, 5)], (FaultCode.PORT, 0xF810, PortEntry.VLAN_ID)),
         ([(0xF811, 1, "01:00:5e:00:00:01")], (FaultCode.PORT, 0xF811, 1)),
     ],
 )
@@ -109,8 +118,8 @@ def test_each_fault_names_its_object(udp, writes, fault):
 )
 def test_a_port_addresses_as_its_interface_can(interface, mode, is_way):
     dictionary = _on(interface)
-    write(dictionary, 0x8000, Frame.ADDRESS_MODE, mode)
-    write(dictionary, 0x8000, Frame.DESTINATION_NETID, bytes(range(1, 7)))
+    write(dictionary, 0x8000, FrameEntry.ADDRESS_MODE, mode)
+    write(dictionary, 0x8000, FrameEntry.DESTINATION_NETID, bytes(range(1, 7)))
     if is_way:
         (read,) = (found.record for found in PortReader(dictionary).frames())
         assert (
@@ -125,19 +134,19 @@ def test_a_port_addresses_as_its_interface_can(interface, mode, is_way):
         )
         assert (read.mac, read.monitor_interval_ms, read.monitor_ip) == ("", 0, "")
     else:
-        assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, Frame.ADDRESS_MODE)
+        assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, FrameEntry.ADDRESS_MODE)
 
 
 @pytest.mark.parametrize(
     ("interface", "subindex", "is_taken"),
     [
-        ("udp://10.0.0.1", Port.TCP, True),
-        ("ethernet://eth0", Port.TCP, False),
-        ("udp://10.0.0.1", Port.BROADCAST, True),
-        ("tcp://10.0.0.1", Port.BROADCAST, False),
-        ("ethernet://eth0", Port.VLAN_ID, True),
-        ("loop://line", Port.VLAN_ID, False),
-        ("ethernet://eth0", Port.VLAN_PRIORITY, False),
+        ("udp://10.0.0.1", PortEntry.TCP, True),
+        ("ethernet://eth0", PortEntry.TCP, False),
+        ("udp://10.0.0.1", PortEntry.BROADCAST, True),
+        ("tcp://10.0.0.1", PortEntry.BROADCAST, False),
+        ("ethernet://eth0", PortEntry.VLAN_ID, True),
+        ("loop://line", PortEntry.VLAN_ID, False),
+        ("ethernet://eth0", PortEntry.VLAN_PRIORITY, False),
     ],
 )
 def test_a_port_has_what_its_interface_can(interface, subindex, is_taken):
@@ -163,13 +172,13 @@ def test_a_frame_that_is_too_long_is_a_fault_of_the_frame(udp):
     udp.grow(0x8000, 17)
     udp[0x8000].entries[17].value = 0xD001
     udp[0x8000].entries[0].value = 17
-    assert _fault(udp) == (FaultCode.FRAME_TOO_LONG, 0x8000, Frame.FRAME_LENGTH)
+    assert _fault(udp) == (FaultCode.FRAME_TOO_LONG, 0x8000, FrameEntry.FRAME_LENGTH)
 
 
 def test_what_is_not_enabled_is_left_out(udp):
     receiver(sender(udp))
     write(udp, 0xD001, Tx.NAME, "later")
-    write(udp, 0x8001, Frame.NAME, "later")
+    write(udp, 0x8001, FrameEntry.NAME, "later")
     write(udp, 0xE000, Rx.FLAGS, 0)
     reader = PortReader(udp)
     assert [found.at for found in reader.frames()] == [0x8000]
@@ -223,24 +232,24 @@ def test_times_of_on_change_switch_it_on(udp):
 
 def test_a_net_id_may_come_with_its_mac_address():
     dictionary = _on("ethernet://eth0")
-    write(dictionary, 0x8000, Frame.ADDRESS_MODE, AddressMode.NET_ID)
-    assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, Frame.DESTINATION_NETID)
-    write(dictionary, 0x8000, Frame.DESTINATION_NETID, b"\5\5\5\5\2\1")
+    write(dictionary, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.NET_ID)
+    assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, FrameEntry.DESTINATION_NETID)
+    write(dictionary, 0x8000, FrameEntry.DESTINATION_NETID, b"\5\5\5\5\2\1")
     for octets, mac in (
         (b"\x02\0\0\0\0\x09", "02:00:00:00:00:09"),
         (bytes(6), ""),
         (b"\x01\0\0\0\0\x09", ""),
     ):
-        write(dictionary, 0x8000, Frame.DESTINATION_MAC, octets)
+        write(dictionary, 0x8000, FrameEntry.DESTINATION_MAC, octets)
         (read,) = (found.record for found in PortReader(dictionary).frames())
         assert (read.destination, read.mac) == ("5.5.5.5.2.1", mac)
 
 
 def test_subscribers_are_monitored_as_the_object_says():
     dictionary = _on("ethernet://eth0")
-    write(dictionary, 0x8000, Frame.ADDRESS_MODE, AddressMode.MAC)
-    write(dictionary, 0x8000, Frame.MONITORING_INTERVAL, 2500)
-    write(dictionary, 0x8000, Frame.MONITOR_IP, b"\x0a\0\0\x09")
+    write(dictionary, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.MAC)
+    write(dictionary, 0x8000, FrameEntry.MONITORING_INTERVAL, 2500)
+    write(dictionary, 0x8000, FrameEntry.MONITOR_IP, b"\x0a\0\0\x09")
     (read,) = (found.record for found in PortReader(dictionary).frames())
     assert (read.monitor_interval_ms, read.monitor_ip) == (2500, "10.0.0.9")
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.device.master_dictionary import MasterDictionary
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, object_list
 from eap.od.model import OdState
-from eap.od.profiles.master1100 import Live
+from eap.od.profiles.master1100 import MasterLive
 
 OP = OdState.OP
 
@@ -30,30 +30,32 @@ class Values:
     def detected(self) -> range:
         return range(1001, 1000 + self.count)
 
-    def of_configured(self, station: int, key: Live) -> Any:
-        return {Live.ADDRESS: station, Live.NAME: f"slave {station}", Live.TYPE: "EL1008"}.get(
-            key, 5
-        )
+    def of_configured(self, station: int, key: MasterLive) -> Any:
+        return {
+            MasterLive.ADDRESS: station,
+            MasterLive.NAME: f"slave {station}",
+            MasterLive.TYPE: "EL1008",
+        }.get(key, 5)
 
-    def of_detected(self, station: int, key: Live) -> Any:
-        return station if key is Live.ADDRESS else 6
+    def of_detected(self, station: int, key: MasterLive) -> Any:
+        return station if key is MasterLive.ADDRESS else 6
 
-    def of_diagnosis(self, station: int, key: Live) -> Any:
+    def of_diagnosis(self, station: int, key: MasterLive) -> Any:
         return 8
 
-    def of_master(self, key: Live) -> Any:
-        sizes = {Live.DETECT_REQUEST: 2, Live.DETECT_RESPONSE: 6}
+    def of_master(self, key: MasterLive) -> Any:
+        sizes = {MasterLive.DETECT_REQUEST: 2, MasterLive.DETECT_RESPONSE: 6}
         return bytes(sizes[key]) if key in sizes else 0
 
-    def write_slave(self, station: int, key: Live, value: int) -> None:
+    def write_slave(self, station: int, key: MasterLive, value: int) -> None:
         self.written.append((station, key, value))
 
-    def write_master(self, key: Live, data: bytes) -> None:
+    def write_master(self, key: MasterLive, data: bytes) -> None:
         self.written.append((key, data))
 
 
 def dictionary(values: Values | None = None, **more: bool) -> MasterDictionary:
-    return MasterDictionary(values or Values(), Identity(device_name="M"), **more)
+    return MasterDictionary(values or Values(), DeviceIdentity(device_name="M"), **more)
 
 
 def refusal(call: Any, *arguments: Any) -> int:
@@ -91,9 +93,9 @@ def test_writes_reach_the_master() -> None:
     od.download(0xF002, 1, b"\1\0", OP)
     od.download(0xF200, 16, b"\1", OP)
     assert values.written == [
-        (1002, Live.AL_CONTROL, 4),
-        (Live.DETECT_REQUEST, b"\1\0"),
-        (Live.RESET, b"\1"),
+        (1002, MasterLive.AL_CONTROL, 4),
+        (MasterLive.DETECT_REQUEST, b"\1\0"),
+        (MasterLive.RESET, b"\1"),
     ]
     assert refusal(od.download, 0xA001, 1, b"\4\0", OP) == AbortCode.READ_ONLY
 

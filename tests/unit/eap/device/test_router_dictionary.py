@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.router9000 import Live
+from eap.od.profiles.router9000 import RouterLive
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from tests.support.routervalues import MAC, Values
 
@@ -28,17 +28,17 @@ STATION = StationSpec(
 
 def route(name):
     return {
-        Live.ROUTE_NET_ID: NetId.parse("5.6.7.8.1.1"),
-        Live.ROUTE_OCTETS: 4,
-        Live.ROUTE_NAME: name,
-        Live.ROUTE_DOOR: "udp:eap0",
-        Live.ROUTE_ADDRESS: "10.0.0.8:34980",
-        Live.ROUTE_ORIGIN: 1,
-        Live.ROUTE_STATE: 2,
-        Live.ROUTE_ROUND_TRIP: 1 << 40,
-        Live.ROUTE_REQUESTS: 5,
-        Live.ROUTE_ERRORS: 3,
-        Live.ROUTE_LAST_ERROR: "no answer",
+        RouterLive.ROUTE_NET_ID: NetId.parse("5.6.7.8.1.1"),
+        RouterLive.ROUTE_OCTETS: 4,
+        RouterLive.ROUTE_NAME: name,
+        RouterLive.ROUTE_DOOR: "udp:eap0",
+        RouterLive.ROUTE_ADDRESS: "10.0.0.8:34980",
+        RouterLive.ROUTE_ORIGIN: 1,
+        RouterLive.ROUTE_STATE: 2,
+        RouterLive.ROUTE_ROUND_TRIP: 1 << 40,
+        RouterLive.ROUTE_REQUESTS: 5,
+        RouterLive.ROUTE_ERRORS: 3,
+        RouterLive.ROUTE_LAST_ERROR: "no answer",
     }
 
 
@@ -49,7 +49,7 @@ def values():
 
 @pytest.fixture
 def dictionary(values):
-    identity = Identity(device_name="EAP station tower", software_version="1.2")
+    identity = DeviceIdentity(device_name="EAP station tower", software_version="1.2")
     return RouterDictionary(STATION, values, identity)
 
 
@@ -85,9 +85,9 @@ def test_ports_are_its_devices(dictionary):
 
 def test_figures_are_those_of_the_router(dictionary):
     shown = plain(dictionary, 0xF110)
-    assert shown[1] == list(Live).index(Live.ANSWERED)
-    assert shown[10] == list(Live).index(Live.SUBSCRIPTIONS)
-    assert plain(dictionary, 0xF100)[1] == list(Live).index(Live.STATE)
+    assert shown[1] == list(RouterLive).index(RouterLive.ANSWERED)
+    assert shown[10] == list(RouterLive).index(RouterLive.SUBSCRIPTIONS)
+    assert plain(dictionary, 0xF100)[1] == list(RouterLive).index(RouterLive.STATE)
 
 
 def test_routes_come_and_go(dictionary, values):

@@ -8,11 +8,11 @@ from eap.errors import LocalProtocolError
 from eap.pd.device import (
     FAULT_TEXTS,
     TRANSITIONS,
-    Device,
     DeviceFault,
     DeviceState,
+    EapDevice,
     FaultCode,
-    Request,
+    StateRequest,
 )
 
 
@@ -34,9 +34,9 @@ def test_states_are_numbered_as_the_al_status_is():
     }
 
 
-@pytest.mark.parametrize(("state", "request_"), list(product(DeviceState, Request)))
+@pytest.mark.parametrize(("state", "request_"), list(product(DeviceState, StateRequest)))
 def test_every_request_goes_where_the_table_says_or_names_what_was_possible(state, request_):
-    device = Device()
+    device = EapDevice()
     device.state = state
     if (state, request_) in TRANSITIONS:
         assert device.request(request_) is TRANSITIONS[state, request_]

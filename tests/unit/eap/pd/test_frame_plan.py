@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from eap.codec.pd import FIRST_PD
 from eap.pd.address import SourceWatch
-from eap.pd.frame_plan import FramePlan, Refused, Taken
+from eap.pd.frame_plan import FramePlan, RefusedPd, TakenPd
 from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.words import RxWord
 from tests.support.cyclic import PEER, octets
@@ -22,9 +22,9 @@ def test_pds_side_by_side_here_and_there_are_copied_in_one_piece():
         100,
         pds,
         [
-            Taken(one, 0, source=14, target=200, size=10),
-            Taken(one, 0, source=24, target=210, size=12),
-            Taken(one, 0, source=36, target=300, size=9),
+            TakenPd(one, 0, source=14, target=200, size=10),
+            TakenPd(one, 0, source=24, target=210, size=12),
+            TakenPd(one, 0, source=36, target=300, size=9),
         ],
         [],
         watch=WATCH,
@@ -39,8 +39,8 @@ def test_each_tracker_has_its_own_copies():
     plan = FramePlan(
         100,
         [(b"\x01\0\0\0\0\0", 0), (b"\x02\0\0\0\0\0", 0)],
-        [Taken(one, 3, 14, 200, 8), Taken(other, 4, 22, 208, 8)],
-        [Refused((1,))],
+        [TakenPd(one, 3, 14, 200, 8), TakenPd(other, 4, 22, 208, 8)],
+        [RefusedPd((1,))],
         watch=WATCH,
         roaming=[other],
         publisher=bytes([5, 23, 91, 23, 1, 1]),

@@ -5,7 +5,7 @@ import pytest
 from eap.pd.address import to_word
 from eap.pd.frame_status import frame_state, frame_status
 from eap.pd.image import Image
-from eap.pd.monitor import Presence
+from eap.pd.monitor import SubscriberPresence
 from eap.pd.spec import TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord
 from tests.support.cyclic import image_of, station, written
@@ -30,15 +30,15 @@ def put(image: Image, **words: int) -> None:
 @pytest.mark.parametrize(
     ("state", "presence", "expected"),
     [
-        (0, Presence.UNKNOWN, 0),
-        (0, Presence.PRESENT, 0),
-        (0, Presence.MISSING, 4),
-        (1, Presence.MISSING, 5),
-        (1, Presence.UNKNOWN, 1),
+        (0, SubscriberPresence.UNKNOWN, 0),
+        (0, SubscriberPresence.PRESENT, 0),
+        (0, SubscriberPresence.MISSING, 4),
+        (1, SubscriberPresence.MISSING, 5),
+        (1, SubscriberPresence.UNKNOWN, 1),
     ],
 )
 def test_bit_2_of_the_state_is_subscriber_missing(
-    image: Image, state: int, presence: Presence, expected: int
+    image: Image, state: int, presence: SubscriberPresence, expected: int
 ) -> None:
     put(image, UNSENT=state, PRESENCE=presence)
     assert frame_state(image, image.layout.frames[0].words) == expected

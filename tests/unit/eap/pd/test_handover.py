@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from eap.pd.handover import ImageHandover
 from eap.pd.image import Image
 from eap.pd.layout import RxPlace, TxPlace
-from eap.pd.monitor import Presence
+from eap.pd.monitor import SubscriberPresence
 from eap.pd.report import station_status, tracker_word
 from eap.pd.spec import (
     OnChangeSpec,
@@ -259,7 +259,9 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     made.start(0)
     frame = octets([(9, b"\0\0")])
     made.takers["eap0"](memoryview(frame), len(frame), MS, From("02:00:00:00:00:07"))
-    made.image.words[made.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
+    made.image.words[made.image.layout.frames[0].words + FrameWord.PRESENCE] = (
+        SubscriberPresence.MISSING
+    )
     by_id, by_mac = made.spec.frames
     moved = msgspec.structs.replace(by_id, destination=THIRD)
     after = succeed(made, msgspec.structs.replace(made.spec, frames=(moved, by_mac)))
@@ -269,7 +271,9 @@ def test_a_frame_to_another_net_id_forgets_the_address_and_who_was_there():
     after.takers["eap0"](memoryview(other), len(other), MS, From("02:00:00:00:00:09"))
     assert station_status(after.image, 0)["frames"][0]["address"] == "02:00:00:00:00:09"
 
-    after.image.words[after.image.layout.frames[0].words + FrameWord.PRESENCE] = Presence.MISSING
+    after.image.words[after.image.layout.frames[0].words + FrameWord.PRESENCE] = (
+        SubscriberPresence.MISSING
+    )
     same = succeed(after, after.spec)
     assert station_status(same.image, 0)["frames"][0]["subscriber"] == "missing"
     watched = msgspec.structs.replace(moved, monitor_interval_ms=1000)

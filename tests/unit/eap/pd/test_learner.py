@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from eap.ids import NetId
-from eap.pd.address import LOOK_NS, Learner
+from eap.pd.address import LOOK_NS, NetIdLearner
 from tests.support.cyclic import OWN, PEER, From, octets
 
 THEIR_MAC = "02:00:00:00:00:02"
@@ -15,7 +15,7 @@ class Port:
     def __init__(self, *sought: str) -> None:
         self.learned: list[tuple[str, str]] = []
         self.taken: list[bytes] = []
-        self.learner = Learner(lambda data, size, *_: self.taken.append(bytes(data[:size])))
+        self.learner = NetIdLearner(lambda data, size, *_: self.taken.append(bytes(data[:size])))
         self.learner.sought = {NetId.parse(text) for text in sought}
         self.learner.learn = lambda net_id, mac: self.learned.append((str(NetId(net_id)), mac))
 
@@ -65,7 +65,7 @@ def test_address_is_looked_at_now_and_then():
 
 def test_nothing_is_wanted_before_somebody_says_so():
     taken: list[int] = []
-    learner = Learner(lambda _data, size, *_: taken.append(size))
+    learner = NetIdLearner(lambda _data, size, *_: taken.append(size))
     learner.take(memoryview(FRAME), len(FRAME), 0, From(THEIR_MAC))
     learner.learn(bytes(6), THEIR_MAC)
     assert taken == [len(FRAME)]

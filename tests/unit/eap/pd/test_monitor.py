@@ -11,16 +11,20 @@ from eap.pd.monitor import (
     USUAL_POLICY,
     Evidence,
     MonitorTarget,
-    Presence,
     PresenceChanged,
     SubscriberMonitor,
+    SubscriberPresence,
 )
 
 MS = 1_000_000
 SECOND = 1000 * MS
 THEIRS = MacAddr.parse("02:00:00:00:00:02")
 OTHER = MacAddr.parse("02:00:00:00:00:03")
-UNKNOWN, PRESENT, MISSING = Presence.UNKNOWN, Presence.PRESENT, Presence.MISSING
+UNKNOWN, PRESENT, MISSING = (
+    SubscriberPresence.UNKNOWN,
+    SubscriberPresence.PRESENT,
+    SubscriberPresence.MISSING,
+)
 
 
 class Run:
@@ -42,7 +46,7 @@ class Run:
                     self.monitor.receive_reply(name, mac, self.now_ns)
         self.now_ns = end_ns
 
-    def presence(self, name: str = "a") -> Presence:
+    def presence(self, name: str = "a") -> SubscriberPresence:
         return self.monitor.presence(name)
 
 

@@ -12,7 +12,7 @@ from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
 from eap.pd.engine import Engine
 from eap.pd.image import Image
-from eap.pd.poll import REQUESTERS_PER_CYCLE, Question, Requests, questions_of, requests_at
+from eap.pd.poll import REQUESTERS_PER_CYCLE, PollQuestion, Requests, questions_of, requests_at
 from eap.pd.report import station_status
 from eap.pd.spec import (
     REQUESTER,
@@ -60,7 +60,7 @@ class Asked:
         spec = desk(trigger, answers=("a", "b"))
         self.image = image_of(spec)
         (self.place,) = self.image.layout.tx
-        self.question: Question = questions_of(self.image)["request"]
+        self.question: PollQuestion = questions_of(self.image)["request"]
 
     def send(self, now_ns: int) -> None:
         if self.place.by_schedule:

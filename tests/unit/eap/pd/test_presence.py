@@ -4,15 +4,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.pd.monitor import DEFAULT_POLICY, Evidence, Presence, PresenceTracker
+from eap.pd.monitor import DEFAULT_POLICY, Evidence, PresenceTracker, SubscriberPresence
 
 SECOND = 1_000_000_000
 SEEN, MISSED, ABSENT = Evidence.SEEN, Evidence.MISSED, Evidence.ABSENT
 PENDING, BLIND = Evidence.PENDING, Evidence.BLIND
-UNKNOWN, PRESENT, MISSING = Presence.UNKNOWN, Presence.PRESENT, Presence.MISSING
+UNKNOWN, PRESENT, MISSING = (
+    SubscriberPresence.UNKNOWN,
+    SubscriberPresence.PRESENT,
+    SubscriberPresence.MISSING,
+)
 
 
-def run(*rounds: Evidence, judge: PresenceTracker | None = None) -> list[Presence]:
+def run(*rounds: Evidence, judge: PresenceTracker | None = None) -> list[SubscriberPresence]:
     """Return what each of *rounds*, one a second, made of the presence."""
     judge = judge or PresenceTracker(SECOND, 0)
     found = []

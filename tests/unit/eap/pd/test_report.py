@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.pd.monitor import Presence
+from eap.pd.monitor import SubscriberPresence
 from eap.pd.report import pd_list, quality, station_status
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, Writer
 from eap.pd.words import FrameWord, RxWord, StationWord
@@ -204,7 +204,11 @@ def test_the_state_of_a_frame_has_what_its_publisher_and_its_monitor_know():
     image = image_of(spec)
     first = image.layout.frames[0].words
     seen = []
-    for state, presence in ((0, Presence.UNKNOWN), (3, Presence.MISSING), (1, Presence.PRESENT)):
+    for state, presence in (
+        (0, SubscriberPresence.UNKNOWN),
+        (3, SubscriberPresence.MISSING),
+        (1, SubscriberPresence.PRESENT),
+    ):
         image.words[first + FrameWord.UNSENT] = state
         image.words[first + FrameWord.PRESENCE] = presence
         (row,) = station_status(image, 0)["pd"]["tx"]

@@ -5,7 +5,7 @@ import pytest
 from eap.codec.datatypes import parse
 from eap.pd.image import take
 from eap.pd.layout import MAX_SAMPLES, MIN_SAMPLES, SAMPLES_SIZE, plan_layout
-from eap.pd.samples import Sampler, Samples
+from eap.pd.samples import ImageSamples, Sampler
 from eap.pd.spec import CounterSource, VariableSpec, Writer
 from eap.pd.words import StationWord
 from tests.support.cyclic import image_of, station, written
@@ -39,7 +39,7 @@ def values(image, data):
 def running():
     made, _ = assemble(counting())
     made.start(0)
-    return made, Samples(made.image)
+    return made, ImageSamples(made.image)
 
 
 def run(made, cycles, *, first_ns=0):
@@ -92,7 +92,7 @@ def test_later_samples_take_the_place_of_the_oldest(running):
 
 def test_sample_that_is_being_taken_is_none_yet():
     image = image_of(counting())
-    sampler, samples = Sampler(image, memoryview(bytearray(len(image.memory)))), Samples(image)
+    sampler, samples = Sampler(image, memoryview(bytearray(len(image.memory)))), ImageSamples(image)
     samples.want(4)
     sampler.end_cycle(4, 1)
     assert samples.read(4) is not None

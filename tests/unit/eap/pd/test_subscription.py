@@ -1,14 +1,14 @@
 from __future__ import annotations
 
-from eap.pd.poll import Question
+from eap.pd.poll import PollQuestion
 from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
-from eap.pd.subscription import Subscription, SubstituteValue
+from eap.pd.subscription import RxSubscription, SubstituteValue
 from eap.pd.words import Discard, FrameWord
 from tests.support.cyclic import MS, PEER, image_of, received, station, written
 
 
-def subscription(*, polled: bool = False, **options: object) -> tuple[Subscription, memoryview]:
+def subscription(*, polled: bool = False, **options: object) -> tuple[RxSubscription, memoryview]:
     """A subscription to one UINT, with a time-out of 5 ms, and the words of its station."""
     spec = RxPdSpec("in", "eap0", 7, ("r",), PEER, version=3, timeout_ms=5, **options)
     image = image_of(
@@ -19,8 +19,8 @@ def subscription(*, polled: bool = False, **options: object) -> tuple[Subscripti
         )
     )
     (place,) = image.layout.rx
-    question = Question(image.words, image.layout.tx[0], ["in"]) if polled else None
-    made = Subscription(spec, place, SubstituteValue(image, place), question)
+    question = PollQuestion(image.words, image.layout.tx[0], ["in"]) if polled else None
+    made = RxSubscription(spec, place, SubstituteValue(image, place), question)
     timing = Timing(step=1, sender_cycle_ns=MS, own_cycle_ns=MS)
     made.tracker = SequenceTracker(image.words, place.words, timing)
     return made, image.words

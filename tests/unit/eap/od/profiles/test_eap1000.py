@@ -7,7 +7,7 @@ import pytest
 from eap.codec import datatypes
 from eap.od.model import Access, ObjectCode
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Derived, Live
+from eap.od.profiles.eap1000 import Derived, EapLive
 from eap.od.profiles.table import CONFIG, OWN_TYPE, UNITS
 from eap.pd.device import DeviceState
 from eap.pd.spec import Substitute, Wake, Writer
@@ -34,7 +34,7 @@ def test_every_entry_is_named_described_and_of_a_type(row, entry):
     assert not (entry.live and entry.derived)
     assert not entry.changeable or entry.access == CONFIG
     if entry.live:
-        assert entry.live in set(Live)
+        assert entry.live in set(EapLive)
     if entry.derived:
         assert entry.derived in set(Derived)
 
@@ -88,12 +88,12 @@ def test_device_type_is_profile_and_module_profile():
     ("index", "names"),
     [
         (0x6000, profile.Var),
-        (0x8000, profile.Frame),
+        (0x8000, profile.FrameEntry),
         (0xD000, profile.Tx),
         (0xE000, profile.Rx),
         (0xF100, profile.Status),
         (0xF800, profile.Configured),
-        (0xF810, profile.Port),
+        (0xF810, profile.PortEntry),
     ],
 )
 def test_each_name_is_that_of_its_entry_and_none_is_missing(index, names):
@@ -114,7 +114,7 @@ def test_received_variables_have_what_sent_ones_have_but_a_writer():
 
 def test_every_key_is_shown_by_an_entry():
     entries = [entry for row in profile.ALL for entry in row.entries]
-    assert {entry.live for entry in entries} - {""} == set(Live)
+    assert {entry.live for entry in entries} - {""} == set(EapLive)
     assert {entry.derived for entry in entries} - {""} == set(Derived)
 
 

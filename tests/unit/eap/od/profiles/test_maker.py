@@ -5,13 +5,13 @@ from __future__ import annotations
 from eap.codec import datatypes
 from eap.od.model import RW, ObjectCode
 from eap.od.profiles.maker import live_octets, live_source, make_object
-from eap.od.profiles.master1100 import CONFIGURED_LIST, DIAGNOSIS, Live
+from eap.od.profiles.master1100 import CONFIGURED_LIST, DIAGNOSIS, MasterLive
 
 
 def test_live_entries_are_asked_for_and_written() -> None:
     written = []
     item = make_object(
-        DIAGNOSIS, 0xA003, live_source(lambda key: 7 if key == Live.AL_STATUS else 0),
+        DIAGNOSIS, 0xA003, live_source(lambda key: 7 if key == MasterLive.AL_STATUS else 0),
         write=lambda key, data: written.append((key, data)), extent=17,
     )  # fmt: skip
     assert (item.name, item.code) == ("Diagnosis data slave 3", ObjectCode.RECORD)
@@ -20,7 +20,7 @@ def test_live_entries_are_asked_for_and_written() -> None:
     assert item.entries[1].write is None
     assert item.entries[2].access == RW
     item.entries[2].write(b"\2\0")
-    assert written == [(Live.AL_CONTROL, b"\2\0")]
+    assert written == [(MasterLive.AL_CONTROL, b"\2\0")]
 
 
 def test_lists_are_as_long_as_they_are_said_to_be() -> None:

@@ -28,7 +28,7 @@ def test_every_entry_is_named_described_and_of_a_type(row, entry):
     if entry.default is not None:
         kind.encode(entry.default)
     if entry.live:
-        assert entry.live in set(profile.Live)
+        assert entry.live in set(profile.MasterLive)
 
 
 def test_ranges_do_not_overlap():
@@ -37,7 +37,7 @@ def test_ranges_do_not_overlap():
 
 
 def test_everything_live_is_shown():
-    assert {entry.live for _, entry in ENTRIES if entry.live} == set(profile.Live)
+    assert {entry.live for _, entry in ENTRIES if entry.live} == set(profile.MasterLive)
 
 
 def test_device_type_is_that_of_a_master():

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 from eap.od.model import RO, RW, ObjectCode
-from eap.od.profiles.eap1000 import Derived, Live
-from eap.od.profiles.table import CONFIG, EntryRow, ObjectRange, config, derived, fixed, live
+from eap.od.profiles.eap1000 import Derived, EapLive
+from eap.od.profiles.table import CONFIG, EntryRow, ObjectRow, config, derived, fixed, live
 
-PLAIN = ObjectRange(
+PLAIN = ObjectRow(
     0xD000, 0xD00F, "TxPD {n}", ObjectCode.RECORD,
     (config(1, "One", "UINT", "1."), fixed(2, "Two", "UINT", "2.")), "PDs.",
 )  # fmt: skip
@@ -34,7 +34,7 @@ def test_rows_say_where_their_content_comes_from():
     rows = (
         config(1, "a", "UINT", "d", default=3),
         fixed(1, "a", "UINT", "d"),
-        live(1, "a", "UINT", Live.VALUE, "d", unit="ms"),
+        live(1, "a", "UINT", EapLive.VALUE, "d", unit="ms"),
         derived(1, "a", "UINT", Derived.COUNT, "d"),
         EntryRow(1, "a", "UINT", RW, "d"),
     )

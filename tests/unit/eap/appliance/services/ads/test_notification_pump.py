@@ -20,7 +20,7 @@ from eap.ids import NetId
 from eap.net.image_file import create_image
 from eap.pd.image import Inputs
 from eap.pd.layout import plan_layout
-from eap.pd.samples import Sampler, Samples
+from eap.pd.samples import ImageSamples, Sampler
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
 
@@ -235,8 +235,8 @@ def test_sample_that_is_overwritten_while_it_is_read_is_missed(bench, monkeypatc
     bench.watch("ticks")
     bench.look()
     bench.engine.run(3)
-    read = Samples.read
-    monkeypatch.setattr(Samples, "read", lambda self, n: None if n == 2 else read(self, n))
+    read = ImageSamples.read
+    monkeypatch.setattr(ImageSamples, "read", lambda self, n: None if n == 2 else read(self, n))
     bench.look()
     assert bench.told() == [(1, 1), (3, 3)]
 

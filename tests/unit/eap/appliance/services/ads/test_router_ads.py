@@ -18,7 +18,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ads import AdsError, AdsState
 from eap.codec.ads import IndexGroup as G
 from eap.codec.ams import AmsCommand, AmsHeader
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.pd.device import DeviceState
@@ -41,7 +41,7 @@ class Bench:
         spec = replace(spec, ports=(*spec.ports, bus))
         router = StationRouter("left", NetId.parse(spec.net_id))
         values = LiveRouter(router, self.device, image, spec.ports)
-        dictionary = RouterDictionary(spec, values, Identity())
+        dictionary = RouterDictionary(spec, values, DeviceIdentity())
         self.ads = RouterAds(spec, self.device, dictionary, device_info("left", "1.2.3"))
 
     def ask(self, port, command, body=b""):

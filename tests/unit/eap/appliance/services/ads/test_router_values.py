@@ -11,11 +11,11 @@ from eap.aoe.routes import Origin, Route
 from eap.aoe.way import Door, Way
 from eap.appliance.services.ads.router_values import LiveRouter
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.device.router_dictionary import RouterDictionary
 from eap.ids import NetId
 from eap.net.image_file import create_image
-from eap.od.profiles.router9000 import Live
+from eap.od.profiles.router9000 import RouterLive
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, PortSpec, VariableSpec, Writer
 from tests.support.routing import KeepingCarrier
@@ -58,7 +58,7 @@ def values(station, stations, router, images, files):
 def test_states_of_ports(values):
     ports = ("eap0", "eap1", "bus0", "bus1")
     assert [values.state_of(port) for port in ports] == [8, 8, 2, 0]
-    assert values.number(Live.STATE) == 8
+    assert values.number(RouterLive.STATE) == 8
 
 
 def test_interfaces_have_addresses_or_none(values):
@@ -73,7 +73,7 @@ def test_interface_tells_its_address(values, tmp_path, monkeypatch):
 
 
 def test_every_live_entry_has_a_value(station, values):
-    dictionary = RouterDictionary(station, values, Identity())
+    dictionary = RouterDictionary(station, values, DeviceIdentity())
     for item in dictionary:
         for entry in item.entries.values():
             assert len(entry.octets) == entry.kind.size or entry.is_text
@@ -82,25 +82,27 @@ def test_every_live_entry_has_a_value(station, values):
 
 def test_routes_are_told_as_they_do(router, values):
     (route,) = values.routes()
-    shown = {key: values.of_route(key, route) for key in Live if key.name.startswith("ROUTE_")}
+    shown = {
+        key: values.of_route(key, route) for key in RouterLive if key.name.startswith("ROUTE_")
+    }
     assert shown == {
-        Live.ROUTE_NET_ID: ROUTE.net_id,
-        Live.ROUTE_OCTETS: 4,
-        Live.ROUTE_NAME: "plc",
-        Live.ROUTE_DOOR: "udp:eap0",
-        Live.ROUTE_ADDRESS: "10.0.0.8:34980",
-        Live.ROUTE_ORIGIN: 1,
-        Live.ROUTE_STATE: 0,
-        Live.ROUTE_ROUND_TRIP: 0,
-        Live.ROUTE_REQUESTS: 0,
-        Live.ROUTE_ERRORS: 0,
-        Live.ROUTE_LAST_ERROR: "",
+        RouterLive.ROUTE_NET_ID: ROUTE.net_id,
+        RouterLive.ROUTE_OCTETS: 4,
+        RouterLive.ROUTE_NAME: "plc",
+        RouterLive.ROUTE_DOOR: "udp:eap0",
+        RouterLive.ROUTE_ADDRESS: "10.0.0.8:34980",
+        RouterLive.ROUTE_ORIGIN: 1,
+        RouterLive.ROUTE_STATE: 0,
+        RouterLive.ROUTE_ROUND_TRIP: 0,
+        RouterLive.ROUTE_REQUESTS: 0,
+        RouterLive.ROUTE_ERRORS: 0,
+        RouterLive.ROUTE_LAST_ERROR: "",
     }
     assert values.routes() is values.routes()
     traffic = router.record.routes.of(route.key, monotonic_ns())
     traffic.ask(40)
     traffic.answer(40, 2_000_000)
-    keys = (Live.ROUTE_STATE, Live.ROUTE_ROUND_TRIP, Live.ROUTE_REQUESTS)
+    keys = (RouterLive.ROUTE_STATE, RouterLive.ROUTE_ROUND_TRIP, RouterLive.ROUTE_REQUESTS)
     assert [values.of_route(key, route) for key in keys] == [1, 2000, 1]
     router.remove_route(ROUTE.net_id, ROUTE.hop)
     assert values.routes() == ()

@@ -14,7 +14,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.codec.ads import IndexGroup as G
 from eap.codec.adsnotification import TransMode, decode_notification
 from eap.codec.ams import AmsCommand
-from eap.device.eap_objects import Identity
+from eap.device.eap_objects import DeviceIdentity
 from eap.ids import NetId
 from eap.pd.image import Inputs
 from eap.pd.samples import Sampler
@@ -43,7 +43,7 @@ def router(stations, carrier):
 @pytest.fixture
 def ads(stations, images, router):
     device, _ = make_device(stations[0])
-    return StationAds(stations[0], device, images["left"], router, Identity())
+    return StationAds(stations[0], device, images["left"], router, DeviceIdentity())
 
 
 def ask(router, carrier, target, command, body=b"", *, port=0xFFFF):

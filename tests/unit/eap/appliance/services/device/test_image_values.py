@@ -12,7 +12,7 @@ from eap.device.eap_fill import fill
 from eap.net.image_file import create_image
 from eap.od.model import OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Live
+from eap.od.profiles.eap1000 import EapLive
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import (
@@ -32,7 +32,7 @@ def values(images):
     return {name: ImageValues(image) for name, image in images.items()}
 
 
-def number(values, key: Live, name: str = "") -> int:
+def number(values, key: EapLive, name: str = "") -> int:
     octets = values.octets(key, name)
     assert octets is not None
     return int.from_bytes(octets, "little")
@@ -45,10 +45,10 @@ def test_values_of_variables(values, files):
         image.write("setpoint", [1.5, -2])
         image.write("name", "xyz")
     left = values["left"]
-    assert left.octets(Live.VALUE, "running") == b"\1"
-    assert left.octets(Live.VALUE, "setpoint") == image.encode("setpoint", [1.5, -2])
-    assert left.octets(Live.VALUE, "name") == b"xyz" + bytes(5)
-    assert left.octets(Live.VALUE, "nobody") is None
+    assert left.octets(EapLive.VALUE, "running") == b"\1"
+    assert left.octets(EapLive.VALUE, "setpoint") == image.encode("setpoint", [1.5, -2])
+    assert left.octets(EapLive.VALUE, "name") == b"xyz" + bytes(5)
+    assert left.octets(EapLive.VALUE, "nobody") is None
 
 
 def test_counters_of_one_moment_do_not_change_and_values_of_programs_do(values, files):
@@ -60,7 +60,7 @@ def test_counters_of_one_moment_do_not_change_and_values_of_programs_do(values, 
         image.words[first + RxWord.RECEIVED] = image.words[first + RxWord.LAST_CYCLE] = count
 
     def seen() -> tuple[int, int]:
-        keys = Live.RX_RECEIVED, Live.RX_CYCLE_INDEX
+        keys = EapLive.RX_RECEIVED, EapLive.RX_CYCLE_INDEX
         return tuple(number(right, key, "left-state") for key in keys)
 
     arrive(5)
@@ -73,7 +73,7 @@ def test_counters_of_one_moment_do_not_change_and_values_of_programs_do(values, 
     with left.at_one_moment(), files["left"].image.writing(Writer.APPLICATION):
         files["left"].image.write("state.VarCtrl", 2)
     with left.at_one_moment():
-        assert number(left, Live.TX_VAR_CTRL, "state") == 2
+        assert number(left, EapLive.TX_VAR_CTRL, "state") == 2
 
 
 def test_counters_of_the_station(values, files):
@@ -82,10 +82,10 @@ def test_counters_of_the_station(values, files):
     words[StationWord.LATENESS_MAX_NS] = 12_345
     words[StationWord.DISCARDED + DISCARD_INDEX[Discard.UNKNOWN_ID]] = 9
     left = values["left"]
-    assert number(left, Live.STATION_CYCLE) == 70_000
-    assert number(left, Live.STATION_LATENESS_MAX) == 12_345
-    assert number(left, Live.STATION_DISCARDED_UNKNOWN_ID) == 9
-    assert number(left, Live.STATION_DISCARDED_TRUNCATED) == 0
+    assert number(left, EapLive.STATION_CYCLE) == 70_000
+    assert number(left, EapLive.STATION_LATENESS_MAX) == 12_345
+    assert number(left, EapLive.STATION_DISCARDED_UNKNOWN_ID) == 9
+    assert number(left, EapLive.STATION_DISCARDED_TRUNCATED) == 0
 
 
 def test_frames_and_pds_that_are_sent(values, files):
@@ -100,23 +100,23 @@ def test_frames_and_pds_that_are_sent(values, files):
         image.write("out.FrameCtrl", 1)
         image.write("state.VarCtrl", 2)
     left = values["left"]
-    assert number(left, Live.FRAME_WHOLE, "out") == 10
-    assert number(left, Live.FRAME_STATE, "out") == 1
-    assert number(left, Live.FRAME_SKIPPED, "out") == 2
-    assert number(left, Live.FRAME_CTRL, "out") == 1
-    assert number(left, Live.TX_VAR_CTRL, "state") == 2
-    assert number(left, Live.TX_SKIPPED, "state") == 3
-    assert number(left, Live.TX_SENT_CYCLE, "state") == 10
-    assert number(left, Live.TX_SENT_EVENT, "state") == 4
-    assert number(left, Live.TX_LAST_REASON, "state") == REASON_INDEX[Reason.CYCLE]
+    assert number(left, EapLive.FRAME_WHOLE, "out") == 10
+    assert number(left, EapLive.FRAME_STATE, "out") == 1
+    assert number(left, EapLive.FRAME_SKIPPED, "out") == 2
+    assert number(left, EapLive.FRAME_CTRL, "out") == 1
+    assert number(left, EapLive.TX_VAR_CTRL, "state") == 2
+    assert number(left, EapLive.TX_SKIPPED, "state") == 3
+    assert number(left, EapLive.TX_SENT_CYCLE, "state") == 10
+    assert number(left, EapLive.TX_SENT_EVENT, "state") == 4
+    assert number(left, EapLive.TX_LAST_REASON, "state") == REASON_INDEX[Reason.CYCLE]
 
 
 def test_pds_that_are_received(values, files):
     image = files["right"].image
     (pd,) = image.layout.rx
     right = values["right"]
-    assert number(right, Live.RX_QUALITY, "left-state") == 0xFFFF
-    assert number(right, Live.RX_CYCLE_INDEX, "left-state") == 0
+    assert number(right, EapLive.RX_QUALITY, "left-state") == 0xFFFF
+    assert number(right, EapLive.RX_CYCLE_INDEX, "left-state") == 0
     image.words[StationWord.CYCLE] = 5
     image.words[pd.words + RxWord.RECEIVED] = 7
     image.words[pd.words + RxWord.LOST] = 1 << 40
@@ -125,13 +125,13 @@ def test_pds_that_are_received(values, files):
     image.words[pd.words + RxWord.STATE] = 1
     image.words[pd.words + RxWord.JITTER_MAX_US] = 1 << 40
     image.words[pd.words + RxWord.DISCARDED + DISCARD_INDEX[Discard.VERSION]] = 2
-    assert number(right, Live.RX_RECEIVED, "left-state") == 7
-    assert number(right, Live.RX_LOST, "left-state") == 1 << 40
-    assert number(right, Live.RX_CYCLE_INDEX, "left-state") == 2
-    assert number(right, Live.RX_QUALITY, "left-state") == 200
-    assert number(right, Live.RX_STATE, "left-state") == 1
-    assert number(right, Live.RX_JITTER_MAX, "left-state") == 0xFFFFFFFF
-    assert number(right, Live.RX_DISCARDED_VERSION, "left-state") == 2
+    assert number(right, EapLive.RX_RECEIVED, "left-state") == 7
+    assert number(right, EapLive.RX_LOST, "left-state") == 1 << 40
+    assert number(right, EapLive.RX_CYCLE_INDEX, "left-state") == 2
+    assert number(right, EapLive.RX_QUALITY, "left-state") == 200
+    assert number(right, EapLive.RX_STATE, "left-state") == 1
+    assert number(right, EapLive.RX_JITTER_MAX, "left-state") == 0xFFFFFFFF
+    assert number(right, EapLive.RX_DISCARDED_VERSION, "left-state") == 2
 
 
 def test_frame_state_tells_that_the_subscriber_is_missing(values, files):
@@ -139,22 +139,22 @@ def test_frame_state_tells_that_the_subscriber_is_missing(values, files):
     first = image.layout.frames[0].words
     image.words[first + FrameWord.UNSENT] = 1
     image.words[first + FrameWord.PRESENCE] = 2
-    assert number(values["left"], Live.FRAME_STATE, "out") == 5
+    assert number(values["left"], EapLive.FRAME_STATE, "out") == 5
 
 
 def test_what_does_not_run_shows_nothing(values):
-    for key in (Live.FRAME_STATE, Live.TX_SKIPPED, Live.RX_LOST):
+    for key in (EapLive.FRAME_STATE, EapLive.TX_SKIPPED, EapLive.RX_LOST):
         assert values["left"].octets(key, "nobody") is None
 
 
 def test_newest_image_counts(values, files, stations):
     left = values["left"]
-    assert number(left, Live.FRAME_STATE, "out") == 0
+    assert number(left, EapLive.FRAME_STATE, "out") == 0
     spec = replace(stations[0], variables=(*stations[0].variables, VariableSpec("more", "UINT")))
     with create_image(files["left"].path, plan_layout(spec)) as fresh:
         fresh.image.words[fresh.image.layout.frames[0].words + FrameWord.UNSENT] = 4
-        assert number(left, Live.FRAME_STATE, "out") == 4
-        assert left.octets(Live.VALUE, "more") == bytes(2)
+        assert number(left, EapLive.FRAME_STATE, "out") == 4
+        assert left.octets(EapLive.VALUE, "more") == bytes(2)
 
 
 def test_image_that_is_gone_shows_nothing(stations, files):
@@ -162,7 +162,7 @@ def test_image_that_is_gone_shows_nothing(stations, files):
     values = ImageValues(image)
     image.image.words[StationWord.RETIRED] = 1
     files["left"].path.unlink()
-    assert values.octets(Live.VALUE, "running") is None
+    assert values.octets(EapLive.VALUE, "running") is None
     image.close()
 
 

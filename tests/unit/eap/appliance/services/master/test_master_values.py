@@ -36,7 +36,7 @@ from eap.appliance.services.slaves.bus_view import BusDescription
 from eap.codec.mailbox import MailboxType
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.master1100 import Live
+from eap.od.profiles.master1100 import MasterLive
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -78,14 +78,16 @@ def test_view_shows_configured_and_detected_slaves() -> None:
         assert view.configured() == ()
         await view.refresh(DIAGNOSIS)
         assert view.configured() == view.detected() == (1001, 1002, 1003, 1004)
-        assert view.of_configured(1001, Live.NAME) == "coupler"
-        assert view.of_configured(1009, Live.NAME) == ""
-        assert view.of_configured(1009, Live.VENDOR) == 0
-        assert view.of_detected(1002, Live.DL_STATUS)
-        assert view.of_detected(1002, Live.VENDOR) == view.of_configured(1002, Live.VENDOR)
-        assert view.of_diagnosis(1001, Live.AL_STATUS) == 2
-        assert view.of_diagnosis(1009, Live.AL_STATUS) == 0
-        assert view.of_master(Live.STATE) == 2
+        assert view.of_configured(1001, MasterLive.NAME) == "coupler"
+        assert view.of_configured(1009, MasterLive.NAME) == ""
+        assert view.of_configured(1009, MasterLive.VENDOR) == 0
+        assert view.of_detected(1002, MasterLive.DL_STATUS)
+        assert view.of_detected(1002, MasterLive.VENDOR) == view.of_configured(
+            1002, MasterLive.VENDOR
+        )
+        assert view.of_diagnosis(1001, MasterLive.AL_STATUS) == 2
+        assert view.of_diagnosis(1009, MasterLive.AL_STATUS) == 0
+        assert view.of_master(MasterLive.STATE) == 2
 
     play(scene)
 
@@ -93,7 +95,12 @@ def test_view_shows_configured_and_detected_slaves() -> None:
 def test_view_shows_the_neighbours_of_ports() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         await view.refresh(DIAGNOSIS)
-        ports = (Live.NEIGHBOUR_0, Live.NEIGHBOUR_1, Live.NEIGHBOUR_2, Live.NEIGHBOUR_3)
+        ports = (
+            MasterLive.NEIGHBOUR_0,
+            MasterLive.NEIGHBOUR_1,
+            MasterLive.NEIGHBOUR_2,
+            MasterLive.NEIGHBOUR_3,
+        )
         wired = [[view.of_diagnosis(at, port) for port in ports] for at in (1001, 1002, 1004)]
         assert wired == [[0, 1002, 1004, 0], [1001, 1003, 0, 0], [1001, 0, 0, 0]]
 
@@ -119,13 +126,15 @@ def test_view_reads_registers_once_for_all_clients_until_they_are_old() -> None:
 def test_view_scans_the_bus_after_a_write() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         await view.refresh(LISTS)
-        view.write_master(Live.DETECT_REQUEST, b"\1\0")
-        view.write_master(Live.DETECT_REQUEST, b"\1\0")
-        assert view.of_master(Live.DETECT_STATUS) == 255
-        await soon(lambda: view.of_master(Live.DETECT_STATUS) == 1)
-        assert view.of_master(Live.DETECT_RESPONSE) == bytes((1, 0, 0, 0, 4, 0))
-        assert view.of_detected(1001, Live.ADDRESS) == 1001
-        assert view.of_detected(1001, Live.PRODUCT) == view.of_configured(1001, Live.PRODUCT)
+        view.write_master(MasterLive.DETECT_REQUEST, b"\1\0")
+        view.write_master(MasterLive.DETECT_REQUEST, b"\1\0")
+        assert view.of_master(MasterLive.DETECT_STATUS) == 255
+        await soon(lambda: view.of_master(MasterLive.DETECT_STATUS) == 1)
+        assert view.of_master(MasterLive.DETECT_RESPONSE) == bytes((1, 0, 0, 0, 4, 0))
+        assert view.of_detected(1001, MasterLive.ADDRESS) == 1001
+        assert view.of_detected(1001, MasterLive.PRODUCT) == view.of_configured(
+            1001, MasterLive.PRODUCT
+        )
 
     play(scene)
 
@@ -133,21 +142,21 @@ def test_view_scans_the_bus_after_a_write() -> None:
 def test_view_requests_states_and_sets_loops() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         await view.refresh(DIAGNOSIS)
-        view.write_slave(1001, Live.AL_CONTROL, 1)
+        view.write_slave(1001, MasterLive.AL_CONTROL, 1)
         await soon(lambda: bool(engine.of(BringSlaves)))
         assert engine.of(BringSlaves)[0].target == 1
-        assert view.of_diagnosis(1001, Live.AL_CONTROL) == 1
+        assert view.of_diagnosis(1001, MasterLive.AL_CONTROL) == 1
         for value in (0, 5, 99):
             with pytest.raises(SdoAbortError, match=f"{value:#x} asks for no AL state"):
-                view.write_slave(1001, Live.AL_CONTROL, value)
-        view.write_slave(1004, Live.LINK_CONTROL, 0x0C)
+                view.write_slave(1001, MasterLive.AL_CONTROL, value)
+        view.write_slave(1004, MasterLive.LINK_CONTROL, 0x0C)
         await asyncio.sleep(0.01)
         await view.refresh(DIAGNOSIS)
-        assert view.of_diagnosis(1004, Live.LINK_CONTROL) == 0x0C
-        view.write_slave(1004, Live.FIXED_LINKS, 1)
-        assert view.of_diagnosis(1004, Live.FIXED_LINKS) is True
-        view.write_slave(1004, Live.FIXED_LINKS, 0)
-        assert view.of_diagnosis(1004, Live.FIXED_LINKS) is False
+        assert view.of_diagnosis(1004, MasterLive.LINK_CONTROL) == 0x0C
+        view.write_slave(1004, MasterLive.FIXED_LINKS, 1)
+        assert view.of_diagnosis(1004, MasterLive.FIXED_LINKS) is True
+        view.write_slave(1004, MasterLive.FIXED_LINKS, 0)
+        assert view.of_diagnosis(1004, MasterLive.FIXED_LINKS) is False
 
     play(scene)
 
@@ -155,16 +164,16 @@ def test_view_requests_states_and_sets_loops() -> None:
 def test_view_counts_frame_errors_from_a_reset_on() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         def total() -> int:
-            ports = (Live.CRC_0, Live.CRC_1, Live.CRC_2, Live.CRC_3)
+            ports = (MasterLive.CRC_0, MasterLive.CRC_1, MasterLive.CRC_2, MasterLive.CRC_3)
             return sum(view.of_diagnosis(at, port) for at in view.configured() for port in ports)
 
         engine.buses[0].line.fault(kind="corrupt", slave="inputs", every=3)
         await view.refresh(DIAGNOSIS)
         await asyncio.sleep(FRESH_S + 0.01)
         await view.refresh(DIAGNOSIS)
-        view.write_master(Live.RESET, b"\0")
+        view.write_master(MasterLive.RESET, b"\0")
         assert total() > 0, "only a rising edge resets"
-        view.write_master(Live.RESET, b"\1")
+        view.write_master(MasterLive.RESET, b"\1")
         assert total() == 0
 
     play(scene)
@@ -172,7 +181,7 @@ def test_view_counts_frame_errors_from_a_reset_on() -> None:
 
 def test_view_counts_faults_of_slaves_from_a_reset_on() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
-        past = (Live.ABSENCES, Live.ABNORMAL_CHANGES, Live.AL_STATUS_CODE)
+        past = (MasterLive.ABSENCES, MasterLive.ABNORMAL_CHANGES, MasterLive.AL_STATUS_CODE)
 
         async def shown() -> list[int]:
             await asyncio.sleep(FRESH_S + 0.01)
@@ -190,7 +199,7 @@ def test_view_counts_faults_of_slaves_from_a_reset_on() -> None:
 
         happens(losses=2, departures=1, al_code=0x1B)
         assert await shown() == [2, 1, 0x1B]
-        view.write_master(Live.RESET, b"\1")
+        view.write_master(MasterLive.RESET, b"\1")
         assert await shown() == [0, 0, 0]
         happens(losses=2, departures=2, al_code=0x1E)
         assert await shown() == [0, 1, 0x1E]
@@ -202,8 +211,8 @@ def test_view_reads_the_device_type_of_slaves_once() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         assert not view.is_fresh(CONFIGURED)
         await asyncio.gather(*(view.refresh(CONFIGURED) for _ in range(3)))
-        assert view.of_configured(1001, Live.DEVICE_TYPE) == 0x0002_0192
-        assert view.of_configured(1001, Live.TYPE) == "drive"
+        assert view.of_configured(1001, MasterLive.DEVICE_TYPE) == 0x0002_0192
+        assert view.of_configured(1001, MasterLive.TYPE) == "drive"
         asked = len(engine.of(ExchangeMailbox))
         await asyncio.sleep(FRESH_S + 0.01)
         await view.refresh(CONFIGURED)
@@ -219,7 +228,7 @@ def test_view_of_a_bus_that_is_down_has_no_slaves() -> None:
         engine.buses[0].is_up = False
         await view.refresh(DIAGNOSIS)
         assert view.configured() == view.detected() == ()
-        assert view.of_master(Live.STATE) == 1
+        assert view.of_master(MasterLive.STATE) == 1
 
     play(scene)
 
@@ -276,7 +285,9 @@ def facts_of(client: ScriptedClient, times: int = 1) -> tuple[int, bool]:
         assert view.is_fresh(CONFIGURED)
 
     asyncio.run(run())
-    return view.of_configured(1001, Live.DEVICE_TYPE), view.of_configured(1001, Live.HAS_HISTORY)
+    return view.of_configured(1001, MasterLive.DEVICE_TYPE), view.of_configured(
+        1001, MasterLive.HAS_HISTORY
+    )
 
 
 def test_slave_objects_are_read_once() -> None:
@@ -294,11 +305,11 @@ def test_slave_objects_are_read_again_after_the_slave_was_gone() -> None:
     async def run() -> None:
         await view.refresh(CONFIGURED)
         client.show(msgspec.structs.replace(slave, state=0))
-        assert view.of_configured(1001, Live.DEVICE_TYPE) == 0
+        assert view.of_configured(1001, MasterLive.DEVICE_TYPE) == 0
         client.show(slave)
         assert not view.is_fresh(CONFIGURED)
         await view.refresh(CONFIGURED)
-        assert view.of_configured(1001, Live.DEVICE_TYPE) == 0x0002_0192
+        assert view.of_configured(1001, MasterLive.DEVICE_TYPE) == 0x0002_0192
 
     asyncio.run(run())
     assert client.asked == 2
@@ -322,23 +333,23 @@ def test_slave_without_coe_is_not_asked() -> None:
 def test_configured_values_are_those_of_slave_and_facts() -> None:
     facts = SlaveFacts(0x0002_0192, has_history=True)
     shown = {
-        Live.TYPE: "AX5000",
-        Live.NAME: "axis",
-        Live.DEVICE_TYPE: 0x0002_0192,
-        Live.MAILBOX_OUT: 256,
-        Live.MAILBOX_IN: 128,
-        Live.LINK_STATUS: 0,
-        Live.LINK_PRESET: 0x11,
-        Live.FLAGS: 0,
-        Live.PHYSICS: 0x31,
-        Live.HAS_HISTORY: True,
+        MasterLive.TYPE: "AX5000",
+        MasterLive.NAME: "axis",
+        MasterLive.DEVICE_TYPE: 0x0002_0192,
+        MasterLive.MAILBOX_OUT: 256,
+        MasterLive.MAILBOX_IN: 128,
+        MasterLive.LINK_STATUS: 0,
+        MasterLive.LINK_PRESET: 0x11,
+        MasterLive.FLAGS: 0,
+        MasterLive.PHYSICS: 0x31,
+        MasterLive.HAS_HISTORY: True,
     }
     assert {key: configured_value(SLAVE, WIRED, facts, key) for key in shown} == shown
 
 
 def test_configured_mailbox_that_is_open_has_its_own_size() -> None:
     slave = msgspec.structs.replace(SLAVE, to_slave=512, to_master=64, order="")
-    keys = (Live.MAILBOX_OUT, Live.MAILBOX_IN, Live.TYPE)
+    keys = (MasterLive.MAILBOX_OUT, MasterLive.MAILBOX_IN, MasterLive.TYPE)
     values = [configured_value(slave, WIRED, SlaveFacts(), key) for key in keys]
     assert values == [512, 64, "axis"]
 
