@@ -20,4 +20,5 @@ def farm() -> Iterator[Plants]:
 def module_farm() -> Iterator[Plants]:
     """Runs appliances that the tests of a file share, and ends them."""
     with plants() as folder:
+        folder.state = folder.folder / "state"
         yield folder

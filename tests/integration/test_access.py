@@ -46,27 +46,41 @@ OPEN, CLOSED = 0x6065_0000, 0x8000_0001
 
 
 class Cell(NamedTuple):
-    """The station, what is at the other end of its cable, and the folder of its audit."""
+    """The station, what is at the other end of its cable, and the file of its audit.
+
+    Attributes:
+        recorded: Lines of the audit when the test began.
+    """
 
     appliance: Appliance
     here: Namespace
     there: Namespace
-    state: Path
+    file: Path
+    recorded: int = 0
+
+    def lines(self) -> list[str]:
+        return self.file.read_text().splitlines() if self.file.exists() else []
 
     def audit(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in self.state.read_text().splitlines()]
+        return [json.loads(line) for line in self.lines()[self.recorded :]]
+
+
+@pytest.fixture(scope="module")
+def shared(module_farm: Plants) -> Iterator[Cell]:
+    copy(BUSES / "drive.yaml", module_farm.folder / "drive.yaml")
+    plant = module_farm.write(PLANT)
+    with cable(addresses=True) as (here, there):
+        there.ip("addr", "add", f"{OTHER}/24", "dev", "line0")
+        appliance = module_farm.run(plant, prefix=here.prefix)
+        appliance.request("bus_describe", station="press", port="bus0", wait=True)
+        wait_until(lambda: appliance.request("trace", target="press/bus0/1001")["answer"])
+        file = module_farm.folder / "state" / "cell" / "audit.jsonl"
+        yield Cell(appliance, here, there, file)
 
 
 @pytest.fixture
-def cell(farm: Plants, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cell]:
-    monkeypatch.setenv("EAP_STATE_DIR", str(farm.folder / "state"))
-    copy(BUSES / "drive.yaml", farm.folder / "drive.yaml")
-    with cable(addresses=True) as (here, there):
-        there.ip("addr", "add", f"{OTHER}/24", "dev", "line0")
-        appliance = farm.run(farm.write(PLANT), prefix=here.prefix)
-        appliance.request("bus_describe", station="press", port="bus0", wait=True)
-        wait_until(lambda: appliance.request("trace", target="press/bus0/1001")["answer"])
-        yield Cell(appliance, here, there, farm.folder / "state" / "cell" / "audit.jsonl")
+def cell(shared: Cell) -> Cell:
+    return shared._replace(recorded=len(shared.lines()))
 
 
 def client(place: Namespace, source: str = "") -> AmsClient:
@@ -114,9 +128,8 @@ def test_a_rule_opens_one_range_of_objects_for_one_address(cell: Cell) -> None:
         (STATION, "0x8000:01", 0, "no rule refuses it to this host"),
     ]
     assert {line["name"] for line in cell.audit()} == {"press/bus0/drive"}
-    _, _, log = cell.appliance.stop()
-    assert f"{BUS}:1001 for {aoe.CLIENT}:33000 ({OTHER}:" in log
-    assert f"write refused: {nobody} (0x723)" in log
+    wait_until(lambda: f"{BUS}:1001 for {aoe.CLIENT}:33000 ({OTHER}:" in cell.appliance.log())
+    assert f"write refused: {nobody} (0x723)" in cell.appliance.log()
 
 
 def test_a_sum_command_is_judged_item_by_item(cell: Cell) -> None:

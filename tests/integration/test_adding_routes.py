@@ -11,7 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from tests.integration.test_ams_doors import is_free
-from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
+from tests.support.appliance import (
+    Appliance,
+    Plants,
+    SharedAppliance,
+    run_eapctl,
+    wait_until,
+)
 from tests.support.namespaces import Namespace, cable
 from tests.support.vectors import load
 
@@ -43,12 +49,21 @@ stations:
 ADD_ROUTE, SERVER_INFO = (vector.octets for vector in load("ams_discovery"))
 
 
-@pytest.fixture
-def appliance(farm: Plants) -> Appliance:
-    wait_until(lambda: all(map(is_free, (OPEN, CLOSED))))
-    plant = farm.write(PLANT)
+@pytest.fixture(scope="module")
+def shared(module_farm: Plants) -> SharedAppliance:
+    plant = module_farm.write(PLANT)
     (plant.parent / "password").write_text("secret\n")
-    return farm.run(plant)
+
+    def begin() -> Appliance:
+        wait_until(lambda: all(map(is_free, (OPEN, CLOSED))))
+        return module_farm.run(plant)
+
+    return SharedAppliance(begin)
+
+
+@pytest.fixture
+def appliance(shared: SharedAppliance) -> Appliance:
+    return shared.running()
 
 
 def added(appliance: Appliance, station: str) -> list[str]:
@@ -61,7 +76,7 @@ def state(appliance: Appliance, station: str, name: str) -> str:
     return str(row["routes"][0]["state"])
 
 
-def test_pyads_adds_a_route_that_is_there_after_a_new_start(appliance, farm):
+def test_pyads_adds_a_route_that_is_there_after_a_new_start(appliance, shared):
     pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 
     def add(address: str, password: str, name: str = "tool") -> bool:
@@ -84,8 +99,7 @@ def test_pyads_adds_a_route_that_is_there_after_a_new_start(appliance, farm):
         wait_until(lambda: state(appliance, "open", "tool") != "client")
     appliance.command("routes", "remove", "open", "tool")
     appliance.stop()
-    wait_until(lambda: all(map(is_free, (OPEN, CLOSED))))
-    again = farm.run(farm.folder / "plant.yaml")
+    again = shared.running()
     assert [added(again, name) for name in ("open", "closed")] == [[], ["tool"]]
 
 
@@ -118,11 +132,12 @@ def test_a_scan_tells_who_is_there(appliance):
     assert "address: Expected 4 octets in 'there'" in refused.stderr
 
 
-@pytest.fixture
-def hosts(farm: Plants) -> Iterator[tuple[Appliance, Namespace, Namespace]]:
+@pytest.fixture(scope="module")
+def hosts(module_farm: Plants) -> Iterator[tuple[Appliance, Namespace, Namespace]]:
     """A station on one host, and another host beside it."""
     with cable(addresses=True) as (near, far):
-        yield farm.run(farm.write(ALONE), prefix=near.prefix), near, far
+        plant = module_farm.write(ALONE, "alone.yaml")
+        yield module_farm.run(plant, prefix=near.prefix), near, far
 
 
 @pytest.mark.root

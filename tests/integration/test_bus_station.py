@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from unittest import mock
@@ -17,7 +16,7 @@ from eap.appliance.commands.bus_running import open_running
 from eap.appliance.commands.bus_sdo import read_entry
 from eap.appliance.runtime import VARIABLE
 from tests.support.addresses import own_address
-from tests.support.appliance import EAPCTL, plants, wait_until
+from tests.support.appliance import EAPCTL, plants, run_eapctl, wait_until
 from tests.support.machine import slowness
 from tests.support.simulator import simulator
 
@@ -61,19 +60,13 @@ def works():
 
 
 def eapctl(works, *words):
-    return subprocess.run(
-        [*EAPCTL, "bus", *words],
-        env=os.environ | {VARIABLE: str(works.runtime)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return run_eapctl(works.runtime, "bus", *words)
 
 
 def begin(works, *words):
     """Start a command and do not wait for it."""
     return subprocess.Popen(
-        [sys.executable, "-m", "eap", "bus", *words],
+        [*EAPCTL, "bus", *words],
         env=os.environ | {VARIABLE: str(works.runtime)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

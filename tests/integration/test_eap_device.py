@@ -301,7 +301,7 @@ def test_applied_configuration_outlives_engine_services_and_supervisor(
     for process in ("engine", "services"):
         pid = appliance.pid(process)
         os.kill(pid, signal.SIGKILL)
-        _wait_for_another(appliance, process, pid)
+        appliance.wait_for_another(process, pid)
         wait_until(lambda: holds(appliance))
     os.kill(appliance.process.pid, signal.SIGKILL)
     appliance.finish()
@@ -310,19 +310,6 @@ def test_applied_configuration_outlives_engine_services_and_supervisor(
     assert holds(again)
     assert again.request("rollback", station="left")["ok"]
     assert again.request("export", station="left")["spec"] == spec
-
-
-def _wait_for_another(appliance: Appliance, process: str, pid: int) -> None:
-    """Wait until *process* runs again under another process id."""
-    wait_until(lambda: _pid(appliance, process) not in {0, pid})
-
-
-def _pid(appliance: Appliance, process: str) -> int:
-    """Return a process id, 0 while nobody answers."""
-    try:
-        return appliance.pid(process) or 0
-    except (ControlError, ValueError, TypeError):
-        return 0
 
 
 @pytest.mark.parametrize("victim", ["engine", "services", "supervisor"])
@@ -348,7 +335,7 @@ def test_kill_in_the_middle_of_apply_leaves_a_whole_configuration(
             appliance = farm.start(plant, runtime=runtime)
             appliance.wait_ready()
         else:
-            _wait_for_another(appliance, victim, pid)
+            appliance.wait_for_another(victim, pid)
         now = _settled(appliance)
         assert now in (before, wanted)
     left = appliance.rx("right", "left-state")

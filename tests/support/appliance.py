@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 from unittest import mock
@@ -22,6 +22,7 @@ from click.testing import CliRunner
 from eap.appliance.commands.client import connect_those
 from eap.appliance.runtime import VARIABLE
 from eap.cli import main as eapctl
+from eap.errors import ControlError
 
 EAPCTL = [sys.executable, "-m", "eap"]
 READY_S = 60.0
@@ -31,10 +32,16 @@ class Appliance:
     """A running appliance with a runtime directory of its own, wherever its network is."""
 
     def __init__(
-        self, plant: Path | None, *arguments: str, runtime: Path, prefix: Sequence[str] = ()
+        self,
+        plant: Path | None,
+        *arguments: str,
+        runtime: Path,
+        prefix: Sequence[str] = (),
+        state: Path | None = None,
     ) -> None:
         self.runtime = runtime
         self._prefix = prefix
+        self._state = {"EAP_STATE_DIR": str(state)} if state else {}
         words = [str(plant), *arguments] if plant else arguments
         self.process = subprocess.Popen(
             [*prefix, *EAPCTL, "run", *words],
@@ -121,6 +128,15 @@ class Appliance:
         """Return the process id of ``engine``, ``services`` or ``supervisor``."""
         return int(self.status()["processes"][process]["pid"])
 
+    def wait_for_another(self, process: str, pid: int) -> None:
+        """Wait until *process*, which was *pid* and was killed, runs again."""
+        wait_until(lambda: self._pid_or_0(process) not in {0, pid})
+
+    def _pid_or_0(self, process: str) -> int:
+        with suppress(ControlError, ValueError, TypeError):  # nobody answers
+            return self.pid(process) or 0
+        return 0
+
     def __enter__(self) -> Self:
         return self
 
@@ -128,7 +144,7 @@ class Appliance:
         self.close()
 
     def _environment(self) -> dict[str, str]:
-        return os.environ | {VARIABLE: str(self.runtime)}
+        return os.environ | {VARIABLE: str(self.runtime)} | self._state
 
 
 def run_eapctl(runtime: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -150,10 +166,15 @@ def spawn_eapctl(runtime: Path, *words: str) -> subprocess.CompletedProcess[str]
 
 
 class Plants:
-    """A short-lived folder for plant files and runtime directories; ends what runs from it."""
+    """A short-lived folder for plant files and runtime directories; ends what runs from it.
+
+    Attributes:
+        state: Folder of what appliances keep; None for that of the test that starts them.
+    """
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
+        self.state: Path | None = None
         self._stack = stack
         self._count = 0
 
@@ -174,7 +195,7 @@ class Plants:
         self._count += 1
         folder = runtime or self.folder / f"run{self._count}"
         return self._stack.enter_context(
-            Appliance(plant, *arguments, runtime=folder, prefix=prefix)
+            Appliance(plant, *arguments, runtime=folder, prefix=prefix, state=self.state)
         )
 
     def run(self, plant: Path, *arguments: str, prefix: Sequence[str] = ()) -> Appliance:
@@ -213,7 +234,7 @@ def plants() -> Iterator[Plants]:
         shutil.rmtree(folder)
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 20.0) -> float:
+def wait_until(condition: Callable[[], object], timeout_s: float = 40.0) -> float:
     """Return the seconds it took until *condition* held."""
     start = time.monotonic()
     while not condition():
