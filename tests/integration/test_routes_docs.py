@@ -1,15 +1,9 @@
-"""docs/routes.md tells the truth: its commands run and print what it says, its screens look so."""
+"""docs/routes.md: its commands run and print what the page says, its screens look so."""
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -17,11 +11,11 @@ from eap.appliance.commands.route_lists import list_routes
 from eap.cli.routes_tui.app import RoutesApp
 from eap.cli.routes_tui.link import Link
 from tests.support.appliance import wait_until
+from tests.support.pages import ROOT, Shell, commands, shell
 from tests.support.screens import Screen, play
 
 pytestmark = pytest.mark.net
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "routes.md").read_text()
 BLOCK = re.compile(r"```(xml|console|text)\n(.*?)```", re.DOTALL)
 KEYS = [("down", "t", "escape"), ("down", "down", "t")]
@@ -38,56 +32,12 @@ def outline(text: str) -> str:
     return "\n".join(" ".join(line.split()) for line in text.splitlines())
 
 
-class Shell:
-    """A folder, and commands in it."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        (folder / "config").symlink_to(ROOT / "config")
-        program = folder / "eapctl"
-        program.write_text(f'#!/bin/sh\nexec {sys.executable} -m eap "$@"\n')
-        program.chmod(0o755)
-        os.environ["EAP_RUNTIME_DIR"] = str(folder / "run")
-        self._environment = os.environ | {
-            "PATH": f"{folder}:{os.environ['PATH']}",
-            "PYTHONPATH": str(ROOT),
-            "COLUMNS": "100",
-        }
-        self._running: list[subprocess.Popen[str]] = []
-
-    def run(self, command: str) -> str:
-        """Return what a command prints on both ways out; one behind & prints a line, and stays."""
-        if command.endswith(" &"):
-            process = subprocess.Popen(
-                command.removesuffix(" &").split(), cwd=self.folder, env=self._environment,
-                stdout=subprocess.PIPE, text=True,
-            )  # fmt: skip
-            self._running.append(process)
-            assert process.stdout is not None
-            return process.stdout.readline()
-        done = subprocess.run(
-            ["sh", "-c", command], cwd=self.folder, env=self._environment,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
-        )  # fmt: skip
-        return done.stdout
-
-    def close(self) -> None:
-        for process in self._running:
-            process.terminate()
-        for process in self._running:
-            process.communicate(timeout=20)
-
-
 @pytest.fixture
-def shell(monkeypatch: pytest.MonkeyPatch) -> Iterator[Shell]:
-    folder = Path(tempfile.mkdtemp(prefix="eap-"))  # short enough for a socket's path
-    monkeypatch.setenv("EAP_RUNTIME_DIR", "")  # so that it is as before in the end
-    shell = Shell(folder)
-    try:
-        yield shell
-    finally:
-        shell.close()
-        shutil.rmtree(folder)
+def reader(monkeypatch: pytest.MonkeyPatch) -> Iterator[Shell]:
+    with shell(COLUMNS="100") as made:
+        (made.folder / "config").symlink_to(ROOT / "config")
+        monkeypatch.setenv("EAP_RUNTIME_DIR", str(made.folder / "run"))
+        yield made
 
 
 def screen_after(keys: tuple[str, ...]) -> str:
@@ -108,23 +58,22 @@ def routes_are_known() -> bool:
     )
 
 
-def replay(shell: Shell) -> Iterator[tuple[str, str, str]]:
+def replay(reader: Shell) -> Iterator[tuple[str, str, str]]:
     """Yield what is done, what the page says comes of it, and what does."""
     keys = iter(KEYS)
     for kind, text in BLOCK.findall(PAGE):
         if kind == "xml":
-            (shell.folder / "StaticRoutes.xml").write_text(text)
+            (reader.folder / "StaticRoutes.xml").write_text(text)
         elif kind == "text":
             pressed = next(keys)
             yield f"keys {pressed}", text, screen_after(pressed)
         else:
-            for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
-                command, _, expected = part.partition("\n")
-                yield command, expected, shell.run(command)
+            for command, expected in commands(text):
+                yield command, expected, reader.run(command)
                 if command.endswith(" &"):
-                    wait_until(routes_are_known, 10)
+                    wait_until(routes_are_known)
 
 
-def test_the_whole_page(shell: Shell) -> None:
-    for command, expected, found in replay(shell):
+def test_the_whole_page(reader: Shell) -> None:
+    for command, expected, found in replay(reader):
         assert outline(found) == outline(expected), f"{command}\n{found}"
