@@ -45,6 +45,7 @@ stations:
       curve: {{type: "INT[4]"}}
       label: {{type: STRING(15), default: pump}}
       open: {{type: BOOL}}
+      recipe: {{type: BLOCK(1000)}}
     sources:
       ticks: {{kind: counter}}
     frames:
@@ -228,9 +229,9 @@ def test_client_that_dies_or_stops_reading_leaves_others_alone(appliance, told) 
     small = socket.socket()
     small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     with AmsClient(ADDRESS, small) as client:
-        error, handle = client.ask(PORT, 9, struct.pack("<4I", 0xF003, 0, 4, 5) + b"label")
+        error, handle = client.ask(PORT, 9, struct.pack("<4I", 0xF003, 0, 4, 6) + b"recipe")
         assert not error
-        watched = struct.pack("<I4sI", 0xF005, handle[8:], 16) + struct.pack("<3I16x", 3, 0, 0)
+        watched = struct.pack("<I4sI", 0xF005, handle[8:], 1000) + struct.pack("<3I16x", 3, 0, 0)
         for _ in range(50):
             client.send(aoe.packet(PORT, 6, watched))  # and takes nothing
         wait_until(lambda: appliance.station("tower")["discarded"].get("ams_slow"))

@@ -14,6 +14,7 @@ import pytest
 
 from tests.support import aoe
 from tests.support.appliance import Appliance, Plants, troubles, wait_until
+from tests.support.machine import slowness
 
 pytestmark = pytest.mark.net
 
@@ -118,10 +119,10 @@ def come_and_go(stop: threading.Event) -> None:
         time.sleep(0.002)
 
 
-def ask_for_a_while(sock: socket.socket) -> list[float]:
+def ask_for_a_while(sock: socket.socket, seconds: float) -> list[float]:
     """Return how long each answer took."""
     took = []
-    end = time.monotonic() + SECONDS
+    end = time.monotonic() + seconds
     while time.monotonic() < end:
         begin = time.monotonic()
         sock.sendall(SMALL)
@@ -131,7 +132,6 @@ def ask_for_a_while(sock: socket.socket) -> list[float]:
     return took
 
 
-@pytest.mark.quiet
 def test_others_are_served_memory_is_bounded_and_the_engine_undisturbed(
     appliance: Appliance,
 ) -> None:
@@ -142,13 +142,13 @@ def test_others_are_served_memory_is_bounded_and_the_engine_undisturbed(
     with socket.create_connection((ADDRESS, 48898)) as good:
         good.settimeout(10)
         with running(*floods):
-            took = ask_for_a_while(good)
+            took = ask_for_a_while(good, SECONDS)
             during = appliance.status()
-        ask_for_a_while(good)
+        ask_for_a_while(good, SECONDS / 10)
     grown = during["processes"]["services"]["rss"] - before["processes"]["services"]["rss"]
     assert grown < MOST_GROWN
     assert len(took) > 20
-    assert max(took) < 2
+    assert max(took) < 2 * slowness()
     after = appliance.status()
     for name, process in before["processes"].items():
         assert after["processes"][name]["pid"] == process["pid"]

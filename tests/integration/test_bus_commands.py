@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.support.addresses import own_address
+from tests.support.appliance import run_eapctl, spawn_eapctl
 from tests.support.simulator import FAR, NEAR, simulator, veth_pair
 
 pytestmark = pytest.mark.net
@@ -21,8 +20,9 @@ NOBODY = f"udp://{own_address(2)}"
 
 
 def eapctl(*words, interface):
-    command = [sys.executable, "-m", "eap", "bus", *words, "--interface", interface]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    # A process keeps the network that it asked for interfaces first.
+    run = spawn_eapctl if interface == f"ethernet://{NEAR}" else run_eapctl
+    return run(Path(), "bus", *words, "--interface", interface)
 
 
 def ask(*words, interface):

@@ -24,6 +24,7 @@ from tests.support.gatewayplant import (
     state_of,
 )
 from tests.support.gatewaywire import AOE, COE, EOE, ERR, FOE, SOE, VENDOR, VOE, Wire, frame, wire
+from tests.support.machine import slowness
 from tests.support.vectors import load
 
 pytestmark = pytest.mark.net
@@ -143,14 +144,13 @@ def test_writing_to_all_needs_a_rule(gateway: Wire) -> None:
     assert [gateway.receive()[8:] for _ in range(5)] == [denied] * 5
 
 
-@pytest.mark.quiet
 def test_who_is_not_there_and_who_says_nothing(gateway: Wire) -> None:
     assert gateway.talk(COE, 1777, VENDOR) == abort(0x1018, 1, NO_OBJECT)
     assert gateway.talk(COE, COUPLER, VENDOR) == abort(0x1018, 1, LOCAL)
     for _ in range(2):
         start = time.monotonic()
         assert gateway.talk(COE, MUTE, VENDOR) == abort(0x1018, 1, TIMED_OUT)
-        assert 0.5 < time.monotonic() - start < 1
+        assert 0.5 < time.monotonic() - start < 1 * slowness()
     assert gateway.talk(COE, LAST, VENDOR) == (COE, IDENTITY)
 
 
@@ -189,7 +189,7 @@ def test_frames_in_halves_and_many_at_once(plant: Appliance) -> None:
     with wire(HOST, tcp=True) as tcp:
         for cut in range(1, len(asked)):
             tcp.send(asked[:cut])
-            time.sleep(0.002)
+            time.sleep(0.002)  # so that the halves come apart
             tcp.send(asked[cut:])
             assert tcp.receive()[8:] == IDENTITY
         crowd = [frame(COE, 0, VENDOR, counter) for counter in range(8)] * 20
@@ -219,7 +219,7 @@ def test_a_reader_that_takes_nothing_hinders_nobody(plant: Appliance) -> None:
             start = time.monotonic()
             assert other.talk(COE, DRIVE, VENDOR) == (COE, IDENTITY)
             slowest = max(slowest, time.monotonic() - start)
-        assert slowest < 0.3
+        assert slowest < 0.3 * slowness()
 
 
 def test_two_clients_move_different_files_at_once(plant: Appliance) -> None:
