@@ -80,7 +80,7 @@ def test_same_values_as_locally(plant: Appliance, via: str, tmp_path: Path) -> N
         assert here["value"] == 1234
         mode = locally(plant, "idn", "read", "mill/bus0", "1001", "S-0-0032")
         assert drive.u32(SOE, 0x40 << 16 | 32) == mode["value"]
-        content = os.urandom(1_000_000)
+        content = os.urandom(250_000)
         drive.store("firmware.bin", content)
         target = tmp_path / "firmware.bin"
         locally(plant, "foe", "get", "mill/bus0", "1001", "firmware.bin", str(target))
@@ -140,7 +140,7 @@ import os, sys
 import pyads
 from tests.support.slavetool import Slave
 with pyads.Connection(sys.argv[1], int(sys.argv[2]), sys.argv[3]) as connection:
-    slave, content = Slave(connection), os.urandom(2_000_000)
+    slave, content = Slave(connection), os.urandom(500_000)
     print("stores", flush=True)
     slave.store("firmware.bin", content)
     print(slave.fetch("firmware.bin") == content, flush=True)
