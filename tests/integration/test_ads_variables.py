@@ -61,10 +61,13 @@ def appliance() -> Iterator[Appliance]:
         yield folder.run(folder.write(PLANT))
 
 
-@pytest.fixture
-def tower(appliance: Appliance) -> Iterator[pyads.Connection]:
-    with pyads.Connection(PORT, DEVICE, ADDRESS) as connection:
-        yield connection
+@pytest.fixture(scope="module")
+def tower(appliance: Appliance) -> pyads.Connection:
+    """Return a connection that stays open: AdsLib may crash where it closes one that notified."""
+    del appliance
+    connection = pyads.Connection(PORT, DEVICE, ADDRESS)
+    connection.open()
+    return connection
 
 
 class Told:

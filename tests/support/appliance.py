@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -25,7 +26,9 @@ from eap.cli import main as eapctl
 from eap.errors import ControlError
 
 EAPCTL = [sys.executable, "-m", "eap"]
-READY_S = 60.0
+READY_S = 90.0
+_PROGRESS = re.compile(r"^supervisor: .* has been starting for .*\n", re.MULTILINE)
+"""Lines of a start that takes long, as on a busy machine."""
 
 
 class Appliance:
@@ -64,10 +67,10 @@ class Appliance:
         assert ready["ready"] is True
         return list(ready["stations"])
 
-    def finish(self, timeout_s: float = 10.0) -> tuple[int, str, str]:
-        """Wait for its end; return exit code, stdout and stderr."""
+    def finish(self, timeout_s: float = 40.0) -> tuple[int, str, str]:
+        """Wait for its end; return exit code, stdout and stderr without the progress of a start."""
         out, err = self.process.communicate(timeout=timeout_s)
-        return self.process.returncode, out, self._logged.decode() + err
+        return self.process.returncode, out, _PROGRESS.sub("", self._logged.decode() + err)
 
     def log(self) -> str:
         """Return what it has written to stderr so far."""
@@ -131,6 +134,12 @@ class Appliance:
     def wait_for_another(self, process: str, pid: int) -> None:
         """Wait until *process*, which was *pid* and was killed, runs again."""
         wait_until(lambda: self._pid_or_0(process) not in {0, pid})
+        if process == "engine":
+            before = self._cycles()
+            wait_until(lambda: self._cycles() != before)
+
+    def _cycles(self) -> list[int]:
+        return [station["cycle"] for station in self.status()["stations"]]
 
     def _pid_or_0(self, process: str) -> int:
         with suppress(ControlError, ValueError, TypeError):  # nobody answers
