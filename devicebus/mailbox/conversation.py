@@ -28,7 +28,7 @@ from eap.errors import CodecError
 T = TypeVar("T")
 
 RESPONSE_TIMEOUT_NS = 2_000_000_000
-"""How long a slave may take to answer, unless a protocol says otherwise (ESI default)."""
+"""Limit for the answer of a slave, unless a protocol says otherwise (ESI default)."""
 
 
 class MailboxRequest(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -64,11 +64,11 @@ Conversation: TypeAlias = Generator[MailboxRequest, MailboxMessage, T]
 
 
 RATE_WINDOW_NS = 2_000_000_000
-"""What a rate is the mean of, at most."""
+"""Longest time that a rate is the mean of."""
 
 
 class Progress:
-    """How far a transfer is; the runner's user may read it at any time.
+    """Progress of a transfer; it may be read at any time.
 
     Attributes:
         done: Octets transferred.
@@ -97,7 +97,7 @@ class Progress:
 
 @contextmanager
 def reading(what: str) -> Iterator[None]:
-    """Turn whatever a decoder says against a slave's octets into MailboxProtocolError."""
+    """Raise errors of a decoder about a slave's message as MailboxProtocolError."""
     try:
         yield
     except CodecError as exc:

@@ -1,4 +1,4 @@
-"""What the master does, written as generators; see :mod:`runner` for who runs them.
+"""Procedure: an action of the master, written as a generator; :mod:`runner` runs it.
 
     def read_twice(station: int) -> Procedure[bytes]:
         first = yield from read(station, Register.TYPE, 1)

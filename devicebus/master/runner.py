@@ -33,20 +33,20 @@ class Runner:
         return run.task
 
     def next_timeout(self) -> int | None:
-        """When the next sleeper wakes."""
+        """Return the time at which the next sleeper wakes."""
         while self._sleeping and self._sleeping[0][2].task.is_done:
             heapq.heappop(self._sleeping)
         return self._sleeping[0][0] if self._sleeping else None
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Resume those whose time has come."""
+        """Resume sleepers that are due."""
         while self._sleeping and self._sleeping[0][0] <= now_ns:
             _, _, run = heapq.heappop(self._sleeping)
             if not run.task.is_done:
                 run.resume(StepResult((), now_ns))
 
     def take_step(self, run: _Run, step: Step, now_ns: int) -> None:
-        """Queue what a procedure wants next."""
+        """Queue the next step of a procedure."""
         if isinstance(step, Sleep):
             entry = (now_ns + step.duration_ns, next(self._number), run)
             heapq.heappush(self._sleeping, entry)
@@ -75,7 +75,7 @@ class _Run:
             self.resume(StepResult(outcome, now_ns))
 
     def resume(self, answer: StepResult) -> None:
-        """Hand the procedure what it waited for."""
+        """Resume the procedure with the result of its step."""
         self.advance(lambda: self._procedure.send(answer), answer.now_ns)
 
     def advance(self, action: Callable[[], Step], now_ns: int) -> None:
@@ -92,7 +92,7 @@ class _Run:
             self._runner.take_step(self, step, now_ns)
 
     def stop(self) -> None:
-        """Close the procedure and forget what it waits for."""
+        """Close the procedure and drop its step."""
         if self.exchange is not None:
             self.exchange.cancel()
         self._procedure.close()

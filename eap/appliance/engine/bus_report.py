@@ -67,7 +67,7 @@ def link_presets(units: Collection[Unit]) -> dict[int, int]:
         if joint.parent is not None:
             ends.append((joint.parent, joint.parent_port))
         for position, port in ends:
-            if port:  # it is not asked for port 0
+            if port:  # the standard has no bits for port 0
                 presets[position] = presets.get(position, 0) | 0x11 << port - 1
     return presets
 
@@ -75,7 +75,7 @@ def link_presets(units: Collection[Unit]) -> dict[int, int]:
 def describe_slave(bus: EngineBus, unit: Unit, presets: Mapping[int, int]) -> SlaveDescription:
     """Return the description of a slave that was found; *presets* as link_presets returns them."""
     identity, sii = unit.found.identity, unit.found.sii
-    past = bus.faults.past(unit.station)
+    counts = bus.faults.counts(unit.station)
     sizes = unit.mailbox.sizes if unit.mailbox is not None else None
     return SlaveDescription(
         station=unit.station,
@@ -96,9 +96,9 @@ def describe_slave(bus: EngineBus, unit: Unit, presets: Mapping[int, int]) -> Sl
         usual_to_master=sii.fixed.send_size,
         port_physics=sii.general.port_physics if sii.general else 0,
         link_preset=presets.get(unit.found.position, 0),
-        losses=past.losses,
-        departures=past.departures,
-        al_code=past.al_code,
+        losses=counts.losses,
+        departures=counts.departures,
+        al_code=counts.al_code,
         fault=_fault(bus, unit),
     )
 
@@ -118,7 +118,7 @@ def _report(bus: EngineBus, unit: Unit, presets: Mapping[int, int], now_ns: int)
 
 
 def _fault(bus: EngineBus, unit: Unit) -> str:
-    """Return why a slave is not where it belongs, as it is at this moment."""
+    """Return the reason why a slave is not in its target state at this moment."""
     fault = bus.faults.of(unit.station)
     if fault == NO_ANSWER and unit.is_busy and unit.state is not None:
         return f"it answers again and is on its way to {unit.target.name}"

@@ -1,7 +1,7 @@
 """One bus port in the engine: a master, its wire, and the station's variables.
 
-Nothing that a bus does may stop the cycles of the stations: what goes wrong is kept as a text for
-whoever asks, and tried again.
+Nothing that a bus does may stop the cycles of the stations: a failure is kept as a text for the
+report of the bus, and tried again.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ WHOLE_BUS = 0
 RETRY_NS = 2_000_000_000
 """Between two attempts to bring a bus up."""
 SILENT_RETRY_NS = 100_000_000
-"""The same while nothing comes back at all: nobody is disturbed then."""
+"""The same while nothing comes back at all: no slave is disturbed then."""
 BATCH = 16
 """Frames taken in one go; the rest waits until the cycles have had their turn."""
 _LONG_CYCLE_NS = 20_000_000
 _MOST_STALE = 4096
 
 
-class Past(NamedTuple):
-    """What has happened to a slave since the engine started."""
+class FaultCounts(NamedTuple):
+    """Faults of a slave since the engine started."""
 
     losses: int = 0
-    """How often it stopped answering."""
+    """Times that it stopped answering."""
     departures: int = 0
-    """How often it left its state by itself."""
+    """Times that it left its state by itself."""
     al_code: int = 0
     """AL status code when it last did."""
 
 
-class Trouble(NamedTuple):
-    """Why a slave is not where it belongs, or was not; *until_ns* is None while it lasts."""
+class SlaveFault(NamedTuple):
+    """Reason why a slave is, or was, not in its target state; *until_ns* is None if it is."""
 
     text: str = ""
     since_ns: int = 0
@@ -63,7 +63,7 @@ class Trouble(NamedTuple):
 
 
 class SlaveFaults:
-    """Texts by station address; :meth:`of` returns one, and :meth:`past` what is over.
+    """Faults by station address: those that last, the last one that is over, and their numbers.
 
     Attributes:
         on_unsolicited: Called with each message that a slave sent unasked.
@@ -71,34 +71,34 @@ class SlaveFaults:
 
     def __init__(self) -> None:
         self.on_unsolicited: list[Callable[[Unsolicited], None]] = []
-        self._troubles: dict[int, Trouble] = {}
-        self._past: dict[int, Past] = {}
+        self._faults: dict[int, SlaveFault] = {}
+        self._counts: dict[int, FaultCounts] = {}
 
     def of(self, station: int) -> str:
-        """Return why a slave is not where it belongs, empty if it is."""
+        """Return the reason why a slave is not in its target state, empty if it is."""
         trouble = self.last(station)
         return trouble.text if trouble.until_ns is None else ""
 
-    def last(self, station: int) -> Trouble:
-        """Return the last trouble of a slave, which may be over."""
-        return self._troubles.get(station, Trouble())
+    def last(self, station: int) -> SlaveFault:
+        """Return the last fault of a slave, which may be over."""
+        return self._faults.get(station, SlaveFault())
 
-    def past(self, station: int) -> Past:
-        """Return what has happened to a slave."""
-        return self._past.get(station, Past())
+    def counts(self, station: int) -> FaultCounts:
+        """Return the numbers of faults of a slave."""
+        return self._counts.get(station, FaultCounts())
 
     def forget_past(self) -> None:
-        """Forget the troubles that are over; what was counted stays."""
-        self._troubles = {at: each for at, each in self._troubles.items() if each.until_ns is None}
+        """Forget the faults that are over; their numbers stay."""
+        self._faults = {at: each for at, each in self._faults.items() if each.until_ns is None}
 
     def end_all(self, now_ns: int) -> None:
-        """End the troubles that last: a master that is replaced reports no end of them."""
-        for station, each in self._troubles.items():
+        """End the faults that last: a master that is replaced reports no end of them."""
+        for station, each in self._faults.items():
             if each.until_ns is None:
                 self._end(station, now_ns)
 
     def take_events(self, master: Master) -> None:
-        """Take what has happened."""
+        """Take the events of the master."""
         while (event := master.next_event()) is not None:
             self._remember(event)
             if isinstance(event, BusLost):
@@ -122,23 +122,23 @@ class SlaveFaults:
                     call(event)
 
     def _begin(self, station: int, text: str, at_ns: int) -> None:
-        """Note a trouble; one that follows another began with it."""
+        """Note a fault; one that follows another began with it."""
         before = self.last(station)
         lasts = bool(before.text) and before.until_ns is None
-        self._troubles[station] = Trouble(text, before.since_ns if lasts else at_ns)
+        self._faults[station] = SlaveFault(text, before.since_ns if lasts else at_ns)
 
     def _end(self, station: int, at_ns: int) -> None:
-        trouble = self._troubles.get(station)
+        trouble = self._faults.get(station)
         if trouble is not None:
-            self._troubles[station] = trouble._replace(until_ns=at_ns)
+            self._faults[station] = trouble._replace(until_ns=at_ns)
 
     def _remember(self, event: Event) -> None:
         if isinstance(event, SlaveLost):
-            past = self.past(event.station)
-            self._past[event.station] = past._replace(losses=past.losses + 1)
+            past = self.counts(event.station)
+            self._counts[event.station] = past._replace(losses=past.losses + 1)
         elif isinstance(event, SlaveLeft):
-            past = self.past(event.station)
-            self._past[event.station] = past._replace(
+            past = self.counts(event.station)
+            self._counts[event.station] = past._replace(
                 departures=past.departures + 1, al_code=event.code or past.al_code
             )
 
@@ -156,7 +156,7 @@ class EngineBus:
 
     Attributes:
         is_up: Whether the bus has been brought up, wherever its slaves are now.
-        tasks: What somebody has asked for and waits for.
+        tasks: Requests that are under way.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class EngineBus:
 
     @property
     def fault(self) -> str:
-        """Why the bus is not wholly as it should be, empty if it is."""
+        """Faults of the bus as a whole, one line each; empty if there is none."""
         faults = (self._wire_fault, self._start_fault, *self._mapping.missing)
         return "\n".join(filter(None, faults))
 
@@ -249,7 +249,7 @@ class EngineBus:
         self._guarded(self._exchange, now_ns)
 
     def next_timeout(self) -> int | None:
-        """When :meth:`handle_timeout` must be called; None if the next cycle is soon enough."""
+        """Return the time for :meth:`handle_timeout`; None if the next cycle is soon enough."""
         return self._due_ns
 
     def handle_timeout(self, now_ns: int) -> None:
@@ -262,7 +262,7 @@ class EngineBus:
             self._guarded(self._receive, now_ns)
 
     def drain(self, now_ns: int) -> None:
-        """Take frames that are there, at most a batch, whether anybody waits for them or not."""
+        """Take frames that are there, at most a batch, also unexpected ones."""
         self._guarded(self._receive, now_ns)
 
     def _guarded(self, action: Callable[[int], None], now_ns: int) -> None:
@@ -346,7 +346,7 @@ class EngineBus:
                 self._wire_fault = str(exc)
 
     def _is_busy(self) -> bool:
-        """Whether something is under way that should not wait for the next cycle."""
+        """Return whether something is under way that should not wait for the next cycle."""
         if self._is_slow or self._starting is not None or self.tasks:
             return True
         return any(unit.is_busy for unit in self.master.units.values())

@@ -18,7 +18,7 @@ from eap.net.busport import BusPort
 from eap.pd.spec import BusPortSpec, PortSpec
 
 REST_NS = 300_000_000
-"""How long slaves may take to rest when the engine ends."""
+"""Limit for bringing slaves to INIT when the engine ends."""
 _MIN_BUDGET, _BUDGET_PER_US = 1536, 3
 _EPOCH_S = 946_684_800
 """2000-01-01, from which the clocks of slaves count."""

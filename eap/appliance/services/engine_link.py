@@ -1,7 +1,7 @@
 """Services' end of the pair on which the engine takes requests for its stations and buses.
 
-Answers are matched by number.  An engine that dies leaves the pair open and says nothing, so an
-answer has a time-out, and a request that waits for long asks now and then whether anybody is there.
+Replies are matched by number.  An engine that dies leaves the pair open and silent, so a reply has
+a time-out, and a request that waits for long pings the engine now and then.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 
 class EngineLink:
-    """Asks the engine; to be made inside the loop that serves it.
+    """Sends requests to the engine; made inside the loop that serves it.
 
     Args:
         sock: This end of the pair; closed by :meth:`close`.
@@ -46,9 +46,9 @@ class EngineLink:
 
     Attributes:
         on_restart: Called when another engine has taken its end of the pair.
-        on_heard: Called with each message that a slave sent unasked.
+        on_unsolicited: Called with each message that a slave sent unasked.
         on_change: Called with each change of a bus.
-        heard_s: Time of the loop at which the engine has sent something last.
+        received_s: Time of the loop at which the engine has sent something last.
     """
 
     def __init__(self, sock: socket.socket, *, look_s: float = LOOK_S) -> None:
@@ -62,24 +62,24 @@ class EngineLink:
         self._waiting: dict[int, asyncio.Future[EngineReply]] = {}
         # Numbers of a process before this one do not come again: late answers to it match nothing.
         self._last_id = monotonic_ns()
-        self.heard_s = 0.0
+        self.received_s = 0.0
         self.on_restart: list[Callable[[], None]] = []
-        self.on_heard: list[Callable[[UnsolicitedMessage], None]] = []
+        self.on_unsolicited: list[Callable[[UnsolicitedMessage], None]] = []
         self.on_change: list[Callable[[BusChange], None]] = []
 
     @property
     def is_alive(self) -> bool:
-        """Whether the engine has sent something within the time after which it counts as gone."""
-        return self._loop.time() < self.heard_s + self._look_s
+        """True if the engine has sent something in the time after which it counts as gone."""
+        return self._loop.time() < self.received_s + self._look_s
 
-    async def ask(self, make: Callable[[int], EngineRequest], timeout_s: float) -> EngineReply:
-        """Send the request that *make* returns for its number, and wait for the answer.
+    async def request(self, make: Callable[[int], EngineRequest], timeout_s: float) -> EngineReply:
+        """Send the request that *make* returns for its number, and wait for the reply.
 
-        Whoever is cancelled here asks the engine to forget the request.
+        When this is cancelled, the request is cancelled at the engine.
 
         Raises:
             EngineGoneError: no engine answers, or it was started again meanwhile.
-            BusError: it answers that it could not do it.
+            BusError, EngineRefusedError: it could not do it.
         """
         request = make(self._next_id())
         future: asyncio.Future[EngineReply] = self._loop.create_future()
@@ -97,15 +97,15 @@ class EngineLink:
             raise to_error(answer.error)
         return answer
 
-    def tell(self, make: Callable[[int], EngineRequest]) -> None:
-        """Send a request whose answer nobody waits for; raises as :meth:`post` does."""
+    def send(self, make: Callable[[int], EngineRequest]) -> None:
+        """Send a request whose reply is ignored; raises as :meth:`post` does."""
         self.post(make(self._next_id()))
 
     def post(self, request: EngineRequest) -> None:
         """Send one message.
 
         Raises:
-            EngineGoneError: there is no room: nobody takes messages.
+            EngineGoneError: there is no room, because the engine takes no messages.
         """
         try:
             self._socket.send(self._encoder.encode(request))
@@ -126,10 +126,10 @@ class EngineLink:
             now_s = self._loop.time()
             if future.done():
                 return future.result()
-            if now_s >= end_s or (looked_s is not None and self.heard_s < looked_s):
+            if now_s >= end_s or (looked_s is not None and self.received_s < looked_s):
                 raise EngineGoneError("the engine does not answer")
             looked_s = now_s
-            self.tell(lambda number: Ping(id=number))
+            self.send(lambda number: Ping(id=number))
 
     def _next_id(self) -> int:
         self._last_id += 1
@@ -152,11 +152,11 @@ class EngineLink:
         except msgspec.MsgspecError as exc:
             logger.warning("an answer of the engine cannot be read: %s", exc)
             return
-        self.heard_s = self._loop.time()
+        self.received_s = self._loop.time()
         if isinstance(message, EngineStarted):
             self._restarted()
         elif isinstance(message, UnsolicitedMessage):
-            for call in self.on_heard:
+            for call in self.on_unsolicited:
                 call(message)
         elif isinstance(message, BusChange):
             for notify in self.on_change:

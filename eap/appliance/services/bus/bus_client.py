@@ -66,12 +66,12 @@ class BusClient:
             if message.bus == number:
                 notify(message)
 
-        self._link.on_heard.append(take)
+        self._link.on_unsolicited.append(take)
 
     async def describe(self, port: PortName, timeout_s: float = DESCRIBE_S) -> BusReport:
         """Return the report of a bus; raises EngineGoneError."""
         bus = self._numbers[port]
-        reply = await self._link.ask(lambda number: DescribeBus(id=number, bus=bus), timeout_s)
+        reply = await self._link.request(lambda number: DescribeBus(id=number, bus=bus), timeout_s)
         if reply.report is None:
             raise BusError(f"{_name(port)}: the engine says nothing about it")
         return reply.report
@@ -192,7 +192,7 @@ class BusClient:
         await self._be_up(port)
         bus = self._numbers[port]
         datagrams = tuple(accesses)
-        reply = await self._link.ask(
+        reply = await self._link.request(
             lambda number: ExchangeDatagrams(id=number, bus=bus, datagrams=datagrams), TRANSFER_S
         )
         return list(reply.replies)
@@ -207,7 +207,7 @@ class BusClient:
         """
         await self._be_up(port)
         bus = self._numbers[port]
-        await self._link.ask(
+        await self._link.request(
             lambda number: BringSlaves(id=number, bus=bus, station=station, target=target),
             BRING_S,
         )
@@ -215,7 +215,7 @@ class BusClient:
     async def forget(self, port: PortName) -> None:
         """Have the engine forget the faults of a bus that are over; raises EngineGoneError."""
         bus = self._numbers[port]
-        await self._link.ask(lambda number: ForgetFaults(id=number, bus=bus), DESCRIBE_S)
+        await self._link.request(lambda number: ForgetFaults(id=number, bus=bus), DESCRIBE_S)
 
 
 def _name(port: PortName) -> str:

@@ -89,7 +89,7 @@ class MailboxTurn:
         """
         self._is_unused = False
         limit_s = (request.delay_ns + request.timeout_ns) / _S + MARGIN_S
-        reply = await self._link.ask(lambda number: self._step(number, request), limit_s)
+        reply = await self._link.request(lambda number: self._step(number, request), limit_s)
         return reply.message or MailboxMessage(self._kind, b"")
 
     ask = exchange
@@ -99,7 +99,7 @@ class MailboxTurn:
         farewell = FAREWELLS.get(self._kind)
         if self._is_open and not self._is_unused and farewell is not None:
             with suppress(EngineGoneError):
-                self._link.tell(lambda number: self._step(number, farewell))
+                self._link.send(lambda number: self._step(number, farewell))
         self.close()
 
     def close(self) -> None:

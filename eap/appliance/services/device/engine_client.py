@@ -46,7 +46,7 @@ class EngineClient:
             path.unlink(missing_ok=True)
             raise EnvironmentalError(f"{path}: {exc.strerror}") from None
         try:
-            await self._link.ask(
+            await self._link.request(
                 lambda number: Configure(id=number, station=station, path=str(path)), CONFIGURE_S
             )
         finally:
@@ -54,6 +54,6 @@ class EngineClient:
 
     async def set_state(self, station: str, state: DeviceState) -> None:
         """Bring *station* to PreOp, SafeOp or Op; raises as :meth:`configure` does."""
-        await self._link.ask(
+        await self._link.request(
             lambda number: SetState(id=number, station=station, state=state), STATE_S
         )

@@ -70,9 +70,11 @@ class BusView:
         process image or from the slave itself, than has come here.
         """
         if self._is_complete:
-            await self._link.ask(lambda number: Ping(id=number), ANSWER_S)
+            await self._link.request(lambda number: Ping(id=number), ANSWER_S)
         else:
-            await self._link.ask(lambda number: Republish(id=number, bus=self._number), ANSWER_S)
+            await self._link.request(
+                lambda number: Republish(id=number, bus=self._number), ANSWER_S
+            )
         if not self._is_complete:
             raise EngineGoneError("the engine says nothing about the bus")
         return self.latest

@@ -4,7 +4,7 @@ import pytest
 
 from devicebus.master.event import BusLost, SlaveBack, SlaveFailed, SlaveLeft, SlaveLost
 from devicebus.master.mailboxes import Unsolicited
-from eap.appliance.engine.engine_bus import Past, SlaveFaults
+from eap.appliance.engine.engine_bus import FaultCounts, SlaveFaults
 from eap.codec.mailbox import MailboxType
 
 
@@ -56,8 +56,8 @@ def test_what_is_over_is_counted():
             BusLost(6),
         )
     )
-    assert faults.past(1001) == Past(losses=2, departures=2, al_code=0x1B)
-    assert faults.past(1002) == Past()
+    assert faults.counts(1001) == FaultCounts(losses=2, departures=2, al_code=0x1B)
+    assert faults.counts(1002) == FaultCounts()
 
 
 def test_what_slaves_send_unasked_is_told_on():

@@ -36,7 +36,7 @@ def describe(bus=0):
 
 def tell_often(link):
     for _ in range(100_000):
-        link.tell(describe())
+        link.send(describe())
 
 
 async def settle():
@@ -47,7 +47,7 @@ async def settle():
 def test_answers_are_matched_by_number():
     async def scene(engine, link):
         engine.holds = True
-        asked = [asyncio.ensure_future(link.ask(describe(), 1)) for _ in range(3)]
+        asked = [asyncio.ensure_future(link.request(describe(), 1)) for _ in range(3)]
         await settle()
         engine._held.reverse()
         engine.release()
@@ -61,7 +61,7 @@ def test_answers_are_matched_by_number():
 def test_failure_is_raised():
     async def scene(engine, link):
         with pytest.raises(BusError, match="no such bus"):
-            await link.ask(describe(7), 1)
+            await link.request(describe(7), 1)
 
     play(scene)
 
@@ -70,7 +70,7 @@ def test_silent_engine_is_gone():
     async def scene(engine, link):
         engine.holds = True
         with pytest.raises(EngineGoneError, match="does not answer"):
-            await link.ask(describe(), 60)
+            await link.request(describe(), 60)
         await settle()
         assert engine.of(Cancel)[0].id == engine.requests[0].id
 
@@ -80,7 +80,7 @@ def test_silent_engine_is_gone():
 def test_slow_engine_that_answers_others_is_not_gone():
     async def scene(engine, link):
         engine.holds = True
-        asked = asyncio.ensure_future(link.ask(describe(), 60))
+        asked = asyncio.ensure_future(link.request(describe(), 60))
         await settle()
         slow, engine._held, engine.holds = list(engine._held), [], False
         await asyncio.sleep(0.2)
@@ -96,7 +96,7 @@ def test_time_out_of_its_own():
     async def scene(engine, link):
         engine.holds = True
         with pytest.raises(EngineGoneError):
-            await link.ask(describe(), 0.02)
+            await link.request(describe(), 0.02)
 
     play(scene)
 
@@ -106,7 +106,7 @@ def test_new_engine_fails_what_waits():
         restarts = []
         link.on_restart.append(lambda: restarts.append(True))
         engine.holds = True
-        asked = asyncio.ensure_future(link.ask(describe(), 60))
+        asked = asyncio.ensure_future(link.request(describe(), 60))
         await settle()
         engine.say_hello()
         with pytest.raises(EngineGoneError, match="started again"):
@@ -119,7 +119,7 @@ def test_new_engine_fails_what_waits():
 def test_who_leaves_cancels():
     async def scene(engine, link):
         engine.holds = True
-        asked = asyncio.ensure_future(link.ask(describe(), 60))
+        asked = asyncio.ensure_future(link.request(describe(), 60))
         await settle()
         asked.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -129,7 +129,7 @@ def test_who_leaves_cancels():
         assert engine.requests[0].id == engine.requests[1].id
         engine.release()  # an answer that nobody waits for does no harm
         await settle()
-        assert (await link.ask(describe(), 1)).report.is_up
+        assert (await link.request(describe(), 1)).report.is_up
 
     play(scene, FakeBus(LoopBus("drive")))
 
@@ -158,6 +158,6 @@ def test_end_of_the_pair():
         engine._sock.shutdown(2)
         await settle()
         with pytest.raises(EngineGoneError):
-            link.tell(describe())
+            link.send(describe())
 
     play(scene)

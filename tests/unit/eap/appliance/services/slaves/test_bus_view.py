@@ -68,9 +68,9 @@ def test_view_asks_the_engine_once():
 def test_view_has_the_state_that_was_requested_when_the_answer_comes():
     async def scene(view, engine, link):
         await view.current()
-        await link.ask(lambda number: BringSlaves(id=number, bus=0, station=1003, target=1), 1)
+        await link.request(lambda number: BringSlaves(id=number, bus=0, station=1003, target=1), 1)
         assert view.latest.slaves[1003].state == AlState.INIT
-        await link.ask(lambda number: BringSlaves(id=number, bus=0, station=1003, target=2), 1)
+        await link.request(lambda number: BringSlaves(id=number, bus=0, station=1003, target=2), 1)
         assert view.latest.slaves[1003].state == AlState.PREOP
         assert not engine.of(DescribeBus)
 
