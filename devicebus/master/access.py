@@ -35,10 +35,6 @@ class DatagramReply(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Times it was sent: with more than one, slaves may have acted more than once."""
 
 
-Access = DatagramRequest
-Reply = DatagramReply
-
-
 def aprd(position: int, ado: int, size: int) -> DatagramRequest:
     """Read from the slave at a position of the line, counted from 0."""
     return DatagramRequest(Command.APRD, -position & 0xFFFF, ado, bytes(size))

@@ -35,7 +35,6 @@ class StepResult(NamedTuple):
     now_ns: int
 
 
-Answer = StepResult
 Step: TypeAlias = Sequence[DatagramRequest] | Sleep
 Procedure: TypeAlias = Generator[Step, StepResult, T]
 

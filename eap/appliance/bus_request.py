@@ -233,7 +233,3 @@ class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):
 
 
 EngineMessage: TypeAlias = EngineReply | EngineStarted | UnsolicitedMessage | BusChange
-
-AskMailbox = ExchangeMailbox
-Bring = BringSlaves
-Heard = UnsolicitedMessage

@@ -67,7 +67,7 @@ class Failure(msgspec.Struct, frozen=True, omit_defaults=True):
     kind: str = ""
     """With code ``bus``: the name of one of ``devicebus.errors``."""
     detail: int = 0
-    """Its number, as ``bus_failure`` packs it; with code ``abort`` the abort code."""
+    """Its number, as ``bus_errors`` packs it; with code ``abort`` the abort code."""
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):

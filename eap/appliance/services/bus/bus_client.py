@@ -132,8 +132,6 @@ class BusClient:
         bus = self._numbers[port]
         return MailboxTurn(self._link, bus, station, kind, lambda: self._queues.release(mailbox))
 
-    open_talk = open_turn
-
     async def converse(
         self,
         port: PortName,

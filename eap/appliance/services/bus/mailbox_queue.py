@@ -92,8 +92,6 @@ class MailboxTurn:
         reply = await self._link.request(lambda number: self._step(number, request), limit_s)
         return reply.message or MailboxMessage(self._kind, b"")
 
-    ask = exchange
-
     def abandon(self) -> None:
         """Close it in the middle, and have the slave end the transfer that was begun."""
         farewell = FAREWELLS.get(self._kind)

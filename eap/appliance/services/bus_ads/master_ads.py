@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from time import monotonic_ns, time_ns
 from typing import TypeAlias
 
-from devicebus.master.access import Access, Reply, brd
+from devicebus.master.access import DatagramReply, DatagramRequest, brd
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.datagram import Command, DatagramHeader, WorkingCounter
 from eap.aoe.access import place_of
@@ -288,17 +288,17 @@ class RawCommands:
         if not self._heads:
             raise AdsRefusedError(AdsError.SIZE, "no command")
 
-    def accesses(self) -> list[Access]:
+    def accesses(self) -> list[DatagramRequest]:
         """Return the datagrams to send, behind one that counts the slaves."""
         return [
             brd(0, 1),
             *(
-                Access(Command(head.command), head.adp, head.ado, octets, _TRIES)
+                DatagramRequest(Command(head.command), head.adp, head.ado, octets, _TRIES)
                 for head, octets in zip(self._heads, self._octets, strict=True)
             ),
         ]
 
-    def encode_answer(self, replies: list[Reply]) -> bytes:
+    def encode_answer(self, replies: list[DatagramReply]) -> bytes:
         """Return the commands as they came back, from the replies to :meth:`accesses`."""
         slaves = replies[0].wkc
         return b"".join(

@@ -23,8 +23,7 @@ from eap.aoe.access import AccessList, host_of
 from eap.aoe.ads_operation import Operation
 from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
-from eap.appliance.bus_failure import no_mailbox
-from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage
+from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage, no_mailbox
 from eap.appliance.services.gateway.client_session import (
     ClientSession,
     Reply,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from devicebus.master.access import Access, fprd
+from devicebus.master.access import DatagramRequest, fprd
 from devicebus.master.procedure import Procedure
 from devicebus.master.scan import Identity, count_slaves, read_identity, read_stations
 from devicebus.master.topology import find_joints
@@ -88,7 +88,7 @@ def read_registers(stations: Sequence[int]) -> Procedure[dict[int, SlaveRegister
     return found
 
 
-def _accesses(station: int) -> list[Access]:
+def _accesses(station: int) -> list[DatagramRequest]:
     return [
         fprd(station, Register.AL_STATUS, AlStatus.SIZE),
         fprd(station, Register.DL_STATUS, DlStatus.SIZE),

@@ -9,8 +9,7 @@ from typing import TypeVar
 from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client, voe_client
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.appliance.bus_failure import no_mailbox
-from eap.appliance.bus_request import SlaveDescription
+from eap.appliance.bus_request import SlaveDescription, no_mailbox
 from eap.appliance.services.slaves.access import UploadSink
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.file_stream import AHEAD, LocalFile

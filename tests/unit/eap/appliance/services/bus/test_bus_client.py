@@ -174,10 +174,10 @@ def test_who_leaves_in_the_middle_of_a_file_leaves_the_slave_usable():
 
 def test_turn_that_was_not_used_is_given_back_without_a_word():
     async def scene(client, engine):
-        talk = await client.open_talk(PORT, DRIVE, MailboxType.FOE, 1)
+        talk = await client.open_turn(PORT, DRIVE, MailboxType.FOE, 1)
         talk.abandon()
         talk.close()
-        await asyncio.wait_for(client.open_talk(PORT, DRIVE, MailboxType.FOE, 2), 1)
+        await asyncio.wait_for(client.open_turn(PORT, DRIVE, MailboxType.FOE, 2), 1)
         assert not engine.of(ExchangeMailbox)
 
     play(scene, "drive")

@@ -7,7 +7,7 @@ import logging
 
 import pytest
 
-from devicebus.master.access import Access, Reply, brd
+from devicebus.master.access import DatagramReply, DatagramRequest, brd
 from devicebus.wire.datagram import Command
 from eap.aoe.ads_master import SlaveState
 from eap.aoe.ads_operation import AdsRefusedError, DeleteNotification, WriteControl
@@ -163,10 +163,14 @@ def test_raw_commands_are_answered_with_their_working_counters():
     commands = RawCommands(COUNT + WRITE)
     assert commands.accesses() == [
         brd(0, 1),
-        Access(Command.APRD, 0, 0, bytes(4), 1),
-        Access(Command.FPWR, 1001, 0x120, b"\x08\0", 1),
+        DatagramRequest(Command.APRD, 0, 0, bytes(4), 1),
+        DatagramRequest(Command.FPWR, 1001, 0x120, b"\x08\0", 1),
     ]
-    replies = [Reply(b"\0", 3), Reply(b"\x11\0\2\0", 1), Reply(b"\x08\0", 1)]
+    replies = [
+        DatagramReply(b"\0", 3),
+        DatagramReply(b"\x11\0\2\0", 1),
+        DatagramReply(b"\x08\0", 1),
+    ]
     assert commands.encode_answer(replies) == (
         bytes.fromhex("01ff 0300 0000 0400 0000 11000200 0100")
         + bytes.fromhex("0507 e903 2001 0200 0000 0800 0100")
@@ -175,7 +179,7 @@ def test_raw_commands_are_answered_with_their_working_counters():
 
 def test_raw_command_position_counts_past_zero():
     last = RawCommands(COUNT[:2] + b"\xfe\xff" + COUNT[4:])
-    assert last.encode_answer([Reply(b"\0", 3), Reply(bytes(4), 1)])[2:4] == b"\1\0"
+    assert last.encode_answer([DatagramReply(b"\0", 3), DatagramReply(bytes(4), 1)])[2:4] == b"\1\0"
 
 
 @pytest.mark.parametrize(

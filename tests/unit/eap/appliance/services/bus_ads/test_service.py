@@ -255,7 +255,7 @@ def test_what_takes_too_long_is_answered_in_time(monkeypatch):
 
 def test_slaves_do_not_wait_for_each_other():
     async def scene(client, engine):
-        talk = await client.bus.open_talk(PORT, 1001, MailboxType.COE, "somebody else")
+        talk = await client.bus.open_turn(PORT, 1001, MailboxType.COE, "somebody else")
         waiting = asyncio.ensure_future(client.do(1001, VENDOR))
         assert await client.good(SENSOR, VENDOR) == VENDOR_ID
         assert not waiting.done()

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from devicebus.mailbox.protocol import MailboxSizes
-from eap.appliance.bus_request import AskMailbox
+from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.services.gateway.file_codec import FileCodec
 from eap.appliance.services.slaves.access import RemoteAccessError
 from eap.codec.ads import AdsError
@@ -156,7 +156,7 @@ def test_a_packet_longer_than_the_mailbox() -> None:
 @pytest.mark.parametrize("goes_on", [True, False])
 def test_who_has_to_wait_is_told_busy(goes_on: bool) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        engine.held_kind = AskMailbox
+        engine.held_kind = ExchangeMailbox
         engine.holds = True
         desk = Files(bus, answer_s=0.1)
         for _ in range(2):

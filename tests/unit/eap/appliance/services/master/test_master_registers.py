@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from devicebus.master.access import Access, Reply
+from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.wire.alstatus import AlState
 from eap.appliance.services.master.master_registers import (
     LOOPS,
@@ -32,10 +32,10 @@ def test_registers_of_many_slaves_are_read_in_few_steps() -> None:
     stations = range(1001, 1041)
     look, steps = read_registers(stations), 0
 
-    def answered(asked: Sequence[Access]) -> tuple[list[Reply], int]:
+    def answered(asked: Sequence[DatagramRequest]) -> tuple[list[DatagramReply], int]:
         nonlocal steps
         steps += 1
-        return [Reply(access.data, 1) for access in asked], 0
+        return [DatagramReply(access.data, 1) for access in asked], 0
 
     def run() -> dict[int, SlaveRegisters]:
         asked = next(look)

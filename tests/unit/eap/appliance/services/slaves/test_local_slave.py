@@ -100,7 +100,8 @@ def test_local_slave_without_turn_is_busy() -> None:
         other = await slave.bus.open_turn(1001, MailboxType.COE, "other")
         with pytest.raises(MailboxBusyError):
             await slave.read_object(0x1018, 1)
-        await other.ask(MailboxRequest(MailboxType.COE, bytes.fromhex("0020 40 1810 01 00000000")))
+        request = bytes.fromhex("0020 40 1810 01 00000000")
+        await other.exchange(MailboxRequest(MailboxType.COE, request))
         other.close()
         assert await slave.read_object(0x1018, 1)
 
