@@ -57,9 +57,6 @@ class MailboxMessage(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Counter of its mailbox header: the slave's own, which says nothing about the request."""
 
 
-Ask = MailboxRequest
-Message = MailboxMessage
-
 Conversation: TypeAlias = Generator[MailboxRequest, MailboxMessage, T]
 
 
