@@ -62,8 +62,6 @@ class MemoryMailbox:
         await asyncio.sleep(0)  # other clients have their turns
         return self._line.exchange(ask)
 
-    ask = exchange
-
     def abandon(self) -> None:
         self.is_abandoned = True
 

@@ -43,6 +43,11 @@ class TaskSet:
         task.add_done_callback(self._tasks.discard)
         return task
 
+    async def wait_any(self) -> None:
+        """Wait until one of the tasks has ended; return at once if there is none."""
+        if self._tasks:
+            await asyncio.wait(self._tasks, return_when=asyncio.FIRST_COMPLETED)
+
     def cancel(self) -> None:
         """Cancel all tasks."""
         for task in self._tasks:

@@ -76,7 +76,7 @@ class _Talk:
     def __init__(self, box: MailboxServer) -> None:
         self._box = box
 
-    async def ask(self, ask: MailboxRequest) -> MailboxMessage:
+    async def exchange(self, ask: MailboxRequest) -> MailboxMessage:
         if not ask.listen:
             octets = encode_message(MailboxHeader(0, 0, type=ask.type), ask.request)
             self._box.receive_message(octets, 0)
@@ -137,7 +137,7 @@ class _Link:
         requester: Hashable,
         turn_s: float | None = None,
     ) -> T:
-        return await drive_async(conversation, _Talk(self._box).ask)
+        return await drive_async(conversation, _Talk(self._box).exchange)
 
     def listen(self, heard: Callable[[UnsolicitedMessage], None]) -> None:
         """It says nothing unasked."""
@@ -210,7 +210,7 @@ async def _serve(data: bytes) -> None:
 def fuzz_one(data: bytes) -> None:
     """Have all frames taken; nothing is raised, every answer is a frame, nothing stays."""
     failures = _Failures()
-    logger = logging.getLogger("eap.appliance.services.gateway")
+    logger = logging.getLogger("eap.appliance.services")
     logger.addHandler(failures)
     try:
         asyncio.run(_serve(data))

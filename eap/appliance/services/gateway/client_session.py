@@ -59,10 +59,6 @@ class SessionCodec(Protocol):
     def is_running(self) -> bool:
         """Whether a transfer is under way, so that more requests belong to it."""
 
-    @property
-    def holds_slave(self) -> bool:
-        """Whether other clients' transfers of this protocol wait for this one."""
-
     async def answer(self, body: bytes) -> list[bytes]:
         """Return the answers to a message.
 
@@ -103,18 +99,11 @@ class ClientSession:
         self._replies: list[Reply] | None = None
         self._lock = asyncio.Lock()
         self._timer: asyncio.TimerHandle | None = None
-        self._idle_since_s = 0.0
 
     @property
     def is_running(self) -> bool:
         """Whether a transfer is under way."""
         return self.codec.is_running
-
-    def pause_s(self) -> float:
-        """Return the time since the last step of a transfer that holds the slave, else 0."""
-        if self._timer is None or not self.codec.holds_slave:
-            return 0.0
-        return asyncio.get_running_loop().time() - self._idle_since_s
 
     async def ask(self, body: bytes, *, is_step: bool) -> list[Reply]:
         """Return the answers to a request, which may be none.
@@ -154,9 +143,7 @@ class ClientSession:
         replies = await self._answer(body, deadline_s)
         self._replies = replies
         if self.is_running:
-            loop = asyncio.get_running_loop()
-            self._idle_since_s = loop.time()
-            self._timer = loop.call_later(self._idle_s, self.close)
+            self._timer = asyncio.get_running_loop().call_later(self._idle_s, self.close)
         return replies
 
     def _is_repeated(self, body: bytes) -> bool:

@@ -8,6 +8,7 @@ knows one file of a server at a time).
 from __future__ import annotations
 
 import asyncio
+import math
 
 from devicebus.errors import FoeError
 from devicebus.mailbox.protocol import MailboxSizes
@@ -64,9 +65,10 @@ class FileCodec:
         return self._file is not None
 
     @property
-    def holds_slave(self) -> bool:
-        """Whether the files of other clients wait for this one."""
-        return self._file is not None and self._file.has_turn and not self._file.has_ended
+    def stalled_since_s(self) -> float:
+        """Time since which the slave waits for this client; infinite while it need not."""
+        since_s = self._file.stalled_since_s if self._file is not None else None
+        return math.inf if since_s is None else since_s
 
     @property
     def waits_for_turn(self) -> bool:

@@ -49,6 +49,7 @@ from eap.appliance.services.gateway.reply_encoder import ReplyEncoder, Request, 
 from eap.appliance.services.slaves.access import SlaveAccess
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
+from eap.appliance.services.tasks import TaskSet
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.errors import EngineGoneError
 from eap.gateway import dialect
@@ -68,8 +69,8 @@ from eap.ids import NetId
 
 ANSWER_S = 0.9
 """Limit for an answer, below the second after which usual clients give up."""
-PAUSE_S = 2.0
-"""Pause of a client in the middle of a file after which it gives way to another client's file."""
+STALL_S = 2.0
+"""How long a slave waits for the client of a file before that gives way to another client's."""
 
 OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
 """Returns access to a slave, or the master, of another station."""
@@ -144,7 +145,7 @@ class MailboxGateway:
         self._dialect = DialectHandler(self.guard, settings.room, settings.answer_s)
         self._masters: SessionTable[MasterSession] = SessionTable()
         self._slaves: SessionTable[ClientSession] = SessionTable()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = TaskSet(f"gateway {settings.name}")
         self._count = 0
         self._listeners = EoeListeners()
         bus.listen(self._take_unasked)
@@ -190,9 +191,8 @@ class MailboxGateway:
         if self._answer_at_once(request, key, now_ns):
             return None
         request = replace(request, ticket=Ticket(self.ledger, way, key))
-        task = asyncio.get_running_loop().create_task(self._serve(request))
-        self._tasks.add(task)
-        task.add_done_callback(partial(self._done, request))
+        task = self._tasks.start(self._serve(request))
+        task.add_done_callback(lambda _: request.give_back())
         return task
 
     def connection_closed(self, way: Way) -> None:
@@ -204,25 +204,17 @@ class MailboxGateway:
 
     async def wait_below(self, way: Way, count: int) -> None:
         """Wait until fewer than *count* requests of a client wait."""
-        while self.ledger.waiting(way) >= count and self._tasks:
-            await asyncio.wait(self._tasks, return_when=asyncio.FIRST_COMPLETED)
+        while self.ledger.waiting(way) >= count and len(self._tasks):
+            await self._tasks.wait_any()
 
     async def close(self) -> None:
         """End everything that is under way."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
         for way in self.ledger.table():
             self.ledger.forget(way)
             self._listeners.forget(way)
         self._slaves.close()
         self._masters.close()
-
-    def _done(self, request: Request, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        request.give_back()
-        if not task.cancelled() and (error := task.exception()) is not None:
-            logger.error("gateway: a request of %s failed", request.way, exc_info=error)
 
     async def _serve(self, request: Request) -> None:
         kind = dialect.kind_of(request.header)
@@ -358,7 +350,7 @@ class MailboxGateway:
             session = self._slaves.take(key, partial(self._begin_local, key, slave))
         replies = await session.ask(body, is_step=is_step)
         if isinstance(session.codec, FileCodec) and session.codec.waits_for_turn:
-            self._end_pauses(key)
+            self._end_stalls(key)
         return replies
 
     async def _stations(self) -> tuple[int, ...]:
@@ -392,13 +384,15 @@ class MailboxGateway:
         codec = codec_for(key.kind, access, sizes, memory, wait_s=answer_s / 3)
         return ClientSession(key.kind, codec, answer_s=answer_s)
 
-    def _end_pauses(self, key: SessionKey) -> None:
-        """Give up the files of other clients at a slave that were left for a while."""
+    def _end_stalls(self, key: SessionKey) -> None:
+        """Give up the files of other clients at a slave that waits for them."""
+        limit_s = asyncio.get_running_loop().time() - STALL_S
         for other, session in self._slaves.of_slave(key.address, key.kind):
-            if other.way != key.way and session.pause_s() > PAUSE_S:
+            codec = session.codec
+            if isinstance(codec, FileCodec) and codec.stalled_since_s < limit_s:
                 logger.info(
                     "gateway %s: file of slave %d given up: %s has paused for %g s, and %s waits",
-                    self.settings.name, key.address, other.way.connection, PAUSE_S,
+                    self.settings.name, key.address, other.way.connection, STALL_S,
                     key.way.connection,
                 )  # fmt: skip
                 session.close()

@@ -45,8 +45,6 @@ class MessageCodec:
         memory: For fragments.
     """
 
-    holds_slave = False
-
     def __init__(self, access: SlaveAccess, sizes: MailboxSizes, memory: MemoryShare) -> None:
         self.sizes = sizes
         self._access = access

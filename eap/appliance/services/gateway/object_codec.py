@@ -12,6 +12,7 @@ import asyncio
 
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.services.slaves.access import SlaveAccess
+from eap.appliance.services.tasks import TaskSet
 from eap.codec.coe import CoeHeader, CoeService, encode_message
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import (
@@ -62,7 +63,7 @@ class _Upload:
         reading = access.read_object(
             head.index, head.subindex, complete=bool(head.complete), sink=self._take
         )
-        self._task = asyncio.get_running_loop().create_task(reading)
+        self._task = TaskSet(f"upload of 0x{head.index:04X}").start_awaited(reading)
         self._task.add_done_callback(lambda _: self._changed.set())
 
     async def next(self, size: int) -> bytes:
@@ -122,8 +123,6 @@ class ObjectCodec:
         sizes: Of the mailboxes that the client writes to and reads from.
         memory: For what is on its way.
     """
-
-    holds_slave = False
 
     def __init__(self, access: SlaveAccess, sizes: MailboxSizes, memory: MemoryShare) -> None:
         self.sizes = sizes

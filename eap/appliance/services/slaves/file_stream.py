@@ -59,6 +59,8 @@ class FileStream(ABC):
         is_open: Whether the slave has opened it.
         is_whole: Whether nothing more will be written to it.
         is_complete: Whether all of it was moved.
+        stalled_since_s: Time of the loop since which the slave waits for the reader or writer; None
+            while it need not.
     """
 
     def __init__(self, name: str, sizes: MailboxSizes, *, is_write: bool, ahead: int) -> None:
@@ -69,7 +71,9 @@ class FileStream(ABC):
         self.name = name
         self.buffer = bytearray()
         """Octets read that are not fetched yet, or written that have not gone on."""
-        self._ahead = self._wanted = ahead
+        self.stalled_since_s: float | None = None
+        self._ahead = ahead
+        self._wanted = 0
         self._error: EapError | None = None
         self._changed = asyncio.Event()
         self._tasks = TaskSet(f"file {name!r}")
@@ -86,7 +90,7 @@ class FileStream(ABC):
 
     async def read(self, size: int) -> bytes:
         """Return the next *size* octets, fewer only at the end."""
-        self._wanted = max(self._ahead, size)
+        self._wanted = size
         self.notify()
         await self._until(lambda: len(self.buffer) >= size)
         return self.cut(size)
@@ -127,12 +131,13 @@ class FileStream(ABC):
         return data
 
     async def wait_room(self) -> None:
-        """Wait until more is to be read."""
-        await self._wait(lambda: len(self.buffer) < self._wanted)
+        """Wait until more is to be read: once there was no room, until there is for a half."""
+        if len(self.buffer) >= max(self._ahead, self._wanted):
+            await self._stall(lambda: len(self.buffer) < max(self._ahead // 2, self._wanted))
 
     async def wait_data(self, size: int) -> None:
         """Wait for octets that go to the slave, fewer than *size* only at the end."""
-        await self._wait(lambda: self.is_whole or len(self.buffer) >= size)
+        await self._stall(lambda: self.is_whole or len(self.buffer) >= size)
 
     async def run(self) -> None:
         """Move the file, and let its reader or writer know the end."""
@@ -145,6 +150,15 @@ class FileStream(ABC):
             if not self.has_ended:
                 self._error = BusError(f"file {self.name!r}: the transfer was given up")
             self.notify()
+
+    async def _stall(self, is_so: Callable[[], bool]) -> None:
+        """Wait for the reader or writer."""
+        if not is_so():
+            self.stalled_since_s = asyncio.get_running_loop().time()
+            try:
+                await self._wait(is_so)
+            finally:
+                self.stalled_since_s = None
 
     async def _until(self, is_so: Callable[[], bool]) -> None:
         """Wait until it is so, or the transfer has ended; raise what has ended it."""

@@ -188,7 +188,7 @@ class Codec:
     """
 
     sizes = MailboxSizes()
-    is_running = holds_slave = False
+    is_running = False
 
     def __init__(self, error: BaseException | None = None, *, is_long: bool = False) -> None:
         self.resets = 0

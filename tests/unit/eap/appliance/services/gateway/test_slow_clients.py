@@ -107,7 +107,7 @@ def test_file_left_in_the_middle_gives_way_to_another_client(
         assert (await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06")
         (held, waiting) = desk.gateway.transfers()
         assert (held.way, waiting.way) == (HERE, ALSO_HERE)
-        monkeypatch.setattr(gateway, "PAUSE_S", 0.0)
+        monkeypatch.setattr(gateway, "STALL_S", 0.0)
         while (answer := await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06"):
             pass
         assert answer.startswith("03 00 01 00 00 00")
@@ -118,7 +118,7 @@ def test_file_left_in_the_middle_gives_way_to_another_client(
 
 
 def test_file_that_is_fetched_ahead_does_not_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway, "PAUSE_S", 0.0)
+    monkeypatch.setattr(gateway, "STALL_S", 0.0)
     content = bytes(range(251)) * 20
 
     async def scene(desk: Desk) -> None:
