@@ -2,8 +2,8 @@
 
 Rules: the top level holds only what ``docs/architecture.md`` allows; modules stay under 700 lines;
 ``tests/unit`` and ``tests/tools`` hold test files, in folders named after what they test;
-nothing that is true of one machine only is committed; unfinished work names its issue; the files
-that pages in ``docs/`` name exist.
+nothing that is true of one machine only is committed; unfinished work names its issue; tasks have
+an owner that keeps and reports them; the files that pages in ``docs/`` name exist.
 
     python tools/check_tree.py [ROOT]
 
@@ -60,6 +60,9 @@ FORBIDDEN = (
 )
 UNFINISHED = re.compile(r"\b(?:TO[D]O|FIX[M]E)\b(?!\W{0,3}#\d)")
 NAMED = re.compile(r"`((?:tests|config|eap|devicebus|docs|tools)/[\w./-]*\w)/?`")
+LOOSE_TASK = re.compile(r"(?<!group)\.create_task\(|\bensure_future\(")
+TASKS = ("services", "tasks.py")
+"""The module that may start tasks, whatever package services is in."""
 CODE_SUFFIXES = frozenset({"", ".py", ".sh", ".toml", ".yaml"})
 
 
@@ -152,7 +155,10 @@ def check_text(name: PurePosixPath, text: str) -> Iterator[Violation]:
     if is_module and len(lines) > MAX_LINES:
         expected = f"at most {MAX_LINES}: split it by what it does"
         yield Violation(name, MAX_LINES + 1, f"{len(lines)} lines", expected)
+    is_bound = name.suffix == ".py" and name.parts[0] in PACKAGES and name.parts[-2:] != TASKS
     for number, line in enumerate(lines, 1):
+        if is_bound and LOOSE_TASK.search(line):
+            yield Violation(name, number, "a task without an owner", "a TaskGroup or a TaskSet")
         for pattern, what, expected in FORBIDDEN:
             if match := pattern.search(line):
                 yield Violation(name, number, f"{what} ({match[0]})", expected)

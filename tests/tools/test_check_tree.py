@@ -137,6 +137,24 @@ def test_a_page_may_talk_about_unfinished_marks():
     assert list(check_text(PurePosixPath("CONTRIBUTING.md"), "no TO" + "DO")) == []
 
 
+@pytest.mark.parametrize(
+    ("path", "line", "is_fine"),
+    [
+        ("eap/net/a.py", "group.create_task(serve())", True),
+        ("eap/net/a.py", "self._group.create_task(serve())", True),
+        ("eap/net/a.py", "asyncio.get_running_loop().create_task(serve())", False),
+        ("eap/net/a.py", "loop.create_task(serve())", False),
+        ("eap/net/a.py", "asyncio.ensure_future(serve())", False),
+        ("eap/services/tasks.py", "asyncio.get_running_loop().create_task(work)", True),
+        ("tests/support/a.py", "loop.create_task(serve())", True),
+    ],
+)
+def test_task_without_an_owner_is_reported(path, line, is_fine):
+    assert [each.what for each in check_text(PurePosixPath(path), line)] == (
+        [] if is_fine else ["a task without an owner"]
+    )
+
+
 def test_binary_files_are_not_read_as_text(tmp_path):
     grow(tmp_path, "tests/vectors/a.pcap", text="\0 /wor" + "k/x")
     assert found(tmp_path) == []

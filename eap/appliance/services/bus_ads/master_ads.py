@@ -35,6 +35,7 @@ from eap.appliance.services.ads.eap_ads import device_info
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.appliance.services.slaves.bus_view import BusDescription
+from eap.appliance.services.tasks import TaskSet
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, to_filetime
 from eap.codec.ams import DEVICE_PORT
@@ -73,12 +74,13 @@ class StateRequests:
         self._client = client
         self._port = port
         self._tasks: dict[int, asyncio.Task[None]] = {}
+        self._running = TaskSet(f"states of {port.station}/{port.port} by ADS")
 
     def request(self, station: int, state: int) -> None:
         """Bring a slave, or with station 0 all of them, to a state."""
         if (before := self._tasks.pop(station, None)) is not None:
             before.cancel()
-        task = asyncio.get_running_loop().create_task(self._bring(station, AlState(state)))
+        task = self._running.start(self._bring(station, AlState(state)))
         self._tasks[station] = task
         task.add_done_callback(lambda task: self._forget(station, task))
 
@@ -237,11 +239,12 @@ class NotificationSender:
         self._net_id = net_id
         self._port = port
         self._task: asyncio.Task[None] | None = None
+        self._tasks = TaskSet(f"notifications of {net_id}")
         table.on_add = self._start
 
     def _start(self) -> None:
         if self._task is None or self._task.done():
-            self._task = asyncio.get_running_loop().create_task(self._run())
+            self._task = self._tasks.start(self._run())
 
     async def _run(self) -> None:
         while (due_ns := self._table.next_timeout()) is not None:

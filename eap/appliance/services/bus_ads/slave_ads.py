@@ -33,6 +33,7 @@ from eap.appliance.services.bus_ads.master_ads import StateRequests
 from eap.appliance.services.bus_ads.slave_files import SlaveFiles
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
+from eap.appliance.services.tasks import TaskSet
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoPlace, SoePlace, device_name
 from eap.codec.ams import AmsHeader, decode_packet
 from eap.codec.sdoinfo import EntryRequest, ListRequest, ObjectRequest, SdoInfoOpcode
@@ -194,6 +195,7 @@ class ProcedureCommands:
 
     def __init__(self) -> None:
         self._tasks: dict[tuple[int, int, int], asyncio.Task[None]] = {}
+        self._running = TaskSet("procedure commands")
 
     async def execute(self, access: LocalSlave, station: int, place: SoePlace) -> None:
         """Execute a command, or wait on for one that goes on."""
@@ -202,7 +204,7 @@ class ProcedureCommands:
         if task is None:
             if len(self._tasks) >= MAX_COMMANDS:
                 raise AdsRefusedError(AdsError.NO_MEMORY, f"{MAX_COMMANDS} commands go on already")
-            task = asyncio.get_running_loop().create_task(_execute(access, place))
+            task = self._running.start_awaited(_execute(access, place))
             self._tasks[key] = task
             task.add_done_callback(lambda task: self._forget_later(key, task))
         await asyncio.wait({task}, timeout=COMMAND_ANSWER_S)

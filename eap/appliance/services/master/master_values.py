@@ -36,6 +36,7 @@ from eap.appliance.services.master.master_registers import (
     neighbour,
     read_registers,
 )
+from eap.appliance.services.tasks import TaskSet
 from eap.device.eap_objects import DeviceIdentity
 from eap.device.master_dictionary import MasterDictionary
 from eap.errors import EapError
@@ -198,7 +199,7 @@ class MasterView:
         self._base: dict[tuple[int, MasterLive], int] = {}
         """Counters at the last reset."""
         self._lock = asyncio.Lock()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = TaskSet(f"dictionary of the master of {port.station}/{port.port}")
 
     async def refresh(self, index: int) -> None:
         """Bring what the object at *index* shows up to date; a bus that is down has no slaves."""
@@ -415,9 +416,7 @@ class MasterView:
         self._base = {key: self._counter(*key) for key in keys}
 
     def _start(self, work: Coroutine[Any, Any, Any]) -> None:
-        task = asyncio.get_running_loop().create_task(self._finish(work))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._tasks.start(self._finish(work))
 
     async def _finish(self, work: Awaitable[Any]) -> None:
         try:
