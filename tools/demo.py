@@ -22,13 +22,11 @@ from time import monotonic
 from typing import Any, NamedTuple
 
 from rich.console import Group, RenderableType
-from rich.text import Text
 
 import eap
 from eap.appliance.attach import AttachedStation
-from eap.cli import words
 from eap.cli.output import repaint
-from eap.cli.table import Column, TextTable
+from eap.cli.table import Column, Styled, TextTable, duration
 from eap.errors import EapError
 
 PLANT = Path("config/demo.yaml")
@@ -232,12 +230,12 @@ def as_screen(look: Look, rates: Mapping[Way, float]) -> RenderableType:
     for row in zip_longest(*(cells(look.values[name], SHOWN[name]) for name in SHOWN)):
         stations.add_row(*(cell or "" for cell in row))
     return Group(
-        Text(f"EAP demo: each station pushes its values to the next one{look.at_s:10.0f} s\n"),
+        Styled(f"EAP demo: each station pushes its values to the next one{look.at_s:10.0f} s\n"),
         stations,
-        Text(),
+        Styled(),
         arrows(look, rates),
-        Text("\nCtrl-C ends it; try in another terminal:", style="dim"),
-        Text("  eapctl status    eapctl pd set island-01 setpoint 75", style="dim"),
+        Styled("\nCtrl-C ends it; try in another terminal:", style="dim"),
+        Styled("  eapctl status    eapctl pd set island-01 setpoint 75", style="dim"),
     )
 
 
@@ -267,13 +265,13 @@ def arrows(look: Look, rates: Mapping[Way, float]) -> TextTable:
         rate = f"{rates[way]:.1f}/s" if way in rates else "      "
         table.add_row(
             way.sender,
-            Text("──────►" if runs else "── x ──", style="green" if runs else "bold red"),
+            Styled("──────►" if runs else "── x ──", style="green" if runs else "bold red"),
             way.receiver,
             f"{way.name:<12}",
             f"{rate:>7}",
-            Text("-" if row["lost"] is None else str(row["lost"]), "red" * bool(row["lost"])),
+            Styled("-" if row["lost"] is None else str(row["lost"]), "red" * bool(row["lost"])),
             str(row["late"]),
-            f"{'-' if row['age_us'] is None else words.duration(row['age_us']):>8}",
+            f"{'-' if row['age_us'] is None else duration(row['age_us']):>8}",
         )
     return table
 

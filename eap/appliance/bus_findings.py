@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+
+import msgspec
 
 from devicebus.master.findings import (
     NO_ANSWER,
@@ -15,6 +16,25 @@ from devicebus.master.findings import (
     find_silence,
 )
 from eap.appliance.bus_request import BusReport, SlaveReport
+
+
+class NamedSlave(msgspec.Struct, frozen=True):
+    """Slave that a finding is about."""
+
+    address: int
+    name: str
+
+
+class FindingRow(msgspec.Struct, frozen=True, kw_only=True):
+    """Finding about a bus as JSON has it; *since* and *until* are Unix times."""
+
+    what: str
+    advice: str
+    slaves: list[NamedSlave]
+    port: int | None
+    is_over: bool
+    since: float | None
+    until: float | None
 
 
 def report_findings(report: BusReport) -> list[BusFinding]:
@@ -47,7 +67,7 @@ def history_of(report: BusReport) -> History:
     return History(tuple(over), silence, since_ns, ports)
 
 
-def finding_row(finding: BusFinding, names: Mapping[int, str], now_s: float) -> dict[str, Any]:
+def finding_row(finding: BusFinding, names: Mapping[int, str], now_s: float) -> FindingRow:
     """Return a finding as JSON has it.
 
     Args:
@@ -55,15 +75,15 @@ def finding_row(finding: BusFinding, names: Mapping[int, str], now_s: float) -> 
         names: Of slaves, by station address.
         now_s: Unix time at which it was made.
     """
-    return {
-        "what": finding.what,
-        "advice": finding.advice,
-        "slaves": [{"address": at, "name": names[at]} for at in finding.slaves],
-        "port": finding.port,
-        "is_over": finding.is_over,
-        "since": _moment(finding.since_ns, now_s),
-        "until": _moment(finding.until_ns, now_s),
-    }
+    return FindingRow(
+        what=finding.what,
+        advice=finding.advice,
+        slaves=[NamedSlave(at, names[at]) for at in finding.slaves],
+        port=finding.port,
+        is_over=finding.is_over,
+        since=_moment(finding.since_ns, now_s),
+        until=_moment(finding.until_ns, now_s),
+    )
 
 
 def _view(slave: SlaveReport) -> SlaveView:

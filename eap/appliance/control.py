@@ -1,20 +1,21 @@
-"""The control protocol on paper: JSON lines, version 1.  docs/control.md is its description.
+"""Control protocol, version 1: JSON lines, and the records of its general methods.
 
-Nothing here opens a socket: the server, the command line's client and the tests share these
-records, so that they cannot disagree about a name.
+Nothing here opens a socket.  Server and client share these records, so that they cannot disagree
+about a name; docs/control.md describes them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum, auto
-from typing import Any, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 
 from eap.errors import ControlError, EnvironmentalError
 from eap.near import near
+from eap.pd.report import PdRow
 
 VERSION = 1
 MAX_LINE = 1 << 23
@@ -130,11 +131,113 @@ class UnsubscribeParameters(Parameters, frozen=True):
     subscription: int
 
 
+class Document(msgspec.Struct, frozen=True):
+    """Base of answers; a field that a newer appliance adds is ignored."""
+
+
+class Subscribed(Document, frozen=True):
+    """Answer to ``subscribe``."""
+
+    subscription: int
+
+
+class Unsubscribed(Document, frozen=True):
+    """Answer to ``unsubscribe``."""
+
+    unsubscribed: int
+
+
+class Hello(Document, frozen=True, kw_only=True):
+    """Answer to ``hello``."""
+
+    version: int
+    release: str = ""
+    plant: str
+    pid: int = 0
+    stations: list[str]
+
+
+class VariableRow(Document, frozen=True):
+    """One variable of an answer to ``variables``."""
+
+    name: str
+    type: str
+    writer: str
+    unit: str
+    comment: str
+
+
+class Values(Document, frozen=True):
+    """Answer to ``read``: values of one moment.
+
+    *quality* is that of received variables, in units of 100 us; None before the first time.
+    """
+
+    station: str
+    cycle: int
+    values: dict[str, Any]
+    quality: dict[str, int | None]
+
+
+class ValuesEvent(Values, frozen=True):
+    """Event of a subscription; *skipped* cycles since the one before were not looked at."""
+
+    skipped: int = 0
+
+
+class Written(Document, frozen=True):
+    """Answer to ``write``: the number of values."""
+
+    written: int
+
+
+class Stopping(Document, frozen=True):
+    """Answer to ``stop``."""
+
+    stopping: bool
+
+
 ParametersT = TypeVar("ParametersT", bound=Parameters)
+AnswerT = TypeVar("AnswerT")
 ItemT = TypeVar("ItemT")
+ServedMethod: TypeAlias = tuple[str, Callable[[dict[str, Any]], Any]]
+"""Name, and function of the undecoded parameters."""
 
 _REQUEST = msgspec.json.Decoder(Request)
 _REPLY = msgspec.json.Decoder(Reply)
+
+
+class Method(Generic[ParametersT, AnswerT]):
+    """Method of the protocol: its name, the record of its parameters, the type of its answer."""
+
+    def __init__(self, name: str, takes: type[ParametersT], returns: type[AnswerT]) -> None:
+        self.name = name
+        self.takes = takes
+        self.returns = returns
+
+    def served_by(
+        self, function: Callable[[ParametersT], AnswerT | Awaitable[AnswerT]]
+    ) -> ServedMethod:
+        """Return the server's entry of this method, which decodes the parameters."""
+        return self.name, lambda params: function(parameters(params, self.takes))
+
+    def decode(self, result: Any) -> AnswerT:
+        """Return a result as a record; raise ControlError if it is none."""
+        try:
+            return msgspec.convert(result, self.returns)
+        except msgspec.ValidationError as exc:
+            reason = f"the answer to {self.name}: {exc}"
+            raise ControlError(reason, code=ErrorCode.BAD_REQUEST) from None
+
+
+HELLO = Method("hello", NoParameters, Hello)
+PD_LIST = Method("pd_list", PdListParameters, list[PdRow])
+VARIABLES = Method("variables", VariablesParameters, list[VariableRow])
+READ = Method("read", ReadParameters, Values)
+WRITE = Method("write", WriteParameters, Written)
+SUBSCRIBE = Method("subscribe", SubscribeParameters, Subscribed)
+UNSUBSCRIBE = Method("unsubscribe", UnsubscribeParameters, Unsubscribed)
+STOP = Method("stop", NoParameters, Stopping)
 
 
 def decode_request(line: bytes) -> Request:
@@ -218,7 +321,7 @@ def encode_failure(number: int | None, failure: Failure) -> bytes:
     return _line({"v": VERSION, "id": number, "error": failure})
 
 
-def encode_event(subscription: int, event: dict[str, Any]) -> bytes:
+def encode_event(subscription: int, event: ValuesEvent | dict[str, Any]) -> bytes:
     """Return the line of one event."""
     return _line({"v": VERSION, "subscription": subscription, "event": event})
 

@@ -1,5 +1,6 @@
-"""The control protocol's words about EAP devices; docs/control.md is their description.
+"""Control protocol: EAP devices and routers, their dictionaries, states and configurations.
 
+The records of requests and answers, which server and client share; docs/control.md describes them.
 Octets are hexadecimal digits, specifications are JSON as ``export`` gives them.
 """
 
@@ -7,10 +8,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
-from eap.appliance.control import Parameters
+from eap.aoe.spec import RoutingSpec
+from eap.appliance.control import Document, Method, Parameters
 from eap.appliance.device_change import Plan
 from eap.appliance.store import Configuration
 from eap.device.difference import EntryChange
@@ -109,19 +110,245 @@ class RollbackParameters(StationParameters, frozen=True, kw_only=True):
     spec: StationSpec | None = None
 
 
-def object_row(item: OdObject, label: str) -> dict[str, Any]:
-    """Return an object without its entries; *label* is the name of what it is about."""
-    return {
-        "index": item.index,
-        "name": item.name,
-        "label": label,
-        "code": item.code.name,
-        "max_subindex": item.max_subindex,
-    }
+class RoutingPlanParameters(StationParameters, frozen=True, kw_only=True):
+    """``routing_plan``: changes that *routing* would bring."""
+
+    routing: RoutingSpec
 
 
-def entry_row(subindex: int, entry: Entry) -> dict[str, Any]:
-    """Return an entry without its value."""
+class RoutingApplyParameters(RoutingPlanParameters, frozen=True, kw_only=True):
+    """``routing_apply``; *cause* as in ``apply``."""
+
+    cause: Annotated[str, Meta(max_length=64)] = ""
+
+
+class ObjectRow(Document, frozen=True, kw_only=True):
+    """Object without its entries; *label* is the name of the frame, PD or port described by it."""
+
+    index: int
+    name: str
+    label: str
+    code: str
+    max_subindex: int
+
+
+class EntryRow(Document, frozen=True, kw_only=True):
+    """Entry without its value."""
+
+    subindex: int
+    name: str
+    type: str
+    bits: int
+    access: str
+    rights: int
+    unit: str
+    default: str
+    minimum: int | float | None
+    maximum: int | float | None
+
+
+class EntryContent(EntryRow, frozen=True, kw_only=True):
+    """Entry with its octets, None if they cannot be read."""
+
+    data: str | None
+
+
+class DescribedObject(ObjectRow, frozen=True, kw_only=True):
+    """Answer to ``od_describe``."""
+
+    entries: list[EntryRow]
+
+
+class DumpedObject(ObjectRow, frozen=True, kw_only=True):
+    """Object of an answer to ``od_dump``."""
+
+    entries: list[EntryContent]
+
+
+class ObjectPage(Document, frozen=True):
+    """Answer to ``od_list``; *next* is the index at which it goes on, None at the end."""
+
+    objects: list[ObjectRow]
+    next: int | None
+
+
+class DumpPage(Document, frozen=True):
+    """Answer to ``od_dump``; *next* as in ``od_list``."""
+
+    objects: list[DumpedObject]
+    next: int | None
+
+
+class EntryData(Document, frozen=True):
+    """Answer to ``od_read``."""
+
+    data: str
+
+
+class EmptyAnswer(Document, frozen=True):
+    """Answer without content."""
+
+
+class StateError(Document, frozen=True):
+    """Reason why a state was refused; the object that it is about where a station refuses."""
+
+    code: int
+    text: str
+    port: str | UnsetType = UNSET
+    index: int | UnsetType = UNSET
+    subindex: int | UnsetType = UNSET
+
+
+class StateAnswer(Document, frozen=True):
+    """State of a device, None if it does not answer, and why it is not the requested one."""
+
+    state: str | None
+    error: StateError | None
+
+
+class TargetState(Document, frozen=True):
+    """``eapctl state``."""
+
+    target: str
+    state: str | None
+    error: StateError | None
+
+
+class ObjectChange(Document, frozen=True, kw_only=True):
+    """Change of one entry."""
+
+    port: str
+    index: int
+    subindex: int
+    name: str
+    change: str
+    old: str
+    new: str
+    unit: str
+
+
+class ChangeResult(ObjectChange, frozen=True, kw_only=True):
+    """Change of one entry that was tried."""
+
+    ok: bool
+    reason: str
+
+
+class PlanAnswer(Document, frozen=True):
+    """Answer to ``plan``: changes of objects, of the station beside them, and refusals."""
+
+    changes: list[ObjectChange]
+    station: list[str]
+    refused: list[str]
+
+
+class ApplyAnswer(Document, frozen=True):
+    """Answer to ``apply`` and ``rollback``."""
+
+    ok: bool
+    results: list[ChangeResult]
+    station: list[str]
+    refused: list[str]
+
+
+class RunningSpec(Document, frozen=True):
+    """Answer to ``export``.
+
+    Attributes:
+        spec: Specification that the station runs.
+        previous: The one before the last change, alternates aside; None if there was none.
+        cause: Name of that change; those of later ones sort behind.
+        undone: Whether it was taken back.
+    """
+
+    spec: StationSpec
+    previous: StationSpec | None = None
+    cause: str = ""
+    undone: bool = False
+
+
+class RunningRouting(Document, frozen=True, kw_only=True):
+    """Answer to ``routing_export``: configuration of the router of a station.
+
+    Attributes:
+        routing: Routes of the plant file, rules, users, brokers.
+        previous: Before the last change; None if there was none.
+        cause: Name of that change.
+        undone: Whether it was taken back.
+    """
+
+    routing: RoutingSpec
+    previous: RoutingSpec | None = None
+    cause: str = ""
+    undone: bool = False
+
+
+class RoutingDifference(Document, frozen=True, kw_only=True):
+    """Changes of a router, a line for each, and refusals: those that need a new start."""
+
+    changes: list[str]
+    refused: list[str]
+
+
+OD_LIST = Method("od_list", OdListParameters, ObjectPage)
+OD_DESCRIBE = Method("od_describe", OdDescribeParameters, DescribedObject)
+OD_READ = Method("od_read", OdReadParameters, EntryData)
+OD_WRITE = Method("od_write", OdWriteParameters, EmptyAnswer)
+OD_DUMP = Method("od_dump", OdDumpParameters, DumpPage)
+STATE = Method("state", TargetParameters, StateAnswer)
+REQUEST_STATE = Method("request_state", RequestStateParameters, StateAnswer)
+EXPORT = Method("export", StationParameters, RunningSpec)
+PLAN = Method("plan", SpecParameters, PlanAnswer)
+APPLY = Method("apply", ApplyParameters, ApplyAnswer)
+ROLLBACK = Method("rollback", RollbackParameters, ApplyAnswer)
+ROUTING_EXPORT = Method("routing_export", StationParameters, RunningRouting)
+ROUTING_PLAN = Method("routing_plan", RoutingPlanParameters, RoutingDifference)
+ROUTING_APPLY = Method("routing_apply", RoutingApplyParameters, RoutingDifference)
+ROUTING_ROLLBACK = Method("routing_rollback", StationParameters, RoutingDifference)
+
+
+def object_row(item: OdObject, label: str) -> ObjectRow:
+    """Return an object without its entries."""
+    return ObjectRow(
+        index=item.index,
+        name=item.name,
+        label=label,
+        code=item.code.name,
+        max_subindex=item.max_subindex,
+    )
+
+
+def described_object(item: OdObject, label: str) -> DescribedObject:
+    """Return an object with its entries."""
+    return DescribedObject(
+        index=item.index,
+        name=item.name,
+        label=label,
+        code=item.code.name,
+        max_subindex=item.max_subindex,
+        entries=[EntryRow(**_entry_fields(*each)) for each in item.entries.items()],
+    )
+
+
+def dumped_object(item: OdObject, label: str, read_right: Access) -> DumpedObject:
+    """Return an object with its entries and the octets of those that *read_right* may read."""
+    return DumpedObject(
+        index=item.index,
+        name=item.name,
+        label=label,
+        code=item.code.name,
+        max_subindex=item.max_subindex,
+        entries=[
+            EntryContent(
+                **_entry_fields(subindex, entry),
+                data=entry.octets.hex() if entry.access & read_right else None,
+            )
+            for subindex, entry in item.entries.items()
+        ],
+    )
+
+
+def _entry_fields(subindex: int, entry: Entry) -> dict[str, Any]:
     reads = "r" if entry.access & Access.READ_ANY else ""
     return {
         "subindex": subindex,
@@ -137,24 +364,40 @@ def entry_row(subindex: int, entry: Entry) -> dict[str, Any]:
     }
 
 
-def state_document(status: StateResult) -> dict[str, Any]:
-    """Return where a device stands, and why it is not where it was asked to."""
-    return {"state": status.state.name, "error": status.fault and fault_document(status.fault)}
+def state_answer(status: StateResult) -> StateAnswer:
+    """Return the state of a device, and why it is not the requested one."""
+    fault = status.fault
+    if fault is None:
+        return StateAnswer(status.state.name, None)
+    error = StateError(int(fault.code), fault.text, fault.port, fault.index, fault.subindex)
+    return StateAnswer(status.state.name, error)
 
 
-def fault_document(fault: DeviceFault) -> dict[str, Any]:
-    """Return why a state was refused."""
-    return {
-        "code": int(fault.code),
-        "text": fault.text,
-        "port": fault.port,
-        "index": fault.index,
-        "subindex": fault.subindex,
-    }
+def plan_answer(plan: Plan) -> PlanAnswer:
+    """Return the changes of a plan; writes that only make way for others are left out."""
+    changes = [ObjectChange(**_change_fields(*each)) for each in plan.changes if _is_final(*each)]
+    return PlanAnswer(changes, plan.station, plan.refused)
 
 
-def change_row(port: str, change: EntryChange) -> dict[str, Any]:
-    """Return a change of one entry."""
+def apply_answer(plan: Plan, fault: DeviceFault | None) -> ApplyAnswer:
+    """Return the changes that were made, or why none was."""
+    refused = plan.refused if fault is None else [fault.text]
+    reason = "" if fault is None else fault.text
+    results = [
+        ChangeResult(**_change_fields(*each), ok=not refused, reason=reason)
+        for each in plan.changes
+        if _is_final(*each)
+    ]
+    return ApplyAnswer(not refused, results, plan.station, refused)
+
+
+def _is_final(port: str, change: EntryChange) -> bool:
+    del port
+    return not change.interim
+
+
+def _change_fields(port: str, change: EntryChange) -> dict[str, Any]:
+    row = profile.row_of(change.index).row(change.subindex)
     return {
         "port": port,
         "index": change.index,
@@ -163,50 +406,16 @@ def change_row(port: str, change: EntryChange) -> dict[str, Any]:
         "change": change.kind,
         "old": change.old,
         "new": change.new,
-        "unit": _unit(change),
+        "unit": "" if row is None else row.unit,
     }
 
 
-def _unit(change: EntryChange) -> str:
-    row = profile.row_of(change.index).row(change.subindex)
-    return "" if row is None else row.unit
-
-
-def plan_document(plan: Plan) -> dict[str, Any]:
-    """Return what would change; writes that only make way for others are left out."""
-    return {
-        "changes": [change_row(*each) for each in plan.changes if not each[1].interim],
-        "station": plan.station,
-        "refused": plan.refused,
-    }
-
-
-def outcome_document(plan: Plan, fault: DeviceFault | None) -> dict[str, Any]:
-    """Return what has changed, or why nothing has."""
-    refused = plan.refused if fault is None else [fault.text]
-    reason = "" if fault is None else fault.text
-    is_ok = not refused
-    found = plan_document(plan)
-    results = [{**row, "ok": is_ok, "reason": reason} for row in found["changes"]]
-    return {"ok": is_ok, "results": results, "station": plan.station, "refused": refused}
-
-
-def spec_document(spec: StationSpec) -> dict[str, Any]:
-    """Return a specification as JSON has it."""
-    document: dict[str, Any] = msgspec.to_builtins(spec)
-    return document
-
-
-def export_document(
+def running_spec(
     spec: StationSpec, previous: Configuration | None, cause: str, undone: bool
-) -> dict[str, Any]:
-    """Return what a station runs, what it ran before the last change, and which that was."""
-    return {
-        "spec": spec_document(spec),
-        "previous": previous and spec_document(without_alternates(previous.spec)),
-        "cause": cause,
-        "undone": undone,
-    }
+) -> RunningSpec:
+    """Return the specification that runs, the one before the last change, and that change."""
+    before = None if previous is None else without_alternates(previous.spec)
+    return RunningSpec(spec, before, cause, undone)
 
 
 def state_of(word: str) -> int:

@@ -1,24 +1,23 @@
-"""The control protocol's words about routes; docs/control.md is their description.
+"""Control protocol: routes, and AMS requests through a router.
 
-What is told are records too: the server fills them in, the command line and the terminal's view
-read them, so that they cannot disagree about a field.
+The records of requests and answers, which server and client share; docs/control.md describes them.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Literal, TypeAlias
 
-import msgspec
-from msgspec import Meta
+from msgspec import Meta, field
 
-from eap.appliance.control import ErrorCode, Parameters
-from eap.errors import ControlError
+from eap.aoe.hop_report import HopReport
+from eap.appliance.control import Document, Method, Parameters
 
 PAGE = 1000
 """Routes of an answer, unless it was asked for fewer."""
 MAX_XML = 1 << 20
 """Characters of a file with routes."""
 MAX_TEXT = 255
+MAX_TIMEOUT_MS = 60_000
 
 Text: TypeAlias = Annotated[str, Meta(max_length=MAX_TEXT)]
 OriginName: TypeAlias = Literal["static", "derived", "added", "learned"]
@@ -29,7 +28,7 @@ class RoutesListParameters(Parameters, frozen=True, kw_only=True):
     """``routes_list``: of one station, or of all.
 
     Of each station *count* routes from number *first* on, of those that have *match* in their name,
-    NetID, door, address, origin or state; and the latest *requests*.
+    NetID, transport, address, origin or state; and the latest *requests*.
     """
 
     station: str = ""
@@ -46,7 +45,7 @@ class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
         station: Whose router gets it.
         name: As people call it.
         net_id: Of the station that it leads to; empty if *name* is a station of the plant.
-        via: Where packets go: ``STATION/PORT`` of the plant, or the kind of a door and an address,
+        via: Where packets go: ``STATION/PORT`` of the plant, or a kind of transport and an address,
             such as ``ams-tcp:192.168.1.5``, ``udp:10.0.0.5``, ``mqtt:NETWORK``.
         port: EAP port that they leave by; empty for the first that can.
         octets: How many octets of a NetID have to be those of *net_id*; 0 for a default route.
@@ -71,11 +70,11 @@ class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
 
 
 class RoutesRemoveParameters(Parameters, frozen=True, kw_only=True):
-    """``routes_remove``: by name or NetID; *door* and *address* choose where several have it."""
+    """``routes_remove``: by name or NetID; *transport* and *address* choose among several."""
 
     station: str
     route: Text
-    door: Text = ""
+    transport: Text = ""
     address: Text = ""
 
 
@@ -129,15 +128,11 @@ class RoutesIntroduceParameters(Parameters, frozen=True, kw_only=True):
     wait_ms: Annotated[int, Meta(ge=10, le=60_000)] = 5_000
 
 
-class Document(msgspec.Struct, frozen=True, kw_only=True):
-    """Base of what is told; a field that somebody newer tells is not looked at."""
-
-
 class WayRow(Document, frozen=True, kw_only=True):
     """One way of packets, and what was asked by it.
 
     Attributes:
-        door: That packets come and go by.
+        transport: Of its packets.
         address: Of the other end.
         requests: That went out by a route, or came in by a connection.
         answers: To them.
@@ -147,7 +142,7 @@ class WayRow(Document, frozen=True, kw_only=True):
         last_error: In words, empty while there was none.
     """
 
-    door: str
+    transport: str
     address: str
     requests: int = 0
     answers: int = 0
@@ -207,7 +202,7 @@ class ConnectionRow(WayRow, frozen=True, kw_only=True):
     """
 
     since_s: int
-    net_ids: list[str] = []
+    net_ids: list[str] = field(default_factory=list)
     took_us: int | None = None
 
 
@@ -220,8 +215,8 @@ class RequestRow(Document, frozen=True, kw_only=True):
         service: Of ADS; empty where the packet could not be read, as with the next two.
         target: NetID and AMS port.
         source: NetID and AMS port.
-        came_by: Address and door; empty if its connection is gone.
-        door: By which it went on; empty for a service of this station, and if it did not.
+        came_by: Address and transport; empty if its connection is gone.
+        transport: Of its next hop; empty for a service of this station, and if it did not go on.
         address: That it went on to.
         error: Of the AMS header of its answer.
         took_us: From the request to its answer.
@@ -234,7 +229,7 @@ class RequestRow(Document, frozen=True, kw_only=True):
     target: str = ""
     source: str = ""
     came_by: str = ""
-    door: str = ""
+    transport: str = ""
     address: str = ""
     error: int = 0
     took_us: int = 0
@@ -245,7 +240,7 @@ class InterruptionRow(Document, frozen=True, kw_only=True):
     """Subscriptions of one client at one server to which nothing comes; they are being restored.
 
     Attributes:
-        client: Address and door of the client.
+        client: Address and transport of the client.
         source: NetID and AMS port of the client.
         target: NetID and AMS port of the server.
         count: How many subscriptions there are.
@@ -268,10 +263,10 @@ class RouterRow(Document, frozen=True, kw_only=True):
     net_id: str
     routes: list[RouteRow]
     total: int
-    connections: list[ConnectionRow] = []
-    requests: list[RequestRow] = []
-    interruptions: list[InterruptionRow] = []
-    warnings: list[str] = []
+    connections: list[ConnectionRow] = field(default_factory=list)
+    requests: list[RequestRow] = field(default_factory=list)
+    interruptions: list[InterruptionRow] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 class TestResult(Document, frozen=True, kw_only=True):
@@ -349,18 +344,179 @@ class Export(Document, frozen=True, kw_only=True):
     """A StaticRoutes file, and the names of routes that it cannot hold."""
 
     xml: str
-    left_out: list[str] = []
+    left_out: list[str] = field(default_factory=list)
 
 
-DocumentT = TypeVar("DocumentT")
+class RouteAnswer(Document, frozen=True, kw_only=True):
+    """Answer to ``routes_remove``."""
+
+    route: RouteRow
 
 
-def read_document(document: Any, kind: type[DocumentT]) -> DocumentT:
-    """Return a result as a record; raise ControlError if it is none."""
-    try:
-        return msgspec.convert(document, kind)
-    except msgspec.ValidationError as exc:
-        raise ControlError(f"the answer: {exc}", code=ErrorCode.BAD_REQUEST) from None
+class AddedRoute(Document, frozen=True, kw_only=True):
+    """Answer to ``routes_add``; *warnings* name what hides the route."""
+
+    route: RouteRow
+    warnings: list[str]
+
+
+class ViaParameters(Parameters, frozen=True, kw_only=True):
+    """Base: *via* is the station whose router asks; empty for the first one here."""
+
+    via: str = ""
+
+
+class ScanParameters(ViaParameters, frozen=True, kw_only=True):
+    """``scan``."""
+
+
+class TraceParameters(ViaParameters, frozen=True, kw_only=True):
+    """``trace``: *target* is ``STATION[/PORT[/SLAVE]]`` or ``NETID[:PORT]``."""
+
+    target: str
+
+
+class AskParameters(TraceParameters, frozen=True, kw_only=True):
+    """``ams_ask``: one ADS request; *data* is what follows the header, in hexadecimal digits.
+
+    With *device* a station stands for its first EAP port, not for its router.
+    """
+
+    command: Annotated[int, Meta(ge=1, le=0xFFFF)]
+    data: str = ""
+    device: bool = False
+    timeout_ms: Annotated[int, Meta(ge=1, le=MAX_TIMEOUT_MS)] = 5000
+
+
+class SlaveEntry(Document, frozen=True):
+    """Slave of a bus port; *state* is None while it is not known."""
+
+    address: int
+    name: str
+    state: str | None
+
+
+class PortEntry(Document, frozen=True):
+    """Port of a station, with the slaves of a bus; *error* says why they are not known."""
+
+    name: str
+    kind: str
+    net_id: str
+    interface: str
+    slaves: list[SlaveEntry]
+    error: str
+
+
+class StationEntry(Document, frozen=True):
+    """Station of the plant; *error* says why it did not answer."""
+
+    name: str
+    net_id: str
+    ports: list[PortEntry]
+    error: str
+
+
+class ScanVia(Document, frozen=True):
+    """Station that scanned, and the address at which AMS/TCP reaches it."""
+
+    station: str
+    address: str
+
+
+class PlantScan(Document, frozen=True):
+    """Answer to ``scan``."""
+
+    stations: list[StationEntry]
+    via: ScanVia
+
+
+class MergedScan(Document, frozen=True):
+    """``eapctl scan``: answers of all appliances."""
+
+    stations: list[StationEntry]
+    via: list[ScanVia]
+
+
+class HopRow(Document, frozen=True, kw_only=True):
+    """One router on the way to a target; *spent_us* is the part of *took_us* behind the last one.
+
+    *interrupted* is None where an older router does not tell it.
+    """
+
+    station: str
+    net_id: str
+    opaque: bool
+    route: str
+    transport: str
+    address: str
+    state: str
+    why: str
+    interrupted: int | None = None
+    interrupted_s: int | None = None
+    may: dict[str, bool | None]
+    took_us: int
+    spent_us: int
+
+
+class TargetAnswer(Document, frozen=True):
+    """Answer of a target to ReadState."""
+
+    error: int
+    text: str
+    ads_state: int | None
+    device_state: int | None
+    took_us: int
+
+
+class TracedPath(Document, frozen=True):
+    """Answer to ``trace``; *why* says where the way ends."""
+
+    target: str
+    address: str
+    name: str
+    ok: bool
+    why: str
+    hops: list[HopRow]
+    answer: TargetAnswer | None
+
+
+class AmsReply(Document, frozen=True):
+    """Answer to ``ams_ask``: error of the AMS header, and what follows it."""
+
+    error: int
+    data: str
+
+
+ROUTES_LIST = Method("routes_list", RoutesListParameters, list[RouterRow])
+ROUTES_ADD = Method("routes_add", RoutesAddParameters, AddedRoute)
+ROUTES_REMOVE = Method("routes_remove", RoutesRemoveParameters, RouteAnswer)
+ROUTES_TEST = Method("routes_test", RoutesTestParameters, TestResult)
+ROUTES_IMPORT = Method("routes_import", RoutesImportParameters, list[ImportRow])
+ROUTES_EXPORT = Method("routes_export", RoutesExportParameters, Export)
+ROUTES_SCAN = Method("routes_scan", RoutesScanParameters, list[NeighbourRow])
+ROUTES_INTRODUCE = Method("routes_introduce", RoutesIntroduceParameters, IntroducedRow)
+SCAN = Method("scan", ScanParameters, PlantScan)
+TRACE = Method("trace", TraceParameters, TracedPath)
+AMS_ASK = Method("ams_ask", AskParameters, AmsReply)
+
+
+def hop_row(report: HopReport, took_us: int, spent_us: int, *, is_opaque: bool) -> HopRow:
+    """Return one router of a way."""
+    return HopRow(
+        station=report.station,
+        net_id=report.net_id,
+        opaque=is_opaque,
+        route=report.route,
+        transport=report.door,
+        address=report.address,
+        state=report.state,
+        why=report.why,
+        interrupted=report.interrupted,
+        interrupted_s=report.interrupted_s,
+        may={str(service): allowed for service, allowed in report.may.items()},
+        took_us=took_us,
+        spent_us=spent_us,
+    )
 
 
 def interruption_text(row: InterruptionRow) -> str:

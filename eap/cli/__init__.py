@@ -1,8 +1,10 @@
-"""The ``eapctl`` command: one module a subcommand, imported only when it is used.
+"""The ``eapctl`` command: a module for each area, imported when one of its commands is used.
 
 The front end owns no plant: it reads plant files, starts an appliance in the foreground, or talks
-to running ones through their control sockets.  ``group`` loads subcommands and is the one place
-where an error becomes a line on stderr and an exit code.
+to running ones through their control sockets.  A command calls an operation of
+``eap.appliance.commands``, which returns a typed result; ``output`` renders that as JSON or by the
+command's view.  ``group`` loads subcommands and is the one place where an error becomes a line on
+stderr and an exit code.
 """
 
 from __future__ import annotations
@@ -15,24 +17,24 @@ from eap.cli.group import LazyGroup
 @click.group(
     cls=LazyGroup,
     commands_at={
-        "apply": "eap.cli.apply:apply",
+        "apply": "eap.cli.plan:apply",
         "bus": "eap.cli.bus:bus",
-        "check": "eap.cli.check:check",
+        "check": "eap.cli.plantfile:check",
         "decode": "eap.cli.decode:decode",
         "gateway": "eap.cli.gateway:gateway",
         "gw": "eap.cli.gw:gw",
-        "new": "eap.cli.new:new",
+        "new": "eap.cli.plantfile:new",
         "od": "eap.cli.od:od",
         "pd": "eap.cli.pd:pd",
         "plan": "eap.cli.plan:plan",
-        "rollback": "eap.cli.apply:rollback",
+        "rollback": "eap.cli.plan:rollback",
         "routes": "eap.cli.routes:routes",
         "run": "eap.cli.run:run",
-        "scan": "eap.cli.scan:scan",
+        "scan": "eap.cli.network:scan",
         "sim": "eap.cli.sim:sim",
-        "state": "eap.cli.state:state",
+        "state": "eap.cli.od:state",
         "status": "eap.cli.status:status",
-        "trace": "eap.cli.trace:trace",
+        "trace": "eap.cli.network:trace",
     },
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )

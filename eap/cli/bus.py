@@ -1,37 +1,46 @@
-"""``eapctl bus``: look at a bus of slaves and talk to them."""
+"""``eapctl bus``: slaves of a bus, their objects, IDNs, files and EEPROMs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.bus_params import (
-    number_up_to,
-    parse_octets,
-    slave_argument,
-)
 from eap.cli.bus_place import BusCommand, BusPort, Place, bus_options, open_session
 from eap.cli.group import LazyGroup
-from eap.cli.output import write_json, write_tables, write_text
-from eap.cli.params import examples, json_option
+from eap.cli.output import Output
+from eap.cli.params import (
+    CommandT,
+    examples,
+    json_option,
+    number_up_to,
+    parse_entry,
+    parse_octets,
+    parse_type,
+    slave_argument,
+)
+
+if TYPE_CHECKING:
+    from eap.appliance.commands.bus_foe import FileTransfer
+    from eap.codec.datatypes import DataType
+    from eap.codec.soe import Idn
+    from eap.ids import ObjectId
 
 STATES = ("INIT", "PREOP", "BOOT", "SAFEOP", "OP")
 _U32 = 0xFFFFFFFF
 _U16 = 0xFFFF
+_MAX_DRIVE = 7
+_STANDARD = Path("-")
 
 
 @click.group(
     cls=LazyGroup,
     commands_at={
-        "diag": "eap.cli.bus:diag",
-        "foe": "eap.cli.bus_foe:foe",
-        "idn": "eap.cli.bus_idn:idn",
-        "scan": "eap.cli.bus:scan",
-        "sdo": "eap.cli.bus_sdo:sdo",
-        "sii": "eap.cli.bus:sii",
-        "state": "eap.cli.bus:state",
-        "voe": "eap.cli.bus:voe",
+        name: f"eap.cli.bus:{name}"
+        for name in ("diag", "foe", "idn", "scan", "sdo", "sii", "state", "voe")
     },
     epilog=examples(
         "eapctl bus scan island-02/bus0",
@@ -53,90 +62,67 @@ def bus() -> None:
 @click.command(cls=BusCommand)
 @bus_options
 @json_option("Print one object.")
-def scan(bus: Place, as_json: bool) -> None:
+def scan(bus: Place, output: Output) -> None:
     """Show all slaves: identity, state, alias, mailbox protocols."""
-    from eap.appliance.commands.bus_info import fault_lines, scan_rows
-
-    with open_session(bus) as session:
-        rows = scan_rows(session)
-    if as_json:
-        write_json({"slaves": rows})
-        return
+    from eap.appliance.commands.bus_info import scan_slaves
     from eap.cli.bus_view import scan_tables
 
-    write_tables(scan_tables(rows, fault_lines(rows)))
+    with open_session(bus) as session:
+        found = scan_slaves(session)
+    output.show(found, scan_tables)
 
 
 @click.command(cls=BusCommand)
 @bus_options
 @click.argument("words", nargs=-1, metavar="[SLAVE] [INIT|PREOP|SAFEOP|OP|BOOT]")
 @json_option("Print one object.")
-def state(words: tuple[str, ...], bus: Place, as_json: bool) -> None:
+def state(words: tuple[str, ...], bus: Place, output: Output) -> None:
     """Show states, or bring slaves to a state.
 
     One slave, or all of them.  The master of a running station keeps them there.  Behind an
-    interface nobody does: a slave with outputs leaves OP when nobody sends it process data.
+    interface no master does: a slave with outputs leaves OP when it receives no process data.
     """
-    from eap.appliance.commands.bus_info import state_rows
+    from eap.appliance.commands.bus_info import slave_states
+    from eap.cli.bus_view import state_view
 
     target = words[-1].upper() if words and words[-1].upper() in STATES else None
     rest = words[:-1] if target else words
     if len(rest) > 1:
         raise click.UsageError(f"{rest[-1]!r} is not a state, expected one of {', '.join(STATES)}")
     with open_session(bus) as session:
-        rows = state_rows(session, rest[0] if rest else None, target)
-    if as_json:
-        write_json({"slaves": rows})
-        return
-    from eap.cli.bus_view import state_table
-
-    write_tables([state_table(rows)])
+        found = slave_states(session, rest[0] if rest else None, target)
+    note = ""
     if target is not None and isinstance(bus, BusPort):
-        write_text(f"\nThe master of {bus} keeps {'it' if rest else 'them'} there.")
+        note = f"\nThe master of {bus} keeps {'it' if rest else 'them'} there."
+    output.show(found, lambda states: state_view(states, note))
 
 
 @click.command(cls=BusCommand)
 @bus_options
 @click.argument("slave", required=False, metavar="[SLAVE]")
 @click.option("--full", is_flag=True, help="Show slaves without errors too, however many.")
-@click.option("--reset", is_flag=True, help="Clear error counters, forget what is over.")
+@click.option("--reset", is_flag=True, help="Clear error counters and findings that are over.")
 @json_option("Print one object.")
-def diag(slave: str | None, bus: Place, full: bool, reset: bool, as_json: bool) -> None:
-    """Show what is wrong with a bus, and what was.
+def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Output) -> None:
+    """Show present and past faults of a bus.
 
     One line for each cause, below a table of states and error counters of ports.  A running station
     tells since when, or until when; behind an interface the counters are those since the slaves
     were switched on, or the last --reset.
     """
-    if reset:
-        if slave is not None:
-            raise click.UsageError("--reset is for the whole bus: leave SLAVE out")
-        _reset(bus, as_json=as_json)
-        return
     from time import time
 
-    from eap.appliance.commands.bus_info import diagnosis
+    from eap.appliance.commands.bus_info import diagnosis, reset_diagnosis
+    from eap.cli.bus_view import diagnosis_view, reset_view
 
+    if reset and slave is not None:
+        raise click.UsageError("--reset is for the whole bus: leave SLAVE out")
     with open_session(bus) as session:
+        if reset:
+            output.show(reset_diagnosis(session), reset_view)
+            return
         found = diagnosis(session, slave, time())
-    if as_json:
-        write_json(found)
-        return
-    from eap.cli.bus_view import diagnosis_tables
-
-    write_tables(diagnosis_tables(found, time(), is_full=full))
-
-
-def _reset(bus: Place, *, as_json: bool) -> None:
-    from eap.appliance.commands.bus_info import reset_diagnosis
-    from eap.cli.words import count
-
-    with open_session(bus) as session:
-        done = reset_diagnosis(session)
-    if as_json:
-        write_json(done)
-    else:
-        write_text(f"error counters of {count(len(done['reset']), 'slave')} cleared")
+    output.show(found, lambda each: diagnosis_view(each, time(), is_full=full))
 
 
 @click.group()
@@ -149,22 +135,18 @@ def sii() -> None:
 @slave_argument
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @json_option("Print one object, with all octets in hexadecimal digits.")
-def sii_dump(slave: str, file: Path | None, bus: Place, as_json: bool) -> None:
+def sii_dump(slave: str, file: Path | None, bus: Place, output: Output) -> None:
     """Read the EEPROM; with FILE, store its octets there."""
     from eap.appliance.commands.bus_info import read_eeprom
     from eap.appliance.durable import whole_file
-
-    with open_session(bus) as session:
-        content, image = read_eeprom(session, slave)
-    if file is not None:
-        with whole_file(file) as target:
-            target.write(image)
-    if as_json:
-        write_json(content | {"data": image.hex()})
-        return
     from eap.cli.bus_view import eeprom_lines
 
-    write_text("\n".join(eeprom_lines(content, b"" if file else image)))
+    with open_session(bus) as session:
+        content = read_eeprom(session, slave)
+    if file is not None:
+        with whole_file(file) as target:
+            target.write(bytes.fromhex(content.data))
+    output.show(content, lambda each: eeprom_lines(each, has_octets=file is None))
 
 
 @sii.command("write", cls=BusCommand)
@@ -172,23 +154,21 @@ def sii_dump(slave: str, file: Path | None, bus: Place, as_json: bool) -> None:
 @slave_argument
 @click.argument("file", type=click.Path(exists=True, path_type=Path, dir_okay=False))
 @json_option("Print one object.")
-def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
-    """Write FILE into the EEPROM and compare what is there then.
+def sii_write(slave: str, file: Path, bus: Place, output: Output) -> None:
+    """Write FILE into the EEPROM, read it back and compare.
 
-    The master of a running station takes note of it when it brings its bus up anew.
+    The master of a running station reads it when it brings its bus up anew.
     """
-    from eap.appliance.commands.bus_info import write_eeprom
+    from eap.appliance.commands.bus_info import WrittenEeprom, write_eeprom
+
+    def lines(done: WrittenEeprom) -> Iterator[str]:
+        yield f"slave {done.address}: {done.octets} octets written and compared"
+        if isinstance(bus, BusPort):
+            yield f"\nThe master of {bus} uses the old content until its plant starts again."
 
     with open_session(bus) as session:
         done = write_eeprom(session, slave, file.read_bytes())
-    if as_json:
-        write_json(done)
-    else:
-        write_text(f"slave {done['address']}: {done['octets']} octets written and compared")
-        if isinstance(bus, BusPort):
-            write_text(
-                f"\nThe master of {bus} goes by the old content until its plant starts again."
-            )
+    output.show(done, lines)
 
 
 @click.command(cls=BusCommand)
@@ -201,16 +181,312 @@ def sii_write(slave: str, file: Path, bus: Place, as_json: bool) -> None:
     type=number_up_to(_U16),
     default=0,
     metavar="TYPE",
-    help="What the vendor makes of it.",
+    help="Type of the message, defined by the vendor.",
 )
 @json_option("Print one object.")
-def voe(slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, as_json: bool) -> None:
-    """Send a message of a vendor's own protocol and print the answer."""
+def voe(slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, output: Output) -> None:
+    """Send a message of a vendor's own protocol (VoE) and print the answer."""
     from eap.appliance.commands.bus_foe import exchange
 
     with open_session(bus) as session:
-        answer = exchange(session, slave, vendor, vendor_type, data)
-    if as_json:
-        write_json(answer)
+        reply = exchange(session, slave, vendor, vendor_type, data)
+    output.show(reply, lambda each: each.data)
+
+
+def _value_options(command: CommandT) -> CommandT:
+    complete = click.option(
+        "--complete", is_flag=True, help="The whole object at once, from INDEX:0 or INDEX:1 on."
+    )
+    kind = click.option(
+        "--type",
+        "kind",
+        type=parse_type,
+        metavar="TYPE",
+        help="Data type, such as UINT or STRING(16); read from the slave if left out.",
+    )
+    return complete(kind(command))
+
+
+@click.group()
+def sdo() -> None:
+    """Read, write and list the objects of a slave (CoE)."""
+
+
+@sdo.command("read", cls=BusCommand)
+@bus_options
+@slave_argument
+@click.argument("entry", type=parse_entry, metavar="INDEX[:SUB]")
+@_value_options
+@json_option("Print one object.")
+def sdo_read(
+    slave: str,
+    entry: ObjectId,
+    kind: DataType | None,
+    complete: bool,
+    bus: Place,
+    output: Output,
+) -> None:
+    """Read an entry.
+
+    INDEX and SUB are hexadecimal, with or without 0x: 0x1018:01, 1018:1.
+    """
+    from eap.appliance.commands.bus_objects import read_entry
+    from eap.cli.bus_view import value_line
+
+    with open_session(bus) as session:
+        found = read_entry(session, slave, *entry, kind=kind, complete=complete)
+    output.show(found, value_line)
+
+
+@sdo.command("write", cls=BusCommand, context_settings={"ignore_unknown_options": True})
+@bus_options
+@slave_argument
+@click.argument("entry", type=parse_entry, metavar="INDEX[:SUB]")
+@click.argument("value")
+@_value_options
+@json_option("Print one object: what was written.")
+def sdo_write(
+    slave: str,
+    entry: ObjectId,
+    value: str,
+    kind: DataType | None,
+    complete: bool,
+    bus: Place,
+    output: Output,
+) -> None:
+    """Write an entry.
+
+    INDEX and SUB are hexadecimal, with or without 0x: 0x8000:01, 8000:1.  VALUE is as the type has
+    it: 12, 0xC, -1.5e3, true, text; hexadecimal digits for a block and with --complete.
+    """
+    from eap.appliance.commands.bus_objects import write_entry
+
+    with open_session(bus) as session:
+        done = write_entry(session, slave, *entry, value, kind=kind, complete=complete)
+    output.show(done, lambda _: f"{entry} = {value}")
+
+
+@sdo.command("list", cls=BusCommand)
+@bus_options
+@slave_argument
+@json_option("Print one object a line.")
+def sdo_list(slave: str, bus: Place, output: Output) -> None:
+    """List the objects that the slave describes."""
+    from eap.appliance.commands import bus_objects
+    from eap.cli.bus_view import object_table
+
+    with open_session(bus) as session:
+        output.show_rows(bus_objects.list_objects(session, slave), object_table)
+
+
+@sdo.command("dump", cls=BusCommand)
+@bus_options
+@slave_argument
+@json_option("Print one object a line.")
+def sdo_dump(slave: str, bus: Place, output: Output) -> None:
+    """Read every entry of every object that the slave describes."""
+    from eap.appliance.commands.bus_objects import dump_entries
+    from eap.cli.bus_view import dump_table
+
+    with open_session(bus) as session:
+        output.show_rows(dump_entries(session, slave), dump_table)
+
+
+def parse_idn(text: str) -> Idn:
+    """Read S-0-0032 or the 16 bits of an IDN; raise BadParameter with an example otherwise."""
+    from eap.codec.soe import Idn
+
+    try:
+        if text[:1].isdecimal() and 0 <= int(text, 0) <= 0xFFFF:
+            return Idn.of(int(text, 0))
+        return Idn.parse(text)
+    except ValueError as exc:
+        raise click.BadParameter(str(exc)) from None
+
+
+def _drive_option(command: CommandT) -> CommandT:
+    return click.option(
+        "--drive",
+        type=click.IntRange(0, _MAX_DRIVE),
+        default=0,
+        show_default=True,
+        metavar="N",
+        help="Number of the drive in the slave.",
+    )(command)
+
+
+@click.group()
+def idn() -> None:
+    """Read, write and list the IDNs of a drive (SoE)."""
+
+
+@idn.command("read", cls=BusCommand)
+@bus_options
+@slave_argument
+@click.argument("number", type=parse_idn, metavar="IDN")
+@_drive_option
+@json_option("Print one object.")
+def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Output) -> None:
+    """Read an IDN with all elements that it has."""
+    from eap.appliance.commands.bus_objects import read_idn
+    from eap.cli.bus_view import idn_lines
+
+    with open_session(bus) as session:
+        found = read_idn(session, slave, number, drive=drive)
+    output.show(found, idn_lines)
+
+
+@idn.command("write", cls=BusCommand, context_settings={"ignore_unknown_options": True})
+@bus_options
+@slave_argument
+@click.argument("number", type=parse_idn, metavar="IDN")
+@click.argument("value")
+@_drive_option
+@json_option("Print one object: what was written.")
+def idn_write(slave: str, number: Idn, value: str, drive: int, bus: Place, output: Output) -> None:
+    """Write the value of an IDN.
+
+    The numbers of a list have commas between them.
+    """
+    from eap.appliance.commands.bus_objects import write_idn
+
+    with open_session(bus) as session:
+        done = write_idn(session, slave, number, value, drive=drive)
+    output.show(done, lambda each: f"{each.idn} = {value}")
+
+
+@idn.command("list", cls=BusCommand)
+@bus_options
+@slave_argument
+@_drive_option
+@json_option("Print one object a line.")
+def idn_list(slave: str, drive: int, bus: Place, output: Output) -> None:
+    """List all IDNs of a drive."""
+    from eap.appliance.commands import bus_objects
+    from eap.cli.bus_view import idn_table
+
+    with open_session(bus) as session:
+        output.show_rows(bus_objects.list_idns(session, slave, drive=drive), idn_table)
+
+
+def _password_option(command: CommandT) -> CommandT:
+    return click.option(
+        "--password",
+        type=number_up_to(0xFFFFFFFF),
+        default=0,
+        metavar="N",
+        help="If the slave requires one.",
+    )(command)
+
+
+@click.group()
+def foe() -> None:
+    """Read and write files of a slave (FoE)."""
+
+
+@foe.command("get", cls=BusCommand)
+@bus_options
+@slave_argument
+@click.argument("name")
+@click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
+@_password_option
+@json_option("Print one object; without it a progress bar is on stderr.")
+def foe_get(
+    slave: str,
+    name: str,
+    file: Path | None,
+    password: int,
+    bus: Place,
+    output: Output,
+) -> None:
+    """Read the file NAME of a slave into FILE.
+
+    FILE is NAME in this folder if left out, and - for stdout.
+    """
+    from eap.appliance.commands.bus_foe import get_file
+
+    target = file or Path(Path(name).name)
+    is_stdout = target == _STANDARD
+    if is_stdout and output.is_json:
+        raise click.UsageError("the file and --json cannot both go to stdout")
+    with open_session(bus) as session, _progress(name, hidden=output.is_json) as report:
+        whole = None if is_stdout else target
+        done = get_file(session, slave, name, whole, password=password, report=report)
+    text = _transfer_text(done, f"{done.name} → {done.file}")
+    if is_stdout:
+        click.echo(text, err=True)
     else:
-        write_text(answer["data"])
+        output.show(done, lambda _: text)
+
+
+@foe.command("put", cls=BusCommand)
+@bus_options
+@slave_argument
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("name", required=False)
+@_password_option
+@json_option("Print one object; without it a progress bar is on stderr.")
+def foe_put(
+    slave: str,
+    file: Path,
+    name: str | None,
+    password: int,
+    bus: Place,
+    output: Output,
+) -> None:
+    """Write FILE to a slave, as NAME if that is given.
+
+    FILE is - for stdin, which needs a NAME.
+    """
+    from eap.appliance.commands.bus_foe import put_file
+
+    is_stdin = file == _STANDARD
+    if is_stdin and not name:
+        raise click.UsageError("a file from stdin needs a NAME at the slave")
+    target = name or file.name
+    with open_session(bus) as session, _progress(target, hidden=output.is_json) as report:
+        source = None if is_stdin else file
+        done = put_file(session, slave, source, target, password=password, report=report)
+    output.show(done, lambda each: _transfer_text(each, f"{each.file} → {each.name}"))
+
+
+def _transfer_text(done: FileTransfer, what: str) -> str:
+    text = (
+        f"{what}: {done.octets} octets in {done.seconds:.1f} s, {done.rate / 1000:.0f} kB/s\n"
+        f"sha256 {done.sha256}"
+    )
+    if done.restarts:
+        text += f"\nbegan anew {done.restarts} times: the bus had interrupted it"
+    return text
+
+
+@contextmanager
+def _progress(name: str, *, hidden: bool) -> Iterator[Callable[[int, int | None, int], None]]:
+    """Show a bar on stderr while a file is on its way; only a terminal gets one."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    disable = hidden or not console.is_terminal
+    with Progress(*columns, console=console, disable=disable) as bar:
+        task = bar.add_task(name, total=None)
+
+        def report(done: int, total: int | None, restarts: int) -> None:
+            again = f" (restart {restarts})" if restarts else ""
+            bar.update(task, completed=done, total=total, description=f"{name}{again}")
+
+        yield report

@@ -1,4 +1,4 @@
-"""Which bus a command of ``eapctl bus`` is about: a port of a running station, or an interface."""
+"""Bus of a command of ``eapctl bus``: a port of a running station, or an interface."""
 
 from __future__ import annotations
 

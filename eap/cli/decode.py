@@ -1,55 +1,41 @@
-"""``eapctl decode``: what is in these octets, or in this capture."""
+"""``eapctl decode``: the frames in hexadecimal digits or in a capture."""
 
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import write_json, write_tables
+from eap.cli.output import Output
 from eap.cli.params import json_option
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from rich.tree import Tree
 
-    from eap.appliance.commands.packets import Packet
+    from eap.appliance.commands.capture import Packet
+    from eap.appliance.commands.decode import DecodedAms, DecodedDatagram, DecodedFrame
 
+_NAMES = {
+    1: "datagrams",
+    2: "AMS",
+    3: "raw I/O",
+    4: "process data",
+    5: "mailbox",
+}
+_SHOWN_OCTETS = 32
 _SEPARATORS = str.maketrans("", "", ":-, \t\r\n")
 
 
-class _Frame(NamedTuple):
-    """One frame to show, and how it came."""
-
-    data: bytes
-    packet: Packet | None = None
-    number: int = 0
-    at_ns: int | None = None
-
-    def origin(self) -> dict[str, Any]:
-        """Return what a capture knows beside the frame: number, time in seconds, addresses."""
-        if self.packet is None:
-            return {}
-        source, destination = self.packet.source, self.packet.destination
-        known: dict[str, Any] = {
-            "transport": self.packet.transport,
-            "source": source,
-            "destination": destination,
-        }
-        if self.packet.vlan_id is not None:
-            known["vlan_id"] = self.packet.vlan_id
-        if self.at_ns is None:
-            return known
-        return {"packet": self.number, "time": self.at_ns / 1e9} | known
-
-
-@click.command(short_help="Say what is in a frame or in a capture.")
+@click.command(short_help="Decode a frame, or the frames of a capture.")
 @click.argument("source", metavar="HEX|FILE", nargs=-1, required=True)
 @json_option("Print one object a frame, on one line.")
 @click.pass_context
-def decode(ctx: click.Context, source: tuple[str, ...], as_json: bool) -> None:
+def decode(ctx: click.Context, source: tuple[str, ...], output: Output) -> None:
     """Decode one frame given as HEX, or all frames of a pcap or pcapng FILE.
 
     HEX starts at the EtherCAT header or at the Ethernet header; spaces are allowed.  A file whose
@@ -58,26 +44,18 @@ def decode(ctx: click.Context, source: tuple[str, ...], as_json: bool) -> None:
 
     Exit code 1 means that a frame had an error, 2 that the input cannot be read.
     """
-    from eap.appliance.commands.decode import decode_frame
-
     failed, shown = False, 0
     for frame in _frames(" ".join(source)):
-        fields = decode_frame(frame.data)
-        failed |= fields["error"] is not None
+        failed |= frame.error is not None
         shown += 1
-        if as_json:
-            write_json(fields | frame.origin())
-        else:
-            from eap.cli.decode_view import frame_tree
-
-            write_tables([frame_tree(fields, frame.origin())])
+        output.show(frame, frame_view)
     if not shown:
         click.echo("no EtherCAT frame in this capture", err=True)
     if failed:
         ctx.exit(ExitCode.FAILED)
 
 
-def _frames(source: str) -> Iterator[_Frame]:
+def _frames(source: str) -> Iterator[DecodedFrame]:
     try:
         octets = bytes.fromhex(source.translate(_SEPARATORS).removeprefix("0x"))
     except ValueError:
@@ -88,30 +66,122 @@ def _frames(source: str) -> Iterator[_Frame]:
     yield from _frames_of_octets(octets)
 
 
-def _frames_of_file(name: str) -> Iterator[_Frame]:
+def _frames_of_file(name: str) -> Iterator[DecodedFrame]:
     from eap.appliance.commands.capture import iter_capture
+    from eap.appliance.commands.decode import decode_frame
     from eap.errors import CodecError
 
     try:
         for captured in iter_capture(Path(name)):
-            yield _Frame(captured.data, captured.packet, captured.number, captured.at_ns)
+            frame = decode_frame(captured.data)
+            frame.packet, frame.time = captured.number, captured.at_ns / 1e9
+            yield _with_origin(frame, captured.packet)
     except (OSError, CodecError) as exc:
         if isinstance(exc, OSError) and exc.errno in {errno.ENOENT, errno.ENAMETOOLONG}:
             raise click.UsageError(f"{name!r} is neither a file nor hexadecimal digits") from None
         raise click.UsageError(str(exc)) from None
 
 
-def _frames_of_octets(octets: bytes) -> Iterator[_Frame]:
-    from eap.appliance.commands.packets import cut_frames, unwrap
+def _frames_of_octets(octets: bytes) -> Iterator[DecodedFrame]:
+    from eap.appliance.commands.capture import cut_frames, unwrap
+    from eap.appliance.commands.decode import decode_frame
 
     packet = unwrap(octets)
     if packet is None:
-        yield _Frame(octets)
+        yield decode_frame(octets)
     elif packet.segment is None:
-        yield _Frame(packet.payload, packet)
+        yield _with_origin(decode_frame(packet.payload), packet)
     else:
         stream = bytearray(packet.payload)
-        for data in cut_frames(stream):
-            yield _Frame(data, packet)
-        if stream:
-            yield _Frame(bytes(stream), packet)
+        frames = list(cut_frames(stream))
+        for data in [*frames, bytes(stream)] if stream else frames:
+            yield _with_origin(decode_frame(data), packet)
+
+
+def _with_origin(frame: DecodedFrame, packet: Packet) -> DecodedFrame:
+    frame.transport = packet.transport
+    frame.source, frame.destination = packet.source, packet.destination
+    if packet.vlan_id is not None:
+        frame.vlan_id = packet.vlan_id
+    return frame
+
+
+def frame_view(frame: DecodedFrame) -> Iterator[Tree]:
+    """Yield one line for a frame, and its parts below."""
+    from rich.text import Text
+    from rich.tree import Tree
+
+    tree = Tree(Text(_headline(frame), style="bold"), guide_style="dim")
+    for line in _parts(frame):
+        tree.add(Text(line))
+    if frame.error is not None:
+        tree.add(Text(f"error: {frame.error}", style="red"))
+    yield tree
+
+
+def _headline(frame: DecodedFrame) -> str:
+    parts = []
+    if frame.packet and frame.time is not None:
+        at = datetime.fromtimestamp(frame.time or 0, UTC)
+        parts.append(f"#{frame.packet} {at:%H:%M:%S.%f}")
+    if frame.transport:
+        vlan = f" VLAN {frame.vlan_id}" if isinstance(frame.vlan_id, int) else ""
+        parts.append(f"{frame.transport}{vlan} {frame.source} → {frame.destination}")
+    if frame.type is None:
+        return "  ".join([*parts, "no frame"])
+    name = _NAMES.get(frame.type, "undocumented")
+    parts.append(f"type {frame.type} ({name}), {frame.length} octets")
+    if frame.publisher:
+        parts.append(f"publisher {frame.publisher}, cycle {frame.cycle}")
+    return "  ".join(parts)
+
+
+def _parts(frame: DecodedFrame) -> Iterator[str]:
+    for pd in frame.pds or ():
+        yield (
+            f"PD {pd.id} (0x{pd.id:04x})  version {pd.version}  "
+            f"quality {pd.quality / 10:g} ms  {_octets(pd.data)}"
+        )
+    yield from map(_datagram_line, frame.datagrams or ())
+    packet = frame.ams
+    if message := frame.mailbox:
+        packet = packet or message.ams
+        data = "" if message.ams else f"  {_octets(message.data)}"
+        yield (
+            f"{message.protocol}  address {message.address}  counter {message.counter}  "
+            f"priority {message.priority}{data}"
+        )
+        if isinstance(message.detail, int):
+            yield f"refused: {message.reason} (0x{message.detail:04x})"
+    if packet:
+        yield _ams_line(packet)
+    if isinstance(frame.data, str):
+        yield _octets(frame.data)
+
+
+def _datagram_line(datagram: DecodedDatagram) -> str:
+    if isinstance(datagram.address, int):
+        where = f"address 0x{datagram.address:08x}"
+    else:
+        where = f"ADP 0x{datagram.adp or 0:04x}  ADO 0x{datagram.ado or 0:04x}"
+    return (
+        f"{datagram.command}  index {datagram.index}  {where}  WKC {datagram.wkc}  "
+        f"{_octets(datagram.data)}"
+    )
+
+
+def _ams_line(packet: DecodedAms) -> str:
+    direction = "response" if packet.state_flags & 1 else "request"
+    return (
+        f"AMS {packet.service} {direction} {packet.invoke_id}  "
+        f"{packet.source}:{packet.source_port} → "
+        f"{packet.target}:{packet.target_port}  error 0x{packet.error_code:x}  "
+        f"{_octets(packet.data)}"
+    )
+
+
+def _octets(digits: str) -> str:
+    size = len(digits) // 2
+    pairs = " ".join(digits[at : at + 2] for at in range(0, min(size, _SHOWN_OCTETS) * 2, 2))
+    more = f" … ({size} octets)" if size > _SHOWN_OCTETS else ""
+    return f"[{pairs}{more}]"

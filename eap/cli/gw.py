@@ -1,15 +1,29 @@
-"""``eapctl gw``: what ``eapctl bus`` does, through any mailbox gateway (ETG.8200)."""
+"""``eapctl gw``: slaves behind any mailbox gateway (ETG.8200), with the commands of ``bus``."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from eap.cli.bus_place import GatewayPlace, place_parameters
+from eap.cli.bus_place import (
+    BusCommand,
+    GatewayPlace,
+    Place,
+    bus_options,
+    open_session,
+    place_parameters,
+)
 from eap.cli.group import LazyGroup
-from eap.cli.params import examples
+from eap.cli.output import Output
+from eap.cli.params import examples, json_option
+
+if TYPE_CHECKING:
+    from rich.tree import Tree
+
+    from eap.appliance.commands.bus_objects import SdoDumpEntry
 
 _PORT = 34980
 _TCP, _MAILBOX = "--tcp", "--mailbox"
@@ -79,11 +93,11 @@ def _call(command: click.Command, **values: Any) -> Any:
 @click.group(
     cls=GatewayGroup,
     commands_at={
-        "foe": "eap.cli.bus_foe:foe",
-        "idn": "eap.cli.bus_idn:idn",
-        "od": "eap.cli.gw_od:od",
+        "foe": "eap.cli.bus:foe",
+        "idn": "eap.cli.bus:idn",
+        "od": "eap.cli.gw:od",
         "scan": "eap.cli.bus:scan",
-        "sdo": "eap.cli.bus_sdo:sdo",
+        "sdo": "eap.cli.bus:sdo",
         "voe": "eap.cli.bus:voe",
     },
     epilog=examples(
@@ -112,3 +126,32 @@ def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) 
     0 is the master itself.  The port is 34980 if it is left out.
     """
     ctx.obj = place._replace(tcp=tcp, mailbox=mailbox)
+
+
+@click.command(cls=BusCommand, short_help="Show all objects of the master or a slave as a tree.")
+@bus_options
+@click.argument("slave", default="0", metavar="[SLAVE]")
+@json_option("Print one object a line.")
+def od(slave: str, bus: Place, output: Output) -> None:
+    """Show every object with its entries and values; of the master if SLAVE is left out."""
+    from eap.appliance.commands.bus_objects import dump_entries
+
+    with open_session(bus) as session:
+        entries = dump_entries(session, slave)
+        output.show_rows(entries, lambda rows: _tree(session.find(slave).name, rows))
+
+
+def _tree(name: str, rows: Iterable[SdoDumpEntry]) -> Iterator[Tree]:
+    from rich.text import Text
+    from rich.tree import Tree
+
+    from eap.cli.bus_view import dumped_value
+
+    tree = Tree(Text(name))
+    branch, index = tree, -1
+    for row in rows:
+        if row.index != index:
+            index = row.index
+            branch = tree.add(Text(f"0x{index:04X} {row.object}"))
+        branch.add(Text(f"{row.subindex:02X} {row.name}: ") + dumped_value(row).__rich__())
+    yield tree

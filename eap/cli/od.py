@@ -1,29 +1,56 @@
-"""``eapctl od``: the object dictionary of a station, or of a slave behind its bus."""
+"""``eapctl od`` and ``state``: dictionary and state of a device, near or reached through routes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from eap.cli.bus_params import parse_entry, parse_octets, parse_type
-from eap.cli.od_params import target_argument
-from eap.cli.output import write_json, write_tables, write_text
-from eap.cli.params import json_option
+from eap.cli.group import ExitCode
+from eap.cli.output import Output
+from eap.cli.params import json_option, parse_entry, parse_octets, parse_type, plant_option
+from eap.errors import ControlError
 
 if TYPE_CHECKING:
-    from eap.appliance.commands.od_target import Target
+    from eap.appliance.commands.od import OdDumpEntry, OdObjectRow
+    from eap.appliance.commands.od_devices import Target
+    from eap.appliance.control_device import StateAnswer
+    from eap.cli.table import TextTable
     from eap.codec.datatypes import DataType
     from eap.ids import ObjectId
+
+STATES = ("PREOP", "SAFEOP", "OP")
+_OF_SLAVES = ("INIT", *STATES, "BOOT")
 
 _TYPE = click.option(
     "--type",
     "kind",
     type=parse_type,
     metavar="TYPE",
-    help="Data type, such as UINT or STRING(16), in place of the one that the device tells.",
+    help="Data type, such as UINT or STRING(16), in place of the one that the device describes.",
 )
+
+
+def target_argument(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add TARGET as the first argument and ``--plant``; the function gets *target*."""
+
+    @wraps(command)
+    def with_target(*args: Any, target: str, plant: str | None, **params: Any) -> Any:
+        return command(*args, target=_target(target, plant), **params)
+
+    return click.argument("target", metavar="TARGET")(plant_option(with_target))
+
+
+def _target(text: str, plant: str | None) -> Target:
+    from eap.appliance.commands.od_devices import Target
+
+    try:
+        return Target.parse(text)._replace(plant=plant)
+    except ValueError as exc:
+        raise click.UsageError(str(exc)) from None
 
 
 @click.group()
@@ -32,7 +59,7 @@ def od() -> None:
 
     TARGET is STATION or STATION/PORT for an EAP port of a station, STATION/router for its router,
     STATION/PORT for the master of a bus port, and STATION/PORT/SLAVE for a slave behind it.  What
-    does not run here, by name or as NETID:PORT, is asked through routes.  INDEX and SUB are
+    does not run here, by name or as NETID:PORT, is reached through routes.  INDEX and SUB are
     hexadecimal, with or without 0x (0xD000:07, D000:7).
     """
 
@@ -40,22 +67,23 @@ def od() -> None:
 @od.command("list")
 @target_argument
 @json_option("Print one object a line.")
-def list_objects(target: Target, as_json: bool) -> None:
+def list_objects(target: Target, output: Output) -> None:
     """List all objects with their names."""
-    from eap.appliance.commands.od_access import object_rows
-    from eap.appliance.commands.od_target import open_device
+    from eap.appliance.commands.od import object_rows
+    from eap.appliance.commands.od_devices import open_device
 
     with open_device(target) as device:
         rows = list(object_rows(device.objects()))
-    if as_json:
-        for row in rows:
-            write_json(row)
-        return
-    from eap.cli.bus_view import object_table
-    from eap.cli.od_view import object_name
+    output.show_rows(rows, _object_table)
 
-    named = (row | {"name": object_name(row["name"], row["label"])} for row in rows)
-    write_tables([object_table(named)])
+
+def _object_table(rows: Iterable[OdObjectRow]) -> Iterator[TextTable]:
+    from msgspec.structs import replace
+
+    from eap.cli.bus_view import object_table
+    from eap.cli.od_text import object_name
+
+    yield from object_table(replace(row, name=object_name(row.name, row.label)) for row in rows)
 
 
 @od.command()
@@ -67,20 +95,18 @@ def list_objects(target: Target, as_json: bool) -> None:
 )
 @json_option("Print one object.")
 def read(
-    entry: ObjectId, kind: DataType | None, complete: bool, target: Target, as_json: bool
+    entry: ObjectId, kind: DataType | None, complete: bool, target: Target, output: Output
 ) -> None:
     """Read an entry, or a whole object."""
-    from eap.appliance.commands.od_access import read_entry, read_object
-    from eap.appliance.commands.od_target import open_device
+    from eap.appliance.commands.od import read_entry, read_object
+    from eap.appliance.commands.od_devices import open_device
+    from eap.cli.od_text import object_lines, value_line
 
     with open_device(target) as device:
-        row = read_object(device, *entry) if complete else read_entry(device, *entry, kind)
-    if as_json:
-        write_json(row)
-        return
-    from eap.cli.od_view import object_lines, value_line
-
-    write_text("\n".join(object_lines(row)) if complete else value_line(row))
+        if complete:
+            output.show(read_object(device, *entry), object_lines)
+        else:
+            output.show(read_entry(device, *entry, kind), value_line)
 
 
 @od.command(context_settings={"ignore_unknown_options": True})
@@ -112,7 +138,7 @@ def write(
     complete: bool,
     file: Path | None,
     target: Target,
-    as_json: bool,
+    output: Output,
 ) -> None:
     """Write an entry, a whole object, or all that a file holds.
 
@@ -124,45 +150,46 @@ def write(
     if file is not None:
         if entry or value or octets is not None or kind is not None or complete:
             raise click.UsageError("--from FILE says what to write: leave the rest out")
-        from eap.cli.od_load import load
-
-        load(target, file, as_json=as_json)
+        _load(target, file, output)
         return
     place = _entry_to_write(entry, value, octets, complete=complete)
-    from eap.appliance.commands.od_access import write_entry, write_octets
-    from eap.appliance.commands.od_target import open_device
+    from eap.appliance.commands.od import write_entry, write_octets
+    from eap.appliance.commands.od_devices import open_device
+    from eap.cli.od_text import octets_line, value_line
 
     with open_device(target) as device:
         if octets is not None:
-            row = write_octets(device, *place, octets, complete=complete)
+            output.show(write_octets(device, *place, octets, complete=complete), octets_line)
         else:
-            row = write_entry(device, *place, value or "", kind)
-    if as_json:
-        write_json(row)
-        return
-    from eap.cli.od_view import value_line
+            output.show(write_entry(device, *place, value or "", kind), value_line)
 
-    write_text(value_line(row))
+
+def _load(target: Target, file: Path, output: Output) -> None:
+    """Write the entries of *file* to *target*."""
+    from eap.appliance.commands import od as ops
+    from eap.appliance.commands.od_devices import open_device
+    from eap.cli.od_text import load_line, read_file
+
+    entries = read_file(file)
+    with open_device(target) as device:
+        done = ops.load(device, entries)
+    output.show(ops.LoadResult(str(target), *done), load_line)
 
 
 @od.command()
 @target_argument
 @json_option("Print one entry a line, as an object.")
-def dump(target: Target, as_json: bool) -> None:
+def dump(target: Target, output: Output) -> None:
     """Write all entries of all objects to stdout, for people and for 'od write --from'."""
-    from eap.appliance.commands.od_access import dump_rows
-    from eap.appliance.commands.od_target import open_device
+    from eap.appliance.commands.od import dump_rows
+    from eap.appliance.commands.od_devices import open_device
+    from eap.cli.od_text import dump_lines
+
+    def lines(rows: Iterable[OdDumpEntry]) -> Iterator[str]:
+        return dump_lines(str(target), rows)
 
     with open_device(target) as device:
-        rows = dump_rows(device.contents())
-        if as_json:
-            for row in rows:
-                write_json(row)
-            return
-        from eap.cli.od_file import dump_lines
-
-        for line in dump_lines(str(target), rows):
-            write_text(line)
+        output.show_rows(dump_rows(device.contents()), lines)
 
 
 def _entry_to_write(
@@ -176,3 +203,81 @@ def _entry_to_write(
     if complete and octets is None:
         raise click.UsageError("--complete writes octets: give them with --hex DIGITS")
     return parse_entry(entry)
+
+
+@click.command(short_help="Show or request the state of a station.")
+@target_argument
+@click.argument(
+    "wanted",
+    required=False,
+    type=click.Choice(_OF_SLAVES, case_sensitive=False),
+    metavar="[PREOP|SAFEOP|OP]",
+)
+@json_option("Print one object: state, and error or null.")
+@click.pass_context
+def state(ctx: click.Context, wanted: str | None, target: Target, output: Output) -> None:
+    """Show the state of TARGET, or bring it to another one.
+
+    TARGET is STATION or STATION/PORT: PREOP takes configuration, SAFEOP sends, OP sends and
+    receives.  A slave is STATION/PORT/SLAVE, and has INIT and BOOT too; so has a bus port, which
+    stands for all its slaves.  What does not run here, by name or NETID:PORT, is reached through
+    routes.
+
+    Exits with 1 when the state was refused, which leaves the station where it was.
+    """
+    from eap.appliance.control_device import TargetState
+
+    wanted = wanted and wanted.upper()
+    answer = _state_of(target, wanted)
+    is_refused = wanted is not None and answer.state != wanted
+    output.show(
+        TargetState(str(target), answer.state, answer.error),
+        lambda found: f"{target}: {found.state or 'no answer'}",
+    )
+    if answer.error is not None:
+        what = f"{wanted} was refused" if is_refused else "the last request was refused"
+        code = f" (0x{answer.error.code:04X})" if answer.error.code else ""
+        output.remark(f"{target}: {what}: {answer.error.text}{code}")
+    if is_refused:
+        ctx.exit(ExitCode.FAILED)
+
+
+def _state_of(target: Target, wanted: str | None) -> StateAnswer:
+    if not target.is_here:
+        return _state_by_ads(target, wanted)
+    if wanted and not target.port and wanted not in STATES:
+        raise click.UsageError(f"{wanted} cannot be requested: expected {', '.join(STATES)}")
+    return _state_of_slave(target, wanted) if target.slave else _state_of_station(target, wanted)
+
+
+def _state_by_ads(target: Target, wanted: str | None) -> StateAnswer:
+    from eap.appliance.commands.ams import open_ams, read_state, request_state
+
+    with open_ams(str(target), target.plant) as device:
+        return request_state(device, wanted) if wanted else read_state(device)
+
+
+def _state_of_station(target: Target, wanted: str | None) -> StateAnswer:
+    from eap.appliance.commands.client import connect_station
+    from eap.appliance.control import ErrorCode
+    from eap.appliance.control_device import REQUEST_STATE, STATE
+
+    try:
+        with connect_station(target.station, target.plant) as client:
+            if wanted:
+                return client.call(REQUEST_STATE, target=str(target), state=wanted)
+            return client.call(STATE, target=str(target))
+    except ControlError as exc:
+        if exc.code != ErrorCode.UNKNOWN_NAME or not target.port:
+            raise
+        return _state_by_ads(target, wanted)  # a bus port has a master, or there is no such port
+
+
+def _state_of_slave(target: Target, wanted: str | None) -> StateAnswer:
+    from eap.appliance.commands.bus_info import slave_states
+    from eap.appliance.commands.bus_running import open_running
+    from eap.appliance.control_device import StateAnswer, StateError
+
+    with open_running(target.station, target.port, target.plant) as bus:
+        (row,) = slave_states(bus, target.slave, wanted).slaves
+    return StateAnswer(row.state, StateError(row.code, row.reason) if row.reason else None)

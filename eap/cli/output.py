@@ -1,15 +1,16 @@
-"""Everything ``eapctl`` prints: JSON for programs, text and tables for people.
+"""The renderer of ``eapctl``: a command's typed result as JSON, or as its text view.
 
-What a command was asked for goes to stdout, what went wrong to stderr.  Whoever reads stdout may
-stop early (``| head``): that ends the command quietly and counts as done.
+Each command hands its result to :class:`Output`: ``--json`` prints the encoded record, else
+the lines and tables of the command's view.  Results go to stdout, everything else to stderr.  A
+reader of stdout may stop early (``| head``): that ends the command quietly and counts as done.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import click
 
@@ -18,12 +19,46 @@ from eap.errors import EnvironmentalError
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
+ResultT = TypeVar("ResultT")
+View: TypeAlias = "str | Iterable[RenderableType]"
+"""One line, or lines and tables from top to bottom."""
+
 UNLIMITED = 10_000
 """Columns of a table when stdout is no terminal: no cell is wrapped, no column left out."""
 
-
 _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 """ECMA-48: cursor to the first column of the first line, erase to the end of line, of screen."""
+
+
+class Output:
+    """Renderer of one command line.
+
+    Attributes:
+        is_json: ``--json`` was given.
+    """
+
+    def __init__(self, *, is_json: bool) -> None:
+        self.is_json = is_json
+
+    def show(self, result: ResultT, view: Callable[[ResultT], View]) -> None:
+        """Print one result: one JSON object, or its text view."""
+        if self.is_json:
+            write_json(result)
+        else:
+            write_view(view(result))
+
+    def show_rows(self, rows: Iterable[ResultT], view: Callable[[Iterable[ResultT]], View]) -> None:
+        """Print a list of results: a JSON object a line as they come, or one text view of all."""
+        if not self.is_json:
+            write_view(view(rows))
+            return
+        for row in rows:
+            write_json(row)
+
+    def remark(self, text: str) -> None:
+        """Print a line on stderr that is in the JSON result already."""
+        if not self.is_json:
+            click.echo(text, err=True)
 
 
 def write_json(document: Any) -> None:
@@ -46,13 +81,22 @@ def write_text(text: str, *, end: str = "\n") -> None:
 
 
 def _close_stdout() -> None:
-    """What is still buffered would fail again when the interpreter flushes at its end."""
+    """Discard what is buffered: the interpreter would fail at its end when it flushes that."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def write_tables(parts: Iterable[RenderableType]) -> None:
-    """Print rich renderables on stdout, coloured and fitted to the screen only on a terminal."""
-    write_text(_render(_console(), parts), end="")
+def write_view(view: View) -> None:
+    """Print lines and tables, coloured and fitted to the screen only on a terminal.
+
+    Lines without a style are printed as they are, each as soon as it is there.
+    """
+    console: Console | None = None
+    for part in (view,) if isinstance(view, str) else view:
+        if isinstance(part, str):
+            write_text(part)
+        else:
+            console = console or _console()
+            write_text(_render(console, [part]), end="")
 
 
 def repaint(parts: Iterable[RenderableType]) -> None:

@@ -1,12 +1,18 @@
-"""Options and parameter types that several commands share."""
+"""Options, arguments and parameter types that several commands share."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import click
+
+from eap.cli.output import Output
+from eap.ids import ObjectId
+
+if TYPE_CHECKING:
+    from eap.codec.datatypes import DataType
 
 CommandT = TypeVar("CommandT", bound=Callable[..., Any])
 
@@ -14,10 +20,10 @@ MIN_CYCLE_US = 100
 MAX_CYCLE_US = 60_000_000
 
 ANSWER_MARGIN_S = 5.0
-"""How much longer a command waits for its appliance than that waits for somebody else."""
+"""Time that a command waits for its appliance beyond the time that the appliance itself waits."""
 
 PLANT_FILE = click.Path(path_type=Path)
-"""A plant file; whether it can be read is for the loader to say, in its own words."""
+"""Path of a plant file; the loader says why it cannot be read."""
 
 
 class VariableName(NamedTuple):
@@ -31,8 +37,17 @@ class VariableName(NamedTuple):
 
 
 def json_option(text: str) -> Callable[[CommandT], CommandT]:
-    """Return the decorator that adds ``--json``; *text* says what comes out."""
-    return click.option("--json", "as_json", is_flag=True, help=text)
+    """Return the decorator that adds ``--json``; the function gets *output*.
+
+    Args:
+        text: Help text: the form of the JSON result.
+    """
+    return click.option("--json", "output", is_flag=True, callback=_to_output, help=text)
+
+
+def _to_output(ctx: click.Context, param: click.Parameter, is_json: bool) -> Output:
+    del ctx, param
+    return Output(is_json=is_json)
 
 
 def plant_option(command: CommandT) -> CommandT:
@@ -105,5 +120,51 @@ def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) ->
 
 
 def examples(*lines: str) -> str:
-    """Return what to show below the options of a command: some ways to call it."""
+    """Return the epilog of a command: examples of calls."""
     return "\n  ".join(("\b\nExamples:", *lines))
+
+
+def number_up_to(limit: int) -> Callable[[str | int], int]:
+    """Return the parser of a whole number, hexadecimal or decimal; it raises BadParameter."""
+
+    def parse(text: str | int) -> int:
+        try:
+            number = text if isinstance(text, int) else int(text, 0)
+        except ValueError:
+            number = -1
+        if not 0 <= number <= limit:
+            raise click.BadParameter(f"{text!r} is not a number from 0 to 0x{limit:X}")
+        return number
+
+    return parse
+
+
+def parse_entry(text: str) -> ObjectId:
+    """Read ``INDEX[:SUB]`` in hexadecimal; raise BadParameter with an example otherwise."""
+    try:
+        return ObjectId.parse(text)
+    except ValueError as exc:
+        raise click.BadParameter(str(exc)) from None
+
+
+def parse_type(text: str) -> DataType:
+    """Read a data type; raise BadParameter with a suggestion otherwise."""
+    from eap.codec import datatypes
+
+    try:
+        return datatypes.parse(text)
+    except ValueError as exc:
+        raise click.BadParameter(str(exc)) from None
+
+
+def parse_octets(text: str) -> bytes:
+    """Read hexadecimal digits; raise BadParameter if there is anything else."""
+    try:
+        return bytes.fromhex(text.removeprefix("0x"))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not pairs of hexadecimal digits") from None
+
+
+def slave_argument(command: CommandT) -> CommandT:
+    """Add the argument SLAVE."""
+    return click.argument("slave", metavar="SLAVE")(command)

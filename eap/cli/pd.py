@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from functools import partial
+from itertools import islice
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from eap.cli.output import write_json, write_tables, write_text
+from eap.cli.output import Output
 from eap.cli.params import (
     json_option,
     parse_assignment,
@@ -20,6 +21,7 @@ from eap.cli.params import (
 from eap.errors import ControlError
 
 if TYPE_CHECKING:
+    from eap.cli.pd_view import ListedPd
     from eap.codec.values import DataType
 
 
@@ -32,25 +34,20 @@ def pd() -> None:
 @plant_option
 @station_option
 @json_option("One object a line: a PD, or the variables of a station that no PD carries.")
-def list_pds(plant: str | None, station: str | None, as_json: bool) -> None:
+def list_pds(plant: str | None, station: str | None, output: Output) -> None:
     """List every PD with what identifies it, and every variable with its type and writer."""
     from eap.appliance.commands.client import connect
-    from eap.cli.pd_view import pd_rows, pd_tables
+    from eap.appliance.control import PD_LIST, VARIABLES
+    from eap.cli.pd_view import listed_pds, pd_table
 
+    rows: list[ListedPd] = []
     with ExitStack() as stack:
-        rows: list[dict[str, Any]] = []
         for client in map(stack.enter_context, connect(plant, station)):
             for name in [station] if station else client.info.stations:
-                rows += pd_rows(
-                    name,
-                    client.request("pd_list", station=name),
-                    client.request("variables", station=name),
-                )
-    if as_json:
-        for row in rows:
-            write_json(row)
-    else:
-        write_tables(pd_tables(rows))
+                pds = client.call(PD_LIST, station=name)
+                variables = client.call(VARIABLES, station=name)
+                rows += listed_pds(name, pds, variables)
+    output.show_rows(rows, pd_table)
 
 
 @pd.command()
@@ -68,26 +65,26 @@ def list_pds(plant: str | None, station: str | None, as_json: bool) -> None:
 @plant_option
 @json_option("One object a line.")
 def watch(
-    names: tuple[str, ...], count: int | None, period_ms: int, plant: str | None, as_json: bool
+    names: tuple[str, ...], count: int | None, period_ms: int, plant: str | None, output: Output
 ) -> None:
     """Print a line for each change of a variable, until Ctrl-C.
 
     All variables of STATION, or those named.  STATION/VAR names one of another station.  The first
-    lines say what the values are now, later ones how many cycles were skipped before them.
+    lines have the present values, later ones the number of cycles that were skipped before them.
     """
-    from eap.cli.watching import SkippedCycles, changes
+    from eap.cli.pd_view import SkippedCycles, change_lines, changes
 
     wanted = parse_names(names)
-    skipped = SkippedCycles(period_ms, partial(click.echo, err=True))
-    write = skipped.without(write_json) if as_json else _write_change
     try:
         with ExitStack() as stack:
-            stack.callback(skipped.close)
             stream = changes(stack, wanted, period_ms=period_ms, plant=plant)
-            for number, change in enumerate(stream, 1):
-                write(change)
-                if number == count:
-                    break
+            if count is not None:
+                stream = islice(stream, count)
+            if output.is_json:
+                skipped = SkippedCycles(period_ms, partial(click.echo, err=True))
+                stack.callback(skipped.close)
+                stream = map(skipped.take_out, stream)
+            output.show_rows(stream, change_lines)
     except KeyboardInterrupt:
         return
 
@@ -96,32 +93,30 @@ def watch(
 @click.argument("words", nargs=-1, required=True, metavar="STATION VAR VALUE")
 @plant_option
 @json_option("Print one object: what was written.")
-def set_value(words: tuple[str, ...], plant: str | None, as_json: bool) -> None:
+def set_value(words: tuple[str, ...], plant: str | None, output: Output) -> None:
     """Set a variable that the plant file gives to the application.
 
     VALUE as the variable's type has it: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,
     hexadecimal digits for a raw block.
     """
     from eap.appliance.commands.client import connect_station
+    from eap.appliance.control import VARIABLES, WRITE
+    from eap.cli.pd_view import WrittenVariable, value_text
     from eap.codec import datatypes
 
     target, text = parse_assignment(words)
     with connect_station(target.station, plant) as client:
-        variables = client.request("variables", station=target.station)
-        kinds = {row["name"]: datatypes.parse(row["type"]) for row in variables}
+        variables = client.call(VARIABLES, station=target.station)
+        kinds = {each.name: datatypes.parse(each.type) for each in variables}
         value: Any = text
         if kind := kinds.get(target.name):
             try:
                 value = _to_json(kind, text)
             except ValueError as exc:
                 raise ControlError(f"variable {target}: {exc}", code="value") from None
-        client.request("write", station=target.station, values={target.name: value})
-    if as_json:
-        write_json({"station": target.station, "variable": target.name, "value": value})
-    else:
-        from eap.cli.pd_view import value_text
-
-        write_text(f"{target} = {value_text(value)}")
+        client.call(WRITE, station=target.station, values={target.name: value})
+    done = WrittenVariable(target.station, target.name, value)
+    output.show(done, lambda each: f"{target} = {value_text(each.value)}")
 
 
 def _to_json(kind: DataType, text: str) -> Any:
@@ -131,9 +126,3 @@ def _to_json(kind: DataType, text: str) -> Any:
     if any(isinstance(number, float) and not isfinite(number) for number in numbers):
         raise ValueError(f"{text!r} cannot be set from here: expected a finite number")
     return kind.to_plain(value)
-
-
-def _write_change(change: dict[str, Any]) -> None:
-    from eap.cli.pd_view import change_line
-
-    write_text(change_line(change))

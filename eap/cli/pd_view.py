@@ -1,81 +1,217 @@
-"""Process data as rows for programs, and as tables and lines for people."""
+"""Process data as records and their text views: the list of PDs, changes of variables.
+
+Each station has a connection to itself; several are read by a thread each, because a wait for two
+sockets with one buffered reader misses data that the buffer already holds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from datetime import datetime
+from queue import SimpleQueue
+from typing import Any, TypeAlias
 
-from eap.cli import words
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-
-Row = Mapping[str, Any]
+from eap.appliance.commands.client import connect_station
+from eap.appliance.control import ValuesEvent, VariableRow
+from eap.cli.table import Column, TextTable, quality
+from eap.errors import EapError
+from eap.pd.report import PdRow, PdRowVariable
 
 _SHOWN = 48
 """Characters of a value in a line for people."""
 
 
-def pd_rows(station: str, pds: Sequence[Row], variables: Sequence[Row]) -> Iterator[dict[str, Any]]:
-    """Yield the PDs of *station*, then one row without a PD for the variables that none carries."""
-    yield from map(dict, pds)
-    carried = {variable["name"] for pd in pds for variable in pd["variables"]}
+class UncarriedVariables(Struct, frozen=True):
+    """Variables of a station that no PD carries, in the form of a PD."""
+
+    station: str
+    direction: None
+    name: None
+    variables: list[PdRowVariable]
+
+
+ListedPd: TypeAlias = PdRow | UncarriedVariables
+
+
+class WrittenVariable(Struct, frozen=True):
+    """``eapctl pd set``."""
+
+    station: str
+    variable: str
+    value: Any
+
+
+class ValueChange(Struct, frozen=True, kw_only=True):
+    """Change of a variable.
+
+    Attributes:
+        station: Name of its station.
+        variable: Its name.
+        value: As JSON has it.
+        time: ISO 8601.
+        cycle: Of the station.
+        quality: Of received variables, in units of 100 us; None before the first time.
+        skipped: Cycles since the station's change before that were not looked at, if any.
+    """
+
+    station: str
+    variable: str
+    value: Any
+    time: str
+    cycle: int
+    quality: int | UnsetType | None = UNSET
+    skipped: int | UnsetType = UNSET
+
+
+def listed_pds(
+    station: str, pds: Sequence[PdRow], variables: Sequence[VariableRow]
+) -> Iterator[ListedPd]:
+    """Yield the PDs of *station*, then one row for the variables that none carries."""
+    yield from pds
+    carried = {variable.name for pd in pds for variable in pd.variables}
     rest = [
-        {key: variable[key] for key in ("name", "type", "unit", "writer")}
+        PdRowVariable(variable.name, variable.type, variable.unit, variable.writer)
         for variable in variables
-        if variable["name"] not in carried
+        if variable.name not in carried
     ]
     if rest:
-        yield {"station": station, "direction": None, "name": None, "variables": rest}
+        yield UncarriedVariables(station, None, None, rest)
 
 
-def pd_tables(rows: Sequence[Row]) -> Iterator[RenderableType]:
-    """Yield the stations of *rows*, each with its PDs and their variables."""
-    from rich.text import Text
-
-    for station in dict.fromkeys(row["station"] for row in rows):
-        text = Text()
-        text.append(f"{station}\n", style="bold")
-        pds = [row for row in rows if row["station"] == station]
-        variables = [variable for pd in pds for variable in pd["variables"]]
-        name_width = max(len(variable["name"]) for variable in variables)
-        type_width = max(len(_typed(variable)) for variable in variables)
-        for pd in pds:
-            text.append(f" {_heading(pd)}\n", style="cyan")
-            for variable in pd["variables"]:
-                text.append(
-                    f"     {variable['name']:<{name_width}}  {_typed(variable):<{type_width}}"
-                    f"  {variable['writer']}\n"
-                )
-        yield text
-
-
-def _heading(pd: Row) -> str:
-    """Say what identifies a PD, and where it comes from or goes to."""
-    if pd["direction"] is None:
-        return "·  in no PD"
-    if pd["direction"] == "tx":
-        arrow, way = "→", f"to {pd['destination']}"
-    else:
-        arrow, way = "←", f"from {pd['publisher'] or 'any publisher'}"
-    line = f"{arrow}  {pd['name']}  id {pd['id']}, version {pd['version']}, {pd['port']} {way}"
-    return f"{line}, polled by {pd['poll']}" if pd.get("poll") else line
-
-
-def _typed(variable: Row) -> str:
-    return f"{variable['type']} {variable['unit']}".rstrip()
-
-
-def change_line(change: Row) -> str:
-    """Return one change as a line: time, variable, value, cycle, quality, cycles not looked at."""
-    at = change["time"][11:23]
-    line = (
-        f"{at}  {change['station']}/{change['variable']} = {value_text(change['value'])}"
-        f"  cycle {change['cycle']}"
+def pd_table(rows: Iterable[ListedPd]) -> Iterator[TextTable]:
+    """Yield the table of PDs, with a line for each of their variables."""
+    table = TextTable(
+        "Station",
+        "",
+        "PD",
+        Column("ID", rank=2, is_number=True),
+        Column("Version", rank=5, is_number=True),
+        Column("Port", rank=4),
+        Column("To or from", rank=3, wraps=True),
+        "Variable",
+        Column("Type", rank=1),
+        "Writer",
     )
-    if "quality" in change:
-        line = f"{line}  quality {words.quality(change['quality']) or 'never received'}"
-    return f"{line}  ({change['skipped']} skipped)" if "skipped" in change else line
+    station = ""
+    for row in rows:
+        name = row.station if row.station != station else ""
+        station = row.station
+        own = (name, *_identification(row))
+        for variable in row.variables:
+            kind = f"{variable.type} {variable.unit}".rstrip()
+            table.add_row(*own, variable.name, kind, variable.writer)
+            own = ("",) * len(own)
+        if not row.variables:
+            table.add_row(*own)
+    yield table
+
+
+def _identification(row: ListedPd) -> tuple[str, ...]:
+    """Return direction, name, ID, version, port, and the other end of a PD."""
+    if isinstance(row, UncarriedVariables):
+        return "", "in no PD", "", "", "", ""
+    arrow = "→" if row.direction == "tx" else "←"
+    far = row.destination or "" if row.direction == "tx" else row.publisher or "any publisher"
+    polled = f", polled by {row.poll}" if row.poll else ""
+    return arrow, row.name, str(row.id), str(row.version), row.port, f"{far}{polled}"
+
+
+def changes(
+    stack: ExitStack, names: Mapping[str, Sequence[str]], *, period_ms: int, plant: str | None
+) -> Iterator[ValueChange]:
+    """Yield each change of the variables *names* of each station; none means all.
+
+    Connections are closed by *stack*.
+
+    Raises:
+        ControlError: a station or variable is not there, or an appliance went away.
+    """
+    events = [
+        stack.enter_context(connect_station(station, plant)).events(
+            station=station, names=list(variables), period_ms=period_ms, on="change"
+        )
+        for station, variables in names.items()
+    ]
+    for event in events[0] if len(events) == 1 else _merge(events):
+        now = datetime.now().astimezone().isoformat(timespec="milliseconds")
+        for variable, value in event.values.items():
+            yield ValueChange(
+                station=event.station,
+                variable=variable,
+                value=value,
+                time=now,
+                cycle=event.cycle,
+                quality=event.quality.get(variable, UNSET),
+                skipped=event.skipped or UNSET,
+            )
+
+
+class SkippedCycles:
+    """Count of the cycles that were skipped, for stderr beside JSON lines.
+
+    Args:
+        period_ms: Period of the looks at the values.
+        write: Prints a line.
+    """
+
+    def __init__(self, period_ms: int, write: Callable[[str], None]) -> None:
+        self._period_ms = period_ms
+        self._write = write
+        self._last: dict[str, int] = {}
+        self._totals: dict[str, int] = {}
+
+    def take_out(self, change: ValueChange) -> ValueChange:
+        """Return *change* without ``skipped``; write the first one of each station."""
+        skipped, station, cycle = change.skipped or 0, change.station, change.cycle
+        if skipped and self._last.get(station) != cycle:  # else another variable of that event
+            if station not in self._totals:
+                self._write(
+                    f"{station}: {skipped} cycles before cycle {cycle} skipped: values are"
+                    f" looked at every {self._period_ms} ms; choose a shorter --period"
+                )
+            self._totals[station] = self._totals.get(station, 0) + skipped
+            self._last[station] = cycle
+        return replace(change, skipped=UNSET)
+
+    def close(self) -> None:
+        """Write the total of each station."""
+        for station, total in self._totals.items():
+            self._write(f"{station}: {total} cycles skipped in all")
+
+
+def _merge(streams: Sequence[Iterator[ValuesEvent]]) -> Iterator[ValuesEvent]:
+    """Yield the events of all *streams* as they come; the first error ends it."""
+    arrivals: SimpleQueue[ValuesEvent | Exception] = SimpleQueue()
+
+    def forward(stream: Iterator[ValuesEvent]) -> None:
+        try:
+            for event in stream:
+                arrivals.put(event)
+        except (EapError, OSError, ValueError) as exc:  # ValueError: closed at the end
+            arrivals.put(exc)
+
+    for stream in streams:
+        threading.Thread(target=forward, args=(stream,), daemon=True).start()
+    while not isinstance(arrival := arrivals.get(), Exception):
+        yield arrival
+    raise arrival
+
+
+def change_lines(stream: Iterable[ValueChange]) -> Iterator[str]:
+    """Yield each change as a line: time, variable, value, cycle, quality, skipped cycles."""
+    for change in stream:
+        line = (
+            f"{change.time[11:23]}  {change.station}/{change.variable} ="
+            f" {value_text(change.value)}  cycle {change.cycle}"
+        )
+        if change.quality is not UNSET:
+            line = f"{line}  quality {quality(change.quality) or 'never received'}"
+        yield f"{line}  ({change.skipped} skipped)" if change.skipped else line
 
 
 def value_text(value: Any) -> str:

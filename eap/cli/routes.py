@@ -1,31 +1,36 @@
-"""``eapctl routes``: which station is reached by which way, and how these ways are doing."""
+"""``eapctl routes``: routes of the routers of running stations."""
 
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from eap.cli.group import ExitCode, LazyGroup
-from eap.cli.output import write_json, write_tables, write_text
+from eap.cli.output import Output, write_text
 from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
 from eap.errors import EnvironmentalError
 
 if TYPE_CHECKING:
-    from eap.appliance.control_routes import TestResult
+    from eap.appliance.control_routes import ImportRow, NeighbourRow, TestResult
+
+_IMPORT_S = 60.0
+"""Time for a file with many routes, each of which is written to disk."""
+_FILE = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
 
 
 @click.group(
     cls=LazyGroup,
     commands_at={
         "add": "eap.cli.routes:add",
-        "export": "eap.cli.routes_file:export",
-        "import": "eap.cli.routes_file:import_routes",
-        "introduce": "eap.cli.routes_introduce:introduce",
+        "export": "eap.cli.routes:export",
+        "import": "eap.cli.routes:import_routes",
+        "introduce": "eap.cli.routes:introduce",
         "list": "eap.cli.routes:list_all",
         "remove": "eap.cli.routes:remove",
-        "scan": "eap.cli.routes_scan:scan",
+        "scan": "eap.cli.routes:scan",
         "test": "eap.cli.routes:test",
     },
     short_help="Show, add, remove and test routes; without a command: a live view.",
@@ -42,21 +47,21 @@ if TYPE_CHECKING:
 def routes(ctx: click.Context, plant: str | None) -> None:
     """Show the routes and connections of the routers of running stations, live.
 
-    In a terminal and without a command: a table to look at and to work with, by keyboard or mouse.
-    Elsewhere it is printed once, as by 'eapctl routes list'.
+    In a terminal and without a command: a live table for keyboard and mouse.  Otherwise it is
+    printed once, as by 'eapctl routes list'.
     """
     if ctx.invoked_subcommand is not None:
         if plant:
             raise click.UsageError("--plant goes behind the command")
         return
     if not is_terminal():
-        ctx.invoke(list_all, plant=plant, station=None, match="", as_json=False)
+        ctx.invoke(list_all, plant=plant, station=None, match="", output=Output(is_json=False))
         return
     _run_view(plant)
 
 
 def is_terminal() -> bool:
-    """Say whether somebody sits before a screen."""
+    """Return whether stdin and stdout are a terminal."""
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
@@ -79,22 +84,17 @@ def _run_view(plant: str | None) -> None:
     "--match",
     default="",
     metavar="TEXT",
-    help="Only routes with TEXT in name, NetID, door, address, origin or state.",
+    help="Only routes with TEXT in name, NetID, transport, address, origin or state.",
 )
 @plant_option
 @json_option("Print one object: stations, each with routes, connections, requests, warnings.")
-def list_all(station: str | None, match: str, plant: str | None, as_json: bool) -> None:
+def list_all(station: str | None, match: str, plant: str | None, output: Output) -> None:
     """List the routes and connections of STATION, or of all running stations."""
-    from eap.appliance.commands.route_lists import list_routes
+    from eap.appliance.commands.route_lists import RouterList, list_routes
+    from eap.cli.routes_view import routes_view
 
-    found = list_routes(plant, station, match, requests=50 if as_json else 0)
-    stations = [row for each in found for row in each.stations]
-    if as_json:
-        write_json({"stations": stations})
-        return
-    from eap.cli.routes_view import routes_tables
-
-    write_tables(routes_tables(stations))
+    found = list_routes(plant, station, match, requests=50 if output.is_json else 0)
+    output.show(RouterList([row for each in found for row in each.stations]), routes_view)
 
 
 @click.command(short_help="Add a route, which is kept until it is removed.")
@@ -108,24 +108,29 @@ def list_all(station: str | None, match: str, plant: str | None, as_json: bool) 
     help="STATION/PORT of the plant, or ams-tcp:HOST[:PORT], udp:ADDRESS, tcp:ADDRESS,"
     " ethernet:MAC, mqtt:NETWORK.",
 )
-@click.option("--port", default="", metavar="PORT", help="EAP port of STATION to leave by.")
+@click.option("--port", default="", metavar="PORT", help="EAP port of STATION to send from.")
 @click.option(
     "--octets",
     type=click.Choice(["6", "5", "4", "0"]),
     default="4",
     show_default=True,
-    help="How many octets of NETID have to match; 0 takes all that no other route does.",
+    help="Number of octets of NETID that have to match; 0 is a default route.",
 )
-@click.option("--virtual", default="", metavar="NETID", help="NetID that it has here (NAT).")
-@click.option("--unidirectional", is_flag=True, help="Nothing may be asked from there.")
+@click.option(
+    "--virtual",
+    default="",
+    metavar="NETID",
+    help="NetID of NAME at STATION, if it differs from its own (NAT).",
+)
+@click.option("--unidirectional", is_flag=True, help="Refuse requests that come from there.")
 @click.option(
     "--timeout",
     "timeout_ms",
     type=click.IntRange(1, 600_000),
     metavar="MS",
-    help="How long an answer may take.",
+    help="Time limit for an answer.",
 )
-@click.option("--no-probe", is_flag=True, help="Do not ask the next hop whether it is alive.")
+@click.option("--no-probe", is_flag=True, help="Do not probe the next hop.")
 @plant_option
 @json_option("Print one object: route and warnings.")
 def add(
@@ -140,53 +145,59 @@ def add(
     timeout_ms: int | None,
     no_probe: bool,
     plant: str | None,
-    as_json: bool,
+    output: Output,
 ) -> None:
     """Add a route to the router of STATION: to NAME with NETID, by way of VIA.
 
     NETID may be left out when NAME is a station of the plant.  A route of the plant file goes
     before one that was added; 'eapctl routes test STATION NAME' shows whether it works.
     """
-    answer = _ask(
-        station, plant, "routes_add", name=name, net_id=net_id, via=via, port=port,
-        octets=int(octets), virtual=virtual, unidirectional=unidirectional,
-        timeout_ms=timeout_ms or 0, probed=not no_probe,
-    )  # fmt: skip
-    if as_json:
-        write_json(answer)
-        return
-    from eap.aoe.way import Way
+    from eap.appliance.commands.client import connect_station
+    from eap.appliance.control_routes import ROUTES_ADD
+    from eap.cli.routes_view import path_of
 
-    route = answer["route"]
-    way = Way(route["door"], route["address"])
-    write_text(f"{station}: added {name} ({route['net_id']}, {way})")
-    for warning in answer["warnings"]:
-        click.echo(f"{station}: {warning}", err=True)
+    with connect_station(station, plant) as client:
+        added = client.call(
+            ROUTES_ADD, station=station, name=name, net_id=net_id, via=via, port=port,
+            octets=int(octets), virtual=virtual, unidirectional=unidirectional,
+            timeout_ms=timeout_ms or 0, probed=not no_probe,
+        )  # fmt: skip
+    route = added.route
+    output.show(added, lambda _: f"{station}: added {name} ({route.net_id}, {path_of(route)})")
+    for warning in added.warnings:
+        output.remark(f"{station}: {warning}")
 
 
 @click.command(short_help="Remove a route that was added.")
 @click.argument("station")
 @click.argument("route")
-@click.option("--door", default="", help="Of several with one name or NetID the one by this door.")
+@click.option(
+    "--transport",
+    default="",
+    help="Of several routes with one name or NetID the one with this transport.",
+)
 @click.option("--address", default="", help="Likewise, the one to this address.")
 @plant_option
 @json_option("Print one object: the route.")
 def remove(
-    station: str, route: str, door: str, address: str, plant: str | None, as_json: bool
+    station: str, route: str, transport: str, address: str, plant: str | None, output: Output
 ) -> None:
     """Remove ROUTE, a name or NetID, from the router of STATION.
 
-    Routes of the plant file are removed there; those that were learned go by themselves.
+    Routes of the plant file are removed there; learned ones expire.
     """
-    answer = _ask(station, plant, "routes_remove", route=route, door=door, address=address)
-    if as_json:
-        write_json(answer)
-        return
-    row = answer["route"]
-    write_text(f"{station}: removed {row['name']} ({row['net_id']}, {row['address']})")
+    from eap.appliance.commands.client import connect_station
+    from eap.appliance.control_routes import ROUTES_REMOVE
+
+    with connect_station(station, plant) as client:
+        removed = client.call(
+            ROUTES_REMOVE, station=station, route=route, transport=transport, address=address
+        )
+    row = removed.route
+    output.show(removed, lambda _: f"{station}: removed {row.name} ({row.net_id}, {row.address})")
 
 
-@click.command(short_help="Measure the way to stations and back.")
+@click.command(short_help="Measure the round trip to stations.")
 @click.argument("station", required=False, metavar="[STATION]")
 @click.argument("targets", nargs=-1, metavar="[TARGET]...")
 @click.option(
@@ -196,7 +207,7 @@ def remove(
     default=5000,
     show_default=True,
     metavar="MS",
-    help="Patience for each answer.",
+    help="Time limit for each answer.",
 )
 @plant_option
 @json_option("Print one object a target and line.")
@@ -207,71 +218,246 @@ def test(
     targets: tuple[str, ...],
     timeout_ms: int,
     plant: str | None,
-    as_json: bool,
+    output: Output,
 ) -> None:
-    """Ask each TARGET for its state, by way of the router of STATION, and measure the time.
+    """Read the state of each TARGET through the router of STATION, and measure the time.
 
     TARGET is the name of a route, a NetID, or a name of the plant (STATION, STATION/PORT,
-    STATION/PORT/SLAVE); all routes without one, of all running stations without STATION.  Says in
-    words what is wrong, where, and what to do.
+    STATION/PORT/SLAVE); all routes without one, of all running stations without STATION.  A target
+    that does not answer is shown with the place of the fault, its cause and a remedy.
 
-    Exits with 1 when one of them does not answer; without a TARGET a client that does not listen
-    is no failure.
+    Exits with 1 when a target does not answer; without a TARGET a client that does not listen is no
+    failure.
     """
-    from eap.appliance.commands.route_lists import list_routes
+    from eap.appliance.commands.route_lists import TestedTarget, list_routes
+    from eap.cli.routes_view import result_table
 
     chosen = [(station, target) for target in targets if station]
     clients: set[tuple[str, str]] = set()
     if not chosen:
-        found = [row for each in list_routes(plant, station) for row in each.stations]
-        chosen = [(row.station, name) for row in found for name in _names(row.routes)]
-        clients = {
-            (row.station, route.net_id)
-            for row in found
-            for route in row.routes
-            if route.state == "client"
-        }
-    results = [(each, _test(each, target, timeout_ms, plant)) for each, target in chosen]
-    failed = [
-        place
-        for place, (_, result) in zip(chosen, results, strict=True)
-        if not result.ok and place not in clients
+        for row in (row for each in list_routes(plant, station) for row in each.stations):
+            # A default route leads to no station of its own.
+            targeted = [route for route in row.routes if route.octets]
+            chosen += [(row.station, name) for name in dict.fromkeys(r.net_id for r in targeted)]
+            clients |= {(row.station, r.net_id) for r in row.routes if r.state == "client"}
+    results = [
+        TestedTarget.of(name, _test(name, target, timeout_ms, plant)) for name, target in chosen
     ]
-    if as_json:
-        for name, result in results:
-            write_json({"station": name} | _plain(result))
-    else:
-        from eap.cli.routes_view import result_table
-
-        write_tables([result_table(results)])
-    if failed:
+    output.show_rows(results, result_table)
+    if any(
+        not result.ok and place not in clients
+        for place, result in zip(chosen, results, strict=True)
+    ):
         ctx.exit(ExitCode.FAILED)
 
 
-def _names(routes: list[Any]) -> list[str]:
-    """Return what to ask to try all routes: their NetIDs; a default route leads to none."""
-    return list(dict.fromkeys(row.net_id for row in routes if row.octets))
-
-
 def _test(station: str, target: str, timeout_ms: int, plant: str | None) -> TestResult:
-    from eap.appliance.control_routes import TestResult, read_document
-
-    patience_s = timeout_ms / 1000 + ANSWER_MARGIN_S
-    answer = _ask(station, plant, "routes_test", patience_s, target=target, timeout_ms=timeout_ms)
-    return read_document(answer, TestResult)
-
-
-def _plain(result: TestResult) -> dict[str, Any]:
-    import msgspec
-
-    document: dict[str, Any] = msgspec.to_builtins(result)
-    return document
-
-
-def _ask(
-    station: str, plant: str | None, method: str, patience_s: float = 10.0, **params: Any
-) -> Any:
     from eap.appliance.commands.client import connect_station
+    from eap.appliance.control_routes import ROUTES_TEST
+
+    within_s = timeout_ms / 1000 + ANSWER_MARGIN_S
+    with connect_station(station, plant) as client:
+        return client.call(
+            ROUTES_TEST, within_s=within_s, station=station, target=target, timeout_ms=timeout_ms
+        )
+
+
+@click.command("import", short_help="Add the routes of a StaticRoutes file.")
+@click.argument("station")
+@click.argument("file", type=_FILE)
+@click.option(
+    "--dry-run", is_flag=True, help="Show the routes that would be added, and add nothing."
+)
+@plant_option
+@json_option("Print one route a line, as an object.")
+@click.pass_context
+def import_routes(
+    ctx: click.Context,
+    station: str,
+    file: Path,
+    dry_run: bool,
+    plant: str | None,
+    output: Output,
+) -> None:
+    """Add the routes of FILE (StaticRoutes.xml of TwinCAT) to the router of STATION.
+
+    Name, address and NetID of each are read; its type has to be TCP_IP.  A route that exists
+    already is replaced.  FILE - is stdin.
+
+    Exits with 1 when a route could not be added; the others are.
+    """
+    from eap.appliance.commands.client import connect_station
+    from eap.appliance.control_routes import ROUTES_IMPORT
+    from eap.cli.routes_view import import_table
+
+    xml = _read(file)
+    with connect_station(station, plant) as client:
+        rows: list[ImportRow] = client.call(
+            ROUTES_IMPORT, within_s=_IMPORT_S, station=station, xml=xml, dry_run=dry_run
+        )
+    output.show_rows(rows, lambda each: import_table(each, is_done=not dry_run))
+    if any(row.reason for row in rows):
+        ctx.exit(ExitCode.FAILED)
+
+
+@click.command(short_help="Write the routes of a station as a StaticRoutes file.")
+@click.argument("station")
+@click.argument("file", type=_FILE, required=False, metavar="[FILE]")
+@plant_option
+def export(station: str, file: Path | None, plant: str | None) -> None:
+    """Write the AMS/TCP routes of STATION to FILE, or to stdout, in the form of TwinCAT.
+
+    Routes with other transports have no place in such a file; they are named on stderr.
+    """
+    from eap.appliance.commands.client import connect_station
+    from eap.appliance.control_routes import ROUTES_EXPORT
+    from eap.appliance.durable import whole_file
 
     with connect_station(station, plant) as client:
-        return client.request_within(patience_s, method, station=station, **params)
+        found = client.call(ROUTES_EXPORT, station=station)
+    if file is None or str(file) == "-":
+        write_text(found.xml, end="")
+    else:
+        with whole_file(file) as target:
+            target.write(found.xml.encode())
+        write_text(f"{file}: the AMS/TCP routes of {station}")
+    if found.left_out:
+        names = ", ".join(found.left_out)
+        click.echo(f"{station}: no AMS/TCP routes, so left out: {names}", err=True)
+
+
+def _read(file: Path) -> str:
+    from eap.appliance.commands.route_lists import text_of_xml
+
+    octets = sys.stdin.buffer.read() if str(file) == "-" else file.read_bytes()
+    try:
+        return text_of_xml(octets)
+    except ValueError as exc:
+        raise click.ClickException(f"{file}: {exc}") from None
+
+
+@click.command(
+    short_help="Add a route to a station at another router.",
+    epilog=examples(
+        "eapctl routes introduce island-01 192.168.1.5 --user Administrator",
+        "eapctl routes introduce island-01 192.168.1.5 --user Administrator --password-file pw",
+    ),
+)
+@click.argument("station")
+@click.argument("address")
+@click.option(
+    "--name", default="", metavar="NAME", help="Name of the route there; STATION without."
+)
+@click.option("--user", default="", metavar="USER", help="User of the other system.")
+@click.option(
+    "--password-file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Its first line is the password; prompt for it without.",
+)
+@click.option(
+    "--wait",
+    "wait_ms",
+    type=click.IntRange(10, 60_000),
+    default=5000,
+    show_default=True,
+    metavar="MS",
+    help="Time limit for the answer.",
+)
+@plant_option
+@json_option("Print one object: ok, result, text.")
+@click.pass_context
+def introduce(
+    ctx: click.Context,
+    station: str,
+    address: str,
+    name: str,
+    user: str,
+    password_file: Path | None,
+    wait_ms: int,
+    plant: str | None,
+    output: Output,
+) -> None:
+    """Request the router at ADDRESS, such as that of a PLC, to add a route to STATION.
+
+    Most routers answer only hosts that they have a route to.  The request goes to UDP 48899, with
+    user and password in clear.
+
+    Exits with 1 when the other router refuses, or does not answer.
+    """
+    password = _password(user, password_file)
+    from eap.appliance.commands.client import connect_station
+    from eap.appliance.control_routes import ROUTES_INTRODUCE
+
+    with connect_station(station, plant) as client:
+        answer = client.call(
+            ROUTES_INTRODUCE,
+            within_s=wait_ms / 1000 + ANSWER_MARGIN_S,
+            station=station,
+            address=address,
+            name=name,
+            user=user,
+            password=password,
+            wait_ms=wait_ms,
+        )
+    output.show(answer, lambda each: f"{address}: {each.text}")
+    if not answer.ok:
+        ctx.exit(ExitCode.FAILED)
+
+
+def _password(user: str, file: Path | None) -> str:
+    if file is not None:
+        from eap.net.password import read_password_text
+
+        return read_password_text(file)
+    return click.prompt("Password", hide_input=True, err=True) if user else ""
+
+
+@click.command(
+    short_help="Discover the routers of other hosts, and learn routes to them.",
+    epilog=examples("eapctl routes scan", "eapctl routes scan island-01 --address 192.168.1.5"),
+)
+@click.argument("station", required=False, metavar="[STATION]")
+@click.option(
+    "--address",
+    default="",
+    metavar="ADDRESS",
+    help="IPv4 address of the only host or network to ask; the networks of STATION without.",
+)
+@click.option(
+    "--wait",
+    "wait_ms",
+    type=click.IntRange(10, 60_000),
+    default=1000,
+    show_default=True,
+    metavar="MS",
+    help="Time limit for answers.",
+)
+@plant_option
+@json_option("Print one object a router and line.")
+def scan(
+    station: str | None, address: str, wait_ms: int, plant: str | None, output: Output
+) -> None:
+    """Discover the AMS routers of other hosts by UDP 48899.
+
+    Routes to those that answer are learned, for ten minutes, unless there is one already or the
+    plant file says 'learn: false'.  The request is sent by STATION, or by all that run here.
+    """
+    from contextlib import ExitStack
+
+    from eap.appliance.commands.client import connect
+    from eap.appliance.control_routes import ROUTES_SCAN
+    from eap.cli.routes_view import neighbour_table
+
+    found: list[NeighbourRow] = []
+    with ExitStack() as stack:
+        for client in [stack.enter_context(each) for each in connect(plant, station)]:
+            rows = client.call(
+                ROUTES_SCAN,
+                within_s=wait_ms / 1000 + ANSWER_MARGIN_S,
+                station=station or "",
+                address=address,
+                wait_ms=wait_ms,
+            )
+            found += rows
+    output.show_rows(found, neighbour_table)

@@ -1,16 +1,20 @@
-"""``eapctl sim run``: simulated slaves that answer a master."""
+"""``eapctl sim``: simulated slaves that answer a master, and faults of simulated buses."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
+from eap.cli.bus_place import BusPort, parse_port
 from eap.cli.group import LazyGroup
-from eap.cli.output import write_json
-from eap.cli.params import examples
+from eap.cli.output import Output, write_json
+from eap.cli.params import CommandT, examples, json_option, plant_option
 from eap.ids import InterfaceUri
+
+_EXAMPLE = "such as power slave=drive for_ms=500"
 
 
 def _parse_interface(
@@ -25,15 +29,15 @@ def _parse_interface(
 @click.group(
     cls=LazyGroup,
     commands_at={
-        "fault": "eap.cli.sim_fault:fault",
+        "fault": "eap.cli.sim:fault",
         "run": "eap.cli.sim:run",
-        "set": "eap.cli.sim_fault:set_value",
+        "set": "eap.cli.sim:set_value",
     },
 )
 def sim() -> None:
-    """Run simulated slaves, and let things happen.
+    """Run simulated slaves, and inject faults.
 
-    A master of the EtherCAT device protocol takes them for real ones.
+    A master of the EtherCAT device protocol cannot tell them from real ones.
     """
 
 
@@ -71,3 +75,122 @@ def run(bus: Path, interface: InterfaceUri, second: InterfaceUri | None, faults:
         )
     command_fd = sys.stdin.fileno() if faults else None
     segment_process.run(loaded, interface, write_json, second=second, command_fd=command_fd)
+
+
+def parse_fault(words: tuple[str, ...]) -> dict[str, Any]:
+    """Read a JSON object, or a kind and ``key=value``; raise UsageError for anything else."""
+    if len(words) == 1 and words[0].lstrip().startswith("{"):
+        import msgspec
+
+        try:
+            return msgspec.json.decode(words[0], type=dict[str, Any])
+        except msgspec.DecodeError as exc:
+            raise click.UsageError(f"not a fault in JSON: {exc}") from None
+    kind, *rest = words
+    fault: dict[str, Any] = {"kind": kind}
+    for word in rest:
+        key, equals, text = word.partition("=")
+        if not key or not equals:
+            raise click.UsageError(f"{word!r} is not key=value: a fault is written {_EXAMPLE}")
+        fault[key.replace("-", "_")] = parse_value(text)
+    return fault
+
+
+def parse_value(text: str) -> bool | int | float | str:
+    """Read a truth value or a number, in hexadecimal too; what is neither stays text."""
+    if text in {"true", "false"}:
+        return text == "true"
+    try:
+        return int(text, 0)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _place_argument(command: CommandT) -> CommandT:
+    return click.argument("bus", callback=_to_port, metavar="STATION/PORT")(command)
+
+
+def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> BusPort:
+    port = parse_port(text)
+    if port is None:
+        raise click.BadParameter(f"{text!r} is no STATION/PORT, such as press/bus0", ctx, param)
+    return port
+
+
+@click.command(
+    epilog=examples(
+        "eapctl sim fault island-01/bus0 power slave=drive for_ms=500",
+        "eapctl sim fault island-02/bus0 cut slave=sensor",
+        "eapctl sim fault island-02/bus0 cut slave=sensor --end",
+    )
+)
+@_place_argument
+@click.argument("words", nargs=-1, required=True, metavar="JSON|KIND [KEY=VALUE]...")
+@click.option("--end", is_flag=True, help="End the described fault instead of beginning it.")
+@plant_option
+@json_option("Print one object: what was sent.")
+def fault(
+    bus: BusPort, words: tuple[str, ...], end: bool, plant: str | None, output: Output
+) -> None:
+    """Inject a fault into a simulated bus of a running station.
+
+    KIND is loss, delay, corrupt, wkc, cut, power, mailbox, foe, sdo, eeprom, tx-pdo, emergency,
+    al-error, refuse or drift; most want slave=NAME, and take at_ms and for_ms.  docs/simulator.md
+    says what each does, and its keys.
+    """
+    command = parse_fault(words) | ({"end": True} if end else {})
+    _send(bus, command, plant)
+    kind = command.get("kind")
+    output.show(command, lambda _: f"{bus}: fault {kind} {'ends' if end else 'begins'}")
+
+
+@click.command(
+    "set",
+    context_settings={"ignore_unknown_options": True},
+    epilog=examples(
+        "eapctl sim set island-02/bus0 buttons start true",
+        "eapctl sim set island-02/bus0 buttons start --release",
+    ),
+)
+@_place_argument
+@click.argument("slave")
+@click.argument("entry")
+@click.argument("value", required=False, metavar="[VALUE]")
+@click.option("--release", is_flag=True, help="Let the entry change again; without VALUE.")
+@plant_option
+@json_option("Print one object: what was sent.")
+def set_value(
+    bus: BusPort,
+    slave: str,
+    entry: str,
+    value: str | None,
+    release: bool,
+    plant: str | None,
+    output: Output,
+) -> None:
+    """Force an entry of a simulated slave to a value, until --release.
+
+    SLAVE is its name in the bus file, ENTRY the name of an input or another entry, or an object
+    such as 0x6000:1.
+    """
+    if release == (value is not None):
+        raise click.UsageError("expected either VALUE or --release")
+    where: dict[str, Any] = {"slave": slave, "entry": entry}
+    if value is None:
+        command = {"release": where}
+    else:
+        command = {"set": where | {"value": parse_value(value)}}
+    _send(bus, command, plant)
+    done = "changes again" if release else f"= {value}"
+    output.show(command, lambda _: f"{bus}: {slave} {entry} {done}")
+
+
+def _send(bus: BusPort, command: dict[str, Any], plant: str | None) -> None:
+    from eap.appliance.commands.client import connect_station
+
+    with connect_station(bus.station, plant) as client:
+        client.request("bus_fault", station=bus.station, port=bus.port, command=command)

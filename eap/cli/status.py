@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from eap.cli.output import repaint, write_json, write_tables
+from eap.cli.output import Output, repaint, write_json
 from eap.cli.params import json_option, plant_option, station_option
 from eap.errors import ControlError
 
@@ -57,23 +57,20 @@ def status(
     interval_s: float,
     plant: str | None,
     station: str | None,
-    as_json: bool,
+    output: Output,
 ) -> None:
-    """Show how the running appliances are: errors first, then a line for each station.
+    """Show the state of the running appliances: errors first, then a line for each station.
 
-    Errors and warnings say what is wrong, where, since when, and what to do.
+    Errors and warnings have place, cause, beginning and remedy.
     """
     view = _full if full else _screen
     if not watch:
         look = _look(plant, station)
-        if as_json:
-            write_json(look.document)
-        else:
-            write_tables(view(look))
+        output.show(look.document, lambda _: view(look))
         return
     try:
         for found in _looks(plant, station, interval_s):
-            if as_json:
+            if output.is_json:
                 _write_object(found)
             else:
                 repaint(_page(found, view, interval_s))
@@ -129,22 +126,22 @@ def _write_object(found: Look | str) -> None:
 def _page(
     found: Look | str, view: Callable[[Look], Iterable[RenderableType]], interval_s: float
 ) -> Iterator[RenderableType]:
-    from rich.text import Text
+    from eap.cli.table import Styled
 
-    yield Text(f"{time.strftime('%H:%M:%S')}, every {interval_s:g} s", style="dim")
+    yield Styled(f"{time.strftime('%H:%M:%S')}, every {interval_s:g} s", style="dim")
     if isinstance(found, Look):
         yield from view(found)
     else:
-        yield Text(f"{found}; waiting for it", style="bold red")
+        yield Styled(f"{found}; waiting for it", style="bold red")
 
 
 def _screen(look: Look) -> Iterator[RenderableType]:
-    from eap.cli.status_screen import StatusScreen  # rich; --help must not wait for it
+    from eap.cli.status_view import StatusScreen
 
     yield StatusScreen(look.document, look.now_s, look.earlier, look.seconds)
 
 
 def _full(look: Look) -> Iterator[RenderableType]:
-    from eap.cli.status_view import status_tables
+    from eap.cli.status_view import full_view
 
-    return status_tables(look.document, look.now_s)
+    return full_view(look.document, look.now_s)

@@ -18,7 +18,8 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from eap.cli import words
+from eap.cli.table import count, duration
+from eap.cli.table import times as times_of
 
 Row = Mapping[str, Any]
 
@@ -174,7 +175,7 @@ def _of_appliance(appliance: Row) -> Iterator[Finding]:
 
 
 def _of_audit(where: str, audit: Row) -> Iterator[Finding]:
-    lost, error = words.count(audit["lines"], "line"), audit["error"]
+    lost, error = count(audit["lines"], "line"), audit["error"]
     if error:
         effect = "changes are refused" if audit["required"] else "changes are not recorded"
         advice = f"{lost} lost; make room for {audit['file']}, or make its folder writable"
@@ -250,11 +251,11 @@ def _of_cycles(station: Row) -> Iterator[Finding]:
         advice = f"'eapctl state {name} OP' ends that"
         yield _warning(name, f"in {state}, as requested: {effect}", advice)
     if held := station.get("links_held"):
-        yield _warning(name, f"held {words.count(held, 'linked value')} back: not a number")
+        yield _warning(name, f"held {count(held, 'linked value')} back: not a number")
     if overruns := station.get("overruns"):
-        yield _info(name, f"left out {words.count(overruns, 'cycle')}")
+        yield _info(name, f"left out {count(overruns, 'cycle')}")
     if torn := station.get("torn"):
-        yield _info(name, f"found {words.count(torn, 'torn write')}")
+        yield _info(name, f"found {count(torn, 'torn write')}")
     if discarded := _counts(station["discarded"]):
         yield _info(name, f"dropped: {discarded}")
 
@@ -278,7 +279,7 @@ def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
         yield _error(where, each["what"], each["advice"] or advice, each["since"])
     for key, noun, text in _BUS_COUNTERS:
         if number := bus.get(key):
-            yield _info(where, f"{words.count(number, noun)} {text}")
+            yield _info(where, f"{count(number, noun)} {text}")
 
 
 def _of_sent(where: str, row: Row) -> Iterator[Finding]:
@@ -290,10 +291,10 @@ def _of_sent(where: str, row: Row) -> Iterator[Finding]:
         advice = "check cable and power of the receiving station"
         yield _error(where, "its subscriber does not answer", advice)
     if row["skipped"]:
-        yield _info(where, f"skipped {words.times(row['skipped'])}")
+        yield _info(where, f"skipped {times_of(row['skipped'])}")
     if len(row["reason"]) > 1:
         counts = (
-            f"{REASONS.get(why, why)} {words.times(count)}" for why, count in row["reason"].items()
+            f"{REASONS.get(why, why)} {times_of(count)}" for why, count in row["reason"].items()
         )
         yield _info(where, f"sent {', '.join(counts)}")
 
@@ -330,7 +331,7 @@ def _of_received(where: str, row: Row) -> Iterator[Finding]:
         yield _error(where, f"dropped: another {wrong} than expected", advice)
     remarks = []
     if row.get("timeouts"):
-        remarks.append(f"timed out {words.times(row['timeouts'])}")
+        remarks.append(f"timed out {times_of(row['timeouts'])}")
     remarks += [f"{row[key]} {key}" for key in ("duplicated", "reordered", "late") if row[key]]
     if discarded := _counts(row["discarded"]):
         remarks.append(f"dropped: {discarded}")
@@ -351,8 +352,8 @@ def _of_sources(station: Row) -> Iterator[Finding]:
             wrong.setdefault(what, []).append(row | {"ago_us": source["age_us"]})
     for what, rows in wrong.items():
         ago_us = min(row["ago_us"] for row in rows)
-        first, last = f"{station['name']} ← {rows[0]['name']}", words.duration(ago_us)
-        where = f"{first} and {words.count(len(rows) - 1, 'other')}" if len(rows) > 1 else first
+        first, last = f"{station['name']} ← {rows[0]['name']}", duration(ago_us)
+        where = f"{first} and {count(len(rows) - 1, 'other')}" if len(rows) > 1 else first
         text = f"{what}; last {last} ago"
         if ago_us > _RECENT_US:
             yield _info(where, text)
@@ -369,4 +370,4 @@ def _moment(at_s: float, now_s: float) -> str:
     """Return a time of day, with the date if it is another day, and how long ago that is."""
     at, now = (datetime.fromtimestamp(each).astimezone() for each in (at_s, now_s))
     form = "%H:%M:%S" if at.date() == now.date() else "%Y-%m-%d %H:%M:%S"
-    return f"{at.strftime(form)} ({words.duration(max(0, round((now_s - at_s) * 1e6)))})"
+    return f"{at.strftime(form)} ({duration(max(0, round((now_s - at_s) * 1e6)))})"

@@ -1,60 +1,284 @@
-"""The whole status as tables: findings, processes, stations with their ports, buses, process data.
+"""Text views of ``eapctl status``: one screen, or with ``--full`` everything as tables.
 
-Pure: the document of ``eapctl status --json`` in, rich renderables out.  Tables hold what every row
-has; what happened since the start without being wrong now follows below them in words.
+The screen shows verdict, findings, stations and processes.  On a terminal it takes no more lines
+than there are: the parts in order give way first, and a line says what was left out.  The full view
+has each process, port, bus and PD, and below the tables the remarks since the start.
+
+Pure: one or two documents of ``eapctl status --json`` in, parts of a view out.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from rich.console import RenderableType
-from rich.text import Text
+from eap.cli.status_findings import (
+    LISTENER_COUNTS,
+    REASONS,
+    STATES,
+    Finding,
+    Severity,
+    is_special,
+)
+from eap.cli.table import Column, ItemLine, Styled, TextTable, count, duration, quality, times
 
-from eap.cli import words
-from eap.cli.status_findings import LISTENER_COUNTS, REASONS, STATES, Finding, Severity, is_special
-from eap.cli.status_screen import appliance_label, finding_grid, verdicts
-from eap.cli.table import Column, TextTable
+if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 Row = Mapping[str, Any]
 
+_STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: ""}
 _GOOD, _BAD, _DIM = "green", "bold red", "dim"
-_STATE_STYLE = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
+_STATE_STYLES = {"OP": _GOOD, "INIT": _BAD, "PREOP": "yellow", "SAFEOP": "yellow"}
 _OFF = "off"
-_STATE_STYLE |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM, _OFF: _DIM}
+_FULL_STYLES = {"OP": _GOOD, "running": _GOOD, "up": _GOOD, "stale": _BAD, "down": _BAD}
+_FULL_STYLES |= {"present": _GOOD, "missing": _BAD, "unknown": _DIM, _OFF: _DIM}
+_SPARE_LINES = 2
+"""Lines of the screen that stay free: for the heading of ``--watch``, and for the shell."""
+_LEAST_ROWS = 1
+"""Number of findings and stations that the smallest screen shows."""
 
 
-def status_tables(document: Row, now_s: float) -> Iterator[RenderableType]:
-    """Yield what to print for a status *document* of *now_s*, top to bottom."""
+class StatusScreen:
+    """One status document, fitted to the screen.
+
+    With the document of *seconds* ago as *earlier* it shows rates in place of counts.
+    """
+
+    def __init__(
+        self, document: Row, now_s: float, earlier: Row | None = None, seconds: float = 0.0
+    ) -> None:
+        findings = [Finding.from_plain(row) for row in document["findings"]]
+        self._document = document
+        self._findings = [each for each in findings if each.severity is not Severity.INFO]
+        self._remarks = len(findings) - len(self._findings)
+        self._now_s = now_s
+        self._earlier = earlier
+        self._seconds = seconds
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        def excess(findings: int, stations: int) -> int:
+            """Return the number of lines for which the screen has no room."""
+            lines = console.render_lines(self._layout(findings, stations), options, pad=False)
+            return len(lines) + _SPARE_LINES - console.height
+
+        stations, findings = len(self._document["stations"]), len(self._findings)
+        if console.is_terminal:
+            while findings > _LEAST_ROWS and (lines := excess(findings, _LEAST_ROWS)) > 0:
+                findings = max(_LEAST_ROWS, findings - lines)
+            while stations > _LEAST_ROWS and (lines := excess(findings, stations)) > 0:
+                stations = max(_LEAST_ROWS, stations - lines)
+        yield self._layout(findings, stations)
+
+    def _layout(self, findings: int, stations: int) -> RenderableType:
+        from rich.console import Group
+
+        parts: list[RenderableType] = [*verdicts(self._document)]
+        if self._findings:
+            parts.append(finding_grid(self._findings[:findings], self._now_s))
+        if rest := len(self._findings) - findings:
+            parts.append(Styled(f"{rest} more: eapctl status --full", style="dim"))
+        parts += [Styled(), self._stations(stations)]
+        if others := self._document["stations"][stations:]:
+            parts.append(Styled(f"{count(len(others), 'more station')}, {_states(others)}"))
+        parts.append(Styled())
+        parts += (
+            _processes(each, appliance_label(self._document, each))
+            for each in self._document["appliances"]
+        )
+        remarks = f", and {count(self._remarks, 'remark')}" if self._remarks else ""
+        parts.append(Styled(f"eapctl status --full: each PD, port and bus{remarks}", style="dim"))
+        return Group(*parts)
+
+    def _stations(self, shown: int) -> RenderableType:
+        rate = "/s" if self._earlier else ""
+        table = TextTable(
+            "Station",
+            "State",
+            Column("Links", rank=3, wraps=True),
+            Column(f"Tx{rate}", is_number=True),
+            Column(f"Rx{rate}", is_number=True),
+            Column("Lost", is_number=True),
+            Column("Late", is_number=True),
+            Column("Dropped", rank=2, is_number=True),
+            Column("Buses", rank=1, wraps=True),
+        )
+        for row in self._document["stations"][:shown]:
+            rx = row["pd"]["rx"]
+            dropped = sum(row["discarded"].values())
+            dropped += sum(number for each in rx for number in each["discarded"].values())
+            table.add_row(
+                row["name"],
+                Styled(row["state"], style=_STATE_STYLES.get(row["state"], "")),
+                _links(row["ports"]),
+                self._figure(row, "tx", "sent"),
+                self._figure(row, "rx", "received"),
+                _bad_count(sum(each["lost"] or 0 for each in rx)),
+                str(sum(each["late"] for each in rx)),
+                str(dropped),
+                _buses(row["ports"]),
+            )
+        return table
+
+    def _figure(self, station: Row, direction: str, key: str) -> str:
+        """Return a sum over all PDs: since the start, or a second where there is a look before."""
+        total = _total(station, direction, key)
+        if self._earlier is None:
+            return str(total)
+        before = [
+            row
+            for row in self._earlier["stations"]
+            if (row["plant"], row["name"]) == (station["plant"], station["name"])
+        ]
+        if not before or total < (total_before := _total(before[0], direction, key)):
+            return ""  # it was not there, or its counters started anew
+        # Not the time between the looks: counters are of a moment that the look does not know.
+        seconds = _station_s(station) - _station_s(before[0])
+        return f"{(total - total_before) / (seconds if seconds > 0 else self._seconds):.0f}"
+
+
+def appliance_label(document: Row, appliance: Row) -> str:
+    """Return the plant of an appliance, with its stations where others run parts of that plant."""
+    plants = [each["plant"] for each in document["appliances"]]
+    plant: str = appliance["plant"]
+    if plants.count(plant) == 1:
+        return plant
+    return f"{plant} ({', '.join(appliance['stations'])})"
+
+
+def verdicts(document: Row) -> list[Styled]:
+    """Return a line for each plant: the number of errors and warnings, and its parts."""
+    plants = dict.fromkeys(appliance["plant"] for appliance in document["appliances"])
+    return [_verdict(document, plant) for plant in plants]
+
+
+def _verdict(document: Row, plant: str) -> Styled:
+    stations = [row for row in document["stations"] if row["plant"] == plant]
+    pds = sum(len(row["pd"]["tx"]) + len(row["pd"]["rx"]) for row in stations)
+    counts = Counter(row["severity"] for row in document["findings"] if row["plant"] == plant)
+    text = Styled(f"{plant}: ", style="bold")
+    if errors := counts[Severity.ERROR]:
+        text.append(count(errors, "error"), _BAD)
+    else:
+        text.append("no errors", _GOOD)
+    if warnings := counts[Severity.WARNING]:
+        text.append(f", {count(warnings, 'warning')}", _STYLES[Severity.WARNING])
+    scope = f" ({count(len(stations), 'station')}, {count(pds, 'PD')})"
+    return text.append(scope, "not bold")
+
+
+def finding_grid(found: Iterable[Finding], now_s: float) -> RenderableType:
+    """Return a line for each finding, or more where it is long."""
+    from rich.table import Table
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(no_wrap=True)
+    grid.add_column()
+    for each in found:
+        grid.add_row(Styled(each.severity, style=_STYLES[each.severity]), Styled(each.text(now_s)))
+    return grid
+
+
+def _total(station: Row, direction: str, key: str) -> int:
+    return sum(row[key] for row in station["pd"][direction])
+
+
+def _station_s(station: Row) -> float:
+    """Return the time of a station's counters: its cycles since the first, also those left out."""
+    cycles: int = station.get("cycle", 0) + station.get("overruns", 0)
+    cycle_us: int = station.get("cycle_us", 0)
+    return cycles * cycle_us / 1e6
+
+
+def _states(stations: Iterable[Row]) -> str:
+    states = Counter(row["state"] for row in stations)
+    return ", ".join(f"{number} in {state}" for state, number in states.items())
+
+
+def _links(ports: Sequence[Row]) -> Styled:
+    down = [port["name"] for port in ports if port.get("link") == "down"]
+    if down:
+        return Styled(f"{', '.join(down)} down", style=_BAD)
+    return (
+        Styled("up", style=_GOOD) if any(port.get("link") == "up" for port in ports) else Styled()
+    )
+
+
+def _buses(ports: Sequence[Row]) -> Styled:
+    """Return each bus with the states of its slaves."""
+    text = Styled()
+    for port in ports:
+        if (bus := port.get("bus")) is None:
+            continue
+        text.append(f"{', ' if text.plain else ''}{port['name']}: ")
+        states = Counter(slave["state"] or "no answer" for slave in bus["slaves"])
+        if not bus["is_up"]:
+            text.append("down", _BAD)
+        for at, (state, number) in enumerate(states.items() if bus["is_up"] else ()):
+            style = _GOOD if state == "OP" else _BAD
+            text.append(", " if at else "").append(f"{number} {state}", style)
+    return text
+
+
+def _bad_count(number: int) -> Styled:
+    return Styled(str(number), style=_BAD if number else "")
+
+
+def _processes(appliance: Row, label: str) -> RenderableType:
+    processes = dict(appliance["processes"])
+    segments = list(processes.pop("segments", {}).values())
+    items = [_process(name, [process]) for name, process in processes.items()]
+    if segments:
+        items.append(_process(count(len(segments), "segment"), segments))
+    return ItemLine(f"{label}:", items)
+
+
+def _process(name: str, processes: Sequence[Row]) -> Styled:
+    """Return name, share of a core and memory of processes of one kind."""
+    text = Styled(name)
+    if not all(process["pid"] for process in processes):
+        return text.append(" restarting", _BAD)
+    if any(process.get("step") for process in processes):
+        return text.append(" starting", _STYLES[Severity.WARNING])
+    if all(process.get("cpu") is not None for process in processes):
+        text.append(f" {sum(process['cpu'] for process in processes):.0f} %")
+    if all(process.get("rss") is not None for process in processes):
+        text.append(f" {sum(process['rss'] for process in processes) / 1e6:.0f} MB")
+    if restarts := sum(process.get("restarts") or 0 for process in processes):
+        text.append(f" restarted {times(restarts)}", _STYLES[Severity.WARNING])
+    return text
+
+
+def full_view(document: Row, now_s: float) -> Iterator[RenderableType]:
+    """Yield everything in a status *document* of *now_s*, as tables."""
     stations = document["stations"]
     yield from verdicts(document)
     found = [Finding.from_plain(row) for row in document["findings"]]
     if faults := [each for each in found if each.severity is not Severity.INFO]:
         yield finding_grid(faults, now_s)
     for appliance in document["appliances"]:
-        yield Text()
-        yield _processes(appliance, appliance_label(document, appliance))
+        yield ""
+        yield _processes_table(appliance, appliance_label(document, appliance))
         if listeners := appliance.get("listeners"):
-            yield Text()
+            yield ""
             yield _listeners(listeners)
-    yield Text()
-    yield _stations(stations)
+    yield ""
+    yield _stations_table(stations)
     if any("bus" in port for station in stations for port in station["ports"]):
-        yield Text()
-        yield _buses(stations)
-    yield Text()
+        yield ""
+        yield _buses_table(stations)
+    yield ""
     yield _process_data(stations)
     if any(is_special(row) for station in stations for row in station.get("frames", ())):
-        yield Text()
+        yield ""
         yield _frames(stations)
     if remarks := [each for each in found if each.severity is Severity.INFO]:
-        yield Text("\nSince the start", style="bold")
-        yield from (Text(each.text(now_s)) for each in remarks)
+        yield Styled("\nSince the start", style="bold")
+        yield from (Styled(each.text(now_s)) for each in remarks)
 
 
-def _processes(appliance: Row, label: str) -> RenderableType:
+def _processes_table(appliance: Row, label: str) -> TextTable:
     table = TextTable(
         f"Process of {label}",
         Column("PID", rank=1, is_number=True),
@@ -68,10 +292,10 @@ def _processes(appliance: Row, label: str) -> RenderableType:
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():
         if not process["pid"]:
-            table.add_row(name, "", Text("restarting", style=_BAD))
+            table.add_row(name, "", Styled("restarting", style=_BAD))
             continue
         if process.get("step"):
-            table.add_row(name, str(process["pid"]), Text("starting", style=_BAD))
+            table.add_row(name, str(process["pid"]), Styled("starting", style=_BAD))
             continue
         cpu, rss = process.get("cpu"), process.get("rss")
         table.add_row(
@@ -89,7 +313,7 @@ def _descriptors(descriptors: Row | None) -> str:
     return "" if descriptors is None else f"{descriptors['used']} of {descriptors['limit']}"
 
 
-def _listeners(listeners: Sequence[Row]) -> RenderableType:
+def _listeners(listeners: Sequence[Row]) -> TextTable:
     table = TextTable(
         "Listener",
         Column("Open", is_number=True),
@@ -104,7 +328,7 @@ def _listeners(listeners: Sequence[Row]) -> RenderableType:
     return table
 
 
-def _stations(stations: Sequence[Row]) -> RenderableType:
+def _stations_table(stations: Sequence[Row]) -> TextTable:
     table = TextTable(
         "Station",
         "State",
@@ -118,13 +342,13 @@ def _stations(stations: Sequence[Row]) -> RenderableType:
         own = (
             station["name"],
             _state(station["state"]),
-            words.duration(station["cycle_us"]) if "cycle_us" in station else "",
+            duration(station["cycle_us"]) if "cycle_us" in station else "",
         )
         for port in station["ports"] or [{}]:
             where, net_id = _interface(port.get("interface", "")), port.get("net_id", "")
             link = _state(port.get("link") or "")
             table.add_row(*own, port.get("name", ""), where, net_id, link)
-            own = ("", Text(), "")
+            own = ("", Styled(), "")
     return table
 
 
@@ -134,7 +358,7 @@ def _interface(uri: str) -> str:
     return f"{scheme}://{path.rpartition('/')[2]}" if scheme == "sim" else uri
 
 
-def _buses(stations: Sequence[Row]) -> RenderableType:
+def _buses_table(stations: Sequence[Row]) -> TextTable:
     table = TextTable(
         "Bus",
         Column("Slaves", rank=3, is_number=True),
@@ -150,7 +374,8 @@ def _buses(stations: Sequence[Row]) -> RenderableType:
                 continue
             states = Counter(slave["state"] or "no answer" for slave in bus["slaves"])
             shown = ", ".join(
-                state if len(states) == 1 else f"{count} {state}" for state, count in states.items()
+                state if len(states) == 1 else f"{number} {state}"
+                for state, number in states.items()
             )
             table.add_row(
                 f"{station['name']}/{port['name']}",
@@ -159,12 +384,12 @@ def _buses(stations: Sequence[Row]) -> RenderableType:
                 str(bus["cycles"]),
                 str(bus["lost"]),
                 f"{bus['received_wkc']} of {bus['expected_wkc']}",
-                words.duration(bus["trip_us"]),
+                duration(bus["trip_us"]),
             )
     return table
 
 
-def _process_data(stations: Sequence[Row]) -> RenderableType:
+def _process_data(stations: Sequence[Row]) -> TextTable:
     table = TextTable(
         "",
         "Process data",
@@ -178,7 +403,7 @@ def _process_data(stations: Sequence[Row]) -> RenderableType:
     for station in stations:
         pd = station["pd"]
         if pd["tx"] or pd["rx"]:
-            table.add_row("", Text(station["name"], style="bold"))
+            table.add_row("", Styled(station["name"], style="bold"))
         for row in pd["tx"]:
             why = row.get("last_reason") or next(reversed(row["reason"]), "silent")
             shown = _OFF if station["state"] == "PREOP" else REASONS.get(why, why)
@@ -188,8 +413,8 @@ def _process_data(stations: Sequence[Row]) -> RenderableType:
     return table
 
 
-def _received(row: Row, state: str) -> tuple[str | Text, ...]:
-    lost, quality, age = row["lost"], row["quality"], row["age_us"]
+def _received(row: Row, state: str) -> tuple[str | Styled, ...]:
+    lost, age = row["lost"], row["age_us"]
     times = row.get("response_us") or row["jitter_us"]
     spread = [times[key] for key in ("p50", "p99", "max")]
     return (
@@ -197,14 +422,16 @@ def _received(row: Row, state: str) -> tuple[str | Text, ...]:
         row["name"],
         _state(state),
         str(row["received"]),
-        Text("unknown", style=_DIM) if lost is None else Text(str(lost), style=_BAD * bool(lost)),
-        words.quality(quality),
-        "" if age is None else words.duration(age),
+        Styled("unknown", style=_DIM)
+        if lost is None
+        else Styled(str(lost), style=_BAD * bool(lost)),
+        quality(row["quality"]),
+        "" if age is None else duration(age),
         "" if None in spread else " / ".join(map(str, spread)),
     )
 
 
-def _frames(stations: Sequence[Row]) -> RenderableType:
+def _frames(stations: Sequence[Row]) -> TextTable:
     table = TextTable(
         "Frame",
         Column("Goes to", wraps=True),
@@ -225,5 +452,5 @@ def _frames(stations: Sequence[Row]) -> RenderableType:
     return table
 
 
-def _state(state: str) -> Text:
-    return Text(state, style=_STATE_STYLE.get(state, ""))
+def _state(state: str) -> Styled:
+    return Styled(state, style=_FULL_STYLES.get(state, ""))

@@ -1,21 +1,25 @@
-"""Table for a terminal: leaves out columns before it breaks a word.
+"""Parts of the text view of a command: tables, styled text, numbers in words.
 
-Each column has a rank.  Where the table is wider than the screen, the columns of the highest rank
-go first, and a line below the table names them.  Columns that wrap give way only at spaces.  Piped
-output has no width, so that nothing is left out there (eap/cli/output.py).
+A table leaves out columns before it breaks a word.  Each column has a rank.  Where the table is
+wider than the screen, the columns of the highest rank go first, and a line below the table names
+them.  Columns that wrap give way only at spaces.  Piped output has no width, so that nothing is
+left out there (eap/cli/output.py).
+
+Rich is imported when something is rendered: a command with ``--json`` never waits for it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, Self
 
-from rich import box
-from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table
-from rich.text import Text
+if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions, RenderResult
+    from rich.text import Text
+
+QUALITY_MAX = 0xFFFF
+"""Saturation value of a quality: 6.5535 s."""
 
 _GAP = 2
 """Spaces between two columns: what rich puts there for one space of padding and no border."""
@@ -40,19 +44,53 @@ class Column:
     wraps: bool = False
 
 
+class Styled:
+    """Text with a style for each of its parts, such as ``bold red``."""
+
+    def __init__(self, text: str = "", style: str = "") -> None:
+        self._whole_style = style
+        self._parts: list[tuple[str, str]] = [(text, "")]
+
+    @property
+    def plain(self) -> str:
+        """The text without its styles."""
+        return "".join(text for text, _ in self._parts)
+
+    @property
+    def style(self) -> str:
+        """Style of the whole text."""
+        return self._whole_style
+
+    def append(self, text: str, style: str = "") -> Self:
+        """Add *text* in a style of its own."""
+        self._parts.append((text, style))
+        return self
+
+    def __rich__(self) -> Text:
+        from rich.text import Text
+
+        whole = Text(style=self._whole_style)
+        for text, style in self._parts:
+            whole.append(text, style or None)
+        return whole
+
+
 class TextTable:
     """Rows below headings, as wide as they need and at most as wide as the screen."""
 
     def __init__(self, *columns: Column | str) -> None:
         self._columns = [Column(each) if isinstance(each, str) else each for each in columns]
-        self._rows: list[list[Text]] = []
+        self._rows: list[list[Styled]] = []
 
-    def add_row(self, *cells: str | Text) -> None:
+    def add_row(self, *cells: str | Styled) -> None:
         """Add one row; cells that are not given are empty."""
-        row = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
-        self._rows.append(row + [Text()] * (len(self._columns) - len(row)))
+        row = [Styled(cell) if isinstance(cell, str) else cell for cell in cells]
+        self._rows.append(row + [Styled()] * (len(self._columns) - len(row)))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        from rich import box
+        from rich.table import Table
+
         shown = self._fitting(options.max_width)
         widths = self._widths(shown, options.max_width)
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
@@ -71,7 +109,7 @@ class TextTable:
         if len(shown) < len(self._columns):
             left_out = (each.heading for at, each in enumerate(self._columns) if at not in shown)
             names = ", ".join(" ".join(heading.split()) for heading in left_out)
-            yield Text(f"not shown for lack of width: {names}", style="dim")
+            yield Styled(f"not shown for lack of width: {names}", style="dim")
 
     def _fitting(self, room: int) -> list[int]:
         """Return the numbers of the columns for which there is *room* without breaking words."""
@@ -102,6 +140,8 @@ class TextTable:
 
     def _needs(self, at: int, size: Literal["narrow", "wide"]) -> int:
         """Return the width of a column on one line a cell, or of its longest word if it wraps."""
+        from rich.cells import cell_len
+
         column = self._columns[at]
         texts = [column.heading, *(row[at].plain for row in self._rows)]
         whole = max(cell_len(line) for text in texts for line in text.splitlines() or [""])
@@ -119,16 +159,47 @@ def _total(widths: Iterable[int]) -> int:
 class ItemLine:
     """A heading and items behind it, with commas between them; a line ends between two items."""
 
-    def __init__(self, heading: str, items: Sequence[Text]) -> None:
+    def __init__(self, heading: str, items: Sequence[Styled]) -> None:
         self._heading = heading
         self._items = items
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        from rich.text import Text
+
         line = Text(self._heading, style="bold")
-        for number, item in enumerate(self._items):
+        for number, item in enumerate(each.__rich__() for each in self._items):
             comma = "," if number + 1 < len(self._items) else ""
             if line.cell_len + item.cell_len + 1 + len(comma) > options.max_width:
                 yield line
                 line = Text(" " * len(self._heading))
             line.append(" ").append_text(item).append(comma, "none")
         yield line
+
+
+def duration(us: int) -> str:
+    """Return microseconds in the unit that keeps the number short."""
+    if us < 1000:
+        return f"{us} µs" if us else "0"
+    if us < 1_000_000:
+        return f"{us / 1000:.1f} ms"
+    seconds = us / 1_000_000
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
+
+
+def quality(units: int | None) -> str:
+    """Return a quality (in units of 100 us) as a time; empty while nothing was received."""
+    if units is None:
+        return ""
+    return "> 6.5 s" if units == QUALITY_MAX else duration(units * 100)
+
+
+def times(count: int) -> str:
+    """Return a number of times in words."""
+    return "once" if count == 1 else f"{count} times"
+
+
+def count(number: int, thing: str) -> str:
+    """Return *number* and *thing*, in singular or plural."""
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"

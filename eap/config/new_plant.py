@@ -12,6 +12,8 @@ from enum import StrEnum
 from ipaddress import IPv4Address
 from typing import NamedTuple
 
+import msgspec
+
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 
@@ -38,6 +40,15 @@ class Shape(StrEnum):
     """Each station the next one."""
     STAR = "star"
     """The first station all others, and they the first."""
+
+
+class NewPlant(msgspec.Struct, frozen=True):
+    """``eapctl new``: file, and number of stations."""
+
+    file: str
+    plant: str
+    shape: str
+    stations: int
 
 
 class _PortPlace(NamedTuple):

@@ -5,7 +5,10 @@ The shapes are a contract: docs/control.md describes them.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
+
+import msgspec
+from msgspec import UNSET, UnsetType
 
 from eap.codec.pd import PdHeader
 from eap.pd.address import source_text
@@ -29,6 +32,32 @@ from eap.pd.words import (
 
 _QUALITY_NS = 100_000
 _QUALITY_MAX = 0xFFFF
+
+
+class PdRowVariable(msgspec.Struct, frozen=True):
+    """Variable of a PD."""
+
+    name: str
+    type: str
+    unit: str
+    writer: str
+
+
+class PdRow(msgspec.Struct, frozen=True, kw_only=True):
+    """PD with its identification; *frame* and *destination* of one to send."""
+
+    station: str
+    direction: Literal["tx", "rx"]
+    name: str
+    id: int
+    version: int
+    length: int
+    port: str
+    poll: str | None
+    publisher: str | None
+    frame: str | UnsetType = UNSET
+    destination: str | UnsetType = UNSET
+    variables: list[PdRowVariable]
 
 
 def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dict[str, Any]:
@@ -66,43 +95,40 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
     }
 
 
-def pd_list(image: Image) -> list[dict[str, Any]]:
-    """Return every PD of the station with what identifies it and its variables."""
+def pd_list(image: Image) -> list[PdRow]:
+    """Return every PD of the station with its identification and its variables."""
     layout = image.layout
     net_ids = {port.name: port.net_id for port in layout.ports}
     destinations = {frame.name: frame.destination for frame in layout.frames}
 
-    def variables(names: tuple[str, ...]) -> list[dict[str, Any]]:
-        return [
-            {"name": p.name, "type": p.type, "unit": p.unit, "writer": p.writer}
-            for p in (image.places[name] for name in names)
-        ]
-
-    def row(place: TxPlace | RxPlace, direction: str, **more: str | None) -> dict[str, Any]:
-        return {
-            "station": layout.station,
-            "direction": direction,
-            "name": place.name,
-            "id": place.pd_id,
-            "version": place.version,
-            "length": place.size,
-            "port": place.port,
-            "poll": place.poll_request or None,
-            **more,
-            "variables": variables(place.variables),
-        }
+    def row(place: TxPlace | RxPlace, **direction: Any) -> PdRow:
+        places = (image.places[name] for name in place.variables)
+        return PdRow(
+            station=layout.station,
+            name=place.name,
+            id=place.pd_id,
+            version=place.version,
+            length=place.size,
+            port=place.port,
+            poll=place.poll_request or None,
+            variables=[PdRowVariable(p.name, p.type, p.unit, p.writer) for p in places],
+            **direction,
+        )
 
     sent = [
         row(
             place,
-            "tx",
+            direction="tx",
             publisher=net_ids[place.port],
             frame=place.frame,
             destination=destinations[place.frame],
         )
         for place in layout.tx
     ]
-    return sent + [row(place, "rx", publisher=place.publisher or None) for place in layout.rx]
+    received = [
+        row(place, direction="rx", publisher=place.publisher or None) for place in layout.rx
+    ]
+    return sent + received
 
 
 def tracker_word(image: Image, place: RxPlace) -> int:

@@ -12,8 +12,8 @@ from unittest import mock
 
 import pytest
 
+from eap.appliance.commands.bus_objects import read_entry
 from eap.appliance.commands.bus_running import open_running
-from eap.appliance.commands.bus_sdo import read_entry
 from eap.appliance.runtime import VARIABLE
 from tests.support.addresses import own_address
 from tests.support.appliance import EAPCTL, plants, run_eapctl, wait_until
@@ -190,8 +190,8 @@ def test_a_file_and_objects_of_one_slave_at_once(works, content):
         open_running("press", "bus1") as bus,
     ):
         while writing.poll() is None:
-            row = read_entry(bus, "drive", 0x1018, 1, kind=None, complete=False)
-            assert row["value"] == 0xE5A
+            found = read_entry(bus, "drive", 0x1018, 1, kind=None, complete=False)
+            assert found.value == 0xE5A
             reads += 1
     out, err = writing.communicate()
     assert (writing.returncode, err) == (0, "")

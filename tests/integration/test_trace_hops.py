@@ -40,7 +40,7 @@ def trace(line: Row, *words: str) -> tuple[int, dict[str, Any]]:
 
 
 def hops(found: dict[str, Any]) -> list[tuple[str, str, bool]]:
-    return [(each["station"], each["door"], each["opaque"]) for each in found["hops"]]
+    return [(each["station"], each["transport"], each["opaque"]) for each in found["hops"]]
 
 
 WHOLE = [("a", "ethernet:eap0", False), ("b", "ethernet:eap1", False), ("c", "", False)]

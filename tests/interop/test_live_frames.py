@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from eap.appliance.commands.capture import iter_capture
@@ -163,7 +164,9 @@ def test_tshark_sees_what_appliances_send(name: str, farm: Plants, tmp_path: Pat
 
 
 def assert_same_as_our_decoder(frames: list[dict[str, Any]], path: Path) -> None:
-    everything = [decode_frame(captured.data) for captured in iter_capture(path)]
+    everything = [
+        msgspec.to_builtins(decode_frame(captured.data)) for captured in iter_capture(path)
+    ]
     ours = [frame for frame in everything if frame["type"] == 4]
     assert len(ours) == len(frames)
     for found, expected in zip(frames, ours, strict=True):

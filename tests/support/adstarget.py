@@ -12,6 +12,7 @@ from eap.aoe.ads_operation import WriteControl
 from eap.aoe.ads_state import al_state_for, states_of
 from eap.aoe.way import Way
 from eap.appliance.control import ErrorCode
+from eap.appliance.control_routes import TracedPath
 from eap.codec.ads import AdsDeviceInfo, AdsStates, device_name
 from eap.errors import ControlError
 from eap.ids import NetId
@@ -42,7 +43,7 @@ class AdsTarget:
         info = AdsDeviceInfo(1, 0, 0, device_name("far"))
         space = ObjectSpace(dictionary, lambda: OdState.PREOP)
         self._device = AdsDevice(info, self._states, [space], control=self._take)
-        methods = {"ams_ask": self._ask, "trace": lambda params: {"why": self.why}}
+        methods = {"ams_ask": self._ask, "trace": self._trace}
         self.stub = ControlStub("line", ["near"], methods, stack)
 
     def _ask(self, params: dict[str, Any]) -> dict[str, Any]:
@@ -53,6 +54,9 @@ class AdsTarget:
         body = bytes.fromhex(params["data"])
         answer = self._device.answer(params["command"], body, NOBODY, 0)
         return {"error": answer.error_code, "data": answer.data.hex()}
+
+    def _trace(self, params: dict[str, Any]) -> TracedPath:
+        return TracedPath(params["target"], "", "", not self.why, self.why, [], None)
 
     def _states(self) -> AdsStates:
         if self._wanted != self.al_state:

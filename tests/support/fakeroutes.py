@@ -26,32 +26,34 @@ from eap.errors import ControlError
 from tests.support.controlstub import Method
 
 ISLAND = RouteRow(
-    name="island-02", net_id="127.0.1.2.1.1", octets=4, door="udp:eap0", address="127.0.1.2:34980",
-    origin="derived", state="up", rtt_us=840, requests=12, answers=12, octets_out=1_234,
+    name="island-02", net_id="127.0.1.2.1.1", octets=4, transport="udp:eap0",
+    address="127.0.1.2:34980", origin="derived",
+    state="up", rtt_us=840, requests=12, answers=12, octets_out=1_234,
     octets_in=45_678,
 )  # fmt: skip
 PRESS = RouteRow(
-    name="press", net_id="5.1.2.3.1.1", octets=6, door="ams-tcp", address="192.168.1.5:48898",
+    name="press", net_id="5.1.2.3.1.1", octets=6, transport="ams-tcp", address="192.168.1.5:48898",
     origin="added", state="down", why="connection refused", requests=3, errors=3,
     last_error="press (192.168.1.5:48898 by ams-tcp): connection refused",
 )  # fmt: skip
 CLIENT = RouteRow(
-    name="laptop", net_id="192.168.1.9.1.1", octets=4, door="ams-tcp", address="192.168.1.9:48898",
-    origin="added", state="client", why="not listening: connection refused", probed=False,
+    name="laptop", net_id="192.168.1.9.1.1", octets=4, transport="ams-tcp",
+    address="192.168.1.9:48898", origin="added",
+    state="client", why="not listening: connection refused", probed=False,
 )  # fmt: skip
 TOOL = ConnectionRow(
-    door="ams-tcp", address="127.0.0.1:40112#3", since_s=75, net_ids=["127.0.0.1.1.1"],
+    transport="ams-tcp", address="127.0.0.1:40112#3", since_s=75, net_ids=["127.0.0.1.1.1"],
     requests=15, answers=15, errors=3, octets_out=45_900, octets_in=1_400, took_us=900,
     last_error="press is down",
 )  # fmt: skip
 READ = RequestRow(
     at=1_795_275_549.9, outcome="answered", service="READ", target="127.0.1.2.2.1:65535",
-    source="127.0.0.1.1.1:32905", came_by="127.0.0.1:40112#3 by ams-tcp", door="udp:eap0",
+    source="127.0.0.1.1.1:32905", came_by="127.0.0.1:40112#3 by ams-tcp", transport="udp:eap0",
     address="127.0.1.2:34980", took_us=1_200,
 )  # fmt: skip
 REFUSED = RequestRow(
     at=1_795_275_550.9, outcome="failed", service="READ", target="5.1.2.3.1.1:851",
-    source="127.0.0.1.1.1:32905", came_by="127.0.0.1:40112#3 by ams-tcp", door="ams-tcp",
+    source="127.0.0.1.1.1:32905", came_by="127.0.0.1:40112#3 by ams-tcp", transport="ams-tcp",
     address="192.168.1.5:48898", error=0x1B, text="press is down",
 )  # fmt: skip
 SHADOW = "route press (5.1.2.3.1.1) is not taken: plc (5.1.2.3.1.1) is before it"
@@ -107,7 +109,7 @@ class FakeRoutes:
             reason = f"via {wanted.via!r} is no port of the plant"
             raise ControlError(reason, code=ErrorCode.VALUE)
         row = RouteRow(
-            name=wanted.name, net_id=wanted.net_id, octets=wanted.octets, door=door,
+            name=wanted.name, net_id=wanted.net_id, octets=wanted.octets, transport=door,
             address=address, origin="added", state="unknown", unidirectional=wanted.unidirectional,
             timeout_ms=wanted.timeout_ms, probed=wanted.probed, real=wanted.virtual,
         )  # fmt: skip

@@ -6,7 +6,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
+from eap.appliance.commands.od import Content, EntryInfo, ObjectInfo
 from eap.od.abort import SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RO, RW, RW_PREOP, WO, Access, Entry, OdObject, OdState, record, variable
@@ -168,7 +168,11 @@ def _entry_row(subindex: int, entry: Entry) -> dict[str, Any]:
         "type": entry.kind.text,
         "bits": entry.kind.bit_length,
         "access": _access(entry),
+        "rights": int(entry.access),
         "unit": "us" if entry.unit else "",
+        "default": entry.default.hex(),
+        "minimum": entry.minimum,
+        "maximum": entry.maximum,
         "data": None if octets is None else octets.hex(),
     }
 

@@ -123,7 +123,8 @@ class PlantStub:
         if is_ok:
             self.specs[name] = spec
             self.taken.append(spec)
-        return {"ok": is_ok, "results": results, "refused": [] if is_ok else ["not today"]}
+        refused = [] if is_ok else ["not today"]
+        return {"ok": is_ok, "results": results, "station": [], "refused": refused}
 
     def _changes(self, name: str, spec: StationSpec) -> list[dict[str, Any]]:
         """Compare the cycle times only: one of them is enough for a test to see."""

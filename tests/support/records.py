@@ -1,31 +1,28 @@
-"""Hypothesis strategies for every record that WireStruct compiles, made from its declaration."""
+"""Records of results with the fields that a test cares about; the others are empty."""
 
 from __future__ import annotations
 
-import struct
-from enum import Enum
-from typing import ClassVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar
 
-from hypothesis import strategies as st
+import msgspec
+from msgspec.inspect import StructType, type_info
 
-from eap.codec.wire import Bits, Scalar, WireStruct
+T = TypeVar("T", bound=msgspec.Struct)
 
-
-def records(record: type[WireStruct]) -> st.SearchStrategy[WireStruct]:
-    """Any value of *record* that fits its layout."""
-    hints = get_type_hints(record, include_extras=True)
-    fields = [
-        _field(get_args(hint)[1]) for hint in hints.values() if get_origin(hint) is not ClassVar
-    ]
-    return st.tuples(*fields).map(lambda values: record(*values))
+_EMPTY: dict[str, Any] = {"str": "", "int": 0, "float": 0.0, "bool": False, "list": []}
 
 
-def _field(kind: Scalar | Bits) -> st.SearchStrategy:
-    if kind.wrap is not None and issubclass(kind.wrap, Enum):
-        return st.sampled_from(kind.wrap)
-    if isinstance(kind, Bits):
-        return st.integers(0, (1 << kind.width) - 1)
-    size = struct.calcsize(f"<{kind.code}")
-    if kind.code.endswith("s"):
-        return st.binary(min_size=size, max_size=size).map(kind.wrap or bytes)
-    return st.integers(0, (1 << 8 * size) - 1)
+def record(kind: type[T], **fields: Any) -> T:
+    """Return a record of *kind*; required fields that are not given are empty."""
+    return msgspec.convert(_filled(kind, fields), kind)
+
+
+def _filled(kind: type[msgspec.Struct], fields: dict[str, Any]) -> dict[str, Any]:
+    info = type_info(kind)
+    assert isinstance(info, StructType)
+    names = {
+        field.encode_name: _EMPTY.get(type(field.type).__name__.removesuffix("Type").lower())
+        for field in info.fields
+        if field.required
+    }
+    return names | fields

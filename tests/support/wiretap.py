@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from eap.appliance.commands.packets import unwrap
+from eap.appliance.commands.capture import unwrap
 from eap.codec.ethercat import FrameType
 from eap.codec.pd import PD_FRAME_START, PdFrameHeader, iter_pds
 

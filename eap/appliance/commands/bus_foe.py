@@ -1,4 +1,7 @@
-"""Files of slaves: to and from files of this machine, without holding them in memory."""
+"""Files of slaves (FoE), to and from files of this machine, and vendor messages (VoE).
+
+A file is never held in memory as a whole.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import BinaryIO, TypeAlias
+
+from msgspec import Struct
 
 from devicebus.errors import BusError, MailboxSizeError
 from devicebus.mailbox import foe_client, voe_client
@@ -26,9 +31,31 @@ Report: TypeAlias = Callable[[int, int | None, int], None]
 restarts."""
 
 
+class FileTransfer(Struct, frozen=True, kw_only=True):
+    """``eapctl bus foe``: a file that was transferred, *rate* in bytes a second."""
+
+    slave: int
+    name: str
+    file: str
+    octets: int
+    seconds: float
+    rate: int
+    sha256: str
+    restarts: int
+
+
+class VendorReply(Struct, frozen=True):
+    """``eapctl bus voe``: the answer to a vendor's message."""
+
+    slave: int
+    vendor_id: int
+    vendor_type: int
+    data: str
+
+
 def get_file(
     bus: SlaveBus, slave: str, name: str, target: Path | None, *, password: int, report: Report
-) -> dict[str, Any]:
+) -> FileTransfer:
     """Read the file *name* of a slave into *target*, None for stdout.
 
     A regular file appears once it is complete; a pipe or a device is written as it is.  A transfer
@@ -61,15 +88,13 @@ def get_file(
         transfer = _Transfer(bus, slave, begin, f"FoE read of {name!r}", progress)
         restarts = transfer.run(rewind if target is not None and file.seekable() else None, report)
     report(progress.done, progress.done, restarts.count)
-    return transfer.summary(name, target, time.monotonic() - start) | {
-        "sha256": digest.hexdigest(),
-        "restarts": restarts.count,
-    }
+    seconds = time.monotonic() - start
+    return transfer.summary(name, target, seconds, digest.hexdigest(), restarts)
 
 
 def put_file(
     bus: SlaveBus, slave: str, source: Path | None, name: str, *, password: int, report: Report
-) -> dict[str, Any]:
+) -> FileTransfer:
     """Write *source*, None for stdin, to a slave as the file *name*.
 
     A transfer that the bus interrupts begins anew, unless *source* cannot be read again.
@@ -103,10 +128,8 @@ def put_file(
         with _telling_how_far(progress, "written"):
             restarts = transfer.run(rewind if is_regular else None, report)
     report(progress.done, progress.done, restarts.count)
-    return transfer.summary(name, source, time.monotonic() - start) | {
-        "sha256": digest.hexdigest(),
-        "restarts": restarts.count,
-    }
+    seconds = time.monotonic() - start
+    return transfer.summary(name, source, seconds, digest.hexdigest(), restarts)
 
 
 class _Transfer:
@@ -149,17 +172,21 @@ class _Transfer:
                 self._bus.scan()
                 self._unit = _find(self._bus, self._slave)
 
-    def summary(self, name: str, path: Path | None, seconds: float) -> dict[str, Any]:
-        """Return what was transferred, and how fast."""
+    def summary(
+        self, name: str, path: Path | None, seconds: float, sha256: str, restarts: Restarts
+    ) -> FileTransfer:
+        """Return the result of the whole transfer."""
         done = self._progress.done
-        return {
-            "slave": self._unit.station,
-            "name": name,
-            "file": "-" if path is None else str(path),
-            "octets": done,
-            "seconds": round(seconds, 3),
-            "rate": round(done / seconds) if seconds else 0,
-        }
+        return FileTransfer(
+            slave=self._unit.station,
+            name=name,
+            file="-" if path is None else str(path),
+            octets=done,
+            seconds=round(seconds, 3),
+            rate=round(done / seconds) if seconds else 0,
+            sha256=sha256,
+            restarts=restarts.count,
+        )
 
 
 def _note_restarts(exc: BusError, restarts: Restarts) -> None:
@@ -220,7 +247,7 @@ def _find(bus: SlaveBus, slave: str) -> Slave:
 
 def exchange(
     bus: SlaveBus, slave: str, vendor_id: int, vendor_type: int, data: bytes
-) -> dict[str, Any]:
+) -> VendorReply:
     """Send a VoE message to a slave and return its answer.
 
     Raises:
@@ -230,9 +257,4 @@ def exchange(
     answer = bus.converse(
         unit, lambda _: voe_client.exchange(vendor_id, vendor_type, data), "VoE request"
     )
-    return {
-        "slave": unit.station,
-        "vendor_id": vendor_id,
-        "vendor_type": vendor_type,
-        "data": answer.hex(),
-    }
+    return VendorReply(unit.station, vendor_id, vendor_type, answer.hex())

@@ -7,7 +7,7 @@ Two kinds fit :class:`SlaveBus`: ``BusSession`` in bus_session.py is a master of
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
 import msgspec
 
@@ -48,7 +48,7 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """How many nanoseconds ago *fault* began, if that is known."""
 
 
-class FrameCounts(NamedTuple):
+class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
     """Frames of a master, and what it knows of their round trip."""
 
     sent: int

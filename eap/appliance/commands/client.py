@@ -1,4 +1,4 @@
-"""The synchronous side of the control protocol: what the command line talks with."""
+"""Blocking client of the control protocol, as commands use it."""
 
 from __future__ import annotations
 
@@ -6,21 +6,34 @@ import select
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from time import monotonic
 from typing import Any
 
 import msgspec
 
 from eap.appliance.bus_errors import ErrorRecord, to_error
-from eap.appliance.control import MAX_LINE, ErrorCode, Reply, decode_reply, encode_request
+from eap.appliance.control import (
+    MAX_LINE,
+    SUBSCRIBE,
+    AnswerT,
+    ErrorCode,
+    Method,
+    ParametersT,
+    Reply,
+    ValuesEvent,
+    decode_reply,
+    encode_request,
+)
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, describe_roots, find_running
 from eap.closing import Closing
 from eap.errors import ControlError
 from eap.near import near
 
 TIMEOUT_S = 10.0
-"""Patience for one answer: services may be on their way back from a restart."""
+"""Time for one answer: services may be on their way back from a restart."""
 _CONNECT_PAUSE_S = 0.02
+_EVENT = partial(msgspec.convert, type=ValuesEvent)
 
 
 class Client(Closing):
@@ -36,6 +49,22 @@ class Client(Closing):
         self._reader = connection.makefile("rb")
         self._last_id = 0
 
+    def call(
+        self,
+        method: Method[ParametersT, AnswerT],
+        /,
+        *,
+        within_s: float = TIMEOUT_S,
+        **params: Any,
+    ) -> AnswerT:
+        """Return the answer to *method*, which may take *within_s*.
+
+        Raises:
+            ControlError: the appliance refused, or does not answer.
+            BusError: a bus or a slave did not do it; as its class says.
+        """
+        return method.decode(self.request_within(within_s, method.name, **params))
+
     def request(self, method: str, /, **params: Any) -> Any:
         """Return the result of *method*.
 
@@ -44,15 +73,15 @@ class Client(Closing):
         """
         return self.request_within(TIMEOUT_S, method, **params)
 
-    def request_within(self, patience_s: float, method: str, /, **params: Any) -> Any:
-        """Return the result of *method*, which may take *patience_s*.
+    def request_within(self, within_s: float, method: str, /, **params: Any) -> Any:
+        """Return the result of *method*, which may take *within_s*.
 
         Raises:
             ControlError: the appliance refused, or does not answer.
             BusError: a bus or a slave did not do it; as its class says.
         """
         self._last_id += 1
-        self._socket.settimeout(patience_s)
+        self._socket.settimeout(within_s)
         try:
             self._socket.sendall(encode_request(self._last_id, method, params))
         except OSError as exc:
@@ -62,7 +91,7 @@ class Client(Closing):
             if reply.subscription is None:
                 return _checked(reply).result
 
-    def events(self, **params: Any) -> Iterator[dict[str, Any]]:
+    def events(self, **params: Any) -> Iterator[ValuesEvent]:
         """Subscribe with *params* and yield each event until the appliance goes.
 
         Nothing else is asked on this connection meanwhile.
@@ -70,7 +99,7 @@ class Client(Closing):
         Raises:
             ControlError: the appliance refused, went away, or cannot read the values now.
         """
-        self.request("subscribe", **params)
+        self.call(SUBSCRIBE, **params)
         self._socket.settimeout(None)
         while True:
             event = _checked(self._next_reply()).event
@@ -78,7 +107,7 @@ class Client(Closing):
                 continue
             if failure := event.get("error"):
                 raise ControlError(failure["message"], code=failure["code"])
-            yield event
+            yield _EVENT(event)
 
     def close(self) -> None:
         """Hang up, also while another thread waits for an event."""

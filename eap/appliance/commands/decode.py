@@ -1,13 +1,13 @@
-"""One EtherCAT frame as plain values, for whoever wants to look at it.
+"""One EtherCAT frame as a typed result.
 
-Nothing is raised for what the octets say: what could be read before a fault is shown, and the fault
-is named in ``error``.
+Nothing is raised for wrong octets: the fields before a fault are there, and ``error`` names it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+
+from msgspec import UNSET, Struct, UnsetType
 
 from devicebus.wire.datagram import iter_datagrams
 from eap.codec import ams, mailbox
@@ -16,8 +16,6 @@ from eap.codec.mailbox import MailboxError, MailboxErrorReply, MailboxHeader, Ma
 from eap.codec.pd import PD_FRAME_START, PdFrameHeader, iter_pds
 from eap.codec.wire import Buffer
 from eap.errors import CodecError
-
-Fields: TypeAlias = dict[str, Any]
 
 PROTOCOLS = {
     MailboxType.ERR: "error",
@@ -30,119 +28,190 @@ PROTOCOLS = {
 }
 
 
-def decode_frame(data: Buffer) -> Fields:
-    """Return the fields of one frame, which starts at the EtherCAT header; padding is ignored.
+class DecodedPd(Struct, frozen=True):
+    """PD of a frame of type 4; *quality* in units of 100 us."""
 
-    The keys are those of ``eapctl decode --json``: ``type``, ``length`` and ``error`` (None if all
-    is well) in every frame; ``publisher``, ``cycle`` and ``pds`` in type 4, ``datagrams`` in
-    type 1, ``ams`` in type 2, ``mailbox`` in type 5, raw ``data`` in all others.  Octets are
-    strings of hexadecimal digits, quality is in units of 100 us.
+    id: int
+    version: int
+    length: int
+    quality: int
+    data: str
+
+
+class DecodedDatagram(Struct, frozen=True, kw_only=True):
+    """Datagram of a frame of type 1: with ADP and ADO, or with a logical address."""
+
+    command: str
+    index: int
+    adp: int | UnsetType = UNSET
+    ado: int | UnsetType = UNSET
+    address: int | UnsetType = UNSET
+    length: int
+    circulating: bool
+    irq: int
+    data: str
+    wkc: int
+
+
+class DecodedAms(Struct, frozen=True, kw_only=True):
+    """AMS packet of a frame of type 2, or of a mailbox message."""
+
+    target: str
+    target_port: int
+    source: str
+    source_port: int
+    command: int
+    service: str
+    state_flags: int
+    length: int
+    error_code: int
+    invoke_id: int
+    data: str
+
+
+class DecodedMailbox(Struct, kw_only=True):
+    """Mailbox message of a frame of type 5; *detail* and *reason* of an error reply."""
+
+    length: int
+    address: int
+    channel: int
+    priority: int
+    type: int
+    protocol: str
+    counter: int
+    data: str = ""
+    ams: DecodedAms | UnsetType = UNSET
+    detail: int | UnsetType = UNSET
+    reason: str | UnsetType = UNSET
+
+
+class DecodedFrame(Struct, kw_only=True):
+    """``eapctl decode``: one frame, and for a capture the packet that it was in.
+
+    Each type has fields of its own: ``publisher``, ``cycle`` and ``pds`` type 4, ``datagrams``
+    type 1, ``ams`` type 2, ``mailbox`` type 5, raw ``data`` all others.  Octets are strings of
+    hexadecimal digits.  *error* is None if all is well.
     """
-    fields: Fields = {"type": None, "length": None}
+
+    type: int | None = None
+    length: int | None = None
+    publisher: str | UnsetType | None = UNSET
+    cycle: int | UnsetType | None = UNSET
+    pds: list[DecodedPd] | UnsetType = UNSET
+    datagrams: list[DecodedDatagram] | UnsetType = UNSET
+    ams: DecodedAms | UnsetType | None = UNSET
+    mailbox: DecodedMailbox | UnsetType | None = UNSET
+    data: str | UnsetType = UNSET
+    error: str | None = None
+    packet: int | UnsetType = UNSET
+    time: float | UnsetType = UNSET
+    transport: str | UnsetType = UNSET
+    source: str | UnsetType = UNSET
+    destination: str | UnsetType = UNSET
+    vlan_id: int | UnsetType = UNSET
+
+
+def decode_frame(data: Buffer) -> DecodedFrame:
+    """Return the fields of one frame, which starts at the EtherCAT header; padding is ignored."""
+    found = DecodedFrame()
     try:
         header = EtherCatHeader.decode(data)
     except CodecError as exc:
-        return fields | {"error": str(exc)}
-    fields |= {"type": header.type, "length": header.length}
+        found.error = str(exc)
+        return found
+    found.type, found.length = header.type, header.length
     end = EtherCatHeader.SIZE + header.length
-    error = None
     try:
-        _READERS.get(header.type, _read_raw)(memoryview(data)[:end], fields)
+        _READERS.get(header.type, _read_raw)(memoryview(data)[:end], found)
     except CodecError as exc:
-        error = str(exc)
+        found.error = str(exc)
     if end > len(data):
         there = len(data) - EtherCatHeader.SIZE
-        error = f"EtherCatHeader at offset 0: length {header.length}, but {there} octets follow"
-    return fields | {"error": error}
+        found.error = (
+            f"EtherCatHeader at offset 0: length {header.length}, but {there} octets follow"
+        )
+    return found
 
 
-def _read_process_data(frame: memoryview, fields: Fields) -> None:
-    fields |= {"publisher": None, "cycle": None, "pds": []}
+def _read_process_data(frame: memoryview, found: DecodedFrame) -> None:
+    found.publisher = found.cycle = None
+    found.pds = pds = []
     header = PdFrameHeader.decode(frame, PD_FRAME_START)
-    fields |= {"publisher": str(header.publisher), "cycle": header.cycle}
+    found.publisher, found.cycle = str(header.publisher), header.cycle
     for pd, data in iter_pds(frame):
-        fields["pds"].append(
-            {
-                "id": pd.pd_id,
-                "version": pd.version,
-                "length": pd.length,
-                "quality": pd.quality,
-                "data": data.hex(),
-            }
-        )
+        pds.append(DecodedPd(pd.pd_id, pd.version, pd.length, pd.quality, data.hex()))
 
 
-def _read_datagrams(frame: memoryview, fields: Fields) -> None:
-    fields["datagrams"] = []
+def _read_datagrams(frame: memoryview, found: DecodedFrame) -> None:
+    found.datagrams = datagrams = []
     for header, data, wkc in iter_datagrams(frame):
-        address: Fields = {"adp": header.adp, "ado": header.ado}
-        if header.command.is_logical:
-            address = {"address": header.logical_address}
-        fields["datagrams"].append(
-            {"command": header.command.name, "index": header.index}
-            | address
-            | {
-                "length": header.length,
-                "circulating": bool(header.circulating),
-                "irq": header.irq,
-                "data": bytes(data).hex(),
-                "wkc": wkc,
-            }
+        is_logical = header.command.is_logical
+        datagrams.append(
+            DecodedDatagram(
+                command=header.command.name,
+                index=header.index,
+                adp=UNSET if is_logical else header.adp,
+                ado=UNSET if is_logical else header.ado,
+                address=header.logical_address if is_logical else UNSET,
+                length=header.length,
+                circulating=bool(header.circulating),
+                irq=header.irq,
+                data=bytes(data).hex(),
+                wkc=wkc,
+            )
         )
 
 
-def _read_ams(frame: memoryview, fields: Fields) -> None:
-    fields["ams"] = None
-    fields["ams"] = _ams_fields(frame[EtherCatHeader.SIZE :])
+def _read_ams(frame: memoryview, found: DecodedFrame) -> None:
+    found.ams = None
+    found.ams = _decoded_ams(frame[EtherCatHeader.SIZE :])
 
 
-def _ams_fields(packet: memoryview) -> Fields:
+def _decoded_ams(packet: memoryview) -> DecodedAms:
     header, data = ams.decode_packet(packet)
-    return {
-        "target": str(header.target),
-        "target_port": header.target_port,
-        "source": str(header.source),
-        "source_port": header.source_port,
-        "command": header.command,
-        "service": ams.AmsCommand.name_of(header.command),
-        "state_flags": header.state_flags,
-        "length": header.length,
-        "error_code": header.error_code,
-        "invoke_id": header.invoke_id,
-        "data": data.hex(),
-    }
+    return DecodedAms(
+        target=str(header.target),
+        target_port=header.target_port,
+        source=str(header.source),
+        source_port=header.source_port,
+        command=header.command,
+        service=ams.AmsCommand.name_of(header.command),
+        state_flags=header.state_flags,
+        length=header.length,
+        error_code=header.error_code,
+        invoke_id=header.invoke_id,
+        data=data.hex(),
+    )
 
 
-def _read_mailbox(frame: memoryview, fields: Fields) -> None:
-    fields["mailbox"] = None
+def _read_mailbox(frame: memoryview, found: DecodedFrame) -> None:
+    found.mailbox = None
     header = MailboxHeader.decode(frame, EtherCatHeader.SIZE)
-    message: Fields = {
-        "length": header.length,
-        "address": header.address,
-        "channel": header.channel,
-        "priority": header.priority,
-        "type": int(header.type),
-        "protocol": PROTOCOLS[header.type],
-        "counter": header.counter,
-        "data": "",
-    }
-    fields["mailbox"] = message
+    found.mailbox = message = DecodedMailbox(
+        length=header.length,
+        address=header.address,
+        channel=header.channel,
+        priority=header.priority,
+        type=int(header.type),
+        protocol=PROTOCOLS[header.type],
+        counter=header.counter,
+    )
     _, data = mailbox.decode_frame(frame)
-    message["data"] = data.hex()
+    message.data = data.hex()
     if header.type is MailboxType.AOE:
-        message["ams"] = _ams_fields(data)
+        message.ams = _decoded_ams(data)
     elif header.type is MailboxType.ERR:
         reply = MailboxErrorReply.decode(data)
         if reply.detail_type == mailbox.ERROR_REPLY and len(data) == MailboxErrorReply.SIZE:
-            message["detail"] = reply.detail
-            message["reason"] = MailboxError.name_of(reply.detail)
+            message.detail = reply.detail
+            message.reason = MailboxError.name_of(reply.detail)
 
 
-def _read_raw(frame: memoryview, fields: Fields) -> None:
-    fields["data"] = frame[EtherCatHeader.SIZE :].hex()
+def _read_raw(frame: memoryview, found: DecodedFrame) -> None:
+    found.data = frame[EtherCatHeader.SIZE :].hex()
 
 
-_READERS: dict[int, Callable[[memoryview, Fields], None]] = {
+_READERS: dict[int, Callable[[memoryview, DecodedFrame], None]] = {
     FrameType.DATAGRAM: _read_datagrams,
     FrameType.AMS: _read_ams,
     FrameType.PROCESS_DATA: _read_process_data,

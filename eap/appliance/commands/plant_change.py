@@ -1,41 +1,267 @@
-"""A running plant becomes what its file says, station by station, and what it was before.
+"""Changes of a running plant: plan, apply and roll back, station by station.
 
-Rule 1: all stations are asked what they think of it before the first one is changed.
-Rule 2: the order is that of :mod:`eap.device.rollout`: whoever receives takes a new layout beside
-the old one before anybody sends it.
-Rule 3: what a station refuses ends it, unless told to go on with the other stations.
+Rule 1: all stations are asked for a plan before the first one is changed.
+Rule 2: the order is that of :mod:`eap.device.rollout`: a receiver takes a new layout beside the old
+one before anything sends it.
+Rule 3: a refusal of a station ends it, unless told to go on with the other stations.
 """
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TypeAlias
+from types import MappingProxyType
+from typing import Any, Self, TypeAlias
 
 import msgspec
 
-from eap.appliance.commands.plant_link import Outcome, PlantLink, StationPlan
-from eap.appliance.control_routing import RoutingDifference
+from eap.aoe.spec import RoutingSpec
+from eap.appliance import control_device as protocol
+from eap.appliance.commands.client import Client, connect_those
+from eap.appliance.control import AnswerT, ErrorCode, Method, ParametersT
+from eap.appliance.control_device import (
+    ApplyAnswer,
+    ChangeResult,
+    ObjectChange,
+    RoutingDifference,
+    RunningRouting,
+    RunningSpec,
+)
 from eap.appliance.plantfile import load_plant
 from eap.appliance.store import new_cause
 from eap.config.load import Plant
 from eap.device.rollout import Step, steps, without_alternates
-from eap.errors import ConfigError
+from eap.errors import ConfigError, ControlError
 from eap.near import near
 from eap.pd.spec import StationSpec
 
-Do: TypeAlias = Callable[[StationSpec], Outcome]
+STATION_S = 60.0
+"""Time for one station: it is checked, stored, and built anew between two cycles."""
+
+Do: TypeAlias = Callable[[StationSpec], ApplyAnswer]
 
 
-class Done(msgspec.Struct, frozen=True):
-    """One step and what became of it."""
+class StationPlan(msgspec.Struct, frozen=True):
+    """Difference between a running station and its plant file.
+
+    Attributes:
+        station: Its name.
+        changes: Of the objects of its ports.
+        notes: Differences beside the objects: sources, links, buses, routes, access rules.
+        refused: Why it cannot be as the file says.
+    """
+
+    station: str
+    changes: list[ObjectChange]
+    notes: list[str]
+    refused: list[str]
+
+    @property
+    def differs(self) -> bool:
+        """Whether there is anything to do, or to refuse."""
+        return bool(self.changes or self.notes or self.refused)
+
+
+class StepResult(msgspec.Struct, frozen=True):
+    """Result of one step."""
 
     station: str
     why: str
-    outcome: Outcome
+    outcome: ApplyAnswer
+
+
+class PlannedStep(msgspec.Struct, frozen=True):
+    """Step that ``apply`` would take."""
+
+    station: str
+    why: str
+
+
+class PlanReport(msgspec.Struct, frozen=True):
+    """``eapctl plan``; *absent* are stations of the plant that do not run here."""
+
+    ok: bool
+    stations: list[StationPlan]
+    steps: list[PlannedStep]
+    absent: tuple[str, ...]
+
+    @classmethod
+    def of(cls, plans: list[StationPlan], order: Iterable[Step], absent: tuple[str, ...]) -> Self:
+        """Return the report of *plans* and the steps in *order*."""
+        steps = [PlannedStep(step.station, step.why) for step in order]
+        return cls(not any(each.refused for each in plans), plans, steps, absent)
+
+
+class TakenStep(msgspec.Struct, frozen=True):
+    """Step of a change that was tried."""
+
+    station: str
+    why: str
+    ok: bool
+    results: list[ChangeResult]
+    refused: list[str]
+
+
+class RefusingStation(msgspec.Struct, frozen=True):
+    """Station that cannot change while it runs, and why."""
+
+    station: str
+    refused: list[str]
+
+
+class ChangeReport(msgspec.Struct, frozen=True):
+    """``eapctl apply`` and ``rollback``; *error* says why it was broken off."""
+
+    ok: bool
+    steps: list[TakenStep]
+    refused: list[RefusingStation]
+    error: str | None
+
+    @classmethod
+    def of(
+        cls,
+        taken: Iterable[StepResult],
+        refusing: Mapping[str, list[str]],
+        error: ControlError | None,
+    ) -> Self:
+        """Return the report of all steps *taken*."""
+        steps = [
+            TakenStep(
+                each.station,
+                each.why,
+                each.outcome.ok,
+                each.outcome.results,
+                each.outcome.refused,
+            )
+            for each in taken
+        ]
+        is_ok = not (refusing or error) and all(step.ok for step in steps)
+        refused = [RefusingStation(name, why) for name, why in refusing.items()]
+        return cls(is_ok, steps, refused, None if error is None else str(error))
+
+
+class PlantLink:
+    """Connections to all appliances that run stations of a plant.
+
+    Args:
+        clients: The appliance of each station.
+        file: The plant file.
+        absent: Its stations that do not run here.
+        routing: Configuration of their routers in it.
+        audit_required: Whether it wants changes refused that cannot be recorded.
+
+    Attributes:
+        file: The plant file, as it was named.
+
+    Raises:
+        ControlError: (every method) the appliance refused, or does not answer.
+    """
+
+    def __init__(
+        self,
+        clients: Mapping[str, Client],
+        file: Path,
+        absent: tuple[str, ...] = (),
+        routing: Mapping[str, RoutingSpec] = MappingProxyType({}),
+        *,
+        audit_required: bool = False,
+    ) -> None:
+        self._clients = clients
+        self._routing = routing
+        self._audit_required = audit_required
+        self.file = file
+        self._file = str(file.resolve())
+        self.absent = absent
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """Those that run here."""
+        return tuple(self._clients)
+
+    def export(self, station: str) -> RunningSpec:
+        """Return the specification that a station runs."""
+        return self._call(protocol.EXPORT, station)
+
+    def plan(self, spec: StationSpec) -> StationPlan:
+        """Return the difference between *spec* and the station of its name."""
+        answer = self._call(protocol.PLAN, spec.name, spec=msgspec.to_builtins(spec))
+        router = self.plan_routing(spec.name)
+        notes, refused = answer.station + router.changes, answer.refused + router.refused
+        if self._clients[spec.name].info.audit_required != self._audit_required:
+            duty = "required" if self._audit_required else "optional"
+            refused += [f"access: audit becomes {duty}: this needs a new start of the appliance"]
+        return StationPlan(spec.name, answer.changes, notes, refused)
+
+    def apply(self, spec: StationSpec, cause: str) -> ApplyAnswer:
+        """Let the station of its name be as *spec* says, as a step of the change named *cause*."""
+        where = {"cause": cause, "file": self._file}
+        return self._call(protocol.APPLY, spec.name, spec=msgspec.to_builtins(spec), **where)
+
+    def rollback(self, spec: StationSpec) -> ApplyAnswer:
+        """Let the station of its name be *spec*: what it was before, or is, alternates aside."""
+        return self._call(protocol.ROLLBACK, spec.name, spec=msgspec.to_builtins(spec))
+
+    def export_routing(self, station: str) -> RunningRouting | None:
+        """Return the configuration of a router; None if the plant file has none of it."""
+        if station not in self._routing:
+            return None
+        return self._call(protocol.ROUTING_EXPORT, station)
+
+    def plan_routing(self, station: str) -> RoutingDifference:
+        """Return the changes that the plant file would bring to a router."""
+        if station not in self._routing:
+            return RoutingDifference(changes=[], refused=[])
+        routing = msgspec.to_builtins(self._routing[station])
+        return self._call(protocol.ROUTING_PLAN, station, routing=routing)
+
+    def apply_routing(self, station: str, cause: str) -> RoutingDifference:
+        """Configure a router as the plant file says, as a step of the change named *cause*."""
+        routing = msgspec.to_builtins(self._routing[station])
+        return self._call(protocol.ROUTING_APPLY, station, routing=routing, cause=cause)
+
+    def rollback_routing(self, station: str) -> RoutingDifference:
+        """Take the last change of a router back, or make it again."""
+        return self._call(protocol.ROUTING_ROLLBACK, station)
+
+    def _call(self, method: Method[ParametersT, AnswerT], station: str, **params: Any) -> AnswerT:
+        client = self._clients[station]
+        return client.call(method, within_s=STATION_S, station=station, **params)
+
+
+@contextmanager
+def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
+    """Connect to the appliances that run stations of *plant*, for the length of a block.
+
+    Blank stations belong to every plant that has a station of their name.
+
+    Raises:
+        ControlError: none of its stations runs here.
+    """
+    names = {station.name for station in plant.stations}
+    clients = connect_those(
+        lambda info: (
+            info.plant == plant.name if info.plant_file else not names.isdisjoint(info.stations)
+        )
+    )
+    try:
+        found = {name: each for each in clients for name in each.info.stations if name in names}
+        if not found:
+            command = shlex.join(["eapctl", "run", str(file)])
+            raise ControlError(
+                f"no station of plant {plant.name} runs here: start them with '{command}'",
+                code=ErrorCode.UNAVAILABLE,
+            )
+        order = [station.name for station in plant.stations]
+        here = {name: found[name] for name in order if name in found}
+        absent = tuple(name for name in order if name not in found)
+        yield PlantLink(here, file, absent, plant.routing, audit_required=plant.audit_required)
+    finally:
+        for client in clients:
+            client.close()
 
 
 def load_or_raise(file: Path) -> Plant:
@@ -91,7 +317,7 @@ def apply_steps(
     *,
     keep_going: bool = False,
     routed: Iterable[str] = (),
-) -> Iterator[Done]:
+) -> Iterator[StepResult]:
     """Take *order* step by step, and yield what became of each; last the routers of *routed*.
 
     A station that refused one is asked for nothing more.  What goes on with a change that was
@@ -108,14 +334,14 @@ def apply_steps(
     if keep_going or not refused:
         names = [name for name in routed if name not in refused]
         yield from _tell_routers(
-            [name for name in names if link.routing.plan(name).changes],
-            partial(link.routing.apply, cause=cause),
+            [name for name in names if link.plan_routing(name).changes],
+            partial(link.apply_routing, cause=cause),
         )
 
 
 def roll_back(
     link: PlantLink, stations: Iterable[str], *, keep_going: bool = False
-) -> Iterator[Done]:
+) -> Iterator[StepResult]:
     """Take the last change of *stations* back, and yield what became of each step.
 
     Those that it did not change are left alone.  If it was taken back everywhere, and nothing is
@@ -125,7 +351,7 @@ def roll_back(
     now = {name: each.spec for name, each in running.items()}
     goal = {name: without_alternates(now[name]) for name in stations}
     known = {name: running[name] for name in goal if running[name].previous is not None}
-    routers = {name: told for name in goal if (told := link.routing.export(name)) is not None}
+    routers = {name: told for name in goal if (told := link.export_routing(name)) is not None}
     routers = {name: told for name, told in routers.items() if told.previous is not None}
     causes = [each.cause for each in known.values()] + [each.cause for each in routers.values()]
     last = max(causes, default="")
@@ -137,7 +363,7 @@ def roll_back(
         left, told_left = part, routed
     goal |= {name: each.previous for name, each in left.items() if each.previous is not None}
     back = _walk(steps(now, {**now, **goal}), link.rollback, keep_going=keep_going)
-    return chain(back, _tell_routers(told_left, link.routing.rollback))
+    return chain(back, _tell_routers(told_left, link.rollback_routing))
 
 
 def _is_under_way(spec: StationSpec) -> bool:
@@ -146,20 +372,20 @@ def _is_under_way(spec: StationSpec) -> bool:
 
 def _tell_routers(
     stations: Iterable[str], tell: Callable[[str], RoutingDifference]
-) -> Iterator[Done]:
+) -> Iterator[StepResult]:
     for name in stations:
         told = tell(name)
-        outcome = Outcome(ok=not told.refused, results=[], refused=told.refused)
-        yield Done(name, f"({', '.join(told.changes) or 'routes'})", outcome)
+        outcome = ApplyAnswer(not told.refused, [], [], told.refused)
+        yield StepResult(name, f"({', '.join(told.changes) or 'routes'})", outcome)
 
 
-def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[Done]:
+def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[StepResult]:
     refused: set[str] = set()
     for step in order:
         if step.station in refused:
             continue
         outcome = do(step.spec)
-        yield Done(step.station, step.why, outcome)
+        yield StepResult(step.station, step.why, outcome)
         if not outcome.ok:
             refused.add(step.station)
             if not keep_going:

@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
+
 from eap.appliance.plantfile import load_plant
 from eap.config.finding import Finding
-from eap.config.load import LoadResult
+from eap.config.load import Plant
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
 from eap.ids import InterfaceUri
@@ -18,11 +20,19 @@ from eap.pd.device import DeviceFault
 from eap.pd.spec import BusSlaveSpec, PortKind, StationSpec
 
 
-def check_plant(path: Path) -> tuple[LoadResult, tuple[Finding, ...]]:
-    """Load the plant file at *path*; return that, and its warnings if it has no errors."""
+class CheckReport(msgspec.Struct, frozen=True):
+    """``eapctl check``: all errors of a plant file, and its warnings if it has none."""
+
+    ok: bool
+    findings: tuple[Finding, ...]
+    warnings: tuple[Finding, ...]
+
+
+def check_plant(path: Path) -> tuple[CheckReport, Plant | None]:
+    """Load the plant file at *path*; return the findings, and the plant if it has no errors."""
     result = load_plant(path)
     if result.plant is None:
-        return result, ()
+        return CheckReport(not result.findings, tuple(result.findings), ()), None
     warnings = []
     for number, station in enumerate(result.plant.stations):
         place = f"stations[{number}]"
@@ -31,7 +41,7 @@ def check_plant(path: Path) -> tuple[LoadResult, tuple[Finding, ...]]:
             warnings.append(
                 Finding(str(path), line, place, f"station {station.name}, {message}", expected)
             )
-    return result, (*warnings, *result.warnings)
+    return CheckReport(True, (), (*warnings, *result.warnings)), result.plant
 
 
 def _small_dictionaries(station: StationSpec) -> Iterator[tuple[str, str]]:

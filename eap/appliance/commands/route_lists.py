@@ -1,15 +1,16 @@
-"""The routes of running stations, as a command sees them."""
+"""Routes of running stations, and the text of StaticRoutes files."""
 
 from __future__ import annotations
 
 import codecs
 import re
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import msgspec
 
 from eap.appliance.commands.client import Client, connect
-from eap.appliance.control_routes import RouterRow, read_document
+from eap.appliance.control import Document
+from eap.appliance.control_routes import ROUTES_LIST, RouterRow, TestResult
 
 _DECLARED = re.compile(rb"""<\?xml[^>]*\sencoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 _MARKS = (
@@ -17,6 +18,33 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+
+
+class RouterList(msgspec.Struct, frozen=True):
+    """``eapctl routes list``."""
+
+    stations: list[RouterRow]
+
+
+class TestedTarget(Document, frozen=True, kw_only=True):
+    """``eapctl routes test``: station that tested a target, and the fields of a TestResult."""
+
+    __test__ = False
+
+    station: str
+    target: str
+    name: str
+    ok: bool
+    rtt_us: int | None
+    state: str
+    error: int
+    text: str
+    hint: str
+
+    @classmethod
+    def of(cls, station: str, result: TestResult) -> Self:
+        """Return the *result* of a test by *station*."""
+        return cls(station=station, **msgspec.structs.asdict(result))
 
 
 class PlantRoutes(NamedTuple):
@@ -39,7 +67,7 @@ def list_routes(
     Args:
         plant: Of the appliance; None for all.
         station: Its name; None for all.
-        match: What name, NetID, door, address, origin or state of a route have in them.
+        match: What name, NetID, transport, address, origin or state of a route have in them.
         requests: How many of the latest ones to return of each station.
         most: Routes of one station; None for as many as there are.
 
@@ -61,16 +89,13 @@ def _ask(
     client: Client, station: str, match: str, requests: int, most: int | None
 ) -> list[RouterRow]:
     """Return the routes of one appliance, page by page."""
-    params = {"station": station, "match": match}
-    answer = client.request("routes_list", **params, requests=requests)
     whole = []
-    for each in read_document(answer, list[RouterRow]):
+    for each in client.call(ROUTES_LIST, station=station, match=match, requests=requests):
         rows = list(each.routes)
         while len(rows) < (each.total if most is None else min(most, each.total)):
-            page = client.request(
-                "routes_list", station=each.station, match=match, first=len(rows), requests=0
+            (more,) = client.call(
+                ROUTES_LIST, station=each.station, match=match, first=len(rows), requests=0
             )
-            (more,) = read_document(page, list[RouterRow])
             if not more.routes:  # some went away meanwhile
                 break
             rows += more.routes

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from eap.aoe.ads_operation import Operation, Read, ReadWrite
 from eap.appliance.control import Request
 from eap.appliance.control_bus import BusOpenParameters, kind_of
+from eap.appliance.control_device import ApplyAnswer, StateAnswer
 from eap.appliance.services.accepting import process_of
 from eap.appliance.services.audit import operation_words
 from eap.codec.ads import AdsError, IndexGroup
@@ -77,8 +78,6 @@ def refusal_in(result: Any, talk: BusOpenParameters | None = None) -> str:
         result: Of a request.
         talk: How the conversation was opened that it is an answer of, if it is one.
     """
-    if not isinstance(result, Mapping):
-        return ""
     if talk is not None:
         from eap.appliance.services.gateway.guard import error_in  # plants without buses have none
 
@@ -88,9 +87,9 @@ def refusal_in(result: Any, talk: BusOpenParameters | None = None) -> str:
             head = SdoHeader.decode(answer, CoeHeader.SIZE)
             return str(SdoAbortError(head.value, head.index, head.subindex))
         return AdsError.words_of(code) if code else ""
-    error = result.get("error")
-    text = error.get("text", "") if isinstance(error, Mapping) else error
-    return str(text or "; ".join(map(str, result.get("refused") or ())))
+    if isinstance(result, StateAnswer) and result.error is not None:
+        return result.error.text
+    return "; ".join(result.refused) if isinstance(result, ApplyAnswer) else ""
 
 
 def _said(talk: BusOpenParameters, params: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:

@@ -26,7 +26,10 @@ from eap.appliance.control import (
     ErrorCode,
     Failure,
     Request,
+    Subscribed,
+    Unsubscribed,
     UnsubscribeParameters,
+    ValuesEvent,
     decode_request,
     encode_error,
     encode_event,
@@ -307,23 +310,24 @@ class _Client:
         watch = self._methods.watch(params)
         self._last_subscription += 1
         subscription = self._last_subscription
-        await self.send(encode_result(number, {"subscription": subscription}))
+        await self.send(encode_result(number, Subscribed(subscription)))
         self.subscriptions[subscription] = group.create_task(self._events(subscription, watch))
 
-    def _unsubscribe(self, params: dict[str, Any]) -> dict[str, Any]:
+    def _unsubscribe(self, params: dict[str, Any]) -> Unsubscribed:
         subscription = parameters(params, UnsubscribeParameters).subscription
         task = self.subscriptions.pop(subscription, None)
         if task is None:
             reason = f"no subscription {subscription} on this connection"
             raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
         task.cancel()
-        return {"unsubscribed": subscription}
+        return Unsubscribed(subscription)
 
     async def _events(self, subscription: int, watch: Watch) -> None:
         clock = asyncio.get_running_loop().time
         period_s = watch.period_ms / 1000
         due_s = clock()
         while True:
+            event: ValuesEvent | dict[str, Any] | None
             try:
                 event = watch.next_event()
             except ImageError as exc:

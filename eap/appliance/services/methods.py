@@ -1,4 +1,4 @@
-"""What the control protocol can be asked for, answered from the process images.
+"""General methods of the control protocol, answered from the process images.
 
 Rule: what is about images does not wait.  An image is read by copying, a value is written under the
 lock that also keeps user programs apart, and the engine notices neither.  Only ``status`` waits a
@@ -20,7 +20,7 @@ from eap.errors import ControlError, WriterConflictError
 from eap.near import near
 from eap.pd.image import Image
 from eap.pd.layout import VariablePlace
-from eap.pd.report import pd_list, quality, tracker_word
+from eap.pd.report import PdRow, pd_list, quality, tracker_word
 from eap.pd.spec import Writer
 from eap.pd.words import RxWord, StationWord
 
@@ -54,13 +54,17 @@ class Methods:
         self._status = status
         self._stop = stop
         self._methods: dict[str, Callable[[dict[str, Any]], Any]] = {
-            "hello": self._hello,
             "status": self._get_status,
-            "pd_list": self._pd_list,
-            "variables": self._variables,
-            "read": self._read,
-            "write": self._write,
-            "stop": self._ask_to_stop,
+            **dict(
+                (
+                    control.HELLO.served_by(self._hello),
+                    control.PD_LIST.served_by(self._pd_list),
+                    control.VARIABLES.served_by(self._variables),
+                    control.READ.served_by(self._read),
+                    control.WRITE.served_by(self._write),
+                    control.STOP.served_by(self._ask_to_stop),
+                )
+            ),
             **(more or {}),
         }
 
@@ -89,39 +93,29 @@ class Methods:
         _places(station.image, wanted.names)
         return Watch(station, wanted.names, wanted.period_ms, only_changes=wanted.on == "change")
 
-    def _hello(self, params: dict[str, Any]) -> dict[str, Any]:
-        parameters(params, control.NoParameters)
-        return {"version": VERSION, **self._identity, "stations": list(self._images)}
+    def _hello(self, wanted: control.NoParameters) -> control.Hello:
+        del wanted
+        return control.Hello(version=VERSION, **self._identity, stations=list(self._images))
 
     async def _get_status(self, params: dict[str, Any]) -> dict[str, Any]:
         parameters(params, control.NoParameters)
         return await self._status()
 
-    def _pd_list(self, params: dict[str, Any]) -> list[dict[str, Any]]:
-        wanted = parameters(params, control.PdListParameters).station
-        names = [wanted] if wanted else list(self._images)
-        return [{"station": name, **pd} for name in names for pd in pd_list(self._image(name))]
+    def _pd_list(self, wanted: control.PdListParameters) -> list[PdRow]:
+        names = [wanted.station] if wanted.station else list(self._images)
+        return [row for name in names for row in pd_list(self._image(name))]
 
-    def _variables(self, params: dict[str, Any]) -> list[dict[str, Any]]:
-        image = self._image(parameters(params, control.VariablesParameters).station)
+    def _variables(self, wanted: control.VariablesParameters) -> list[control.VariableRow]:
         return [
-            {
-                "name": place.name,
-                "type": place.type,
-                "writer": place.writer,
-                "unit": place.unit,
-                "comment": place.comment,
-            }
-            for place in image.layout.variables
+            control.VariableRow(place.name, place.type, place.writer, place.unit, place.comment)
+            for place in self._image(wanted.station).layout.variables
         ]
 
-    def _read(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control.ReadParameters)
+    def _read(self, wanted: control.ReadParameters) -> control.Values:
         image = self._image(wanted.station)
         return _snapshot(image, _places(image, wanted.names))
 
-    def _write(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control.WriteParameters)
+    def _write(self, wanted: control.WriteParameters) -> control.Written:
         station = self._station(wanted.station)
         places = _places(station.image, wanted.values)
         values = {place.name: _checked(place, wanted.values[place.name]) for place in places}
@@ -131,12 +125,12 @@ class Methods:
             raise ControlError(str(exc), code=ErrorCode.REFUSED) from None
         except ValueError as exc:  # another type, since the station was configured anew
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
-        return {"written": len(values)}
+        return control.Written(len(values))
 
-    def _ask_to_stop(self, params: dict[str, Any]) -> dict[str, Any]:
-        parameters(params, control.NoParameters)
+    def _ask_to_stop(self, wanted: control.NoParameters) -> control.Stopping:
+        del wanted
         self._stop()
-        return {"stopping": True}
+        return control.Stopping(stopping=True)
 
     def _image(self, station: str) -> Image:
         return self._station(station).image
@@ -164,40 +158,33 @@ class Watch:
         self._looked_in: int | None = None
         self._skipped = 0
 
-    def next_event(self) -> dict[str, Any] | None:
-        """Return what to send now, None if nothing changed.
-
-        ``skipped`` counts the cycles since the event before whose values nobody has looked at.
+    def next_event(self) -> control.ValuesEvent | None:
+        """Return the event to send now, None if nothing changed.
 
         Raises:
             ImageError: the values cannot be read.
             ControlError: the station was configured anew, and one of the variables is gone.
         """
         image = self._station.image
-        event = _snapshot(image, _places(image, self._names))
+        now = _snapshot(image, _places(image, self._names))
         if self._looked_in is not None:
-            self._skipped += max(event["cycle"] - self._looked_in - 1, 0)
-        self._looked_in = event["cycle"]
+            self._skipped += max(now.cycle - self._looked_in - 1, 0)
+        self._looked_in = now.cycle
+        values, quality = now.values, now.quality
         if self._only_changes:
-            values = event["values"]
-            changed = {
-                name: value
-                for name, value in values.items()
-                if name not in self._last or self._last[name] != value
-            }
-            self._last = values
-            if not changed:
+            last, self._last = self._last, values
+            values = {n: v for n, v in values.items() if n not in last or last[n] != v}
+            if not values:
                 return None
-            event["values"] = changed
-            event["quality"] = {n: q for n, q in event["quality"].items() if n in changed}
-        event["skipped"], self._skipped = self._skipped, 0
-        return event
+            quality = {n: q for n, q in quality.items() if n in values}
+        skipped, self._skipped = self._skipped, 0
+        return control.ValuesEvent(now.station, now.cycle, values, quality, skipped)
 
 
-def _snapshot(image: Image, places: list[VariablePlace]) -> dict[str, Any]:
+def _snapshot(image: Image, places: list[VariablePlace]) -> control.Values:
     """Return the values of *places*; those of one writer belong to one moment.
 
-    What the engine writes is that of the cycle which is named.
+    Values that the engine writes are those of the cycle that is named.
     """
     engine = image.snapshot()
     if len(places) == 1:
@@ -207,12 +194,8 @@ def _snapshot(image: Image, places: list[VariablePlace]) -> dict[str, Any]:
     else:
         values = engine.read_all((Writer.ENGINE,)) | image.read_all(_OTHERS)
     plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in places}
-    return {
-        "station": image.layout.station,
-        "cycle": engine.words[StationWord.CYCLE],
-        "values": plain,
-        "quality": _qualities(engine, plain),
-    }
+    cycle = engine.words[StationWord.CYCLE]
+    return control.Values(image.layout.station, cycle, plain, _qualities(engine, plain))
 
 
 def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:

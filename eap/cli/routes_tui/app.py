@@ -13,7 +13,7 @@ from textual.containers import VerticalScroll
 from textual.widgets import DataTable, Footer, Input, Static
 
 from eap.appliance.control_routes import RouteRow
-from eap.cli import routes_text
+from eap.cli import routes_view
 from eap.cli.routes_tui.forms import Message, Question, RouteForm, values_of
 from eap.cli.routes_tui.grid import STYLES, Grid
 from eap.cli.routes_tui.link import Link, Picture, Router
@@ -129,7 +129,7 @@ class RoutesApp(App[None]):
         stations = [each.routes for each in routers]
         plants = ", ".join(dict.fromkeys(each.plant for each in self._picture.routers))
         where = self._station if self._station != _ALL else f"{len(stations)} stations"
-        text = Text(f" {plants}, {where}: {routes_text.summary(stations)}" if stations else " ")
+        text = Text(f" {plants}, {where}: {routes_view.summary(stations)}" if stations else " ")
         if self._picture.problem:
             text = Text(f" {self._picture.problem}", style="bold red")
         text.truncate(self.size.width, overflow="ellipsis")
@@ -226,7 +226,7 @@ class RoutesApp(App[None]):
                 self._remove(router, row)
 
         station = router.routes.station
-        text = f"Remove route {row.name} ({row.pattern}, {routes_text.way(row)}) of {station}?"
+        text = f"Remove route {row.name} ({row.pattern}, {routes_view.path_of(row)}) of {station}?"
         self.push_screen(Question(text), answered)
 
     def action_test(self) -> None:
@@ -246,7 +246,7 @@ class RoutesApp(App[None]):
     @work(thread=True)
     def _remove(self, router: Router, row: RouteRow) -> None:
         try:
-            self._link.remove(router, row.net_id, row.door, row.address)
+            self._link.remove(router, row.net_id, row.transport, row.address)
         except EapError as exc:
             self.call_from_thread(self._tell, "Remove", str(exc))
         self.call_from_thread(self.look)
@@ -258,7 +258,7 @@ class RoutesApp(App[None]):
         except EapError as exc:
             text = str(exc)
         else:
-            trip = f" in {routes_text.round_trip(result.rtt_us)}" if result.ok else ""
+            trip = f" in {routes_view.round_trip(result.rtt_us)}" if result.ok else ""
             said = f"{result.target}{trip}: {result.text}"
             text = "\n".join(filter(None, [said, result.hint]))
         title = f"{router.routes.station} to {row.name}"

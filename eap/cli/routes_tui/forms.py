@@ -185,7 +185,7 @@ class Message(ModalScreen[None]):
 
 def values_of(row: RouteRow) -> dict[str, Any]:
     """Return what a form for a change of *row* begins with."""
-    kind, _, port = row.door.partition(":")
+    kind, _, port = row.transport.partition(":")
     address = port if kind == "mqtt" else row.address
     return {
         "name": row.name,

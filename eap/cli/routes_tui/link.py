@@ -1,4 +1,4 @@
-"""What the live view asks of running appliances: each time anew, so that they may come and go."""
+"""Requests of the live view to running appliances; each connects anew: appliances come and go."""
 
 from __future__ import annotations
 
@@ -6,14 +6,21 @@ from typing import Any, NamedTuple
 
 from eap.appliance.commands.client import connect_station
 from eap.appliance.commands.route_lists import list_routes
-from eap.appliance.control_routes import RouterRow, TestResult, read_document
+from eap.appliance.control import AnswerT, Method, ParametersT
+from eap.appliance.control_routes import (
+    ROUTES_ADD,
+    ROUTES_REMOVE,
+    ROUTES_TEST,
+    RouterRow,
+    TestResult,
+)
 from eap.errors import EapError
 
 MOST = 500
 """Routes of a station that are shown; a filter finds the others."""
 _REQUESTS = 256
 _TEST_MS = 5000
-_TEST_PATIENCE_S = 10.0
+_TEST_S = 10.0
 
 
 class Router(NamedTuple):
@@ -24,7 +31,7 @@ class Router(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """What there is to see; *problem* says why there is nothing new."""
+    """Content of the view; *problem* says why there is nothing new."""
 
     routers: list[Router]
     problem: str = ""
@@ -45,20 +52,18 @@ class Link:
         return Picture([Router(each.plant, row) for each in found for row in each.stations])
 
     def add(self, router: Router, params: dict[str, Any]) -> list[str]:
-        """Add a route, and return what there is to say against it; raise EapError if refused."""
-        warnings: list[str] = self._ask(router, "routes_add", **params)["warnings"]
-        return warnings
+        """Add a route, and return the warnings; raise EapError if refused."""
+        return self._call(router, ROUTES_ADD, **params).warnings
 
-    def remove(self, router: Router, route: str, door: str, address: str) -> None:
+    def remove(self, router: Router, route: str, transport: str, address: str) -> None:
         """Remove a route; raise EapError if refused."""
-        self._ask(router, "routes_remove", route=route, door=door, address=address)
+        self._call(router, ROUTES_REMOVE, route=route, transport=transport, address=address)
 
     def test(self, router: Router, target: str) -> TestResult:
-        """Ask *target* for its state, which may take some seconds; raise EapError if refused."""
-        answer = self._ask(router, "routes_test", target=target, timeout_ms=_TEST_MS)
-        return read_document(answer, TestResult)
+        """Test the way to *target*, which may take some seconds; raise EapError if refused."""
+        return self._call(router, ROUTES_TEST, target=target, timeout_ms=_TEST_MS)
 
-    def _ask(self, router: Router, method: str, **params: Any) -> Any:
+    def _call(self, router: Router, method: Method[ParametersT, AnswerT], **params: Any) -> AnswerT:
         station = router.routes.station
         with connect_station(station, router.plant) as client:
-            return client.request_within(_TEST_PATIENCE_S, method, station=station, **params)
+            return client.call(method, within_s=_TEST_S, station=station, **params)

@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from eap.appliance.control_routes import ConnectionRow, RouteRow
-from eap.cli import routes_text
+from eap.cli import routes_view
 from eap.cli.routes_tui.link import Router
 
 _GAP = 1
@@ -64,7 +64,7 @@ COLUMNS = {
         _STATION,
         Column("Route", 8, 20),
         Column("NetID", 11, 23, rank=1),
-        Column("Door", 7, 16, rank=3),
+        Column("Transport", 9, 16, rank=3),
         Column("State", 5, 7),
         Column("Trip", 7, 8, is_number=True, rank=2),
         Column("Asked", 5, 5, is_number=True, rank=4),
@@ -77,7 +77,7 @@ COLUMNS = {
     View.CONNECTIONS: (
         _STATION,
         Column("Connection", 16, 26),
-        Column("Door", 7, 16, rank=3),
+        Column("Transport", 9, 16, rank=3),
         Column("NetIDs", 12, 23, rank=1),
         Column("For", 6, 8, is_number=True, rank=2),
         Column("Asked", 5, 5, is_number=True),
@@ -164,12 +164,12 @@ def cut(text: str, size: int, *, is_number: bool) -> str:
 
 def _route_line(router: Router, row: RouteRow) -> Line:
     station = router.routes.station
-    key = f"{router.plant}/{station}/{row.net_id}/{row.door}/{row.address}"
+    key = f"{router.plant}/{station}/{row.net_id}/{row.transport}/{row.address}"
     cells = (
-        station, row.name, row.pattern, routes_text.door(row),
+        station, row.name, row.pattern, routes_view.transport_of(row),
         "?" if row.state == "unknown" else row.state,
-        routes_text.round_trip(row.rtt_us), routes_text.short(row.requests),
-        routes_text.octets(row), routes_text.short(row.errors), row.address, row.origin,
+        routes_view.round_trip(row.rtt_us), routes_view.short(row.requests),
+        routes_view.octets_of(row), routes_view.short(row.errors), row.address, row.origin,
         row.last_error,
     )  # fmt: skip
     return Line(key, router, row, cells, row.state)
@@ -177,11 +177,11 @@ def _route_line(router: Router, row: RouteRow) -> Line:
 
 def _connection_line(router: Router, row: ConnectionRow) -> Line:
     station = router.routes.station
-    key = f"{router.plant}/{station}/{row.door}/{row.address}"
+    key = f"{router.plant}/{station}/{row.transport}/{row.address}"
     cells = (
-        station, row.address, routes_text.door(row), " ".join(row.net_ids),
-        routes_text.age(row.since_s), routes_text.short(row.requests),
-        routes_text.octets(row), routes_text.short(row.errors), row.last_error,
+        station, row.address, routes_view.transport_of(row), " ".join(row.net_ids),
+        routes_view.age(row.since_s), routes_view.short(row.requests),
+        routes_view.octets_of(row), routes_view.short(row.errors), row.last_error,
     )  # fmt: skip
     return Line(key, router, row, cells, "")
 
@@ -195,20 +195,20 @@ def detail(line: Line | None) -> list[tuple[str, str]]:
         return [(line.cells[1], "down")]
     if isinstance(row, RouteRow):
         texts = [
-            (f"{row.name}  {row.pattern}  {routes_text.way(row)}", "bold"),
-            (f"{routes_text.route_kind(row)}; {routes_text.route_state(row)}", row.state),
+            (f"{row.name}  {row.pattern}  {routes_view.path_of(row)}", "bold"),
+            (f"{routes_view.route_kind(row)}; {routes_view.route_state(row)}", row.state),
         ]
     else:
         asked = f"asked by {', '.join(row.net_ids)}" if row.net_ids else "nothing asked yet"
-        texts = [(routes_text.way(row), "bold"), (asked, "")]
-    texts.append((routes_text.figures(row), ""))
+        texts = [(routes_view.path_of(row), "bold"), (asked, "")]
+    texts.append((routes_view.figures(row), ""))
     if row.last_error:
         texts.append((f"last error: {row.last_error}", "down"))
     own = row.net_id if isinstance(row, RouteRow) else row.address
     texts += [(text, "down") for text in line.router.routes.warnings if own in text]
-    requests = [each for each in line.router.routes.requests if routes_text.belongs(each, row)]
+    requests = [each for each in line.router.routes.requests if routes_view.belongs(each, row)]
     texts += [
-        (routes_text.request_line(each), "" if each.outcome == "answered" else "down")
+        (routes_view.request_line(each), "" if each.outcome == "answered" else "down")
         for each in reversed(requests)
     ]
     return texts

@@ -1,15 +1,14 @@
-"""What the control protocol can be asked for about EAP devices: objects, states, configurations."""
+"""Methods of the control protocol about EAP devices: objects, states, configurations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
 from eap.appliance import control_device as words
-from eap.appliance.control import ErrorCode, of_station, parameters
+from eap.appliance.control import ErrorCode, of_station
 from eap.appliance.control_bus import to_octets
 from eap.appliance.services.device.station_device import StationDevice
 from eap.device.eap_dictionary import EapDictionary
@@ -19,6 +18,8 @@ from eap.near import near
 from eap.od.model import Access, OdObject
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.router9000 import ROUTER
+
+RowT = TypeVar("RowT")
 
 _FLAGS = {
     "rx": Access.RX_MAPPABLE,
@@ -54,22 +55,23 @@ class DeviceMethods:
             ControlError: (every method) there is no such target, or the parameters are wrong.
             SdoAbortError: (od_… methods) the dictionary refuses.
         """
-        return {
-            "od_list": self._list,
-            "od_describe": self._describe,
-            "od_read": self._read,
-            "od_write": self._write,
-            "od_dump": self._dump,
-            "state": self._state,
-            "request_state": self._request_state,
-            "export": self._export,
-            "plan": self._plan,
-            "apply": self._apply,
-            "rollback": self._roll_back,
-        }
+        return dict(
+            (
+                words.OD_LIST.served_by(self._list),
+                words.OD_DESCRIBE.served_by(self._describe),
+                words.OD_READ.served_by(self._read),
+                words.OD_WRITE.served_by(self._write),
+                words.OD_DUMP.served_by(self._dump),
+                words.STATE.served_by(self._state),
+                words.REQUEST_STATE.served_by(self._request_state),
+                words.EXPORT.served_by(self._export),
+                words.PLAN.served_by(self._plan),
+                words.APPLY.served_by(self._apply),
+                words.ROLLBACK.served_by(self._roll_back),
+            )
+        )
 
-    def _list(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.OdListParameters)
+    def _list(self, wanted: words.OdListParameters) -> words.ObjectPage:
         dictionary = self._find(wanted.target).dictionary
         flag = _FLAGS.get(wanted.list)
         chosen = (
@@ -77,75 +79,68 @@ class DeviceMethods:
             for item in dictionary
             if flag is None or any(each.access & flag for each in item.entries.values())
         )
-        return _page(chosen, wanted.first, partial(_object_row, dictionary))
+        return words.ObjectPage(
+            *_page(
+                chosen,
+                wanted.first,
+                lambda item: words.object_row(item, _label(dictionary, item)),
+            )
+        )
 
-    def _describe(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.OdDescribeParameters)
+    def _describe(self, wanted: words.OdDescribeParameters) -> words.DescribedObject:
         dictionary = self._find(wanted.target).dictionary
         if isinstance(dictionary, EapDictionary):
             item = _existing_or_new(dictionary, wanted.index, wanted.subindex)
         else:
             item = dictionary[wanted.index]
-        rows = [words.entry_row(*each) for each in item.entries.items()]
-        return _object_row(dictionary, item) | {"entries": rows}
+        return words.described_object(item, _label(dictionary, item))
 
-    def _read(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.OdReadParameters)
+    def _read(self, wanted: words.OdReadParameters) -> words.EntryData:
         found = self._find(wanted.target)
         read = found.dictionary.upload_complete if wanted.complete else found.dictionary.upload
-        return {"data": read(wanted.index, wanted.subindex, found.device.od_state()).hex()}
+        return words.EntryData(read(wanted.index, wanted.subindex, found.device.od_state()).hex())
 
-    async def _write(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.OdWriteParameters)
+    async def _write(self, wanted: words.OdWriteParameters) -> words.EmptyAnswer:
         found = self._find(wanted.target)
         place, data = (wanted.index, wanted.subindex), to_octets(wanted.data)
         if isinstance(found.dictionary, EapDictionary):
             await found.device.download(found.port, *place, data, complete=wanted.complete)
         else:
             found.dictionary.download(*place, data, found.device.od_state())
-        return {}
+        return words.EmptyAnswer()
 
-    def _dump(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.OdDumpParameters)
+    def _dump(self, wanted: words.OdDumpParameters) -> words.DumpPage:
         found = self._find(wanted.target)
-        dictionary, state = found.dictionary, found.device.od_state()
+        dictionary, right = found.dictionary, found.device.od_state().read_right
+        return words.DumpPage(
+            *_page(
+                dictionary,
+                wanted.first,
+                lambda item: words.dumped_object(item, _label(dictionary, item), right),
+            )
+        )
 
-        def row(item: OdObject) -> dict[str, Any]:
-            entries = [
-                words.entry_row(subindex, entry)
-                | {"data": entry.octets.hex() if entry.access & state.read_right else None}
-                for subindex, entry in item.entries.items()
-            ]
-            return _object_row(dictionary, item) | {"entries": entries}
+    def _state(self, wanted: words.TargetParameters) -> words.StateAnswer:
+        return words.state_answer(self._find(wanted.target).device.status)
 
-        return _page(dictionary, wanted.first, row)
-
-    def _state(self, params: dict[str, Any]) -> dict[str, Any]:
-        found = self._find(parameters(params, words.TargetParameters).target)
-        return words.state_document(found.device.status)
-
-    async def _request_state(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.RequestStateParameters)
+    async def _request_state(self, wanted: words.RequestStateParameters) -> words.StateAnswer:
         device = self._find(wanted.target).device
-        return words.state_document(await device.request_state(words.state_of(wanted.state)))
+        return words.state_answer(await device.request_state(words.state_of(wanted.state)))
 
-    def _export(self, params: dict[str, Any]) -> dict[str, Any]:
-        device = self._device(parameters(params, words.StationParameters).station)
-        return words.export_document(device.spec, *device.last_change)
+    def _export(self, wanted: words.StationParameters) -> words.RunningSpec:
+        device = self._device(wanted.station)
+        return words.running_spec(device.spec, *device.last_change)
 
-    async def _plan(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.SpecParameters)
-        return words.plan_document(await self._device(wanted.station).plan(wanted.spec))
+    async def _plan(self, wanted: words.SpecParameters) -> words.PlanAnswer:
+        return words.plan_answer(await self._device(wanted.station).plan(wanted.spec))
 
-    async def _apply(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.ApplyParameters)
+    async def _apply(self, wanted: words.ApplyParameters) -> words.ApplyAnswer:
         is_own = bool(wanted.file) and wanted.file == self._plant_file
         change = self._device(wanted.station).apply(wanted.spec, wanted.cause, of_plant_file=is_own)
-        return words.outcome_document(*await change)
+        return words.apply_answer(*await change)
 
-    async def _roll_back(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.RollbackParameters)
-        return words.outcome_document(*await self._device(wanted.station).roll_back(wanted.spec))
+    async def _roll_back(self, wanted: words.RollbackParameters) -> words.ApplyAnswer:
+        return words.apply_answer(*await self._device(wanted.station).roll_back(wanted.spec))
 
     def _device(self, station: str) -> StationDevice:
         return of_station(station, self._devices)
@@ -175,25 +170,24 @@ class _Target(NamedTuple):
     dictionary: EapDictionary | RouterDictionary
 
 
-def _object_row(dictionary: EapDictionary | RouterDictionary, item: OdObject) -> dict[str, Any]:
-    is_there = item.index in dictionary
-    return words.object_row(item, dictionary.name_of(item.index) if is_there else "")
+def _label(dictionary: EapDictionary | RouterDictionary, item: OdObject) -> str:
+    return dictionary.name_of(item.index) if item.index in dictionary else ""
 
 
 def _page(
-    items: Iterable[OdObject], first: int, row: Callable[[OdObject], dict[str, Any]]
-) -> dict[str, Any]:
-    """Return as many rows as one answer may have, and where to go on."""
-    rows: list[dict[str, Any]] = []
+    items: Iterable[OdObject], first: int, row: Callable[[OdObject], RowT]
+) -> tuple[list[RowT], int | None]:
+    """Return as many rows as one answer may have, and the index at which it goes on."""
+    rows: list[RowT] = []
     room = words.PAGE
     for item in items:
         if item.index < first:
             continue
         if room <= 0:
-            return {"objects": rows, "next": item.index}
+            return rows, item.index
         rows.append(row(item))
         room -= len(msgspec.json.encode(rows[-1]))
-    return {"objects": rows, "next": None}
+    return rows, None
 
 
 def _existing_or_new(dictionary: EapDictionary, index: int, subindex: int | None) -> OdObject:

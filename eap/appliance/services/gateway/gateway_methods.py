@@ -1,12 +1,15 @@
-"""The methods of the control protocol about mailbox gateways."""
+"""Methods of the control protocol about mailbox gateways."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from eap.appliance.control import ErrorCode, parameters
-from eap.appliance.control_gateway import GatewayParameters
+import msgspec
+
+from eap.appliance import control_gateway as words
+from eap.appliance.control import ErrorCode
+from eap.appliance.control_gateway import GatewayParameters, GatewayRow
 from eap.appliance.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.errors import ControlError
 from eap.near import near
@@ -32,29 +35,30 @@ class GatewayMethods:
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name."""
-        return {
-            "gateway_start": self._start,
-            "gateway_stop": self._stop,
-            "gateway_status": self._status,
-        }
+        return dict(
+            (
+                words.GATEWAY_START.served_by(self._start),
+                words.GATEWAY_STOP.served_by(self._stop),
+                words.GATEWAY_STATUS.served_by(self._status),
+            )
+        )
 
-    def _start(self, params: dict[str, Any]) -> list[dict[str, Any]]:
-        found = self._find(params)
+    def _start(self, wanted: GatewayParameters) -> list[GatewayRow]:
+        found = self._find(wanted)
         for owner in found:
             self._gateways[owner].start()
         return self._rows(found)
 
-    async def _stop(self, params: dict[str, Any]) -> list[dict[str, Any]]:
-        found = self._find(params)
+    async def _stop(self, wanted: GatewayParameters) -> list[GatewayRow]:
+        found = self._find(wanted)
         for owner in found:
             await self._gateways[owner].stop()
         return self._rows(found)
 
-    def _status(self, params: dict[str, Any]) -> list[dict[str, Any]]:
-        return self._rows(self._find(params))
+    def _status(self, wanted: GatewayParameters) -> list[GatewayRow]:
+        return self._rows(self._find(wanted))
 
-    def _find(self, params: dict[str, Any]) -> list[PortName]:
-        wanted = parameters(params, GatewayParameters)
+    def _find(self, wanted: GatewayParameters) -> list[PortName]:
         names = [station.name for station in self._handover.stations]
         if wanted.station not in names:
             reason = f"no station {wanted.station!r} here{near(wanted.station, names)}"
@@ -69,13 +73,8 @@ class GatewayMethods:
             raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
         return found
 
-    def _rows(self, owners: list[PortName]) -> list[dict[str, Any]]:
-        return [
-            {"station": owner.station, "port": owner.port}
-            | {"served": self._served(owner)}
-            | gateway_row(self._gateways[owner])
-            for owner in owners
-        ]
+    def _rows(self, owners: list[PortName]) -> list[GatewayRow]:
+        return [gateway_row(owner, self._gateways[owner], self._served(owner)) for owner in owners]
 
     def _served(self, owner: PortName) -> list[str]:
         """Return the sockets behind which a gateway is."""
@@ -93,38 +92,47 @@ class GatewayMethods:
         return found
 
 
-def gateway_row(gateway: MailboxGateway) -> dict[str, Any]:
-    """Return how a gateway behaves and what it did, as plain values."""
+def gateway_row(owner: PortName, gateway: MailboxGateway, served: list[str]) -> GatewayRow:
+    """Return state, settings and counters of a gateway.
+
+    Args:
+        owner: Its bus port.
+        gateway: The gateway.
+        served: Sockets behind which it is.
+    """
     settings = gateway.settings
     transfers = gateway.transfers()
-    return {
-        "state": "running" if gateway.is_open else "stopped",
-        "turned_away": gateway.turned_away,
-        "settings": {
-            "answer_ms": round(settings.answer_s * 1000),
-            "silent": settings.is_silent,
-            "in_flight": settings.limits.in_flight,
-            "rate": settings.limits.rate,
-            "clients": settings.limits.clients,
-        },
-        "clients": [
-            {
-                "door": way.door,
-                "address": way.connection,
-                "requests": counts.requests,
-                "repeated": counts.repeated,
-                "errors": counts.errors,
-                "waiting": gateway.ledger.waiting(way),
-                "transfers": [
-                    {"address": key.address, "protocol": key.kind.name}
+    return GatewayRow(
+        station=owner.station,
+        port=owner.port,
+        served=served,
+        state="running" if gateway.is_open else "stopped",
+        turned_away=gateway.turned_away,
+        settings=words.GatewaySettings(
+            round(settings.answer_s * 1000),
+            settings.is_silent,
+            settings.limits.in_flight,
+            settings.limits.rate,
+            settings.limits.clients,
+        ),
+        clients=[
+            words.GatewayClientRow(
+                transport=way.door,
+                address=way.connection,
+                requests=counts.requests,
+                repeated=counts.repeated,
+                errors=counts.errors,
+                waiting=gateway.ledger.waiting(way),
+                transfers=[
+                    words.TransferRow(key.address, key.kind.name)
                     for key in transfers
                     if key.way == way
                 ],
-            }
+            )
             for way, counts in gateway.ledger.table().items()
         ],
-        "slaves": gateway.statistics.report(),
-    }
+        slaves=msgspec.convert(gateway.statistics.report(), list[words.MailboxFigures]),
+    )
 
 
 def _place(scheme: str, shared: SharedSocket) -> str:

@@ -1,4 +1,4 @@
-"""What the control protocol can be asked for about AMS: ways, who is behind them, and requests."""
+"""Methods of the control protocol that send AMS requests: scan, trace and single requests."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from eap.aoe.directory import AmsAddress, Directory
-from eap.appliance import control_ams as words
-from eap.appliance.control import ErrorCode, of_station, parameters
+from eap.appliance import control_routes as words
+from eap.appliance.control import ErrorCode, of_station
 from eap.appliance.control_bus import to_octets
 from eap.appliance.services.routes.scanning import scan, stations_of
 from eap.appliance.services.routes.tracing import Traced, trace
@@ -43,36 +43,40 @@ class AmsMethods:
         Raises:
             ControlError: (every method) there is no such station or target.
         """
-        return {"scan": self._scan, "trace": self._trace, "ams_ask": self._ask}
+        return dict(
+            (
+                words.SCAN.served_by(self._scan),
+                words.TRACE.served_by(self._trace),
+                words.AMS_ASK.served_by(self._ask),
+            )
+        )
 
-    async def _scan(self, params: dict[str, Any]) -> dict[str, Any]:
-        router = self._router(parameters(params, words.ScanParameters).via)
-        rows = await scan(router, stations_of(self._directory, router.table))
-        via = {"station": router.name, "address": self._addresses.get(router.name, "")}
-        return {"stations": rows, "via": via}
+    async def _scan(self, wanted: words.ScanParameters) -> words.PlantScan:
+        router = self._router(wanted.via)
+        stations = await scan(router, stations_of(self._directory, router.table))
+        via = words.ScanVia(router.name, self._addresses.get(router.name, ""))
+        return words.PlantScan(stations, via)
 
-    async def _trace(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.TraceParameters)
+    async def _trace(self, wanted: words.TraceParameters) -> words.TracedPath:
         router, address = self._router(wanted.via), _found(self._directory.find, wanted.target)
         found = await trace(router, *address)
-        return {
-            "target": wanted.target,
-            "address": str(address),
-            "name": self._directory.name_of(*address),
-            "ok": not found.why,
-            "why": found.why,
-            "hops": _hop_rows(found),
-            "answer": _answer_row(found),
-        }
+        return words.TracedPath(
+            wanted.target,
+            str(address),
+            self._directory.name_of(*address),
+            not found.why,
+            found.why,
+            _hop_rows(found),
+            _target_answer(found),
+        )
 
-    async def _ask(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, words.AskParameters)
+    async def _ask(self, wanted: words.AskParameters) -> words.AmsReply:
         find = self._directory.find_device if wanted.device else self._directory.find
         router, address = self._router(wanted.via), _found(find, wanted.target)
         timeout_s = wanted.timeout_ms / 1000
         data = to_octets(wanted.data)
         answer = await router.ask(*address, wanted.command, data, timeout_s=timeout_s)
-        return {"error": answer.error_code, "data": answer.data.hex()}
+        return words.AmsReply(answer.error_code, answer.data.hex())
 
     def _router(self, via: str) -> StationRouter:
         return of_station(via or next(iter(self._routers)), self._routers)
@@ -85,7 +89,7 @@ def _found(find: Callable[[str], AmsAddress], target: str) -> AmsAddress:
         raise _unknown(str(exc)) from None
 
 
-def _hop_rows(found: Traced) -> list[dict[str, Any]]:
+def _hop_rows(found: Traced) -> list[words.HopRow]:
     rows, before_us = [], 0
     for hop in found.hops:
         took_us = hop.took_ns // _NS_PER_US
@@ -95,17 +99,17 @@ def _hop_rows(found: Traced) -> list[dict[str, Any]]:
     return rows
 
 
-def _answer_row(found: Traced) -> dict[str, Any] | None:
+def _target_answer(found: Traced) -> words.TargetAnswer | None:
     if found.answer is None:
         return None
-    states = found.states
-    return {
-        "error": found.answer.result,
-        "text": AdsError.words_of(found.answer.result) if found.answer.result else "",
-        "ads_state": states and states.ads_state,
-        "device_state": states and states.device_state,
-        "took_us": found.took_ns // _NS_PER_US,
-    }
+    states, result = found.states, found.answer.result
+    return words.TargetAnswer(
+        result,
+        AdsError.words_of(result) if result else "",
+        None if states is None else states.ads_state,
+        None if states is None else states.device_state,
+        found.took_ns // _NS_PER_US,
+    )
 
 
 def _unknown(reason: str) -> ControlError:

@@ -1,4 +1,4 @@
-"""The methods of the control protocol about routes."""
+"""Methods of the control protocol about routes."""
 
 from __future__ import annotations
 
@@ -11,24 +11,8 @@ from typing import Any
 from eap.aoe.directory import Directory
 from eap.aoe.spec import DoorKind, RouteSpec
 from eap.aoe.via import parse_via
-from eap.appliance.control import ErrorCode, of_station, parameters, unless_unavailable
-from eap.appliance.control_routes import (
-    Export,
-    ImportRow,
-    IntroducedRow,
-    NeighbourRow,
-    RouteRow,
-    RouterRow,
-    RoutesAddParameters,
-    RoutesExportParameters,
-    RoutesImportParameters,
-    RoutesIntroduceParameters,
-    RoutesListParameters,
-    RoutesRemoveParameters,
-    RoutesScanParameters,
-    RoutesTestParameters,
-    TestResult,
-)
+from eap.appliance import control_routes as words
+from eap.appliance.control import ErrorCode, of_station, unless_unavailable
 from eap.appliance.services.routes.neighbours import (
     Found,
     Introduction,
@@ -64,44 +48,41 @@ class RouteMethods:
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name."""
-        return {
-            "routes_list": self._list,
-            "routes_add": self._add,
-            "routes_remove": self._remove,
-            "routes_introduce": self._introduce,
-            "routes_scan": self._scan,
-            "routes_test": self._test,
-            "routes_import": self._import,
-            "routes_export": self._export,
-        }
+        return dict(
+            (
+                words.ROUTES_LIST.served_by(self._list),
+                words.ROUTES_ADD.served_by(self._add),
+                words.ROUTES_REMOVE.served_by(self._remove),
+                words.ROUTES_INTRODUCE.served_by(self._introduce),
+                words.ROUTES_SCAN.served_by(self._scan),
+                words.ROUTES_TEST.served_by(self._test),
+                words.ROUTES_IMPORT.served_by(self._import),
+                words.ROUTES_EXPORT.served_by(self._export),
+            )
+        )
 
-    def _list(self, params: dict[str, Any]) -> list[RouterRow]:
-        wanted = parameters(params, RoutesListParameters)
+    def _list(self, wanted: words.RoutesListParameters) -> list[words.RouterRow]:
         views = [self._view(wanted.station)] if wanted.station else self._views.values()
         return [view.row(wanted) for view in views]
 
-    async def _add(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, RoutesAddParameters)
+    async def _add(self, wanted: words.RoutesAddParameters) -> words.AddedRoute:
         view = self._view(wanted.station)
         row = await self._take(view, wanted)
         warnings = [text for text in view.warnings() if f"route {row.name} " in text]
-        return {"route": row, "warnings": warnings}
+        return words.AddedRoute(route=row, warnings=warnings)
 
-    async def _remove(self, params: dict[str, Any]) -> dict[str, RouteRow]:
-        wanted = parameters(params, RoutesRemoveParameters)
+    async def _remove(self, wanted: words.RoutesRemoveParameters) -> words.RouteAnswer:
         routes = self._view(wanted.station).routes
         with unless_unavailable():
-            spec = await routes.remove(wanted.route, door=wanted.door, address=wanted.address)
-        return {"route": _removed(spec)}
+            spec = await routes.remove(wanted.route, door=wanted.transport, address=wanted.address)
+        return words.RouteAnswer(route=_removed(spec))
 
-    async def _test(self, params: dict[str, Any]) -> TestResult:
-        wanted = parameters(params, RoutesTestParameters)
+    async def _test(self, wanted: words.RoutesTestParameters) -> words.TestResult:
         router = self._view(wanted.station).router
         target = find_target(router, self._directory, wanted.target)
         return await probe_target(router, target, wanted.timeout_ms / 1000)
 
-    async def _scan(self, params: dict[str, Any]) -> list[NeighbourRow]:
-        wanted = parameters(params, RoutesScanParameters)
+    async def _scan(self, wanted: words.RoutesScanParameters) -> list[words.NeighbourRow]:
         if wanted.address:
             _address(wanted.address)
         if wanted.station:
@@ -110,8 +91,7 @@ class RouteMethods:
         rows = await asyncio.gather(*(self._scan_from(view, wanted) for view in views))
         return [row for each in rows for row in each]
 
-    async def _introduce(self, params: dict[str, Any]) -> IntroducedRow:
-        wanted = parameters(params, RoutesIntroduceParameters)
+    async def _introduce(self, wanted: words.RoutesIntroduceParameters) -> words.IntroducedRow:
         view, address = self._view(wanted.station), _address(wanted.address)
         name = wanted.name or view.router.name
         if "\0" in name + wanted.user + wanted.password:
@@ -120,19 +100,18 @@ class RouteMethods:
         with unless_unavailable():
             result = await introduce(view.routes, route, address, wanted.wait_ms / 1000)
         if result is None:
-            return IntroducedRow(ok=False, result=None, text="no answer by UDP 48899")
+            return words.IntroducedRow(ok=False, result=None, text="no answer by UDP 48899")
         text = "added" if result == AdsError.NONE else AdsError.words_of(result)
-        return IntroducedRow(ok=result == AdsError.NONE, result=result, text=text)
+        return words.IntroducedRow(ok=result == AdsError.NONE, result=result, text=text)
 
     async def _scan_from(
-        self, view: RouterView, wanted: RoutesScanParameters
-    ) -> list[NeighbourRow]:
+        self, view: RouterView, wanted: words.RoutesScanParameters
+    ) -> list[words.NeighbourRow]:
         with unless_unavailable():
             found = await find_neighbours(view.routes, wanted.address, wanted.wait_ms / 1000)
         return [_neighbour_row(view, each) for each in found]
 
-    async def _import(self, params: dict[str, Any]) -> list[ImportRow]:
-        wanted = parameters(params, RoutesImportParameters)
+    async def _import(self, wanted: words.RoutesImportParameters) -> list[words.ImportRow]:
         view = self._view(wanted.station)
         try:
             found = staticroutes.parse(wanted.xml)
@@ -144,8 +123,8 @@ class RouteMethods:
             await asyncio.sleep(0)  # others have their turns between
         return rows
 
-    def _export(self, params: dict[str, Any]) -> Export:
-        view = self._view(parameters(params, RoutesExportParameters).station)
+    def _export(self, wanted: words.RoutesExportParameters) -> words.Export:
+        view = self._view(wanted.station)
         routes, left_out = [], []
         for route in view.router.table:
             is_plain = route.octets and route.real is None
@@ -156,13 +135,13 @@ class RouteMethods:
                 left_out.append(route.name)
         router = view.router
         xml = staticroutes.dump(router.name, str(router.net_id), routes, tcp_port=AMS_TCP_PORT)
-        return Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
+        return words.Export(xml=xml, left_out=list(dict.fromkeys(left_out)))
 
     async def _import_one(
         self, view: RouterView, route: StaticRoute, *, dry_run: bool
-    ) -> ImportRow:
+    ) -> words.ImportRow:
         via, reason = f"{DoorKind.AMS_TCP}:{route.address}", ""
-        wanted = RoutesAddParameters(
+        wanted = words.RoutesAddParameters(
             station=view.router.name, name=route.name, net_id=route.net_id, via=via
         )
         if route.type != TCP_IP:
@@ -177,15 +156,15 @@ class RouteMethods:
                     await self._take(view, wanted)
             except ControlError as exc:
                 reason = str(exc)
-        return ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
+        return words.ImportRow(name=route.name, net_id=route.net_id, via=via, reason=reason)
 
-    async def _take(self, view: RouterView, wanted: RoutesAddParameters) -> RouteRow:
+    async def _take(self, view: RouterView, wanted: words.RoutesAddParameters) -> words.RouteRow:
         spec = self._spec(wanted)
         with unless_unavailable():
             route = await view.routes.add(spec, replaces=wanted.replaces)
         return route_row(view.router.report(route), monotonic_ns(), is_derived=False)
 
-    def _spec(self, wanted: RoutesAddParameters) -> RouteSpec:
+    def _spec(self, wanted: words.RoutesAddParameters) -> RouteSpec:
         """Return the route that is wanted; raise ControlError if there cannot be one."""
         try:
             net_id = self._net_id(wanted)
@@ -208,7 +187,7 @@ class RouteMethods:
             is_probed=wanted.probed,
         )
 
-    def _net_id(self, wanted: RoutesAddParameters) -> str:
+    def _net_id(self, wanted: words.RoutesAddParameters) -> str:
         """Return the NetID of a route; raise ValueError if there is none."""
         stations = self._directory.stations
         if wanted.net_id:
@@ -226,11 +205,11 @@ class RouteMethods:
         return of_station(station, self._views)
 
 
-def _neighbour_row(view: RouterView, found: Found) -> NeighbourRow:
+def _neighbour_row(view: RouterView, found: Found) -> words.NeighbourRow:
     name, net_id, address, version = found.neighbour
     route = view.router.table.find(net_id)
     is_own = route is not None and route[1] > 0  # a default route leads anywhere
-    return NeighbourRow(
+    return words.NeighbourRow(
         station=view.router.name,
         name=name,
         net_id=str(net_id),
@@ -248,13 +227,13 @@ def _address(text: str) -> IPv4Address:
         raise ControlError(f"address: {exc}", code=ErrorCode.VALUE) from None
 
 
-def _removed(spec: RouteSpec) -> RouteRow:
+def _removed(spec: RouteSpec) -> words.RouteRow:
     kind, port, address = spec.hop.kind, spec.hop.port, spec.hop.address
-    return RouteRow(
+    return words.RouteRow(
         name=spec.name,
         net_id=spec.virtual or spec.net_id,
         octets=spec.octets,
-        door=f"{kind}:{port}" if port else kind,
+        transport=f"{kind}:{port}" if port else kind,
         address=address,
         origin="added",
         state="down",

@@ -128,7 +128,7 @@ def route_row(report: RouteReport, now_ns: int, *, is_derived: bool) -> RouteRow
         name=route.name,
         net_id=str(route.net_id),
         octets=route.octets,
-        door=route.hop.door,
+        transport=route.hop.door,
         address=route.hop.connection,
         origin="derived" if is_derived else _ORIGINS[route.origin],
         state=report.state.value,
@@ -153,7 +153,7 @@ def connection_row(report: ConnectionReport, now_ns: int) -> ConnectionRow:
     """Return a connection in plain values."""
     way, traffic = report
     return ConnectionRow(
-        door=way.door,
+        transport=way.door,
         address=way.connection,
         since_s=(now_ns - traffic.since_ns) // _S,
         net_ids=[str(each) for each in traffic.sources],
@@ -179,7 +179,7 @@ def request_row(trace: Trace, now_ns: int) -> RequestRow:
         at=round(time() - (now_ns - trace.at_ns) / _S, 3),
         outcome=trace.outcome,
         came_by="" if trace.came_by is None else str(trace.came_by),
-        door="" if hop is None else hop.door,
+        transport="" if hop is None else hop.door,
         address="" if hop is None else hop.connection,
         error=trace.error_code,
         took_us=trace.took_ns // 1000,

@@ -1,18 +1,13 @@
-"""The methods of the control protocol about what routers are told."""
+"""Methods of the control protocol about the configuration of routers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from eap.appliance.control import of_station, parameters, unless_unavailable
-from eap.appliance.control_routing import (
-    RoutingApplyParameters,
-    RoutingDifference,
-    RoutingExportParameters,
-    RoutingPlanParameters,
-    RunningRouting,
-)
+from eap.appliance import control_device as words
+from eap.appliance.control import of_station, unless_unavailable
+from eap.appliance.control_device import RoutingDifference
 from eap.appliance.services.routes.station_routing import StationRouting
 
 
@@ -24,29 +19,29 @@ class RoutingMethods:
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name."""
-        return {
-            "routing_export": self._export,
-            "routing_plan": self._plan,
-            "routing_apply": self._apply,
-            "routing_rollback": self._roll_back,
-        }
+        return dict(
+            (
+                words.ROUTING_EXPORT.served_by(self._export),
+                words.ROUTING_PLAN.served_by(self._plan),
+                words.ROUTING_APPLY.served_by(self._apply),
+                words.ROUTING_ROLLBACK.served_by(self._roll_back),
+            )
+        )
 
-    def _export(self, params: dict[str, Any]) -> RunningRouting:
-        station = self._station(parameters(params, RoutingExportParameters).station)
+    def _export(self, wanted: words.StationParameters) -> words.RunningRouting:
+        station = self._station(wanted.station)
         last = station.applied
         if last is None:
-            return RunningRouting(routing=station.routes.spec)
-        return RunningRouting(
+            return words.RunningRouting(routing=station.routes.spec)
+        return words.RunningRouting(
             routing=last.spec, previous=last.previous, cause=last.cause, undone=last.undone
         )
 
-    def _plan(self, params: dict[str, Any]) -> RoutingDifference:
-        wanted = parameters(params, RoutingPlanParameters)
+    def _plan(self, wanted: words.RoutingPlanParameters) -> RoutingDifference:
         plan = self._station(wanted.station).plan(wanted.routing)
         return RoutingDifference(changes=plan.changes, refused=plan.refused)
 
-    async def _apply(self, params: dict[str, Any]) -> RoutingDifference:
-        wanted = parameters(params, RoutingApplyParameters)
+    async def _apply(self, wanted: words.RoutingApplyParameters) -> RoutingDifference:
         station = self._station(wanted.station)
         plan = station.plan(wanted.routing)
         if plan.refused:
@@ -55,8 +50,8 @@ class RoutingMethods:
             changes = await station.apply(wanted.routing, wanted.cause)
         return RoutingDifference(changes=changes, refused=[])
 
-    async def _roll_back(self, params: dict[str, Any]) -> RoutingDifference:
-        station = self._station(parameters(params, RoutingExportParameters).station)
+    async def _roll_back(self, wanted: words.StationParameters) -> RoutingDifference:
+        station = self._station(wanted.station)
         with unless_unavailable():
             return RoutingDifference(changes=await station.roll_back(), refused=[])
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from devicebus.wire.alstatus import state_name
 from eap.aoe.ads_io import IoDeviceType
@@ -16,12 +16,11 @@ from eap.aoe.ads_operation import OperationOutcome, Read, ReadDeviceInfo
 from eap.aoe.directory import AmsAddress, Directory
 from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryPort, DirectoryStation
+from eap.appliance.control_routes import PortEntry, SlaveEntry, StationEntry
 from eap.appliance.services.routes.tracing import Station, ask_one, find_fault
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.ids import STATION_OCTETS, NetId
-
-Row: TypeAlias = dict[str, Any]
 
 PATIENCE_S = 3.0
 """For one answer."""
@@ -66,8 +65,8 @@ def stations_of(directory: Directory, routes: Iterable[Route]) -> list[Known]:
     return [*found.values()]
 
 
-async def scan(station: Station, known: Sequence[Known]) -> list[Row]:
-    """Ask all stations; return a row for each, in their order.
+async def scan(station: Station, known: Sequence[Known]) -> list[StationEntry]:
+    """Ask all stations; return an entry for each, in their order.
 
     Args:
         station: Whose router asks.
@@ -75,7 +74,7 @@ async def scan(station: Station, known: Sequence[Known]) -> list[Row]:
     """
     turns = asyncio.Semaphore(_AT_A_TIME)
 
-    async def look(each: Known) -> Row:
+    async def look(each: Known) -> StationEntry:
         async with turns:
             return await _Look(station, each).station()
 
@@ -93,9 +92,9 @@ class _Look:
         ports = known.planned.ports if known.planned else ()
         self._planned = {NetId.parse(port.net_id): port for port in ports}
 
-    async def station(self) -> Row:
-        """Return all there is of it."""
-        row: Row = {"name": self._known.name, "net_id": str(self._known.net_id)}
+    async def station(self) -> StationEntry:
+        """Return the station with its ports and slaves."""
+        name, net_id = self._known.name, str(self._known.net_id)
         try:
             async with asyncio.timeout(STATION_S):
                 ids = await self._read_io(0, "ids")
@@ -104,12 +103,12 @@ class _Look:
         except (_FailedError, TimeoutError) as exc:
             reason = str(exc) or f"not all was said within {STATION_S:g} s"
             reason = await find_fault(self._asker, self._known.net_id, IO_PORT) or reason
-            planned = [_planned_row(port) for port in self._planned.values()]
-            return row | {"ports": planned, "error": reason}
-        ports.sort(key=lambda port: port["kind"] != "eap")
-        return row | {"ports": ports, "error": ""}
+            planned = [_planned_port(port) for port in self._planned.values()]
+            return StationEntry(name, net_id, planned, reason)
+        ports.sort(key=lambda port: port.kind != "eap")
+        return StationEntry(name, net_id, ports, "")
 
-    async def _port(self, place: int, number: int) -> Row:
+    async def _port(self, place: int, number: int) -> PortEntry:
         """Return a port; *place* is where it stands in the list."""
         octets = await self._read_io(number, "net_id")
         type_number = int.from_bytes(await self._read_io(number, "type"), "little")
@@ -117,15 +116,15 @@ class _Look:
         net_id = NetId(octets[:6].ljust(6, b"\0"))
         planned = self._planned.get(net_id)
         name = _text(await self._read_io(number, "name"))
-        row: Row = {"name": name, "kind": kind, "net_id": str(net_id)}
-        row["interface"] = planned.interface if planned else await self._interface(place)
-        row |= {"slaves": [], "error": ""}
+        interface = planned.interface if planned else await self._interface(place)
+        slaves: list[SlaveEntry] = []
+        error = ""
         if kind == "bus":
             try:
-                row["slaves"] = await self._slaves(net_id, planned)
+                slaves = await self._slaves(net_id, planned)
             except _FailedError as exc:
-                row |= {"slaves": _planned_slaves(planned), "error": str(exc)}
-        return row
+                slaves, error = _planned_slaves(planned), str(exc)
+        return PortEntry(name, kind, str(net_id), interface, slaves, error)
 
     async def _interface(self, place: int) -> str:
         """Return what a port is attached to, as the dictionary of the router says."""
@@ -136,17 +135,17 @@ class _Look:
         except _FailedError:
             return ""
 
-    async def _slaves(self, net_id: NetId, planned: DirectoryPort | None) -> list[Row]:
+    async def _slaves(self, net_id: NetId, planned: DirectoryPort | None) -> list[SlaveEntry]:
         master = AmsAddress(net_id, DEVICE_PORT)
         addresses = _numbers(await self._read(master, IndexGroup.SLAVE_ADDRESSES, 0))
         states = await self._read(master, IndexGroup.SLAVE_STATES, 0)
         names = {number: name for name, number in planned.slaves.items()} if planned else {}
         return [
-            {
-                "address": address,
-                "name": names.get(address) or await self._slave_name(net_id, address),
-                "state": _state(states[2 * place : 2 * place + 1]),
-            }
+            SlaveEntry(
+                address,
+                names.get(address) or await self._slave_name(net_id, address),
+                _state(states[2 * place : 2 * place + 1]),
+            )
             for place, address in enumerate(addresses)
         ]
 
@@ -174,24 +173,16 @@ class _Look:
         return await ask_one(self._asker, *address, operation, PATIENCE_S)
 
 
-def _planned_row(port: DirectoryPort) -> Row:
-    return {
-        "name": port.name,
-        "kind": "bus" if port.is_bus else "eap",
-        "net_id": port.net_id,
-        "interface": port.interface,
-        "slaves": _planned_slaves(port),
-        "error": "",
-    }
+def _planned_port(port: DirectoryPort) -> PortEntry:
+    kind = "bus" if port.is_bus else "eap"
+    return PortEntry(port.name, kind, port.net_id, port.interface, _planned_slaves(port), "")
 
 
-def _planned_slaves(port: DirectoryPort | None) -> list[Row]:
-    """Return slaves as the plant file has them, in states that nobody knows."""
+def _planned_slaves(port: DirectoryPort | None) -> list[SlaveEntry]:
+    """Return the slaves of the plant file, in unknown states."""
     if port is None:
         return []
-    return [
-        {"address": number, "name": name, "state": None} for name, number in port.slaves.items()
-    ]
+    return [SlaveEntry(number, name, None) for name, number in port.slaves.items()]
 
 
 def _state(octet: bytes) -> str | None:

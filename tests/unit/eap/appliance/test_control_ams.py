@@ -5,15 +5,15 @@ import pytest
 from eap.aoe.hop_report import HopReport
 from eap.aoe.spec import AccessService
 from eap.appliance.control import parameters
-from eap.appliance.control_ams import AskParameters, hop_row
+from eap.appliance.control_routes import AskParameters, hop_row
 from eap.errors import ControlError
 
 
 def test_a_hop_as_a_row() -> None:
     report = HopReport(station="a", net_id="5.1.1.1.1.1", may={AccessService.WRITE: None})
     row = hop_row(report, 12, 7, is_opaque=False)
-    assert (row["station"], row["took_us"], row["spent_us"]) == ("a", 12, 7)
-    assert row["may"] == {"write": None}
+    assert (row.station, row.took_us, row.spent_us) == ("a", 12, 7)
+    assert row.may == {"write": None}
 
 
 def test_limits_of_a_request() -> None:

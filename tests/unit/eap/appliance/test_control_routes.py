@@ -5,10 +5,9 @@ import pytest
 
 from eap.appliance.control import parameters
 from eap.appliance.control_routes import (
-    RouterRow,
+    ROUTES_LIST,
     RoutesAddParameters,
     RoutesListParameters,
-    read_document,
 )
 from eap.errors import ControlError
 from tests.support.fakeroutes import FakeRoutes
@@ -17,9 +16,9 @@ from tests.support.fakeroutes import FakeRoutes
 def test_what_is_told_is_read_again_and_new_fields_are_ignored() -> None:
     told = msgspec.to_builtins(FakeRoutes().stations["island-01"])
     told["routes"][0]["colour"] = "new"
-    assert read_document([told], list[RouterRow]) == [FakeRoutes().stations["island-01"]]
-    with pytest.raises(ControlError, match=r"the answer: Object missing required field"):
-        read_document([{}], list[RouterRow])
+    assert ROUTES_LIST.decode([told]) == [FakeRoutes().stations["island-01"]]
+    with pytest.raises(ControlError, match=r"answer to routes_list: Object missing required"):
+        ROUTES_LIST.decode([{}])
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 
 from eap.aoe.spec import AccessRule, RoutingSpec
 from eap.appliance.control import parameters
-from eap.appliance.control_routing import RoutingApplyParameters, RunningRouting
+from eap.appliance.control_device import RoutingApplyParameters, RunningRouting
 from eap.errors import ControlError
 
 

@@ -80,7 +80,7 @@ def test_refusal_in_the_middle(stub, file):
         "  ! not today",
         "1 station changed, 2 as before",
         "station-02 refused: changed until then is station-01",
-        "'eapctl apply' goes on with it, 'eapctl rollback' brings back what ran before",
+        "'eapctl apply' goes on with it, 'eapctl rollback' brings back the state before",
     ]
     assert stub.specs["station-03"].cycle_us == 20_000
     result = run("apply", file, "--keep-going")
@@ -121,7 +121,7 @@ def test_appliance_that_goes_away(stub, file):
     assert result.output.splitlines()[2:5] == [
         "1 station changed, 2 as before",
         "broken off: changed until then is station-01",
-        "'eapctl apply' goes on with it, 'eapctl rollback' brings back what ran before",
+        "'eapctl apply' goes on with it, 'eapctl rollback' brings back the state before",
     ]
     result = run("apply", file, "--json")
     assert result.exit_code == 1

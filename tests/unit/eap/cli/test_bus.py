@@ -152,7 +152,7 @@ def test_what_the_running_master_makes_of_it(bus_appliance, command, tmp_path):
     file = tmp_path / "image.bin"
     assert command("sii", "dump", "press/bus0", "sensor", str(file))[0] == 0
     out = command("sii", "write", "press/bus0", "sensor", str(file))[1]
-    assert "goes by the old content" in out
+    assert "uses the old content" in out
 
 
 @pytest.mark.net

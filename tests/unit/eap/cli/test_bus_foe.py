@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from eap.cli.bus_foe import foe
+from eap.cli.bus import foe
 from eap.cli.group import exit_code_of
 from tests.support.loopbus import LoopBus
 

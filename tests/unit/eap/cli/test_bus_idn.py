@@ -8,7 +8,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from eap.cli.bus_idn import idn, parse_idn
+from eap.cli.bus import idn, parse_idn
 from eap.cli.group import exit_code_of
 from tests.support.loopbus import LoopBus
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 import pytest
 
-from eap.cli.bus_params import number_up_to, parse_entry, parse_octets, parse_type
+from eap.cli.params import number_up_to, parse_entry, parse_octets, parse_type
 
 
 def test_what_is_read():

@@ -6,7 +6,6 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from eap.cli.bus_params import slave_argument
 from eap.cli.bus_place import (
     BusCommand,
     BusPort,
@@ -15,7 +14,7 @@ from eap.cli.bus_place import (
     parse_port,
     parse_uri,
 )
-from eap.cli.params import json_option
+from eap.cli.params import json_option, slave_argument
 
 UDP = "udp://127.0.4.1"
 
@@ -25,8 +24,8 @@ UDP = "udp://127.0.4.1"
 @slave_argument
 @click.option("--type", "kind")
 @json_option("Nothing.")
-def show(bus, slave, kind, as_json):
-    click.echo(f"{type(bus).__name__} {bus} {slave} {kind} {as_json}")
+def show(bus, slave, kind, output):
+    click.echo(f"{type(bus).__name__} {bus} {slave} {kind} {output.is_json}")
 
 
 def invoke(*words):

@@ -7,7 +7,7 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from eap.cli.bus_sdo import sdo
+from eap.cli.bus import sdo
 from eap.cli.group import exit_code_of
 from tests.support.loopbus import LoopBus
 

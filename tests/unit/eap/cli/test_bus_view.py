@@ -4,22 +4,32 @@ from __future__ import annotations
 
 import io
 
+import msgspec
 import pytest
 from rich.console import Console
 
+from eap.appliance.bus_findings import FindingRow
+from eap.appliance.commands.bus_info import BusScan, BusStates, Diagnosis, EepromContent
+from eap.appliance.commands.bus_objects import (
+    IdnElements,
+    NamedIdn,
+    SdoDumpEntry,
+    SdoValue,
+    SlaveObject,
+)
 from eap.cli.bus_view import (
-    diagnosis_tables,
+    diagnosis_view,
     dump_table,
     eeprom_lines,
-    entry_name,
     finding_line,
     idn_lines,
     idn_table,
     object_table,
     scan_tables,
-    state_table,
+    state_view,
     value_line,
 )
+from tests.support.records import record
 
 
 def shown(*parts):
@@ -36,7 +46,8 @@ def port(number, **counters):
 
 def test_slave_whose_eeprom_is_unreadable():
     row = {"address": 1001, "name": "", "vendor": 0, "product": 0, "revision": 0, "serial": 0,
-           "alias": 7, "state": "INIT+ERROR", "mailbox": [], "fault": "no end"}  # fmt: skip
+           "alias": 7, "state": "INIT+ERROR", "mailbox": [], "fault": "no end",
+           "code": 0, "parent": None, "ports": []}  # fmt: skip
     gone = row | {
         "address": 1002,
         "name": "b",
@@ -44,7 +55,7 @@ def test_slave_whose_eeprom_is_unreadable():
         "fault": "it does not answer",
         "mailbox": None,
     }
-    text = shown(*scan_tables([row, gone], ["b (1002) does not answer"]))
+    text = shown(*scan_tables(record(BusScan, slaves=[row, gone])))
     assert "b (1002) does not answer" in text
     assert "no answer" in text
     assert "INIT+ERROR" in text
@@ -54,18 +65,31 @@ def test_slave_whose_eeprom_is_unreadable():
 def test_state_with_its_reason():
     row = {"address": 1001, "name": "a", "state": "INIT+ERROR", "code": 0x51, "reason": "bad"}
     gone = row | {"state": None, "code": 0, "reason": "it does not answer"}
-    text = shown(state_table([row, gone]))
+    text = shown(*state_view(record(BusStates, slaves=[row, gone]), ""))
     assert "bad (0x0051)" in text
     assert "no answer" in text
     assert "it does not answer (" not in text
 
 
-FRAMES = {"sent": 1, "late": 3, "lost": 0, "retried": 2, "timeout_us": 2000, "round_trip_us": 480}
+FRAMES = {
+    "sent": 1,
+    "received": 1,
+    "late": 3,
+    "lost": 0,
+    "retried": 2,
+    "timeout_us": 2000,
+    "round_trip_us": 480,
+}
 NOW_S = 1_000_000_000.0
 OVER = {"what": "b (1002) did not answer", "advice": "check", "port": None, "is_over": True,
         "slaves": [{"address": 1002, "name": "b"}],
         "since": NOW_S - 30, "until": NOW_S - 12}  # fmt: skip
 PRESENT = OVER | {"what": "c (1003) does not answer", "is_over": False, "until": None}
+
+
+def diagnosis(slaves, *findings):
+    found = {"slaves": slaves, "frames": FRAMES, "findings": findings, "starts_at": None}
+    return msgspec.convert(found, Diagnosis)
 
 
 def diagnosed(address, **more):
@@ -77,8 +101,8 @@ def diagnosed(address, **more):
 def test_diagnosis_shows_ports_frames_and_findings():
     bad = diagnosed(1002, ports=[port(0, invalid_frames=3), port(1), port(2, lost_links=9)])
     gone = diagnosed(1003, state="", answers=False, ports=[])
-    found = {"slaves": [bad, gone], "frames": FRAMES, "findings": [PRESENT, OVER]}
-    lines = [line.rstrip() for line in shown(*diagnosis_tables(found, NOW_S)).splitlines()]
+    found = diagnosis([bad, gone], PRESENT, OVER)
+    lines = [line.rstrip() for line in shown(*diagnosis_view(found, NOW_S)).splitlines()]
     assert lines[-3:] == [
         "round trip 480 µs, time-out 2.0 ms",
         "since 30.0 s ago: c (1003) does not answer; check",
@@ -91,16 +115,16 @@ def test_diagnosis_shows_ports_frames_and_findings():
 def test_diagnosis_of_many_slaves_shows_those_with_errors_unless_all_are_wanted():
     rows = [diagnosed(1001 + number) for number in range(100)]
     rows[49] = diagnosed(1050, ports=[port(0, lost_links=1)])
-    found = {"slaves": rows, "frames": FRAMES, "findings": [PRESENT]}
-    short = shown(*diagnosis_tables(found, NOW_S))
+    found = diagnosis(rows, PRESENT)
+    short = shown(*diagnosis_view(found, NOW_S))
     assert "not shown: 98 slaves without errors of their own (--full)" in short
     assert "s1002" in short
     assert "s1050" in short
-    assert "s1100" in shown(*diagnosis_tables(found, NOW_S, is_full=True))
+    assert "s1100" in shown(*diagnosis_view(found, NOW_S, is_full=True))
 
 
 def test_diagnosis_of_counters_of_an_unknown_time_says_so():
-    assert finding_line(OVER | {"until": None}, NOW_S) == (
+    assert finding_line(msgspec.convert(OVER | {"until": None}, FindingRow), NOW_S) == (
         "was, before the master looked: b (1002) did not answer; --reset clears this"
     )
 
@@ -108,7 +132,8 @@ def test_diagnosis_of_counters_of_an_unknown_time_says_so():
 def test_eeprom():
     content = {"address": 1001, "name": "", "vendor": 1, "product": 2, "revision": 3, "serial": 4,
                "intact": False, "octets": 17, "categories": []}  # fmt: skip
-    lines = list(eeprom_lines(content, bytes(17)))
+    found = record(EepromContent, **content, data=bytes(17).hex())
+    lines = list(eeprom_lines(found, has_octets=True))
     assert lines[0] == "slave 1001: without a name"
     assert lines[-4:-2] == ["  check sum WRONG; 17 bytes", "  categories (bytes) none"]
     assert lines[-1] == "0010  00"
@@ -127,19 +152,19 @@ def test_eeprom():
     ],
 )
 def test_value(row, text):
-    place = {"index": 0x1018, "subindex": 1}
-    assert entry_name(place) == "0x1018:01"
-    assert value_line(place | row) == f"0x1018:01 = {text}"
+    found = record(SdoValue, index=0x1018, subindex=1, **row)
+    assert value_line(found) == f"0x1018:01 = {text}"
 
 
 def test_objects_and_entries():
     assert "RECORD" in shown(
-        object_table([{"index": 1, "name": "x", "code": "RECORD", "max_subindex": 3}])
+        *object_table([record(SlaveObject, index=1, name="x", code="RECORD", max_subindex=3)])
     )
     own = {"index": 1, "subindex": 2, "object": "Whole", "name": "Part"}
     text = shown(
-        dump_table(
-            [
+        *dump_table(
+            record(SdoDumpEntry, **row)
+            for row in [
                 own | {"type": "BLOCK(40)", "access": "rw", "value": "00" * 40, "data": "00" * 40},
                 own | {"type": "UINT", "access": "w", "value": None, "data": None},
                 own | {"name": "", "error": "broken"},
@@ -156,15 +181,16 @@ def test_idns():
            "maximum": 5, "default": None, "data_state": None, "display": "SIGNED", "octets": 2,
            "decimals": 1, "factor": 10, "is_list": True, "is_command": False,
            "protected_in": ["SAFEOP", "OP"]}  # fmt: skip
-    assert list(idn_lines(row)) == [
+    row |= {"slave": 1, "drive": 0}
+    assert list(idn_lines(IdnElements(**row))) == [
         "S-0-0024 = 1, 2 mm",
         "  name       Targets",
         "  maximum    5",
         "  attribute  signed, 2 octets each, a list, 1 decimal, factor 10, read only in SAFEOP, OP",
     ]
     command = row | {"is_list": False, "is_command": True, "data_state": 7, "protected_in": []}
-    assert list(idn_lines(command))[-2:] == [
+    assert list(idn_lines(IdnElements(**command)))[-2:] == [
         "  attribute  signed, 2 octets, 1 decimal, factor 10, a procedure command",
         "  data state 0x0007 (executing)",
     ]
-    assert "Targets" in shown(idn_table([row]))
+    assert "Targets" in shown(*idn_table([NamedIdn("S-0-0024", 24, "Targets")]))

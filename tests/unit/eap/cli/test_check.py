@@ -37,7 +37,9 @@ def break_plant(path: Path) -> None:
 def test_a_plant_that_is_well(plant: Path) -> None:
     result = CliRunner().invoke(main, ["check", str(plant)])
     assert result.exit_code == 0, result.stderr
-    assert result.stdout == (f"{plant}: plant line is well: 1 station, 1 PD sent, 0 PDs received\n")
+    assert result.stdout == (
+        f"{plant}: no errors (plant line: 1 station, 1 PD sent, 0 PDs received)\n"
+    )
     result = CliRunner().invoke(main, ["check", str(plant), "--json"])
     assert (result.exit_code, result.stdout) == (0, '{"ok":true,"findings":[],"warnings":[]}\n')
     plant.write_text(PLANT.replace("[speed]", f"[{', '.join(['speed'] * 255)}]"))

@@ -4,14 +4,18 @@ import pytest
 from rich.console import Console
 
 from eap.appliance.commands.decode import decode_frame
-from eap.cli.decode_view import frame_tree
+from eap.cli.decode import frame_view
 from tests.support.vectors import Vector, load_all
 
 
 def render(octets: bytes, **origin: object) -> str:
     console = Console(width=200, color_system=None)
     with console.capture() as capture:
-        console.print(frame_tree(decode_frame(octets), origin))
+        frame = decode_frame(octets)
+        for name, value in origin.items():
+            setattr(frame, name, value)
+        for part in frame_view(frame):
+            console.print(part)
     return capture.get()
 
 

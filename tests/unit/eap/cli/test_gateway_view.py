@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import msgspec
 from rich.console import Console
 
-from eap.cli.gateway_view import gateway_tables
+from eap.appliance.control_gateway import GatewayRow
+from eap.cli.gateway import gateway_view
 
 ROW = {
     "station": "mixer",
@@ -15,7 +17,7 @@ ROW = {
     },
     "clients": [
         {
-            "door": "udp:eap0", "address": "10.0.0.9:5000", "requests": 7, "repeated": 1,
+            "transport": "udp:eap0", "address": "10.0.0.9:5000", "requests": 7, "repeated": 1,
             "errors": 2, "waiting": 0, "transfers": [{"address": 1001, "protocol": "FOE"}],
         }
     ],
@@ -36,7 +38,7 @@ ROW = {
 def shown(row):
     console = Console(width=120)
     with console.capture() as captured:
-        for each in gateway_tables(row):
+        for each in gateway_view(msgspec.convert(row, GatewayRow)):
             console.print(each)
     return captured.get()
 
@@ -60,7 +62,7 @@ def test_of_many_clients_the_latest_are_shown_and_those_with_transfers():
     text = shown(ROW | {"clients": [busy, *idle]})
     ports = [line.split()[0][-4:] for line in text.splitlines() if "10.0.0.9:" in line]
     assert ports == [*(str(port) for port in range(6019, 6009, -1)), "5000"]
-    assert "10 clients more asked before these; --json shows all" in text
+    assert "10 earlier clients not shown; --json shows all" in text
 
 
 def test_one_that_is_stopped_and_silent():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.cli.od_file import read_file
+from eap.cli.od_text import read_file
 from eap.errors import ConfigError
 
 TEXT = """\

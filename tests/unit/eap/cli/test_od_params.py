@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 from click.testing import CliRunner
 
-from eap.cli.od_params import target_argument
+from eap.cli.od import target_argument
 
 
 @click.command()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from eap.cli.od_view import object_lines, value_line
+from eap.appliance.commands.od import OdValue, OdWholeObject
+from eap.cli.od_text import object_lines, value_line
+from tests.support.records import record
 
 
 def row(kind, data, value=None, name="", unit=""):
-    return {"index": 0x8000, "subindex": 1, "type": kind, "data": data, "value": value,
-            "name": name, "unit": unit}  # fmt: skip
+    return record(OdValue, index=0x8000, subindex=1, type=kind, data=data, value=value, name=name,
+                  unit=unit)  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -34,5 +36,5 @@ def test_values_read_as_they_were(given, line):
 
 
 def test_whole_object_that_nobody_knows():
-    given = {"index": 0x8000, "name": "Settings", "label": "", "data": "0102", "entries": []}
+    given = record(OdWholeObject, index=0x8000, name="Settings", data="0102")
     assert list(object_lines(given)) == ["# 0x8000 Settings", "hex 01 02  # 2 octets"]

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from rich.text import Text
 
-from eap.cli.output import repaint, write_json, write_tables, write_text
+from eap.cli.output import repaint, write_json, write_text, write_view
 from eap.cli.table import Column, TextTable
 from eap.errors import EnvironmentalError
 
@@ -33,7 +33,7 @@ def test_piped_tables_are_never_cut(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
-    write_tables([wide_table(), Text("word " * 400)])
+    write_view([wide_table(), Text("word " * 400)])
     *table, text = capfd.readouterr().out.splitlines()
     assert table[-1] == "x" * 150 + "  [red]y[/red]"
     assert text.count("word") == 400
@@ -43,7 +43,7 @@ def test_tables_obey_columns(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    write_tables([wide_table()])
+    write_view([wide_table()])
     assert max(map(len, capfd.readouterr().out.splitlines())) == 80
 
 

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
-from eap.appliance.commands.plant_link import StationPlan
-from eap.cli.plan_view import change_line, plan_lines
+from eap.appliance.commands.plant_change import PlanReport, StationPlan
+from eap.appliance.control_device import ObjectChange
+from eap.cli.plan import change_text, plan_lines
 from eap.device.rollout import Step
 from tests.support.fakeappliance import station
 
 
 def change(kind, old="", new="", subindex=0, unit=""):
-    return {"port": "eap0", "index": 0x6003, "subindex": subindex, "name": "Tx variable 3 (speed)",
-            "change": kind, "old": old, "new": new, "unit": unit}  # fmt: skip
+    return ObjectChange(
+        port="eap0", index=0x6003, subindex=subindex, name="Tx variable 3 (speed)", change=kind,
+        old=old, new=new, unit=unit,
+    )  # fmt: skip
+
+
+def shown(plans, order):
+    return list(plan_lines(PlanReport.of(plans, order, ()), ""))
 
 
 @pytest.mark.parametrize(
@@ -27,7 +35,7 @@ def change(kind, old="", new="", subindex=0, unit=""):
     ],
 )
 def test_signs(given, line):
-    assert change_line(given) == line
+    assert change_text(given, given.name) == line
 
 
 def test_all_kinds_of_differences():
@@ -37,7 +45,7 @@ def test_all_kinds_of_differences():
         StationPlan("saw", [change("changed", "1", "2")], [], []),
     ]
     order = [Step("saw", station("saw"), "takes both"), Step("mixer", station("mixer"), "switches")]
-    assert list(plan_lines(plans, order)) == [
+    assert shown(plans, order) == [
         "mixer",
         "  + 0x6003:00 Tx variable 3 (speed)",
         "  - 0x6003:00 Tx variable 3 (speed)",
@@ -53,7 +61,7 @@ def test_all_kinds_of_differences():
 
 def test_refusals():
     plans = [StationPlan("mixer", [], [], ["port eap1 would be new"])]
-    assert list(plan_lines(plans, [])) == [
+    assert shown(plans, []) == [
         "mixer",
         "  ! port eap1 would be new",
         "1 station of 1 to change",
@@ -62,8 +70,8 @@ def test_refusals():
 
 
 def test_several_ports():
-    changes = [change("added"), change("added") | {"port": "eap1"}]
-    lines = list(plan_lines([StationPlan("mixer", changes, [], [])], []))
+    changes = [change("added"), replace(change("added"), port="eap1")]
+    lines = shown([StationPlan("mixer", changes, [], [])], [])
     assert lines[1:3] == [
         "  + 0x6003:00 eap0: Tx variable 3 (speed)",
         "  + 0x6003:00 eap1: Tx variable 3 (speed)",

@@ -3,18 +3,21 @@ from __future__ import annotations
 import msgspec
 from rich.console import Console
 
+from eap.appliance.commands.route_lists import RouterList, TestedTarget
 from eap.appliance.control_routes import (
     ImportRow,
     InterruptionRow,
     NeighbourRow,
     TestResult,
 )
-from eap.cli import routes_text
+from eap.cli import routes_view
 from eap.cli.routes_view import (
     import_table,
     neighbour_table,
     result_table,
-    routes_tables,
+)
+from eap.cli.routes_view import (
+    routes_view as view_of,
 )
 from tests.support.fakeroutes import FakeRoutes
 
@@ -28,7 +31,7 @@ def shown(*parts: object) -> str:
 
 
 def test_tables_of_routes_and_connections() -> None:
-    text = shown(*routes_tables(list(FakeRoutes().stations.values())))
+    text = shown(*view_of(RouterList(list(FakeRoutes().stations.values()))))
     rows = [line.split() for line in text.splitlines()]
     assert ["island-02", "none"] in rows
     assert ["press", "5.1.2.3.1.1", "ams-tcp", "192.168.1.5:48898", "down", "3", "3"] in rows
@@ -43,8 +46,8 @@ def test_tables_of_routes_and_connections() -> None:
 
 def test_stations_that_are_well_have_no_remarks() -> None:
     quiet = FakeRoutes().stations["island-02"]
-    assert "Worth a look" not in shown(*routes_tables([quiet]))
-    assert "Connection" not in shown(*routes_tables([quiet]))
+    assert "Worth a look" not in shown(*view_of(RouterList([quiet])))
+    assert "Connection" not in shown(*view_of(RouterList([quiet])))
 
 
 def test_routes_name_subscriptions_that_are_interrupted() -> None:
@@ -53,18 +56,20 @@ def test_routes_name_subscriptions_that_are_interrupted() -> None:
         target="127.0.1.2.2.1:65535", count=20, since_s=12, why="island-02 is down",
     )  # fmt: skip
     station = msgspec.structs.replace(FakeRoutes().stations["island-02"], interruptions=[row])
-    text = " ".join(shown(*routes_tables([station])).split())
+    text = " ".join(shown(*view_of(RouterList([station]))).split())
     assert (
         "island-02: 20 subscriptions are interrupted, of 127.0.0.1.1.1:32905"
         " (127.0.0.1:40112#3 by ams-tcp) at 127.0.1.2.2.1:65535: island-02 is down, for 12 s"
     ) in text
-    assert "20 subscriptions interrupted" in routes_text.summary([station])
+    assert "20 subscriptions interrupted" in routes_view.summary([station])
 
 
 def test_results() -> None:
     ok = TestResult(target="1.1.1.1.1.1:10000", name="a", ok=True, rtt_us=840, text="answers: RUN")
     bad = TestResult(target="2.1.1.1.1.1:10000", name="", ok=False, text="down", hint="look there")
-    text = " ".join(shown(result_table([("mixer", ok), ("mixer", bad)])).split())
+    text = " ".join(
+        shown(*result_table([TestedTarget.of("mixer", each) for each in (ok, bad)])).split()
+    )
     assert "mixer a 1.1.1.1.1.1:10000 840 µs answers: RUN" in text
     assert "mixer 2.1.1.1.1.1:10000 down look there" in text
 
@@ -74,12 +79,12 @@ def test_imports() -> None:
         ImportRow(name="a", net_id="1.1.1.1.1.1", via="ams-tcp:a"),
         ImportRow(name="b", net_id="", via="", reason="no NetID"),
     ]
-    text = shown(import_table(rows, is_done=True))
+    text = shown(*import_table(rows, is_done=True))
     assert "Added" in text
     assert ["a", "1.1.1.1.1.1", "ams-tcp:a", "yes"] in [each.split() for each in text.splitlines()]
     assert "b" in text
     assert "no NetID" in text
-    assert "Would be added" in shown(import_table(rows, is_done=False))
+    assert "Would be added" in shown(*import_table(rows, is_done=False))
 
 
 def test_routers_of_other_hosts() -> None:
@@ -88,7 +93,7 @@ def test_routers_of_other_hosts() -> None:
         route="cx", is_learned=True,
     )  # fmt: skip
     lone = msgspec.structs.replace(cx, name="pc", version="", route="", is_learned=False)
-    rows = [line.split() for line in shown(neighbour_table([cx, lone])).splitlines()]
+    rows = [line.split() for line in shown(*neighbour_table([cx, lone])).splitlines()]
     assert ["left", "cx", "5.1.2.3.1.1", "10.0.0.5", "3.1.4024", "cx", "(learned)"] in rows
     assert ["left", "pc", "5.1.2.3.1.1", "10.0.0.5", "none"] in rows
 
@@ -98,10 +103,12 @@ def test_routes_by_a_hop_that_is_down_are_one_remark() -> None:
     (press,) = (each for each in station.routes if each.name == "press")
     down = msgspec.structs.replace(press, name="saw", net_id="5.1.2.4.1.1", last_error="")
     rows = [msgspec.structs.replace(each, next_name="press") for each in (down, press)]
-    text = " ".join(shown(*routes_tables([msgspec.structs.replace(station, routes=rows)])).split())
+    text = " ".join(
+        shown(*view_of(RouterList([msgspec.structs.replace(station, routes=rows)]))).split()
+    )
     assert (
         "press (192.168.1.5:48898 by ams-tcp) is down: connection refused; so are the routes by it:"
         " saw" in text
     )
     assert "saw (192" not in text
-    assert routes_text.route_state(rows[0]) == "down: press: connection refused"
+    assert routes_view.route_state(rows[0]) == "down: press: connection refused"

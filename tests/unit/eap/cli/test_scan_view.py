@@ -2,9 +2,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 from rich.console import Console
 
-from eap.cli.scan_view import client_line, fault_lines, scan_table
+from eap.appliance.control_routes import PlantScan
+from eap.cli.network import client_line, fault_lines, scan_table
 
 BUS = {
     "name": "bus0",
@@ -28,7 +30,7 @@ def answer(*stations: dict[str, Any], address: str = "127.0.1.1") -> dict[str, A
 def lines(found: dict[str, Any], width: int = 200) -> list[str]:
     console = Console(width=width, highlight=False)
     with console.capture() as capture:
-        console.print(scan_table(found))
+        console.print(scan_table(msgspec.convert(found, PlantScan)))
     return [line.rstrip() for line in capture.get().splitlines()]
 
 
@@ -52,7 +54,10 @@ def test_scan_leaves_out_lines_to_paste_that_would_wrap() -> None:
 
 
 def test_scan_names_what_did_not_answer() -> None:
-    assert list(fault_lines(answer(STATION, DEAD))) == ["i2: 7", "i2/bus0: down"]
+    assert list(fault_lines(msgspec.convert(answer(STATION, DEAD), PlantScan).stations)) == [
+        "i2: 7",
+        "i2/bus0: down",
+    ]
     assert lines(answer(DEAD))[2].split()[:3] == ["i2", "router", "?"]
     assert len(lines(answer())) == 2
 

@@ -9,7 +9,7 @@ import pytest
 
 from devicebus.sim.spec import FaultKind
 from eap.cli import main
-from eap.cli.sim_fault import parse_fault, parse_value
+from eap.cli.sim import parse_fault, parse_value
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from eap.cli.status_view import status_tables
+from eap.cli.status_view import full_view
 from tests.support.statusdocument import (
     NOW_S,
     bus_port,
@@ -24,7 +24,7 @@ def show(status: dict[str, Any], *, width: int = 100, color: bool = False) -> st
     stream = io.StringIO()
     system = "standard" if color else None
     console = Console(file=stream, width=width, force_terminal=color, color_system=system)
-    for part in status_tables(with_findings(status), NOW_S):
+    for part in full_view(with_findings(status), NOW_S):
         console.print(part)
     return stream.getvalue()
 

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 from rich.console import Console
 
-from eap.cli.trace_view import trace_tables
+from eap.appliance.control_routes import TracedPath
+from eap.cli.network import trace_view
 
 MAY = dict.fromkeys(("read", "write", "control", "files", "raw"), True)
 FIRST = {
@@ -12,7 +14,7 @@ FIRST = {
     "net_id": "127.0.1.1.1.1",
     "opaque": False,
     "route": "island-03",
-    "door": "udp:eap0",
+    "transport": "udp:eap0",
     "address": "127.0.1.3:34980",
     "state": "up",
     "why": "",
@@ -42,7 +44,7 @@ FOUND = {
 def lines(found: dict[str, Any]) -> list[list[str]]:
     console = Console(width=110, highlight=False)
     with console.capture() as capture:
-        for part in trace_tables(found):
+        for part in trace_view(msgspec.convert(found, TracedPath)):
             console.print(part)
     return [line.split() for line in capture.get().splitlines() if line.strip()]
 
@@ -53,7 +55,7 @@ def test_a_way_that_ends_well() -> None:
     assert " ".join(first) == (
         "1 island-01 127.0.1.1.1.1 80 µs 80 µs island-03: udp:eap0 to 127.0.1.3:34980 (up)"
     )
-    assert " ".join(last) == "2 island-03 127.0.1.3.1.1 1.5 ms 1.4 ms it is here"
+    assert " ".join(last) == "2 island-03 127.0.1.3.1.1 1.5 ms 1.4 ms local"
     assert " ".join(target) == "target 1.8 ms answers: RUN, device state 8"
     assert " ".join(rules) == "island-03: its access rules refuse write, raw"
 
@@ -70,7 +72,7 @@ def test_a_router_that_is_not_ours_and_an_error() -> None:
     opaque = FIRST | {"opaque": True, "may": {}}
     error = FOUND["answer"] | {"error": 0x701, "text": "error 0x701"}
     *_, hop, target = lines(FOUND | {"hops": [opaque], "answer": error})
-    assert " ".join(hop[-5:]) == "says nothing of its routes"
+    assert " ".join(hop[-5:]) == "does not report its routes"
     assert " ".join(target) == "target 1.8 ms answers: error 0x701"
     unknown = FOUND["answer"] | {"ads_state": 99}
     assert lines(FOUND | {"hops": [opaque], "answer": unknown})[-1][-4] == "99,"

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.cli import words
+from eap.cli import table
 
 
 @pytest.mark.parametrize(
@@ -19,16 +19,16 @@ from eap.cli import words
     ],
 )
 def test_duration(us: int, text: str) -> None:
-    assert words.duration(us) == text
+    assert table.duration(us) == text
 
 
 def test_quality_counts_in_100_us_and_saturates() -> None:
-    assert words.quality(None) == ""
-    assert words.quality(3) == "300 µs"
-    assert words.quality(0xFFFE) == "6.6 s"
-    assert words.quality(0xFFFF) == "> 6.5 s"
+    assert table.quality(None) == ""
+    assert table.quality(3) == "300 µs"
+    assert table.quality(0xFFFE) == "6.6 s"
+    assert table.quality(0xFFFF) == "> 6.5 s"
 
 
 def test_numbers_agree_with_their_words() -> None:
-    assert (words.times(1), words.times(2)) == ("once", "2 times")
-    assert (words.count(1, "PD"), words.count(0, "PD")) == ("1 PD", "0 PDs")
+    assert (table.times(1), table.times(2)) == ("once", "2 times")
+    assert (table.count(1, "PD"), table.count(0, "PD")) == ("1 PD", "0 PDs")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from eap.pd.monitor import SubscriberPresence
 from eap.pd.report import pd_list, quality, station_status
-from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec, Writer
+from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord, RxWord, StationWord
 from tests.support.cyclic import (
     MS,
@@ -172,7 +172,7 @@ def test_the_list_names_every_pd_with_its_variables():
         subscriptions=(RxPdSpec("r", "eap0", 2, ("y",)),),
     )
     sent, taken = pd_list(image_of(spec))
-    assert sent == {
+    assert msgspec.to_builtins(sent) == {
         "station": "a",
         "direction": "tx",
         "name": "p",
@@ -184,9 +184,9 @@ def test_the_list_names_every_pd_with_its_variables():
         "publisher": OWN,
         "frame": "f",
         "destination": "10.0.0.9",
-        "variables": [{"name": "x", "type": "UINT", "unit": "", "writer": Writer.APPLICATION}],
+        "variables": [{"name": "x", "type": "UINT", "unit": "", "writer": "application"}],
     }
-    assert (taken["direction"], taken["publisher"], taken["length"]) == ("rx", None, 4)
+    assert (taken.direction, taken.publisher, taken.length) == ("rx", None, 4)
     assert msgspec.json.encode([sent, taken])
 
 

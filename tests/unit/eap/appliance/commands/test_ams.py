@@ -9,6 +9,7 @@ import pytest
 
 from eap.appliance.commands import ams
 from eap.appliance.control import ErrorCode
+from eap.appliance.control_routes import PlantScan, ScanVia, StationEntry, TracedPath
 from eap.errors import ControlError
 from tests.support.controlstub import ControlStub
 
@@ -22,15 +23,15 @@ class Plant:
             name, [f"{name}-1"], {"trace": self.trace, "scan": self.scan}, stack
         )
 
-    def trace(self, params: dict[str, Any]) -> dict[str, Any]:
+    def trace(self, params: dict[str, Any]) -> TracedPath:
         if params["target"] == "broken":
             raise ControlError("broken", code=ErrorCode.INTERNAL)
         if params["target"] != f"{self.name}-2":
             raise ControlError(f"{self.name} does not know it", code=ErrorCode.UNKNOWN_NAME)
-        return {"target": params["target"]}
+        return TracedPath(params["target"], "", "", True, "", [], None)
 
-    def scan(self, params: dict[str, Any]) -> dict[str, Any]:
-        return {"stations": [{"name": self.name}], "via": params["via"]}
+    def scan(self, params: dict[str, Any]) -> PlantScan:
+        return PlantScan([StationEntry(self.name, "", [], "")], ScanVia(params["via"], ""))
 
 
 @pytest.fixture
@@ -41,8 +42,8 @@ def plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Pla
 
 
 def test_the_appliance_that_knows_a_target_is_asked(plants: list[Plant]) -> None:
-    assert ams.trace("press-2") == {"target": "press-2"}
-    assert ams.trace("line-2", "line", "line-1") == {"target": "line-2"}
+    assert ams.trace("press-2").target == "press-2"
+    assert ams.trace("line-2", "line", "line-1").target == "line-2"
     with pytest.raises(ControlError, match="does not know it"):
         ams.trace("x")
     with pytest.raises(ControlError, match="broken"):
@@ -50,5 +51,5 @@ def test_the_appliance_that_knows_a_target_is_asked(plants: list[Plant]) -> None
 
 
 def test_each_plant_is_scanned_once(plants: list[Plant]) -> None:
-    assert [each["stations"][0]["name"] for each in ams.scan()] == ["line", "press"]
-    assert [each["via"] for each in ams.scan(via="press-1")] == ["press-1"]
+    assert [each.stations[0].name for each in ams.scan()] == ["line", "press"]
+    assert [each.via.station for each in ams.scan(via="press-1")] == ["press-1"]

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 import pytest
 
 from eap.aoe.ads_operation import ReadState
-from eap.appliance.commands.ams_device import AmsRefusedError, open_ams
+from eap.appliance.commands.ams import AmsRefusedError, open_ams
 from eap.errors import ControlError
 from tests.support.adstarget import TARGET, AdsTarget
 from tests.support.oddevice import mixer

@@ -4,8 +4,14 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.appliance.commands.ams_device import AmsRefusedError, open_ams
-from eap.appliance.commands.ams_state import PATIENCE_S, read_state, request_state
+from eap.appliance.commands.ams import (
+    STATE_S,
+    AmsRefusedError,
+    open_ams,
+    read_state,
+    request_state,
+)
+from eap.appliance.control_device import StateAnswer, StateError
 from tests.support.adstarget import TARGET, AdsTarget
 from tests.support.oddevice import mixer
 
@@ -36,11 +42,11 @@ def bring(wanted: str, clock: Clock | None = None):
 
 def test_state_is_shown_and_requested(target):
     with open_ams(TARGET, None) as device:
-        assert read_state(device) == {"state": "PREOP", "error": None}
-    assert bring("OP") == {"state": "OP", "error": None}
+        assert read_state(device) == StateAnswer("PREOP", None)
+    assert bring("OP") == StateAnswer("OP", None)
     target.slow = 3
     clock = Clock()
-    assert bring("BOOT", clock) == {"state": "BOOT", "error": None}
+    assert bring("BOOT", clock) == StateAnswer("BOOT", None)
     assert clock.now > 0.1
 
 
@@ -48,8 +54,8 @@ def test_a_device_that_does_not_get_there(target):
     target.slow = 1000
     clock = Clock()
     found = bring("OP", clock)
-    assert found == {"state": "PREOP", "error": {"code": 0, "text": "not there within 10 s"}}
-    assert clock.now >= PATIENCE_S
+    assert found == StateAnswer("PREOP", StateError(0, "not there within 10 s"))
+    assert clock.now >= STATE_S
 
 
 @pytest.mark.parametrize("error", [0x723, 0x1B])

@@ -14,7 +14,7 @@ from devicebus.errors import FoeError, MailboxClosedError
 from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.commands import bus_foe, bus_session
-from eap.appliance.commands.bus_foe import exchange, get_file, put_file
+from eap.appliance.commands.bus_foe import VendorReply, exchange, get_file, put_file
 from eap.appliance.commands.bus_gateway import open_gateway
 from eap.appliance.foe_restart import RESTARTS
 from eap.codec.foe import FoeOpcode, encode_message
@@ -65,7 +65,7 @@ def test_there_and_back(bus, tmp_path, reports):
     assert target.read_bytes() == CONTENT
     digest = hashlib.sha256(CONTENT).hexdigest()
     for row in (there, back):
-        assert (row["octets"], row["sha256"], row["name"]) == (50_000, digest, "firmware.bin")
+        assert (row.octets, row.sha256, row.name) == (50_000, digest, "firmware.bin")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bin", "b.bin"]
 
 
@@ -140,12 +140,8 @@ def test_name_that_does_not_fit_the_mailbox(bus, tmp_path, reports):
 
 
 def test_vendor_message_is_echoed(bus):
-    assert exchange(bus, "drive", 0x1234, 5, b"\1\2\3") == {
-        "slave": 1001,
-        "vendor_id": 0x1234,
-        "vendor_type": 5,
-        "data": "010203",
-    }
+    reply = exchange(bus, "drive", 0x1234, 5, b"\1\2\3")
+    assert reply == VendorReply(1001, 0x1234, 5, "010203")
 
 
 @pytest.mark.parametrize("is_write", [True, False])
@@ -173,8 +169,8 @@ def test_transfer_interrupted_by_a_power_fault_begins_anew(
             get(bus, "firmware.bin", target, reports)
         else:
             row = get_file(bus, "drive", "firmware.bin", target, password=0, report=interrupt)
-    assert (row["restarts"], row["octets"]) == (1, len(CONTENT))
-    assert row["sha256"] == hashlib.sha256(CONTENT).hexdigest()
+    assert (row.restarts, row.octets) == (1, len(CONTENT))
+    assert row.sha256 == hashlib.sha256(CONTENT).hexdigest()
     assert target.read_bytes() == CONTENT
     assert seen[-1] == 1
 

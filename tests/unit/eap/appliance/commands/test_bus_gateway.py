@@ -14,9 +14,8 @@ from devicebus.wire.alstatus import AlState
 from eap.appliance.commands import bus_gateway
 from eap.appliance.commands.bus_foe import exchange, put_file
 from eap.appliance.commands.bus_gateway import open_gateway
-from eap.appliance.commands.bus_idn import read_idn
-from eap.appliance.commands.bus_info import scan_rows
-from eap.appliance.commands.bus_sdo import dump_entries, read_entry, write_entry
+from eap.appliance.commands.bus_info import scan_slaves
+from eap.appliance.commands.bus_objects import dump_entries, read_entry, read_idn, write_entry
 from eap.codec import datatypes
 from eap.codec.soe import Idn
 from eap.errors import ConfigError
@@ -42,9 +41,9 @@ def bus(gateway):
 
 
 def test_slaves_and_the_master(bus) -> None:
-    (row,) = scan_rows(bus)
-    assert (row["address"], row["name"], row["state"]) == (1001, "drive", "OP")
-    assert row["mailbox"] is None, "the usual dictionary ends before them"
+    (row,) = scan_slaves(bus).slaves
+    assert (row.address, row.name, row.state) == (1001, "drive", "OP")
+    assert row.mailbox is None, "the usual dictionary ends before them"
     assert bus.find("drive").station == bus.find("1001").station == 1001
     assert bus.find("master").station == bus.find("0").station == 0
     with pytest.raises(BusError, match=r"no slave 'x'; there are 1001 \(drive\)"):
@@ -58,7 +57,7 @@ def test_a_dictionary_with_all_entries_tells_the_protocols() -> None:
         FakeGateway(full=True) as gateway,
         open_gateway("127.0.0.1", gateway.port, tcp=True) as bus,
     ):
-        assert scan_rows(bus)[0]["mailbox"] == ["CoE", "FoE"]
+        assert scan_slaves(bus).slaves[0].mailbox == ["CoE", "FoE"]
 
 
 def test_virtual_addresses_are_the_gateways_business(bus) -> None:
@@ -92,10 +91,10 @@ def test_mailboxes_behind_virtual_addresses_are_as_large_as_it_is_said(gateway) 
 
 def test_objects(bus) -> None:
     write_entry(bus, "drive", 0x2000, 0, "77", kind=None, complete=False)
-    assert read_entry(bus, "drive", 0x2000, 0, kind=None, complete=False)["value"] == 77
+    assert read_entry(bus, "drive", 0x2000, 0, kind=None, complete=False).value == 77
     rows = list(dump_entries(bus, "0"))
-    assert {row["index"] for row in rows} >= {0x1000, 0x8000, 0xA000, 0xF020}
-    assert not any("error" in row for row in rows), "gaps are left out"
+    assert {row.index for row in rows} >= {0x1000, 0x8000, 0xA000, 0xF020}
+    assert not any(row.error for row in rows), "gaps are left out"
 
 
 def test_a_gateway_whose_master_has_no_dictionary(gateway, bus) -> None:
@@ -119,10 +118,10 @@ def test_slave_by_station_address_never_asks_the_master(gateway, silent_at_maste
     write_entry(bus, "1001", 0x2000, 0, "77", kind=None, complete=False)
     text = datatypes.parse("STRING(500)")
     write_entry(bus, "1001", 0x1008, 0, "y" * 400, kind=text, complete=False)
-    assert read_entry(bus, "1001", 0x1008, 0, kind=text, complete=False)["value"] == "y" * 400
-    assert {row["index"] for row in dump_entries(bus, "0x3E9")} == {0x1008, 0x2000}
-    assert read_idn(bus, "1001", MODE, drive=0)["value"] == 7
-    assert exchange(bus, "1001", 0x1164, 1, b"\1\2")["data"] == "0102"
+    assert read_entry(bus, "1001", 0x1008, 0, kind=text, complete=False).value == "y" * 400
+    assert {row.index for row in dump_entries(bus, "0x3E9")} == {0x1008, 0x2000}
+    assert read_idn(bus, "1001", MODE, drive=0).value == 7
+    assert exchange(bus, "1001", 0x1164, 1, b"\1\2").data == "0102"
     assert set(gateway.addresses) == {1001}
 
 
@@ -133,7 +132,7 @@ def test_object_for_a_mailbox_that_is_smaller_than_usual_is_written_in_more_piec
         open_gateway("127.0.0.1", gateway.port, tcp=False) as bus,
     ):
         write_entry(bus, "1001", 0x1008, 0, "y" * 400, kind=text, complete=False)
-        assert read_entry(bus, "1001", 0x1008, 0, kind=text, complete=False)["value"] == "y" * 400
+        assert read_entry(bus, "1001", 0x1008, 0, kind=text, complete=False).value == "y" * 400
 
 
 def test_refusal_of_a_slave_that_has_answered_asks_the_master_for_no_hint(gateway, bus) -> None:
@@ -166,7 +165,7 @@ def test_file_of_a_slave_where_the_master_is_silent_needs_the_mailbox(
     gateway.addresses.clear()
     with open_gateway("127.0.0.1", gateway.port, tcp=False, mailbox=SIZES.to_slave) as bus:
         done = put_file(bus, "1001", source, "f", password=0, report=lambda *_: None)
-    assert done["octets"] == len(FILE)
+    assert done.octets == len(FILE)
     assert set(gateway.addresses) == {1001}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.errors import SoeError
-from eap.appliance.commands.bus_idn import list_idns, read_idn, write_idn
+from eap.appliance.commands.bus_objects import list_idns, read_idn, write_idn
 from eap.codec.soe import Idn
 from eap.errors import ConfigError
 from tests.support.loopbus import LoopBus
@@ -19,31 +19,31 @@ def bus():
 
 def test_read(bus):
     row = read_idn(bus, "drive", Idn.parse("S-0-0032"), drive=0)
-    assert (row["idn"], row["name"], row["value"]) == ("S-0-0032", "Primary operation mode", 2)
-    assert (row["octets"], row["is_list"], row["display"]) == (4, False, "UNSIGNED")
-    assert (row["data_state"], row["factor"], row["protected_in"]) == (None, 1, [])
+    assert (row.idn, row.name, row.value) == ("S-0-0032", "Primary operation mode", 2)
+    assert (row.octets, row.is_list, row.display) == (4, False, "UNSIGNED")
+    assert (row.data_state, row.factor, row.protected_in) == (None, 1, [])
     command = read_idn(bus, "drive", Idn.parse("S-0-0099"), drive=0)
-    assert (command["is_command"], command["data_state"]) == (True, 0)
+    assert (command.is_command, command.data_state) == (True, 0)
     status = read_idn(bus, "drive", Idn.parse("S-0-0135"), drive=0)
-    assert status["protected_in"] == ["PREOP", "SAFEOP", "OP"]
+    assert status.protected_in == ["PREOP", "SAFEOP", "OP"]
 
 
 def test_write(bus):
     idn = Idn.parse("S-0-0032")
-    assert write_idn(bus, "drive", idn, "0x5", drive=0)["value"] == 5
-    assert read_idn(bus, "drive", idn, drive=0)["value"] == 5
+    assert write_idn(bus, "drive", idn, "0x5", drive=0).value == 5
+    assert read_idn(bus, "drive", idn, drive=0).value == 5
 
 
 def test_list_of_idns_is_written(bus):
     idn = Idn.parse("S-0-0024")
     before = read_idn(bus, "drive", idn, drive=0)
-    text = ",".join(map(str, before["value"]))
-    assert before["is_list"]
-    assert write_idn(bus, "drive", idn, text, drive=0)["value"] == before["value"]
+    text = ",".join(map(str, before.value))
+    assert before.is_list
+    assert write_idn(bus, "drive", idn, text, drive=0).value == before.value
 
 
 def test_text_is_read(bus):
-    assert isinstance(read_idn(bus, "drive", Idn.parse("S-0-0030"), drive=0)["value"], str)
+    assert isinstance(read_idn(bus, "drive", Idn.parse("S-0-0030"), drive=0).value, str)
 
 
 def test_refusals(bus):
@@ -65,5 +65,5 @@ def test_value_that_does_not_fit(bus):
 
 
 def test_list(bus):
-    rows = {row["idn"]: row["name"] for row in list_idns(bus, "drive", drive=0)}
+    rows = {row.idn: row.name for row in list_idns(bus, "drive", drive=0)}
     assert rows["S-0-0047"] == "Position command value"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from devicebus.errors import MailboxProtocolError
 from devicebus.mailbox.coeinfo_client import entry_description
-from eap.appliance.commands.bus_sdo import dump_entries, list_objects, read_entry, write_entry
+from eap.appliance.commands.bus_objects import dump_entries, list_objects, read_entry, write_entry
 from eap.codec import datatypes
 from eap.errors import ConfigError
 from eap.od.abort import AbortCode, SdoAbortError
@@ -42,22 +43,22 @@ def write(bus, index, subindex, text, kind=None, *, complete=False):
 )
 def test_read(bus, place, kind, expected):
     row = read(bus, *place, kind)
-    assert (row["type"], row["value"], row["data"]) == expected
-    assert (row["slave"], row["index"], row["subindex"]) == (1003, *place)
+    assert (row.type, row.value, row.data) == expected
+    assert (row.slave, row.index, row.subindex) == (1003, *place)
 
 
 def test_complete_access(bus):
     row = read(bus, 0x8000, complete=True)
-    assert (row["value"], row["data"]) == (None, "020032000000e803")
+    assert (row.value, row.data) == (None, "020032000000e803")
     write(bus, 0x8000, 0, "0200 07000000 0500", complete=True)
-    assert read(bus, 0x8000, 1)["value"] == 7
+    assert read(bus, 0x8000, 1).value == 7
 
 
 def test_write(bus):
-    assert write(bus, 0x8000, 2, "-77")["data"] == "b3ff"
-    assert read(bus, 0x8000, 2)["value"] == -77
+    assert write(bus, 0x8000, 2, "-77").data == "b3ff"
+    assert read(bus, 0x8000, 2).value == -77
     write(bus, 0x8000, 1, "0x10", "UDINT")
-    assert read(bus, 0x8000, 1)["value"] == 16
+    assert read(bus, 0x8000, 1).value == 16
 
 
 @pytest.mark.parametrize(
@@ -95,8 +96,8 @@ def test_type_that_nobody_knows(bus):
 
 
 def test_list(bus):
-    rows = {row["index"]: row for row in list_objects(bus, "sensor")}
-    assert rows[0x1018] == {
+    rows = {row.index: row for row in list_objects(bus, "sensor")}
+    assert msgspec.to_builtins(rows[0x1018]) == {
         "index": 0x1018,
         "name": "Identity",
         "code": "RECORD",
@@ -107,8 +108,8 @@ def test_list(bus):
 
 
 def test_dump(bus):
-    rows = {(row["index"], row["subindex"]): row for row in dump_entries(bus, "sensor")}
-    assert rows[0x8000, 2] == {
+    rows = {(row.index, row.subindex): row for row in dump_entries(bus, "sensor")}
+    assert msgspec.to_builtins(rows[0x8000, 2]) == {
         "index": 0x8000,
         "subindex": 2,
         "object": "Settings",
@@ -127,16 +128,16 @@ def test_dump_goes_on_behind_a_description_that_makes_no_sense(bus, monkeypatch)
         return (yield from entry_description(index, subindex))
 
     monkeypatch.setattr("devicebus.mailbox.coeinfo_client.entry_description", short_answer)
-    rows = {(row["index"], row["subindex"]): row for row in dump_entries(bus, "sensor")}
-    assert "needs 4 octets" in rows[0x8000, 1]["error"]
-    assert rows[0x8000, 2]["value"] == 1000
-    assert read(bus, 0x1018, 1)["value"] == 0xE5A
+    rows = {(row.index, row.subindex): row for row in dump_entries(bus, "sensor")}
+    assert "needs 4 octets" in rows[0x8000, 1].error
+    assert rows[0x8000, 2].value == 1000
+    assert read(bus, 0x1018, 1).value == 0xE5A
 
 
 def test_dump_goes_on_behind_what_is_refused():
     line = LoopBus("coe")
     line.fault(kind="sdo", slave="sensor", object="0x8000", code=AbortCode.HARDWARE)
     with line.session() as bus:
-        rows = {(row["index"], row["subindex"]): row for row in dump_entries(bus, "sensor")}
-    assert "hardware" in rows[0x8000, 1]["error"]
-    assert len(rows[0x8001, 0]["value"]) == 4096
+        rows = {(row.index, row.subindex): row for row in dump_entries(bus, "sensor")}
+    assert "hardware" in rows[0x8000, 1].error
+    assert len(rows[0x8001, 0].value) == 4096

@@ -75,15 +75,18 @@ def test_a_refusal_keeps_its_code():
 
 
 def test_events_follow_until_one_is_an_error():
+    def event(cycle):
+        return {"station": "a", "cycle": cycle, "values": {}, "quality": {}}
+
     lines = [
         {"v": 1, "id": 1, "result": {"subscription": 1}},
-        {"v": 1, "subscription": 1, "event": {"cycle": 1}},
-        {"v": 1, "subscription": 1, "event": {"cycle": 2}},
+        {"v": 1, "subscription": 1, "event": event(1)},
+        {"v": 1, "subscription": 1, "event": event(2)},
         {"v": 1, "subscription": 1, "event": {"error": {"code": "unavailable", "message": "t"}}},
     ]
     with Script(lines) as script:
         events = script.client.events(station="a")
-        assert [next(events)["cycle"], next(events)["cycle"]] == [1, 2]
+        assert [next(events).cycle, next(events).cycle] == [1, 2]
         with pytest.raises(ControlError) as caught:
             next(events)
         assert caught.value.code == "unavailable"

@@ -6,8 +6,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from eap.appliance.commands.ams_device import AmsDevice, AmsRefusedError, open_ams
-from eap.appliance.commands.od_ads import AdsOd
+from eap.appliance.commands.ams import AmsDevice, AmsRefusedError, open_ams
+from eap.appliance.commands.od_devices import AdsOd
 from eap.errors import ControlError
 from tests.support.adstarget import TARGET, AdsTarget
 from tests.support.oddevice import mixer

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from eap.appliance.commands.od_described import entry_info, object_info, read_all, with_entries
-from eap.appliance.commands.od_device import Content, EntryInfo, ObjectInfo
+from eap.appliance.commands.od import Content, EntryInfo, ObjectInfo
+from eap.appliance.commands.od_devices import entry_info, object_info, read_all, with_entries
 from eap.codec.datatypes import parse
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.errors import ControlError

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from eap.appliance.commands.od_device import OdDevice
-from eap.appliance.commands.od_slave import SlaveOd
-from eap.appliance.commands.od_station import StationOd
+from eap.appliance.commands.od import OdDevice
+from eap.appliance.commands.od_devices import SlaveOd, StationOd
 
 
 def test_both_kinds_have_all_of_it():

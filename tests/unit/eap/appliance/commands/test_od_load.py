@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.appliance.commands.od_load import Loaded, load
+from eap.appliance.commands.od import LoadedEntries, load
 from eap.appliance.plantfile import load_plant
 from eap.config.load import blank
 from eap.device.eap_dictionary import EapDictionary
@@ -29,7 +29,7 @@ def test_order():
         )
     )
     entries = [(index, sub, bytes((1,) * (2 if sub else 1))) for index in indexes for sub in (0, 1)]
-    assert load(device, entries) == Loaded(18, 0)
+    assert load(device, entries) == LoadedEntries(18, 0)
     order = [0x6000, 0x7001, 0x1600, 0x1A00, 0x2000, 0xD000, 0xE000, 0x8000, 0xF800]
     assert list(dict.fromkeys(index for index, _, _ in device.written)) == order
     assert [step[1:] for step in device.written if step[0] == 0x1A00] == [
@@ -44,7 +44,7 @@ def test_what_is_there_is_left_alone():
     device = MemoryDevice(mixer())
     entries = [(0x1A00, 0, b"\1"), (0x1A00, 1, (0x60000120).to_bytes(4, "little"))]
     entries += [(0xD000, 7, bytes(4)), (0xF200, 1, b"\x02\0")]
-    assert load(device, entries) == Loaded(1, 3)
+    assert load(device, entries) == LoadedEntries(1, 3)
     assert device.written == [(0xD000, 7, bytes(4))]
 
 

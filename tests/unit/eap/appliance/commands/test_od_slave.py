@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.appliance.commands.od_slave import SlaveOd
+from eap.appliance.commands.od_devices import SlaveOd
 from eap.od.abort import AbortCode, SdoAbortError
 from tests.support.loopbus import LoopBus
 

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import pytest
 
 from eap.appliance.commands.client import connect_station
-from eap.appliance.commands.od_station import StationOd
+from eap.appliance.commands.od_devices import StationOd
 from eap.errors import ControlError
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
@@ -87,6 +87,7 @@ def test_refusal_of_another_kind(station, answers):
 
 def test_type_of_a_later_release(station, answers):
     row = {"index": 1, "name": "", "label": "", "code": "VAR", "max_subindex": 0}
-    entry = {"subindex": 0, "name": "New", "type": "DATE", "access": "r", "unit": ""}
+    entry = {"subindex": 0, "name": "New", "type": "DATE", "access": "r", "unit": "", "bits": 16,
+             "rights": 7, "default": "", "minimum": None, "maximum": None}  # fmt: skip
     answers["od_describe"] = lambda _: row | {"entries": [entry]}
     assert station.entry(1, 0).kind is None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eap.appliance.commands.od_target import Target, open_device
+from eap.appliance.commands.od_devices import Target, open_device
 from eap.errors import ControlError
 
 

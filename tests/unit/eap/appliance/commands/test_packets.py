@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.appliance.commands.packets import Stream, TcpSegment, cut_frames, unwrap
+from eap.appliance.commands.capture import Stream, TcpSegment, cut_frames, unwrap
 from eap.codec.ethercat import EtherCatHeader
 from tests.support.packets import ethernet, tcp_segment, tcp_stream, udp
 

@@ -11,12 +11,12 @@ from eap.aoe.spec import AccessRule
 from eap.appliance.commands.plant_change import (
     apply_steps,
     choose,
+    link_to,
     load_or_raise,
     plan_all,
     roll_back,
     steps_to,
 )
-from eap.appliance.commands.plant_link import link_to
 from eap.config.load import Plant
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ConfigError

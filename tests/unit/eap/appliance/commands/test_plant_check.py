@@ -37,8 +37,8 @@ def write(folder: Path, name: str = "level", count: int = 1) -> Path:
 
 @pytest.mark.parametrize("count", [1, 248])
 def test_what_fits_is_no_warning(tmp_path: Path, count: int) -> None:
-    result, warnings = check_plant(write(tmp_path, count=count))
-    assert (result.findings, warnings) == ((), ())
+    report, _ = check_plant(write(tmp_path, count=count))
+    assert (report.findings, report.warnings) == ((), ())
 
 
 @pytest.mark.parametrize(
@@ -46,8 +46,9 @@ def test_what_fits_is_no_warning(tmp_path: Path, count: int) -> None:
 )
 def test_what_does_not_fit_is_said_with_its_line(tmp_path: Path, more: dict, reason: str) -> None:
     path = write(tmp_path, **more)
-    result, (warning,) = check_plant(path)
-    assert result.plant
+    report, plant = check_plant(path)
+    (warning,) = report.warnings
+    assert plant
     assert (warning.file, warning.line, warning.path) == (str(path), 8, "stations[1]")
     assert warning.message.startswith("station oven, port eap0: 0x")
     assert "does not fit into the dictionary" in warning.message
@@ -55,9 +56,9 @@ def test_what_does_not_fit_is_said_with_its_line(tmp_path: Path, more: dict, rea
 
 
 def test_a_file_that_is_no_plant_has_findings_only(tmp_path: Path) -> None:
-    result, warnings = check_plant(write(tmp_path, name="a b"))
-    assert result.findings
-    assert warnings == ()
+    report, plant = check_plant(write(tmp_path, name="a b"))
+    assert report.findings
+    assert (report.warnings, plant) == ((), None)
 
 
 BUS_PLANT = """\
@@ -80,13 +81,14 @@ slaves:
 def test_check_warns_of_slaves_of_one_product_with_other_process_data(tmp_path: Path) -> None:
     (tmp_path / "plant.yaml").write_text(BUS_PLANT)
     (tmp_path / "bus.yaml").write_text(BUS)
-    result, (warning,) = check_plant(tmp_path / "plant.yaml")
-    assert (result.findings, warning.line) == ((), 3)
+    report, _ = check_plant(tmp_path / "plant.yaml")
+    (warning,) = report.warnings
+    assert (report.findings, warning.line) == ((), 3)
     assert warning.message.startswith("station mixer, port bus0: in and out have the same vendor")
     (tmp_path / "bus.yaml").write_text(BUS.replace("out, kind", "out, product: 7, kind"))
-    assert check_plant(tmp_path / "plant.yaml")[1] == ()
+    assert check_plant(tmp_path / "plant.yaml")[0].warnings == ()
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda path: path.stem)
 def test_check_has_no_warning_for_our_own_plants(plant: Path) -> None:
-    assert check_plant(plant)[1] == ()
+    assert check_plant(plant)[0].warnings == ()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from eap.appliance.commands.plant_link import StationPlan, link_to
+from eap.appliance.commands.plant_change import StationPlan, link_to
 from eap.config.load import Plant
 from eap.errors import ControlError
 from tests.support.fakeappliance import station
@@ -66,7 +66,7 @@ def test_requests(stack):
         )
         plan = link.plan(faster)
         assert plan.differs
-        assert [change["new"] for change in plan.changes] == ["5000"]
+        assert [change.new for change in plan.changes] == ["5000"]
         assert link.apply(faster, "1").ok
         assert (link.export("mixer").cause, link.export("mixer").undone) == ("1", False)
         assert link.export("mixer").previous == station("mixer")

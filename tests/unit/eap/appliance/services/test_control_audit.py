@@ -10,6 +10,7 @@ import pytest
 
 from eap.appliance.control import Request
 from eap.appliance.control_bus import BusOpenParameters
+from eap.appliance.control_device import ApplyAnswer, StateAnswer, StateError
 from eap.appliance.services.control_audit import change_of, peer_of, refusal_in
 
 
@@ -97,9 +98,9 @@ def test_a_conversation_that_is_not_open() -> None:
     [
         ({}, ""),
         ([], ""),
-        ({"state": "OP", "error": None}, ""),
-        ({"error": {"code": 1, "text": "PD has no PDO"}}, "PD has no PDO"),
-        ({"ok": False, "refused": ["a", "b"]}, "a; b"),
+        (StateAnswer("OP", None), ""),
+        (StateAnswer("PREOP", StateError(1, "PD has no PDO")), "PD has no PDO"),
+        (ApplyAnswer(False, [], [], ["a", "b"]), "a; b"),
     ],
 )
 def test_refusals_that_are_results(result: Any, text: str) -> None:

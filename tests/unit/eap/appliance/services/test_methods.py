@@ -6,6 +6,7 @@ import asyncio
 import subprocess
 import sys
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -23,7 +24,7 @@ async def status():
 
 
 def call(methods: Methods, method: str, params: dict):
-    return asyncio.run(methods.call(method, params))
+    return msgspec.to_builtins(asyncio.run(methods.call(method, params)))
 
 
 @pytest.fixture
@@ -52,6 +53,7 @@ def test_hello_status_and_stop(methods, stopped):
         "version": 1,
         "plant": "demo",
         "release": "0",
+        "pid": 0,
         "stations": ["left", "right"],
     }
     assert call(methods, "status", {}) == {"version": 1}
@@ -168,13 +170,13 @@ def test_a_watch_by_period_tells_all_and_by_change_what_changed(methods, files):
     changes = methods.watch({**params, "on": "change", "period_ms": 10})
     assert (always.period_ms, changes.period_ms) == (500, 10)
     start = {"running": False, "name": "abc"}
-    assert always.next_event()["values"] == start
-    assert changes.next_event()["values"] == start
+    assert always.next_event().values == start
+    assert changes.next_event().values == start
     assert changes.next_event() is None
     with image.writing(Writer.APPLICATION):
         image.write("running", True)
-    assert always.next_event()["values"] == {"running": True, "name": "abc"}
-    assert changes.next_event()["values"] == {"running": True}
+    assert always.next_event().values == {"running": True, "name": "abc"}
+    assert changes.next_event().values == {"running": True}
 
 
 def test_watch_event_counts_the_cycles_since_the_event_before_that_were_not_looked_at(
@@ -189,15 +191,15 @@ def test_watch_event_counts_the_cycles_since_the_event_before_that_were_not_look
         image.words[StationWord.CYCLE] = image.words[StationWord.FUTEX] = cycle
 
     run_until(10)
-    assert (always.next_event()["skipped"], changes.next_event()["skipped"]) == (0, 0)
+    assert (always.next_event().skipped, changes.next_event().skipped) == (0, 0)
     run_until(11)
-    assert (always.next_event()["skipped"], changes.next_event()) == (0, None)
+    assert (always.next_event().skipped, changes.next_event()) == (0, None)
     run_until(21)
-    assert (always.next_event()["skipped"], changes.next_event()) == (9, None)
+    assert (always.next_event().skipped, changes.next_event()) == (9, None)
     run_until(24)
     with image.writing(Writer.APPLICATION):
         image.write("running", True)
-    assert (always.next_event()["skipped"], changes.next_event()["skipped"]) == (2, 11)
+    assert (always.next_event().skipped, changes.next_event().skipped) == (2, 11)
 
 
 def test_read_while_a_cycle_runs_brings_values_of_the_cycle_that_is_named(methods, files):
@@ -244,11 +246,11 @@ def test_a_watch_goes_on_when_the_station_is_configured_anew(methods, files, sta
     all_of_them = methods.watch({"station": "left"})
     more = (*stations[0].variables, VariableSpec("more", "UINT"))
     with create_image(files["left"].path, plan_layout(replace(stations[0], variables=more))):
-        assert some.next_event()["values"] == {"running": False, "name": "abc"}
-        assert "more" in all_of_them.next_event()["values"]
+        assert some.next_event().values == {"running": False, "name": "abc"}
+        assert "more" in all_of_them.next_event().values
     fewer = tuple(each for each in stations[0].variables if each.name != "running")
     without = replace(stations[0], variables=fewer, frames=())
     with create_image(files["left"].path, plan_layout(without)):
         with pytest.raises(ControlError, match="no variable 'running'"):
             some.next_event()
-        assert "running" not in all_of_them.next_event()["values"]
+        assert "running" not in all_of_them.next_event().values

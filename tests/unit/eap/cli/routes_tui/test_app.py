@@ -47,7 +47,7 @@ def test_everything_fits_80_by_24(stub):
         assert shown[0] == " line, 2 stations: 2 routes, 1 down, 1 connection, 1 warning"
         assert shown[1] == " r Routes 2  c Connections 1  w Warnings 1  s all stations"
         assert shown[2].split() == [
-            "Station", "Route", "NetID", "Door", "State", "Trip", "Asked", "Octets", "Errors"
+            "Station", "Route", "NetID", "Transport", "State", "Trip", "Asked", "Octets", "Errors"
         ]  # fmt: skip
         assert shown[3].split() == [
             "island-01", "island-02", "127.0.1.2.*.*", "udp:eap0", "up", "840", "µs", "12",
@@ -118,7 +118,7 @@ def test_figures_move_and_the_cursor_stays_on_its_row(stub, fake):
 def test_connections_and_warnings(stub):
     async def script(screen):
         shown = await screen.press("c")
-        assert "127.0.0.1:40112#3 ams-tcp 127.0.0.1.1.1   75 s    15  47.3k      3" in shown
+        assert "127.0.0.1:40112#3 ams-tcp   127.0.0.1.1.1   75 s    15  47.3k      3" in shown
         assert " asked by 127.0.0.1.1.1\n" in shown
         shown = await screen.press("w")
         assert "island-01 route press (5.1.2.3.1.1) is not taken" in shown

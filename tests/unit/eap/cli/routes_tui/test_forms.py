@@ -26,7 +26,7 @@ def test_form_for_a_change_begins_with_the_route() -> None:
     found = values_of(behind)
     assert (found["via"], found["port"]) == ("udp:127.0.1.2:34980", "eap0")
     assert (found["net_id"], found["virtual"]) == ("9.1.1.1.1.1", "127.0.1.2.1.1")
-    broker = msgspec.structs.replace(PRESS, door="mqtt:line", address="5.1.2.3.1.1")
+    broker = msgspec.structs.replace(PRESS, transport="mqtt:line", address="5.1.2.3.1.1")
     assert values_of(broker)["via"] == "mqtt:line"
 
 

@@ -18,7 +18,7 @@ def widths(view: View, width: int, *, has_station: bool = True) -> dict[str, int
 def test_columns_are_as_wide_as_they_need_to_be() -> None:
     found = widths(View.ROUTES, 80)
     assert found == {
-        "Station": 9, "Route": 9, "NetID": 13, "Door": 8, "State": 5, "Trip": 7, "Asked": 5,
+        "Station": 9, "Route": 9, "NetID": 13, "Transport": 9, "State": 5, "Trip": 7, "Asked": 5,
         "Octets": 6, "Errors": 6,
     }  # fmt: skip
     assert sum(found.values()) + len(found) <= 80
@@ -36,7 +36,7 @@ def test_what_is_left_out_on_narrow_screens_comes_on_wide_ones() -> None:
 @pytest.mark.parametrize("width", [40, 72, 80, 100, 200])
 def test_long_texts_give_way_to_their_least(view: View, width: int) -> None:
     names = msgspec.structs.replace(
-        ISLAND, name="a name that is much too long", door="ethernet:an-interface"
+        ISLAND, name="a name that is much too long", transport="ethernet:an-interface"
     )
     routes = msgspec.structs.replace(ROUTER.routes, station="station-of-cell-17", routes=[names])
     found = lines(view, [ROUTER._replace(routes=routes)], "")

@@ -59,22 +59,22 @@ def test_bus_document_has_one_finding_for_all_behind_the_first_that_is_silent():
     slaves = [slave(8)] + [slave(0, at, fault="it does not answer") for at in range(1002, 1101)]
     report = BusReport(is_up=True, slaves=tuple(slaves))
     (finding,) = bus_document(report, 100.0)["bus"]["findings"]
-    assert finding["what"] == (
+    assert finding.what == (
         "s1002 (1002) and 98 slaves behind it do not answer; the last that answers before it is"
         " s1001 (1001)"
     )
-    assert finding["advice"] == "check the cable to s1002 (1002) and its power"
-    assert len(finding["slaves"]) == 99
-    assert (finding["is_over"], finding["since"]) == (False, None)
+    assert finding.advice == "check the cable to s1002 (1002) and its power"
+    assert len(finding.slaves) == 99
+    assert (finding.is_over, finding.since) == (False, None)
 
 
 def test_bus_document_blames_no_slave_while_no_frame_comes_back():
     silent = msgspec.structs.replace(UP, silent_since_ns=3_000_000_000)
     (finding,) = bus_document(silent, 100.0)["bus"]["findings"]
-    assert finding["what"] == "no frame comes back: 2 slaves cannot be reached"
-    assert finding["since"] == 97.0
+    assert finding.what == "no frame comes back: 2 slaves cannot be reached"
+    assert finding.since == 97.0
     (finding,) = bus_document(msgspec.structs.replace(silent, silent_until_ns=1), 100.0)["bus"][
         "findings"
     ]
-    assert finding["what"].startswith("s1002 (1002) does not answer")
-    assert finding["since"] == 98.0
+    assert finding.what.startswith("s1002 (1002) does not answer")
+    assert finding.since == 98.0

@@ -6,6 +6,7 @@ import asyncio
 from inspect import isawaitable
 from typing import Any
 
+import msgspec
 import pytest
 
 from eap.aoe.way import Way
@@ -68,7 +69,8 @@ def ask(gateways):
         async def wait() -> Any:
             return await answer
 
-        return asyncio.run(wait()) if isawaitable(answer) else answer
+        found = asyncio.run(wait()) if isawaitable(answer) else answer
+        return msgspec.to_builtins(found)
 
     return call
 
@@ -83,7 +85,7 @@ def test_what_is_told_of_a_gateway(ask, gateways) -> None:
     assert first["settings"]["answer_ms"] == 900
     assert first["clients"] == [
         {
-            "door": "udp:eap0",
+            "transport": "udp:eap0",
             "address": "127.0.0.1:9",
             "requests": 1,
             "repeated": 0,

@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+import msgspec
 import pytest
 
 from eap.aoe.answer import AmsAnswer
@@ -32,7 +33,7 @@ def call(method: str, **params: Any) -> Any:
             Route(NetId.parse("6.1.1.1.1.1"), "far", Way("udp:none", "10.0.0.6:34980"))
         )
         methods = AmsMethods({"island-01": router}, PLANT, {"island-01": "127.0.1.1"})
-        return await methods.table()[method](params)
+        return msgspec.to_builtins(await methods.table()[method](params))
 
     return asyncio.run(get())
 

@@ -60,17 +60,17 @@ def test_list_of_all_and_of_one(ask):
 
 def test_add_and_remove(ask, left):
     answer = ask("add", **PLC, octets=6, timeout_ms=900, unidirectional=True, probed=False)
-    row = answer["route"]
-    assert (row.name, row.door, row.address, row.origin) == (
+    row = answer.route
+    assert (row.name, row.transport, row.address, row.origin) == (
         "plc", "ams-tcp:10.0.0.5:48898", "10.0.0.5:48898", "added"
     )  # fmt: skip
-    assert answer["warnings"] == []
+    assert answer.warnings == []
     (route,) = (each for each in left.router.table if each.name == "plc")
     assert (route.origin, route.octets, route.timeout_ns) == (Origin.ADDED, 6, 900_000_000)
     assert (route.is_unidirectional, route.is_probed) == (True, False)
     assert names(Left()) == ["right", "plc"]  # it is kept
-    removed = ask("remove", station="left", route="plc")["route"]
-    assert (removed.name, removed.net_id, removed.door) == ("plc", "5.1.2.3.1.1", "ams-tcp")
+    removed = ask("remove", station="left", route="plc").route
+    assert (removed.name, removed.net_id, removed.transport) == ("plc", "5.1.2.3.1.1", "ams-tcp")
     assert names(left) == ["right"]
 
 
@@ -93,7 +93,7 @@ def test_replaced_route_goes(ask, left):
 def test_what_speaks_against_a_route_is_told(ask, left):
     net_id = NetId.parse(PLC["net_id"])
     left.router.add_route(Route(net_id, "first", Way("udp:eap0", "127.0.9.9:34980"), octets=6))
-    (warning,) = ask("add", **PLC)["warnings"]
+    (warning,) = ask("add", **PLC).warnings
     assert warning.startswith("route plc (5.1.2.3.1.1, 10.0.0.5:48898 by ams-tcp)")
     assert "is not taken for 5.1.2.3.1.1: first" in warning
 
@@ -130,7 +130,7 @@ def test_what_cannot_be_kept_is_refused(ask, left, monkeypatch):
 
 def test_virtual_routes_are_told_by_their_net_ids_here(ask):
     ask("add", **PLC, virtual="9.9.9.9.1.1")
-    removed = ask("remove", station="left", route="9.9.9.9.1.1")["route"]
+    removed = ask("remove", station="left", route="9.9.9.9.1.1").route
     assert (removed.net_id, removed.real) == ("9.9.9.9.1.1", "5.1.2.3.1.1")
 
 

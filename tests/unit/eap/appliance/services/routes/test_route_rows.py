@@ -45,7 +45,7 @@ def test_router_in_a_row() -> None:
     assert (route.name, route.pattern, route.origin, route.state) == (
         "right", "127.0.9.2.*.*", "derived", "unknown"
     )  # fmt: skip
-    assert (route.door, route.address) == HOP
+    assert (route.transport, route.address) == HOP
     assert (found.connections, found.requests, found.warnings) == ([], [], [])
 
 
@@ -120,7 +120,7 @@ def test_all_of_a_route_is_told() -> None:
 
 def test_all_of_a_connection_is_told() -> None:
     found = connection_row(ConnectionReport(HOP, TRAFFIC), 8 * 10**9)
-    assert (found.door, found.address, found.since_s, found.net_ids) == (*HOP, 3, [str(FAR)])
+    assert (found.transport, found.address, found.since_s, found.net_ids) == (*HOP, 3, [str(FAR)])
     assert (found.octets_in, found.octets_out, found.took_us) == (90, 80, 1500)
     new = replace(TRAFFIC, answers=0)
     assert connection_row(ConnectionReport(HOP, new), 8 * 10**9).took_us is None
@@ -133,8 +133,8 @@ def test_all_of_a_request_is_told() -> None:
     assert abs(time() - 3 - found.at) < 1
     assert (found.service, found.target) == ("READ", "127.0.9.2.1.1:851")
     assert (found.source, found.came_by) == ("5.1.1.1.1.1:30000", "127.0.0.1:1 by ams-tcp")
-    assert (found.door, found.address, found.error, found.took_us) == (*HOP, 6, 2000)
+    assert (found.transport, found.address, found.error, found.took_us) == (*HOP, 6, 2000)
     said = "READ of 127.0.9.2.1.1:851 for 5.1.1.1.1.1:30000 (127.0.0.1:1 by ams-tcp): cut"
     assert request_row(trace._replace(text=said), 4 * 10**9).text == "cut"
     bare = request_row(trace._replace(came_by=None, hop=None, header=None), 4 * 10**9)
-    assert (bare.service, bare.came_by, bare.door, bare.text) == ("", "", "", "no such port")
+    assert (bare.service, bare.came_by, bare.transport, bare.text) == ("", "", "", "no such port")

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from eap.aoe.spec import DoorKind, HopSpec, MqttSpec, RouteSpec, RoutingSpec
-from eap.appliance.control_routing import RoutingDifference, RunningRouting
+from eap.appliance.control_device import RoutingDifference, RunningRouting
 from eap.appliance.services.routes.routing_methods import RoutingMethods
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routes.station_routing import StationRouting

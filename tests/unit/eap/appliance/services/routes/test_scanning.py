@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
 import pytest
 
 from eap.aoe.ads_device import AdsDevice
@@ -98,7 +99,7 @@ def plant(*more: Route) -> tuple[Line, Station]:
 
 
 def look(station: Station, directory: Directory = PLANT, *routes: Route) -> list[dict[str, Any]]:
-    return asyncio.run(scan(station, stations_of(directory, routes)))
+    return msgspec.to_builtins(asyncio.run(scan(station, stations_of(directory, routes))))
 
 
 def test_stations_ports_and_slaves_are_listed() -> None:
