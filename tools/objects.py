@@ -13,8 +13,7 @@ from pathlib import Path
 from eap.codec import datatypes
 from eap.od.model import Access, Entry, ObjectCode
 from eap.od.profiles import eap1000, router9000
-from eap.od.profiles.forms import to_text
-from eap.od.profiles.table import CONFIG, OWN_TYPE, EntryRow, ObjectRow
+from eap.od.profiles.table import CONFIG, OWN_TYPE, EntryRow, ObjectRow, to_text
 
 _COLUMNS = (
     "Sub", "Name", "Type", "Bits", "Access", "Content", "Default", "Limits", "Unit", "Description",

@@ -13,12 +13,11 @@ from enum import StrEnum
 import msgspec
 
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_mapping import MappingEntry
+from eap.device.eap_rules import MappingEntry
 from eap.device.stored import Configuration, configuration
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import FrameEntry, Rx, Tx, Var
-from eap.od.profiles.forms import Form, to_text
-from eap.od.profiles.table import ObjectRow
+from eap.od.profiles.table import Form, ObjectRow, to_text
 
 _NONE = b"\0"
 _REFERENCES = {

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 
 from eap.codec import pdo
 from eap.device import eap_rules
-from eap.device.eap_mapping import check_mapped, lay_out_mapping
 from eap.device.eap_objects import DeviceIdentity, EapObjects, LiveValues
+from eap.device.eap_rules import check_mapped, lay_out_mapping
 from eap.ids import ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary, check_value, take_bits

@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from eap.codec import datatypes
 from eap.device.eap_dictionary import EapDictionary
-from eap.device.eap_mapping import encode_mapping
+from eap.device.eap_rules import encode_mapping
 from eap.device.pdlayout import bus_variables
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
 from eap.od.profiles import eap1000 as profile

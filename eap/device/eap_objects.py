@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.pd import FIRST_PD, PdHeader
-from eap.device.eap_mapping import MappingEntry, mapped_bits
+from eap.device.eap_rules import MappingEntry, mapped_bits
 from eap.ids import InterfaceUri, NetId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary

@@ -11,7 +11,7 @@ import re
 from typing import NamedTuple
 
 from eap.codec.datatypes import DataType, Plain
-from eap.od.profiles.forms import Form, from_text, to_text
+from eap.od.profiles.table import Form, from_text, to_text
 
 _OCTETS = 0x0A
 

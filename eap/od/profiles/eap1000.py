@@ -14,11 +14,12 @@ from enum import IntEnum, StrEnum, auto
 
 from eap.ids import DestinationKind
 from eap.od.model import RO, RW, Access, ObjectCode
-from eap.od.profiles.forms import Form, Rule
 from eap.od.profiles.table import (
     OWN_TYPE,
     EntryRow,
+    Form,
     ObjectRow,
+    Rule,
     config,
     derived,
     fixed,

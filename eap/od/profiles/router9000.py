@@ -11,8 +11,7 @@ from enum import StrEnum, auto
 
 from eap.od.model import ObjectCode
 from eap.od.profiles.eap1000 import MAX_ENTRIES, NAME, TEXT, identity
-from eap.od.profiles.forms import Form
-from eap.od.profiles.table import ObjectRow, fixed, live, single
+from eap.od.profiles.table import Form, ObjectRow, fixed, live, single
 
 MODULE_PROFILE = 9000
 ROUTER = "router"

@@ -6,6 +6,8 @@ import pytest
 from eap.pd.spec import (
     INTERFACE_MEASURES,
     CounterSource,
+    GatewayAddress,
+    GatewaySpec,
     HostSource,
     Measure,
     OnChangeSpec,
@@ -65,3 +67,13 @@ def test_measures_of_interfaces_are_those_of_octets_and_packets():
     assert {measure.value for measure in INTERFACE_MEASURES} == {
         f"{way}_{what}" for way in ("rx", "tx") for what in ("octets", "packets")
     }
+
+
+def test_a_specification_crosses_as_json():
+    told = GatewaySpec(silent=True, addresses=(GatewayAddress(0x9000, members=(1001, 1002)),))
+    assert msgspec.json.decode(msgspec.json.encode(told), type=GatewaySpec) == told
+
+
+def test_fields_that_nobody_knows_are_refused():
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.json.decode(b'{"quiet": true}', type=GatewaySpec)

@@ -8,14 +8,18 @@ from collections import Counter
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import PdFrameHeader
 from eap.ids import NetId
+from eap.pd.poll import REQUESTERS_PER_CYCLE, Requests
 from eap.pd.report import quality, station_status
 from eap.pd.spec import RxAlternateSpec, RxPdSpec, Substitute, TakenVariableSpec
+from eap.pd.subscriber import Subscriber
 from eap.pd.words import RxState, RxWord
 from tests.support.cyclic import MS, OWN, PEER, SECOND, Receiver, give, octets, received
+from tests.support.examples import examples
 
 THIRD = "5.99.99.99.1.1"
 
@@ -330,3 +334,160 @@ def test_the_own_port_is_no_special_case():
     r = receiver(publisher=OWN)
     give(r.subscriber.receive_frame, octets([(7, b"ab", 3)], publisher=OWN), 0)
     assert r.word("r", RxWord.RECEIVED) == 1
+
+
+class Naive:
+    """One PD alone, followed without any of the tricks: the plain rules of the counters."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+        self.late: set[int] = set()
+        self.counts: Counter[str] = Counter()
+
+    def arrive(self, cycle: int) -> None:
+        if not self.seen:
+            self.counts["received"] += 1
+        elif cycle > self.seen[-1]:
+            self.counts["received"] += 1
+            self.counts["lost"] += cycle - self.seen[-1] - 1
+        elif cycle == self.seen[-1]:
+            self.counts["received"] += 1
+            self.counts["duplicated"] += 1
+            return
+        else:
+            self.counts["reordered"] += 1
+            if cycle not in self.late and cycle > self.seen[0] and cycle not in self.seen:
+                self.counts["lost"] -= 1
+            self.late.add(cycle)
+            return
+        self.seen.append(cycle)
+
+
+NAMES = ("p0", "p1", "p2", "p3")
+
+
+@examples(60, stateful_step_count=40)
+class PartingTrackers(RuleBasedStateMachine):
+    """PDs that share a tracker, part and are restarted count as if each had its own."""
+
+    @initialize(first=st.integers(0, 0xFFFF))
+    def begin(self, first: int) -> None:
+        self.r = Receiver(
+            *(
+                RxPdSpec(name, "eap0", i, (name,), PEER, sender_cycle_us=1000, step=1)
+                for i, name in enumerate(NAMES)
+            ),
+            variables=received(*(f"{name}:USINT" for name in NAMES)),
+        )
+        self.models = {name: Naive() for name in NAMES}
+        self.data = dict.fromkeys(NAMES, 0)
+        self.cycle = first
+        self.withheld: list[tuple[int, tuple[int, ...]]] = []
+
+    def deliver(self, cycle: int, pds: tuple[int, ...]) -> None:
+        frame = octets([(i, bytes([cycle & 0xFF])) for i in pds], cycle=cycle & 0xFFFF)
+        self.r.give(frame, self.cycle * MS)
+        for i in pds:
+            model = self.models[NAMES[i]]
+            before = model.counts["received"]
+            model.arrive(cycle)
+            if model.counts["received"] > before:
+                self.data[NAMES[i]] = cycle & 0xFF
+
+    @rule(pds=st.sets(st.integers(0, 3), min_size=1), dropped=st.integers(0, 3))
+    def a_frame_arrives(self, pds: set[int], dropped: int) -> None:
+        self.cycle += 1 + dropped
+        self.deliver(self.cycle, tuple(sorted(pds)))
+
+    @rule()
+    def all_arrive(self) -> None:
+        self.cycle += 1
+        self.deliver(self.cycle, (0, 1, 2, 3))
+
+    @rule(pds=st.sets(st.integers(0, 3), min_size=1))
+    def a_frame_is_doubled(self, pds: set[int]) -> None:
+        self.cycle += 1
+        self.deliver(self.cycle, tuple(sorted(pds)))
+        self.deliver(self.cycle, tuple(sorted(pds)))
+
+    @rule(pds=st.sets(st.integers(0, 3), min_size=1))
+    def a_frame_is_overtaken(self, pds: set[int]) -> None:
+        self.cycle += 2
+        self.deliver(self.cycle, (0, 1, 2, 3))
+        self.deliver(self.cycle - 1, tuple(sorted(pds)))
+
+    @rule(cycles=st.integers(1, 200_000))
+    def a_cable_is_cut(self, cycles: int) -> None:
+        self.cycle += cycles
+
+    @rule()
+    def the_engine_is_restarted(self) -> None:
+        self.r.start(0)
+
+    @invariant()
+    def every_pd_has_its_own_true_counters(self) -> None:
+        for name, model in self.models.items():
+            for counter in ("received", "lost", "duplicated", "reordered"):
+                word = self.r.word(name, RxWord[counter.upper()])
+                assert word == model.counts[counter], (name, counter)
+            assert self.r.image.read(name) == self.data[name]
+
+
+TestPartingTrackers = PartingTrackers.TestCase
+
+
+def asking(*names: str) -> tuple[Receiver, Requests]:
+    """A receiver of r and s, of which those called *names* are requests."""
+    r = Receiver(
+        RxPdSpec("r", "eap0", 1, ("x",), PEER),
+        RxPdSpec("s", "eap0", 2, ("y",)),
+        variables=received("x:UINT", "y:UINT"),
+    )
+    requests = Requests(names)
+    pairs = zip(r.spec.subscriptions, r.image.layout.rx, strict=True)
+    r.subscriber = Subscriber(r.image, list(pairs), MS, requests)
+    r.subscriber.open(0)
+    return r, requests
+
+
+def test_a_request_is_noted_with_its_sender_and_taken_like_any_other_pd():
+    r, requests = asking("r")
+    for cycle in (1, 2):
+        frame = octets([(1, b"ab"), (2, b"cd")], cycle=cycle)
+        give(r.subscriber.receive_frame, frame, cycle * MS, "10.0.0.1:7")
+        assert requests.take() == {"10.0.0.1:7": {"r"}}
+    give(r.subscriber.receive_frame, octets([(2, b"cd")], cycle=3), 3 * MS, "10.0.0.1:7")
+    assert requests.take() == {}
+    assert (r.word("r", RxWord.RECEIVED), r.word("s", RxWord.RECEIVED)) == (2, 3)
+    assert r.discarded() == {}
+
+
+def test_a_request_that_is_not_taken_is_not_answered():
+    r, requests = asking("r")
+    r.give(octets([(1, b"ab")], cycle=9), MS)
+    requests.take()
+    r.give(octets([(1, b"ab")], cycle=8), 2 * MS)  # reordered
+    r.give(octets([(1, b"abc")], cycle=10), 3 * MS)
+    r.subscriber.close()
+    r.give(octets([(1, b"ab")], cycle=11), 4 * MS)
+    assert requests.take() == {}
+
+
+def test_a_request_from_nowhere_is_counted_and_its_data_taken():
+    r, requests = asking("r", "s")
+    give(r.subscriber.receive_frame, octets([(1, b"ab"), (2, b"cd")], cycle=1), MS, "")
+    assert requests.take() == {}
+    assert r.discarded() == {"no_sender": 2}
+    assert r.discarded("r") == r.discarded("s") == {"no_sender": 1}
+    assert r.image.read("x") == 0x6261
+
+
+def test_requests_of_too_many_are_counted():
+    r, requests = asking("s")
+    for number in range(REQUESTERS_PER_CYCLE + 3):
+        publisher = f"10.0.0.{number}.1.1"
+        frame = octets([(2, b"cd")], cycle=7, publisher=publisher)
+        give(r.subscriber.receive_frame, frame, MS, publisher)
+    assert len(requests.take()) == REQUESTERS_PER_CYCLE
+    assert r.discarded() == r.discarded("s") == {"too_many_requests": 3}
+    assert r.word("s", RxWord.RECEIVED) == REQUESTERS_PER_CYCLE + 3
