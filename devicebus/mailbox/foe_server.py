@@ -1,8 +1,7 @@
 """FoE on the side of a slave: files read and written one message at a time (ETG.1000.6).
 
 Where the files are is somebody else's concern: a :class:`FileStore`, such as
-:class:`devicebus.mailbox.foe_store.MemoryStore`, opens them and refuses with FoeError.  One that
-needs time raises NotReadyError: the master is told BUSY, asks again, and so is the store.
+:class:`devicebus.mailbox.foe_store.MemoryStore`, opens them and refuses with FoeError.
 """
 
 from __future__ import annotations
@@ -25,11 +24,6 @@ from eap.codec.mailbox import MailboxError
 from eap.errors import MalformedError, TruncatedError
 
 _REQUESTS = frozenset((FoeOpcode.READ, FoeOpcode.WRITE))
-_NOT_BEGUN = Busy(0, 100)
-
-
-class NotReadyError(Exception):
-    """It takes more time, and nothing was done yet."""
 
 
 class FileReader(Protocol):
@@ -43,7 +37,7 @@ class FileReader(Protocol):
 
 
 class FileWriter(Protocol):
-    """A file that is being written; each method may raise FoeError, or NotReadyError."""
+    """A file that is being written; each method may raise FoeError."""
 
     def write(self, data: bytes, /) -> object:
         """Take the next octets."""
@@ -56,7 +50,7 @@ class FileWriter(Protocol):
 
 
 class FileStore(Protocol):
-    """Where the files are; each method may raise FoeError, or NotReadyError."""
+    """Where the files are; each method may raise FoeError."""
 
     def open_read(self, name: str, password: int) -> FileReader:
         """Open a file for reading."""
@@ -87,14 +81,13 @@ class FoeServer:
         self._writer: FileWriter | None = None
         self._number = 0
         self._sent = b""
-        self._is_last = self._is_taken = False
+        self._is_last = False
         self._busy_from_ns = self._busy_until_ns = 0
 
     def reset(self) -> None:
         """Forget the transfer under way."""
         reader, self._reader = self._reader, None
         writer, self._writer = self._writer, None
-        self._is_taken = False
         if reader is not None:
             reader.close()
         if writer is not None:
@@ -110,8 +103,6 @@ class FoeServer:
         try:
             header = FoeHeader.decode(data)
             return self._answer(header, data[FoeHeader.SIZE :], now_ns)
-        except NotReadyError:
-            return [encode_message(FoeOpcode.BUSY, _NOT_BEGUN.number)]
         except TruncatedError as exc:
             refuse(MailboxError.SIZE_TOO_SHORT, str(exc))
         except MalformedError:
@@ -171,13 +162,10 @@ class FoeServer:
             entire = max(1, self._busy_until_ns - self._busy_from_ns)
             done = (now_ns - self._busy_from_ns) * 100 // entire
             return [encode_message(FoeOpcode.BUSY, Busy(done, 100).number)]
-        if not self._is_taken:
-            writer.write(data)
-            self._is_taken = True  # also if its commit takes longer
+        writer.write(data)
         if len(data) < self._sizes.to_slave - DATA_OVERHEAD:
             writer.commit()
             self._writer = None
-        self._is_taken = False
         self._busy_from_ns, self._busy_until_ns = now_ns, now_ns + self.packet_time_ns
         self._number = number
         return [encode_message(FoeOpcode.ACK, number)]

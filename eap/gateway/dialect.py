@@ -105,7 +105,7 @@ class TalkVoe(msgspec.Struct, frozen=True):
 Task: TypeAlias = ReadSdo | WriteSdo | ReadIdn | WriteIdn | ReadFile | TalkVoe
 
 
-class Failure(IntEnum):
+class DialectFailure(IntEnum):
     """Why something could not be done; each protocol has codes of its own for it."""
 
     GENERAL = 0
@@ -121,35 +121,35 @@ class Failure(IntEnum):
     FILE_NAME = 7
 
 
-_CODES: dict[MailboxType, dict[Failure, int]] = {
+_CODES: dict[MailboxType, dict[DialectFailure, int]] = {
     MailboxType.COE: {
-        Failure.GENERAL: 0x08000000,
-        Failure.MISSING: 0x06020000,
-        Failure.NOT_SUPPORTED: 0x06010000,
-        Failure.READ_ONLY: 0x06010002,
-        Failure.COMMAND: 0x05040001,
+        DialectFailure.GENERAL: 0x08000000,
+        DialectFailure.MISSING: 0x06020000,
+        DialectFailure.NOT_SUPPORTED: 0x06010000,
+        DialectFailure.READ_ONLY: 0x06010002,
+        DialectFailure.COMMAND: 0x05040001,
     },
     MailboxType.SOE: {
-        Failure.GENERAL: 0x8000,
-        Failure.MISSING: 0x1009,
-        Failure.NOT_SUPPORTED: 0x8001,
-        Failure.READ_ONLY: 0x7002,
-        Failure.COMMAND: 0x1001,
-        Failure.SIZE: 0x3002,
+        DialectFailure.GENERAL: 0x8000,
+        DialectFailure.MISSING: 0x1009,
+        DialectFailure.NOT_SUPPORTED: 0x8001,
+        DialectFailure.READ_ONLY: 0x7002,
+        DialectFailure.COMMAND: 0x1001,
+        DialectFailure.SIZE: 0x3002,
     },
     MailboxType.FOE: {
-        Failure.GENERAL: 0x8000,
-        Failure.MISSING: 0x8002,
-        Failure.NOT_SUPPORTED: 0x8001,
-        Failure.COMMAND: 0x8001,
-        Failure.FILE_NAME: 0x8003,
+        DialectFailure.GENERAL: 0x8000,
+        DialectFailure.MISSING: 0x8002,
+        DialectFailure.NOT_SUPPORTED: 0x8001,
+        DialectFailure.COMMAND: 0x8001,
+        DialectFailure.FILE_NAME: 0x8003,
     },
     MailboxType.VOE: {
-        Failure.GENERAL: 0,
-        Failure.NOT_SUPPORTED: 1,
-        Failure.COMMAND: 2,
-        Failure.SIZE: 2,
-        Failure.NO_RESPONSE: 3,
+        DialectFailure.GENERAL: 0,
+        DialectFailure.NOT_SUPPORTED: 1,
+        DialectFailure.COMMAND: 2,
+        DialectFailure.SIZE: 2,
+        DialectFailure.NO_RESPONSE: 3,
     },
 }
 
@@ -259,7 +259,12 @@ def encode_done(request: bytes, task: Task, data: bytes) -> bytes:
 
 
 def encode_failure(
-    kind: MailboxType, request: bytes, failure: Failure, *, code: int | None = None, text: str = ""
+    kind: MailboxType,
+    request: bytes,
+    failure: DialectFailure,
+    *,
+    code: int | None = None,
+    text: str = "",
 ) -> bytes:
     """Return the message that says why something was not done.
 
@@ -271,7 +276,7 @@ def encode_failure(
         text: For people, where the protocol has room for it.
     """
     codes = _CODES[kind]
-    number = codes.get(failure, codes[Failure.GENERAL]) if code is None else code
+    number = codes.get(failure, codes[DialectFailure.GENERAL]) if code is None else code
     match kind:
         case MailboxType.COE:
             index = int.from_bytes(request[3:5], "little")

@@ -26,7 +26,7 @@ from eap.codec.foe import FoeErrorCode
 from eap.codec.mailbox import MailboxError
 from eap.codec.soeerror import SoeErrorCode
 from eap.errors import EapError, EngineGoneError
-from eap.gateway.dialect import Failure
+from eap.gateway.dialect import DialectFailure
 from eap.od.abort import AbortCode, SdoAbortError
 
 
@@ -39,7 +39,7 @@ class ErrorCodes(NamedTuple):
     soe: SoeErrorCode
     foe: FoeErrorCode
     ads: AdsError
-    dialect: Failure
+    dialect: DialectFailure
     received: tuple[IntEnum, ...] = ()
     """Codes that are understood as this cause, members of the enums of the other columns."""
     is_from_slave: bool = False
@@ -51,7 +51,7 @@ def _by_slave(
     soe: SoeErrorCode,
     foe: FoeErrorCode,
     ads: AdsError,
-    dialect: Failure,
+    dialect: DialectFailure,
     *received: IntEnum,
 ) -> ErrorCodes:
     """Return the row of a refusal by the slave itself; VoE and EoE have no code for it."""
@@ -70,7 +70,7 @@ class Cause(Enum):
         SoeErrorCode.INVALID_DRIVE,
         FoeErrorCode.NOT_FOUND,
         AdsError.TARGET_PORT,
-        Failure.MISSING,
+        DialectFailure.MISSING,
         (AdsError.TARGET_PORT, AdsError.TARGET_MACHINE),
     )
     NO_MAILBOX = ErrorCodes(
@@ -80,7 +80,7 @@ class Cause(Enum):
         SoeErrorCode.COMMAND_NOT_NOW,
         FoeErrorCode.ILLEGAL,
         AdsError.NOT_READY,
-        Failure.NOT_SUPPORTED,
+        DialectFailure.NOT_SUPPORTED,
         (AdsError.NOT_READY,),
     )
     NO_PROTOCOL = ErrorCodes(
@@ -90,7 +90,7 @@ class Cause(Enum):
         SoeErrorCode.NO_IDN,
         FoeErrorCode.NOT_DEFINED,
         AdsError.SERVICE,
-        Failure.NOT_SUPPORTED,
+        DialectFailure.NOT_SUPPORTED,
     )
     TIMEOUT = ErrorCodes(
         "it did not answer in time",
@@ -99,7 +99,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
         AdsError.TIMEOUT,
-        Failure.NO_RESPONSE,
+        DialectFailure.NO_RESPONSE,
         (AdsError.TIMEOUT,),
     )
     BUS_DOWN = ErrorCodes(
@@ -109,7 +109,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
         AdsError.HOST_UNREACHABLE,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
     )
     UNREACHABLE = ErrorCodes(
         "its bus, or a station on the way to it, is down",
@@ -118,7 +118,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
         AdsError.HOST_UNREACHABLE,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
         (AdsError.HOST_UNREACHABLE,),
     )
     TOO_LONG = ErrorCodes(
@@ -128,7 +128,7 @@ class Cause(Enum):
         SoeErrorCode.VALUE_TOO_LONG,
         FoeErrorCode.DISK_FULL,
         AdsError.SIZE,
-        Failure.SIZE,
+        DialectFailure.SIZE,
     )
     TOO_SHORT = ErrorCodes(
         "the message is too short",
@@ -137,7 +137,7 @@ class Cause(Enum):
         SoeErrorCode.VALUE_TOO_SHORT,
         FoeErrorCode.ILLEGAL,
         AdsError.SIZE,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
     )
     SERVICE = ErrorCodes(
         "it does not offer this service",
@@ -146,7 +146,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.ILLEGAL,
         AdsError.SERVICE,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
     )
     PROTOCOL = ErrorCodes(
         "its answer breaks the protocol",
@@ -155,7 +155,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
         AdsError.GENERAL,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
     )
     BUSY = ErrorCodes(
         "it is busy with another client's transfer",
@@ -164,7 +164,7 @@ class Cause(Enum):
         SoeErrorCode.COMMAND_ACTIVE,
         FoeErrorCode.NOT_DEFINED,
         AdsError.BUSY,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
         (AdsError.BUSY, MailboxError.SERVICE_IN_WORK),
     )
     CROWDED = ErrorCodes(
@@ -174,7 +174,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NO_USER,
         AdsError.NO_MEMORY,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
     )
     TOO_FAST = ErrorCodes(
         "more requests a second than the plant file allows",
@@ -183,7 +183,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
         AdsError.BUSY,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
     )
     DENIED = ErrorCodes(
         "access refused: the plant file has no rule that allows it",
@@ -192,7 +192,7 @@ class Cause(Enum):
         SoeErrorCode.VALUE_PROTECTED,
         FoeErrorCode.NO_RIGHTS,
         AdsError.ACCESS_DENIED,
-        Failure.READ_ONLY,
+        DialectFailure.READ_ONLY,
         (AdsError.ACCESS_DENIED,),
     )
     NOT_RECORDED = ErrorCodes(
@@ -202,7 +202,7 @@ class Cause(Enum):
         SoeErrorCode.VALUE_PROTECTED,
         FoeErrorCode.NO_RIGHTS,
         AdsError.ACCESS_DENIED,
-        Failure.READ_ONLY,
+        DialectFailure.READ_ONLY,
     )
 
     # The slave refused the request.
@@ -212,7 +212,7 @@ class Cause(Enum):
         SoeErrorCode.NO_IDN,
         FoeErrorCode.NOT_FOUND,
         AdsError.NOT_FOUND,
-        Failure.MISSING,
+        DialectFailure.MISSING,
         AdsError.NOT_FOUND,
         AbortCode.NO_OBJECT,
         AbortCode.NO_SUBINDEX,
@@ -230,7 +230,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.ILLEGAL,
         AdsError.SERVICE,
-        Failure.NOT_SUPPORTED,
+        DialectFailure.NOT_SUPPORTED,
         AdsError.SERVICE,
         AbortCode.UNSUPPORTED_ACCESS,
         AbortCode.NO_COMPLETE_ACCESS,
@@ -244,7 +244,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
         AdsError.INDEX_GROUP,
-        Failure.NOT_SUPPORTED,
+        DialectFailure.NOT_SUPPORTED,
         AdsError.INDEX_GROUP,
     )
     ACCESS = _by_slave(
@@ -253,7 +253,7 @@ class Cause(Enum):
         SoeErrorCode.VALUE_READ_ONLY,
         FoeErrorCode.ACCESS_DENIED,
         AdsError.ACCESS,
-        Failure.READ_ONLY,
+        DialectFailure.READ_ONLY,
         AdsError.ACCESS,
         AbortCode.READ_ONLY,
         AbortCode.WRITE_ONLY,
@@ -271,7 +271,7 @@ class Cause(Enum):
         SoeErrorCode.VALUE_TOO_LONG,
         FoeErrorCode.NOT_DEFINED,
         AdsError.SIZE,
-        Failure.SIZE,
+        DialectFailure.SIZE,
         AdsError.SIZE,
         AbortCode.LENGTH,
         AbortCode.TOO_LONG,
@@ -286,7 +286,7 @@ class Cause(Enum):
         SoeErrorCode.INVALID_VALUE,
         FoeErrorCode.CHECKSUM,
         AdsError.VALUE,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
         AdsError.VALUE,
         AbortCode.VALUE,
         AbortCode.TOO_HIGH,
@@ -302,7 +302,7 @@ class Cause(Enum):
         SoeErrorCode.COMMAND_NOT_NOW,
         FoeErrorCode.ILLEGAL,
         AdsError.STATE,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
         AdsError.STATE,
         AbortCode.DEVICE_STATE,
         AbortCode.LOCAL_CONTROL,
@@ -318,7 +318,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.DISK_FULL,
         AdsError.NO_MEMORY,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
         AdsError.NO_MEMORY,
         FoeErrorCode.DISK_FULL,
         MailboxError.NO_MORE_MEMORY,
@@ -329,7 +329,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.ALREADY_EXISTS,
         AdsError.EXISTS,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
         AdsError.EXISTS,
         FoeErrorCode.ALREADY_EXISTS,
     )
@@ -339,7 +339,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NO_USER,
         AdsError.NO_MORE_HANDLES,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
         AdsError.NO_MORE_HANDLES,
     )
     GENERAL = _by_slave(
@@ -348,7 +348,7 @@ class Cause(Enum):
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
         AdsError.GENERAL,
-        Failure.GENERAL,
+        DialectFailure.GENERAL,
     )
 
     def __init__(self, *columns: object) -> None:

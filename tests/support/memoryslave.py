@@ -19,7 +19,7 @@ from eap.appliance.services.gateway.client_session import SessionCodec
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
 from eap.codec.mailbox import MailboxType
-from eap.gateway.ledger import MemoryBudget, MemoryShare
+from eap.gateway.request_tracker import MemoryBudget, MemoryShare
 from tests.support.mailbox import Line, open_line
 
 T = TypeVar("T")

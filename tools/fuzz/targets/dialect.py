@@ -7,7 +7,7 @@ from itertools import cycle
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_message, encode_message
 from eap.errors import MalformedError
 from eap.gateway import dialect
-from eap.gateway.dialect import Failure
+from eap.gateway.dialect import DialectFailure
 from tools.fuzz.messages import cut
 
 _KINDS = (MailboxType.COE, MailboxType.SOE, MailboxType.FOE, MailboxType.VOE)
@@ -19,7 +19,7 @@ def fuzz_one(data: bytes) -> None:
         try:
             task = dialect.decode(kind, body)
         except MalformedError:
-            answer = dialect.encode_failure(kind, body, Failure.COMMAND, text="malformed")
+            answer = dialect.encode_failure(kind, body, DialectFailure.COMMAND, text="malformed")
         else:
             answer = dialect.encode_done(body, task, data[:40])
         message = encode_message(dialect.encode_header(kind, 1001), answer)

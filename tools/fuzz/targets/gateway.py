@@ -39,7 +39,7 @@ from eap.codec.mailbox import (
     encode_message,
 )
 from eap.gateway.address import AddressMap, RemoteAddress
-from eap.gateway.ledger import ClientLimits
+from eap.gateway.request_tracker import ClientLimits
 from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
@@ -201,7 +201,7 @@ async def _serve(data: bytes) -> None:
     for octets in answered:
         decode_frame(octets)
     await gateway.close()
-    if gateway.transfers() or gateway.ledger.table():
+    if gateway.transfers() or gateway.tracker.table():
         raise AssertionError("transfers or clients are left over")
     if held := gateway.memory.held + gateway.file_memory.held:
         raise AssertionError(f"{held} octets are held for nothing")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from eap.aoe.way import Way
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
-from eap.gateway.ledger import Admission, ClientLimits, Ledger
 from eap.gateway.refusal import refuse
+from eap.gateway.request_tracker import ClientLimits, RequestAdmission, RequestTracker
 from eap.gateway.rights import operation_of
 from tools.fuzz.messages import cut
 
@@ -29,17 +29,17 @@ def fuzz_one(data: bytes) -> None:
 def _keep_books(messages: list[bytes]) -> None:
     """Admit and answer requests of more clients than there is room for."""
     limits = ClientLimits(in_flight=2, rate=3, clients=3, in_flight_in_all=4)
-    ledger = Ledger(limits)
+    tracker = RequestTracker(limits)
     waiting: list[tuple[Way, bytes]] = []
     for number, body in enumerate(messages):
         way = _WAYS[len(body) % len(_WAYS)]
-        if ledger.admit(way, body, number) is Admission.TAKEN:
+        if tracker.admit(way, body, number) is RequestAdmission.TAKEN:
             waiting.append((way, body))
         if len(waiting) > limits.in_flight_in_all:
             raise AssertionError(f"{len(waiting)} requests wait")
         if number % 3 == 0 and waiting:
-            ledger.answered(*waiting.pop(0))
+            tracker.answered(*waiting.pop(0))
     for way, body in waiting:
-        ledger.answered(way, body)
-    if any(ledger.waiting(way) for way in _WAYS) or len(ledger.table()) > limits.clients:
+        tracker.answered(way, body)
+    if any(tracker.waiting(way) for way in _WAYS) or len(tracker.table()) > limits.clients:
         raise AssertionError("clients or requests are left over")

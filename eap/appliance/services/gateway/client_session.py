@@ -35,7 +35,7 @@ _GRACE_S = 0.03
 _BUSY = bytes((FoeOpcode.BUSY,))
 
 
-class Reply(msgspec.Struct, frozen=True):
+class GatewayReply(msgspec.Struct, frozen=True):
     """A message that goes back to the client."""
 
     type: MailboxType
@@ -96,7 +96,7 @@ class ClientSession:
         self._answer_s = answer_s
         self._idle_s = idle_s
         self._request = b""
-        self._replies: list[Reply] | None = None
+        self._replies: list[GatewayReply] | None = None
         self._lock = asyncio.Lock()
         self._timer: asyncio.TimerHandle | None = None
 
@@ -105,7 +105,7 @@ class ClientSession:
         """Whether a transfer is under way."""
         return self.codec.is_running
 
-    async def ask(self, body: bytes, *, is_step: bool) -> list[Reply]:
+    async def ask(self, body: bytes, *, is_step: bool) -> list[GatewayReply]:
         """Return the answers to a request, which may be none.
 
         Args:
@@ -133,7 +133,7 @@ class ClientSession:
         self.codec.reset()
         self._replies = None
 
-    async def _ask(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[Reply]:
+    async def _ask(self, body: bytes, deadline_s: float, *, is_step: bool) -> list[GatewayReply]:
         if self._is_repeated(body):
             return [replace(each, is_again=True) for each in self._replies or ()]
         if is_step and not self.is_running:
@@ -160,7 +160,7 @@ class ClientSession:
         )
         return not is_busy
 
-    async def _answer(self, body: bytes, deadline_s: float) -> list[Reply]:
+    async def _answer(self, body: bytes, deadline_s: float) -> list[GatewayReply]:
         try:
             async with asyncio.timeout_at(deadline_s + _GRACE_S):
                 answers = await self.codec.answer(body)
@@ -169,7 +169,7 @@ class ClientSession:
             return self._refuse(body, Cause.TIMEOUT)
         except MailboxRefusedError as exc:
             self.codec.reset()
-            return [Reply(*mailbox_error(exc.detail))]
+            return [GatewayReply(*mailbox_error(exc.detail))]
         except CodecError as exc:
             is_cut = isinstance(exc, TruncatedError)
             return self._refuse(body, Cause.TOO_SHORT if is_cut else Cause.SERVICE)
@@ -179,9 +179,9 @@ class ClientSession:
         except BaseException:
             self.close()
             raise
-        return [Reply(self._kind, answer) for answer in answers]
+        return [GatewayReply(self._kind, answer) for answer in answers]
 
-    def _refuse(self, body: bytes, reason: Cause, text: str = "") -> list[Reply]:
+    def _refuse(self, body: bytes, reason: Cause, text: str = "") -> list[GatewayReply]:
         return refusals(self._kind, body, reason, text)
 
     def _stop_timer(self) -> None:
@@ -190,9 +190,9 @@ class ClientSession:
             self._timer = None
 
 
-def refusals(kind: MailboxType, body: bytes, reason: Cause, text: str = "") -> list[Reply]:
+def refusals(kind: MailboxType, body: bytes, reason: Cause, text: str = "") -> list[GatewayReply]:
     """Return the error that answers a request."""
-    return [Reply(*refuse(kind, body, reason, text), reason=reason)]
+    return [GatewayReply(*refuse(kind, body, reason, text), reason=reason)]
 
 
 def cause_of(error: EapError) -> Cause:

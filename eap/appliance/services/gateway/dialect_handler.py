@@ -14,7 +14,7 @@ from devicebus.errors import FoeError, MailboxRefusedError, SoeError
 from eap.aoe.ads_operation import Operation, ReadWrite
 from eap.aoe.way import Way
 from eap.appliance.services.gateway.client_session import cause_of, text_of
-from eap.appliance.services.gateway.guard import Guard, Target, reason_of_refusal
+from eap.appliance.services.gateway.guard import Guard, RuleTarget, reason_of_refusal
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.slaves.access import RemoteAccessError, SlaveAccess
 from eap.codec.ads import AdsError, IndexGroup
@@ -23,7 +23,7 @@ from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SdoHeader
 from eap.errors import EapError, MalformedError
 from eap.gateway.dialect import (
-    Failure,
+    DialectFailure,
     ReadFile,
     ReadIdn,
     ReadSdo,
@@ -59,7 +59,7 @@ class DialectError(EapError):
 
     def __init__(
         self,
-        failure: Failure,
+        failure: DialectFailure,
         text: str,
         code: int | None = None,
         cause: Cause = Cause.SERVICE,
@@ -89,7 +89,7 @@ class DialectHandler:
         kind: MailboxType,
         body: bytes,
         way: Way,
-        target: Target,
+        target: RuleTarget,
         find: FindTarget,
     ) -> tuple[bytes, Cause | None]:
         """Return the answer to a request, and why it is an error if it is one.
@@ -106,14 +106,14 @@ class DialectHandler:
             data = await self._perform_allowed(task, way, target, find)
             return encode_done(body, task, data), None
         except MalformedError as exc:
-            error = DialectError(Failure.COMMAND, str(exc))
+            error = DialectError(DialectFailure.COMMAND, str(exc))
         except DialectError as exc:
             error = exc
         answer = encode_failure(kind, body, error.failure, code=error.code, text=str(error))
         return answer, error.cause
 
     async def _perform_allowed(
-        self, task: Task, way: Way, target: Target, find: FindTarget
+        self, task: Task, way: Way, target: RuleTarget, find: FindTarget
     ) -> bytes:
         operation = operation_of(task)
         verdict = self._guard.judge(way, target, operation)
@@ -139,7 +139,7 @@ class DialectHandler:
                 data = await perform(task, subject, self._room)
         except TimeoutError:
             raise DialectError(
-                Failure.NO_RESPONSE, Cause.TIMEOUT.text, cause=Cause.TIMEOUT
+                DialectFailure.NO_RESPONSE, Cause.TIMEOUT.text, cause=Cause.TIMEOUT
             ) from None
         except DialectError:
             raise
@@ -174,7 +174,7 @@ async def perform(task: Task, access: SlaveAccess, room: int) -> bytes:
 
 async def _read_file(name: str, access: SlaveAccess, room: int) -> bytes:
     if not name:
-        raise DialectError(Failure.FILE_NAME, "no file name")
+        raise DialectError(DialectFailure.FILE_NAME, "no file name")
     file = access.open_file(name, 0, is_write=False)
     try:
         return await file.read(room + 1)
@@ -189,16 +189,16 @@ async def _perform_by_master(task: Task, master: MasterSession) -> bytes:
         case WriteSdo(index, subindex, data):
             master.write(index, subindex, data)
             return b""
-    raise DialectError(Failure.NOT_SUPPORTED, "the master has only a CoE dictionary")
+    raise DialectError(DialectFailure.NOT_SUPPORTED, "the master has only a CoE dictionary")
 
 
 def _refusal(error: EapError) -> DialectError:
     text = str(error)
     match error:
         case SdoAbortError():
-            return DialectError(Failure.GENERAL, text, error.code)
+            return DialectError(DialectFailure.GENERAL, text, error.code)
         case MailboxRefusedError():  # the dialect has no mailbox errors
-            return DialectError(Failure.NOT_SUPPORTED, text)
+            return DialectError(DialectFailure.NOT_SUPPORTED, text)
         case RemoteAccessError() if not error.is_of_way:
             return DialectError(cause_of_result(error.result).dialect, text)
         case SoeError() | FoeError():
@@ -209,7 +209,7 @@ def _refusal(error: EapError) -> DialectError:
 
 def _too_long(room: int) -> DialectError:
     text = f"more than {room} octets do not fit one packet of this dialect"
-    return DialectError(Failure.GENERAL, text)
+    return DialectError(DialectFailure.GENERAL, text)
 
 
 def operation_of(task: Task) -> Operation:

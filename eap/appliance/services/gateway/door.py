@@ -75,7 +75,7 @@ class GatewayDoor:
         """Return how many requests of a connection wait for their answers."""
         if self._gateway is None:
             return 0
-        return self._gateway.ledger.waiting(Way(self._name, connection))
+        return self._gateway.tracker.waiting(Way(self._name, connection))
 
     async def wait_below(self, connection: str, count: int) -> None:
         """Wait until fewer than *count* requests of a connection wait."""

@@ -18,7 +18,7 @@ MAX_LISTENERS = 8
 """Of one slave."""
 
 
-class Listener(NamedTuple):
+class EoeListener(NamedTuple):
     """A client that talks EoE to a slave."""
 
     address: int
@@ -31,19 +31,19 @@ class EoeListeners:
     """The listeners of all slaves of a bus."""
 
     def __init__(self) -> None:
-        self._of: dict[int, OrderedDict[Way, Listener]] = {}
+        self._of: dict[int, OrderedDict[Way, EoeListener]] = {}
 
     def note(
         self, station: int, way: Way, address: int, send: Callable[[bytes], None], now_ns: int
     ) -> None:
         """Note that a client talks to a slave; the one that did so least lately makes room."""
         of_slave = self._of.setdefault(station, OrderedDict())
-        of_slave[way] = Listener(address, send, now_ns + LISTENS_NS)
+        of_slave[way] = EoeListener(address, send, now_ns + LISTENS_NS)
         of_slave.move_to_end(way)
         if len(of_slave) > MAX_LISTENERS:
             of_slave.popitem(last=False)
 
-    def of(self, station: int, now_ns: int) -> list[Listener]:
+    def of(self, station: int, now_ns: int) -> list[EoeListener]:
         """Return who hears a slave now."""
         of_slave = self._of.get(station)
         if of_slave is None:

@@ -26,8 +26,8 @@ from eap.codec.foe import (
 from eap.codec.mailbox import MailboxHeader
 from eap.errors import MalformedError
 from eap.gateway.error_table import Cause
-from eap.gateway.ledger import MemoryShare
 from eap.gateway.refusal import GatewayError
+from eap.gateway.request_tracker import MemoryShare
 
 AHEAD = 4 << 20
 """Octets of a file that are fetched ahead of a client, as far as there is memory for them."""

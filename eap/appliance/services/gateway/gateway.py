@@ -26,7 +26,7 @@ from eap.aoe.way import Way
 from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage, no_mailbox
 from eap.appliance.services.gateway.client_session import (
     ClientSession,
-    Reply,
+    GatewayReply,
     SessionKey,
     SessionTable,
     cause_of,
@@ -38,14 +38,14 @@ from eap.appliance.services.gateway.file_codec import FileCodec
 from eap.appliance.services.gateway.guard import (
     MASTER_PORT,
     Guard,
-    Judged,
-    Target,
+    RequestDecision,
+    RuleTarget,
     reason_of_refusal,
     result_of,
 )
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.message_codecs import codec_for
-from eap.appliance.services.gateway.reply_encoder import ReplyEncoder, Request, Send
+from eap.appliance.services.gateway.reply_encoder import GatewayRequest, ReplyEncoder, Send
 from eap.appliance.services.slaves.access import SlaveAccess
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
@@ -63,7 +63,14 @@ from eap.gateway.address import (
     SlaveAddress,
 )
 from eap.gateway.error_table import Cause
-from eap.gateway.ledger import Admission, ClientLimits, Ledger, MemoryBudget, MemoryShare, Ticket
+from eap.gateway.request_tracker import (
+    ClientLimits,
+    MemoryBudget,
+    MemoryShare,
+    RequestAdmission,
+    RequestTracker,
+    Ticket,
+)
 from eap.gateway.rights import operation_of
 from eap.ids import NetId
 
@@ -75,7 +82,7 @@ STALL_S = 2.0
 OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
 """Returns access to a slave, or the master, of another station."""
 
-_NOT_TAKEN = {Admission.CROWDED: Cause.CROWDED, Admission.TOO_FAST: Cause.TOO_FAST}
+_NOT_TAKEN = {RequestAdmission.CROWDED: Cause.CROWDED, RequestAdmission.TOO_FAST: Cause.TOO_FAST}
 
 _BY_TCP = f"{DoorKind.TCP}:"
 """Prefix of the names of TCP transports."""
@@ -111,7 +118,7 @@ class MailboxGateway:
 
     Attributes:
         statistics: Requests and answers by slave and protocol.
-        ledger: Requests by client.
+        tracker: Requests by client.
         memory: Octets of objects and messages that are under way.
         file_memory: Octets of files that are fetched ahead; without room fewer are.
         guard: Access rules and audit.
@@ -129,16 +136,16 @@ class MailboxGateway:
         addresses: AddressMap,
         open_remote: OpenRemote,
     ) -> None:
-        self.ledger = Ledger(settings.limits)
+        self.tracker = RequestTracker(settings.limits)
         self.memory, self.file_memory = MemoryBudget(), MemoryBudget()
-        self._encoder = ReplyEncoder(self.ledger, settings.name, is_silent=settings.is_silent)
+        self._encoder = ReplyEncoder(self.tracker, settings.name, is_silent=settings.is_silent)
         self.statistics = self._encoder.statistics
         self.guard = Guard(access)
         self.settings = settings
         self.is_open = True
         self.turned_away = 0
         self._bus = bus
-        self._master = Target(settings.net_id, MASTER_PORT)
+        self._master = RuleTarget(settings.net_id, MASTER_PORT)
         self._open_master = open_master
         self._addresses = addresses
         self._open_remote = open_remote
@@ -181,42 +188,42 @@ class MailboxGateway:
             self._count += 1
             key += self._count.to_bytes(8)
         now_ns = monotonic_ns()
-        admission = self.ledger.admit(way, key, now_ns)
-        if admission is Admission.REPEATED:
+        admission = self.tracker.admit(way, key, now_ns)
+        if admission is RequestAdmission.REPEATED:
             return None
-        request = Request(header, bytes(body), way, send)
-        if admission is not Admission.TAKEN:
+        request = GatewayRequest(header, bytes(body), way, send)
+        if admission is not RequestAdmission.TAKEN:
             self._encoder.refuse(request, _NOT_TAKEN[admission])
             return None
         if self._answer_at_once(request, key, now_ns):
             return None
-        request = replace(request, ticket=Ticket(self.ledger, way, key))
+        request = replace(request, ticket=Ticket(self.tracker, way, key))
         task = self._tasks.start(self._serve(request))
         task.add_done_callback(lambda _: request.give_back())
         return task
 
     def connection_closed(self, way: Way) -> None:
         """Forget a client, and end what it had under way."""
-        self.ledger.forget(way)
+        self.tracker.forget(way)
         self._listeners.forget(way)
         self._slaves.close_of(way)
         self._masters.close_of(way)
 
     async def wait_below(self, way: Way, count: int) -> None:
         """Wait until fewer than *count* requests of a client wait."""
-        while self.ledger.waiting(way) >= count and len(self._tasks):
+        while self.tracker.waiting(way) >= count and len(self._tasks):
             await self._tasks.wait_any()
 
     async def close(self) -> None:
         """End everything that is under way."""
         await self._tasks.close()
-        for way in self.ledger.table():
-            self.ledger.forget(way)
+        for way in self.tracker.table():
+            self.tracker.forget(way)
             self._listeners.forget(way)
         self._slaves.close()
         self._masters.close()
 
-    async def _serve(self, request: Request) -> None:
+    async def _serve(self, request: GatewayRequest) -> None:
         kind = dialect.kind_of(request.header)
         if kind is not None:
             await self._serve_dialect(request, kind)
@@ -238,19 +245,19 @@ class MailboxGateway:
             case destination:
                 await self._ask(request, destination, address)
 
-    def _answer_at_once(self, request: Request, key: bytes, start_ns: int) -> bool:
+    def _answer_at_once(self, request: GatewayRequest, key: bytes, start_ns: int) -> bool:
         """Answer from the master's dictionary; return whether nothing had to be waited for."""
         header, body, way = request.header, request.body, request.way
         if header.address != MASTER_ADDRESS or header.type is not MailboxType.COE:
             return False
-        if self.ledger.waiting(way) > 1:
+        if self.tracker.waiting(way) > 1:
             return False  # what came first is answered first
         operation = operation_of(MailboxType.COE, body)
         key_of_session = SessionKey(way, MASTER_ADDRESS, MailboxType.COE)
         master = self._masters.take(key_of_session, self._open_master)
         if not master.is_ready(operation):
             return False
-        self.ledger.answered(way, key)
+        self.tracker.answered(way, key)
         judged = self._judge(way, MASTER_ADDRESS, self._master, operation)
         replies = (
             master.ask_now(body)
@@ -261,7 +268,12 @@ class MailboxGateway:
         return True
 
     async def _ask(
-        self, request: Request, destination: Destination, address: int, *, is_group: bool = False
+        self,
+        request: GatewayRequest,
+        destination: Destination,
+        address: int,
+        *,
+        is_group: bool = False,
     ) -> None:
         """Have the master or a slave answer a request, from *address*."""
         kind, body, way = request.header.type, request.body, request.way
@@ -278,8 +290,8 @@ class MailboxGateway:
         self._finish(request, judged, address, replies, start_ns)
 
     async def _ask_allowed(
-        self, request: Request, destination: Destination, station: int, *, is_step: bool
-    ) -> list[Reply]:
+        self, request: GatewayRequest, destination: Destination, station: int, *, is_step: bool
+    ) -> list[GatewayReply]:
         kind, body, way = request.header.type, request.body, request.way
         key = SessionKey(way, station, kind)
         match destination:
@@ -298,22 +310,22 @@ class MailboxGateway:
         self,
         way: Way,
         station: int,
-        target: Target,
+        target: RuleTarget,
         operation: Operation | None,
         *,
         by_rule: bool = False,
-    ) -> Judged:
+    ) -> RequestDecision:
         if operation is None or self.guard.may_read(way, target, operation):
-            return Judged(station, target, None, None)
+            return RequestDecision(station, target, None, None)
         verdict = self.guard.judge(way, target, operation, by_rule=by_rule)
-        return Judged(station, target, operation, verdict)
+        return RequestDecision(station, target, operation, verdict)
 
     def _finish(
         self,
-        request: Request,
-        judged: Judged,
+        request: GatewayRequest,
+        judged: RequestDecision,
         address: int,
-        replies: Sequence[Reply],
+        replies: Sequence[GatewayReply],
         start_ns: int,
     ) -> None:
         """Tell the audit, count, and answer from *address*."""
@@ -323,16 +335,18 @@ class MailboxGateway:
         took_ns = monotonic_ns() - start_ns
         self._encoder.answer(request, judged.station, address, replies, took_ns)
 
-    def _target(self, destination: Destination) -> Target:
+    def _target(self, destination: Destination) -> RuleTarget:
         """Return the name of a destination in access rules."""
         match destination:
             case RemoteAddress(net_id, port):
-                return Target(net_id, port)
+                return RuleTarget(net_id, port)
             case SlaveAddress(station):
-                return Target(self.settings.net_id, station)
+                return RuleTarget(self.settings.net_id, station)
         return self._master
 
-    async def _ask_slave(self, request: Request, key: SessionKey, *, is_step: bool) -> list[Reply]:
+    async def _ask_slave(
+        self, request: GatewayRequest, key: SessionKey, *, is_step: bool
+    ) -> list[GatewayReply]:
         kind, body, station = key.kind, request.body, key.address
         slave = await self._find(station)
         if isinstance(slave, Cause):
@@ -404,7 +418,7 @@ class MailboxGateway:
         for listener in self._listeners.of(message.station, monotonic_ns()):
             self._encoder.send(listener.send, listener.address, MailboxType.EOE, message.data)
 
-    async def _serve_dialect(self, request: Request, kind: MailboxType) -> None:
+    async def _serve_dialect(self, request: GatewayRequest, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()
         destination = self._addresses.resolve(address, ())
         if isinstance(

@@ -122,14 +122,14 @@ def gateway_row(owner: PortName, gateway: MailboxGateway, served: list[str]) -> 
                 requests=counts.requests,
                 repeated=counts.repeated,
                 errors=counts.errors,
-                waiting=gateway.ledger.waiting(way),
+                waiting=gateway.tracker.waiting(way),
                 transfers=[
                     words.TransferRow(key.address, key.kind.name)
                     for key in transfers
                     if key.way == way
                 ],
             )
-            for way, counts in gateway.ledger.table().items()
+            for way, counts in gateway.tracker.table().items()
         ],
         slaves=msgspec.convert(gateway.statistics.report(), list[words.MailboxFigures]),
     )

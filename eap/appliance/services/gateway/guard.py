@@ -16,7 +16,7 @@ from eap.aoe.ads_operation import Operation, Read
 from eap.aoe.judged import AuditedOperation, AuditEntry
 from eap.aoe.spec import AccessService
 from eap.aoe.way import Way
-from eap.appliance.services.gateway.client_session import Reply
+from eap.appliance.services.gateway.client_session import GatewayReply
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.codec.coe import CoeHeader, CoeService
@@ -37,14 +37,14 @@ _SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
 _SOE_ERROR = 0x10
 
 
-class Target(NamedTuple):
+class RuleTarget(NamedTuple):
     """Whom rules name: a NetID and an AMS port, which is 0xFFFF for a master."""
 
     net_id: NetId
     port: int
 
 
-class Judged(msgspec.Struct, frozen=True):
+class RequestDecision(msgspec.Struct, frozen=True):
     """What a request does, to whom, and whether it may.
 
     Attributes:
@@ -56,7 +56,7 @@ class Judged(msgspec.Struct, frozen=True):
     """
 
     station: int
-    target: Target
+    target: RuleTarget
     operation: Operation | None
     verdict: Verdict | None
 
@@ -83,14 +83,14 @@ class Guard:
         self.before_change: Callable[[AuditEntry], str] | None = None
         self._access = access
 
-    def may_read(self, way: Way, target: Target, operation: Operation) -> bool:
+    def may_read(self, way: Way, target: RuleTarget, operation: Operation) -> bool:
         """Say whether an operation is a read, of somebody of whom a client may read everything."""
         if not isinstance(operation, Read):
             return False
         return self._access().grants(way, NOBODY, *target).may_read
 
     def judge(
-        self, way: Way, target: Target, operation: Operation, *, by_rule: bool = False
+        self, way: Way, target: RuleTarget, operation: Operation, *, by_rule: bool = False
     ) -> Verdict:
         """Decide on an operation; *by_rule*: a change only if a rule says so."""
         verdict = self._access().grants(way, NOBODY, *target).judge(operation)
@@ -100,7 +100,7 @@ class Guard:
         return self._record_first(way, target, operation, verdict)
 
     def _record_first(
-        self, way: Way, target: Target, operation: Operation, verdict: Verdict
+        self, way: Way, target: RuleTarget, operation: Operation, verdict: Verdict
     ) -> Verdict:
         """Return the verdict on a change when it has been recorded, where that is required."""
         change = AuditedOperation(operation, verdict, None)
@@ -113,7 +113,12 @@ class Guard:
         return verdict._replace(is_allowed=False, is_recordable=False, why=why)
 
     def tell(
-        self, way: Way, target: Target, operation: Operation, verdict: Verdict, result: int | None
+        self,
+        way: Way,
+        target: RuleTarget,
+        operation: Operation,
+        verdict: Verdict,
+        result: int | None,
     ) -> None:
         """Have the audit written of what was decided and how it came out.
 
@@ -132,7 +137,7 @@ class Guard:
                 write(_entry(way, target, audited))
 
 
-def _entry(way: Way, target: Target, audited: AuditedOperation) -> AuditEntry:
+def _entry(way: Way, target: RuleTarget, audited: AuditedOperation) -> AuditEntry:
     return AuditEntry(way, AmsHeader(*target, NOBODY, 0, 0), "", (audited,))
 
 
@@ -142,7 +147,7 @@ def reason_of_refusal(verdict: Verdict | None) -> Cause:
     return Cause.DENIED if is_recordable else Cause.NOT_RECORDED
 
 
-def result_of(replies: Sequence[Reply]) -> int | None:
+def result_of(replies: Sequence[GatewayReply]) -> int | None:
     """Return what an audit says of the answers to a request, as an error of ADS."""
     if not replies:
         return None

@@ -9,7 +9,7 @@ from devicebus.mailbox.coe_server import CoeServer
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.access import place_of
 from eap.aoe.ads_operation import Operation
-from eap.appliance.services.gateway.client_session import Reply, refusals
+from eap.appliance.services.gateway.client_session import GatewayReply, refusals
 from eap.codec.mailbox import MailboxError, MailboxType
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import mailbox_error, refuse
@@ -42,7 +42,7 @@ class MasterSession:
         self._is_fresh = is_fresh
         self._server = CoeServer(dictionary, _op, MailboxSizes.of_data(room))
 
-    async def ask(self, kind: MailboxType, body: bytes) -> list[Reply]:
+    async def ask(self, kind: MailboxType, body: bytes) -> list[GatewayReply]:
         """Return the answers to a request."""
         if kind is not MailboxType.COE:
             return refusals(kind, body, Cause.NO_PROTOCOL)
@@ -53,15 +53,15 @@ class MasterSession:
         """Say whether the answer to a request by CoE, which does *operation*, need not wait."""
         return self._is_fresh(_index_of(operation))
 
-    def ask_now(self, body: bytes) -> list[Reply]:
+    def ask_now(self, body: bytes) -> list[GatewayReply]:
         """Return the answers to a request by CoE that is ready."""
         try:
             answers = self._server.receive_message(body, 0)
         except MailboxRefusedError as exc:
             if exc.detail == MailboxError.SIZE_TOO_SHORT:
-                return [Reply(*refuse(MailboxType.COE, body, Cause.TOO_SHORT))]
-            return [Reply(*mailbox_error(exc.detail))]
-        return [Reply(MailboxType.COE, answer) for answer in answers]
+                return [GatewayReply(*refuse(MailboxType.COE, body, Cause.TOO_SHORT))]
+            return [GatewayReply(*mailbox_error(exc.detail))]
+        return [GatewayReply(MailboxType.COE, answer) for answer in answers]
 
     async def read(self, index: int, subindex: int, *, complete: bool) -> bytes:
         """Return an entry or an object as it is now; raise SdoAbortError."""

@@ -19,8 +19,8 @@ from eap.codec.eoe import EoeType
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import SoeHeader, SoeOpcode, encode_fragments
 from eap.gateway.error_table import Cause
-from eap.gateway.ledger import MemoryShare
 from eap.gateway.refusal import GatewayError
+from eap.gateway.request_tracker import MemoryShare
 
 _INCOMPLETE = 0x08
 MAX_WRITTEN = 0x10004

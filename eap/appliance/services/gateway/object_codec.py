@@ -33,8 +33,8 @@ from eap.codec.sdo import (
 from eap.codec.sdoinfo import InfoError, SdoInfoHeader, SdoInfoOpcode
 from eap.errors import TruncatedError
 from eap.gateway.error_table import Cause
-from eap.gateway.ledger import MemoryShare
 from eap.gateway.refusal import GatewayError
+from eap.gateway.request_tracker import MemoryShare
 from eap.od.abort import AbortCode, SdoAbortError
 
 _LAST = 0x01

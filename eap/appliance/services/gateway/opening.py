@@ -15,7 +15,7 @@ from eap.appliance.services.routing.station_router import StationRouter
 from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.remote_slave import RemoteSlave
 from eap.gateway.address import AddressMap, GroupAddress, RemoteAddress, SlaveAddress
-from eap.gateway.ledger import ClientLimits
+from eap.gateway.request_tracker import ClientLimits
 from eap.ids import NetId
 from eap.pd.spec import GatewayAddress, GatewaySpec
 

@@ -11,12 +11,12 @@ import msgspec
 from devicebus.mailbox.counter import next_counter
 from eap.aoe.access import host_of
 from eap.aoe.way import Way
-from eap.appliance.services.gateway.client_session import Reply, refusals
+from eap.appliance.services.gateway.client_session import GatewayReply, refusals
 from eap.appliance.services.log_limits import caused_by
 from eap.codec.mailbox import MailboxHeader, MailboxType, encode_frame, encode_plain_frame
 from eap.gateway import dialect
 from eap.gateway.error_table import Cause
-from eap.gateway.ledger import Ledger, Ticket
+from eap.gateway.request_tracker import RequestTracker, Ticket
 
 Send: TypeAlias = Callable[[bytes], None]
 """Sends a frame back to who sent a request, now or later."""
@@ -38,7 +38,7 @@ _LOGGED = frozenset(
 logger = logging.getLogger(__name__)
 
 
-class _Row:
+class _StatisticsRow:
     """One slave, or the master, in one protocol.
 
     Attributes:
@@ -87,7 +87,7 @@ class GatewayStatistics:
     """All rows of a gateway, by station address (0 is the master) and protocol."""
 
     def __init__(self) -> None:
-        self._rows: dict[tuple[int, MailboxType], _Row] = {}
+        self._rows: dict[tuple[int, MailboxType], _StatisticsRow] = {}
 
     def note(
         self, station: int, kind: MailboxType, reasons: Sequence[Cause | None], took_ns: int
@@ -97,7 +97,7 @@ class GatewayStatistics:
         if row is None:
             if len(self._rows) >= _MAX_ROWS:
                 return
-            row = self._rows[station, kind] = _Row()
+            row = self._rows[station, kind] = _StatisticsRow()
         row.note(reasons, took_ns)
 
     def report(self) -> list[dict[str, Any]]:
@@ -136,7 +136,7 @@ class RefusalLog:
         )  # fmt: skip
 
 
-class Request(msgspec.Struct, frozen=True):
+class GatewayRequest(msgspec.Struct, frozen=True):
     """A message of a client; *send* takes whole frames."""
 
     header: MailboxHeader
@@ -156,7 +156,7 @@ class ReplyEncoder:
     """Answers the requests of one gateway.
 
     Args:
-        ledger: Counts errors of clients.
+        tracker: Counts errors of clients.
         name: Of the bus port, for log lines.
         is_silent: Whether errors of the gateway itself are kept back.
 
@@ -164,15 +164,20 @@ class ReplyEncoder:
         statistics: Requests and answers by slave and protocol.
     """
 
-    def __init__(self, ledger: Ledger, name: str, *, is_silent: bool) -> None:
+    def __init__(self, tracker: RequestTracker, name: str, *, is_silent: bool) -> None:
         self.statistics = GatewayStatistics()
-        self._ledger = ledger
+        self._tracker = tracker
         self._log = RefusalLog(name)
         self._is_silent = is_silent
         self._counter = 0
 
     def answer(
-        self, request: Request, station: int, address: int, replies: Sequence[Reply], took_ns: int
+        self,
+        request: GatewayRequest,
+        station: int,
+        address: int,
+        replies: Sequence[GatewayReply],
+        took_ns: int,
     ) -> None:
         """Answer a request from *address*; it is counted for *station*."""
         reasons = [each.reason for each in replies]
@@ -190,7 +195,7 @@ class ReplyEncoder:
 
     def answer_dialect(
         self,
-        request: Request,
+        request: GatewayRequest,
         kind: MailboxType,
         body: bytes,
         reason: Cause | None,
@@ -204,7 +209,7 @@ class ReplyEncoder:
         if not (self._is_silent and reason is not None):
             request.send(encode_frame(dialect.encode_header(kind, address), body))
 
-    def refuse(self, request: Request, reason: Cause) -> None:
+    def refuse(self, request: GatewayRequest, reason: Cause) -> None:
         """Answer with an error."""
         address, kind = request.header.address, request.header.type
         self.answer(request, address, address, refusals(kind, request.body, reason), 0)
@@ -215,12 +220,12 @@ class ReplyEncoder:
         send(encode_plain_frame(kind, address, self._counter, body))
 
     def _note_repeated(self, way: Way) -> None:
-        counts = self._ledger.counts_of(way)
+        counts = self._tracker.counts_of(way)
         if counts is not None:
             counts.repeated += 1
 
     def _note_refusals(
-        self, request: Request, kind: MailboxType, reasons: Iterable[Cause | None]
+        self, request: GatewayRequest, kind: MailboxType, reasons: Iterable[Cause | None]
     ) -> None:
         """Count what the gateway answers itself, and log it."""
         for reason in reasons:
@@ -228,7 +233,7 @@ class ReplyEncoder:
                 break
         else:
             return
-        counts = self._ledger.counts_of(request.way)
+        counts = self._tracker.counts_of(request.way)
         if counts is not None:
             counts.errors += 1
         self._log.write(request.way, request.header.address, kind, reason)

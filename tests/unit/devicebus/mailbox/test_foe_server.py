@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devicebus.errors import FoeError, MailboxRefusedError
-from devicebus.mailbox.foe_server import FileReader, FoeServer, NotReadyError
+from devicebus.mailbox.foe_server import FileReader, FoeServer
 from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.codec.foe import FoeErrorCode
@@ -195,57 +195,3 @@ def test_every_request_is_refused_with_a_code_and_its_text(code, request_) -> No
     assert slave.ask(READ) == "03 00 01 00 00 00 61 62"
     slave.server.refuses = code
     assert slave.ask("04 00 01000000") == ""
-
-
-class SlowStore:
-    """A store, and the only file in it, each of whose steps needs a second try."""
-
-    def __init__(self) -> None:
-        self.content = b""
-        self.committed = b""
-        self._is_late = False
-
-    def _wait(self) -> None:
-        self._is_late = not self._is_late
-        if self._is_late:
-            raise NotReadyError
-
-    def open_read(self, name: str, password: int) -> SlowStore:
-        self._wait()
-        return self
-
-    def open_write(self, name: str, password: int) -> SlowStore:
-        self._wait()
-        return self
-
-    def read(self, size: int, /) -> bytes:
-        self._wait()
-        return b"abcdefg"[:size]
-
-    def write(self, data: bytes, /) -> None:
-        self._wait()
-        self.content += data
-
-    def commit(self) -> None:
-        self._wait()
-        self.committed = self.content
-
-    def close(self) -> None:
-        pass
-
-    discard = close
-
-
-def test_a_store_that_needs_time_is_asked_again() -> None:
-    store = SlowStore()
-    server = FoeServer(store, MailboxSizes(16, 16))
-
-    def ask(octets: str, busy: int) -> str:
-        answers = [server.receive_message(bytes.fromhex(octets), 0) for _ in range(busy + 1)]
-        assert answers[:-1] == [[bytes.fromhex("06 00 00006400")]] * busy
-        return answers[-1][0].hex(" ")
-
-    assert ask(WRITE, 1) == "04 00 00 00 00 00"
-    assert ask("03 00 01000000 61626364", 1) == "04 00 01 00 00 00"
-    assert ask("03 00 02000000 65", 2) == "04 00 02 00 00 00"  # to be taken, and to be complete
-    assert store.committed == b"abcde"

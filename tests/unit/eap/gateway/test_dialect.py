@@ -11,7 +11,7 @@ from eap.codec.soe import Element
 from eap.errors import CodecError, MalformedError
 from eap.gateway import dialect
 from eap.gateway.dialect import (
-    Failure,
+    DialectFailure,
     ReadFile,
     ReadIdn,
     ReadSdo,
@@ -136,16 +136,16 @@ def test_what_is_done(request_, task, data, answer) -> None:
 @pytest.mark.parametrize(
     ("kind", "octets", "failure", "answer"),
     [
-        (COE, "0020 40 1810 01", Failure.MISSING, "0020 80 1810 01 00000206"),
-        (COE, "0020 40", Failure.COMMAND, "0020 80 0000 00 01000405"),
-        (COE, "0020 40 1810 01", Failure.NO_RESPONSE, "0020 80 1810 01 00000008"),
-        (SOE, "01 05 2000", Failure.MISSING, "12 05 2000 0910"),
-        (SOE, "02 05 2000 01", Failure.SIZE, "14 05 2000 0230"),
-        (SOE, "", Failure.COMMAND, "12 000000 0110"),
-        (FOE, "01 00000000 66", Failure.MISSING, "05 00000000 02800000"),
-        (FOE, "01 00000000", Failure.FILE_NAME, "05 00000000 03800000"),
-        (VOE, "64110000 0100 01", Failure.NO_RESPONSE, "64110000 0100 03000000"),
-        (VOE, "64", Failure.COMMAND, "640000000000 02000000"),
+        (COE, "0020 40 1810 01", DialectFailure.MISSING, "0020 80 1810 01 00000206"),
+        (COE, "0020 40", DialectFailure.COMMAND, "0020 80 0000 00 01000405"),
+        (COE, "0020 40 1810 01", DialectFailure.NO_RESPONSE, "0020 80 1810 01 00000008"),
+        (SOE, "01 05 2000", DialectFailure.MISSING, "12 05 2000 0910"),
+        (SOE, "02 05 2000 01", DialectFailure.SIZE, "14 05 2000 0230"),
+        (SOE, "", DialectFailure.COMMAND, "12 000000 0110"),
+        (FOE, "01 00000000 66", DialectFailure.MISSING, "05 00000000 02800000"),
+        (FOE, "01 00000000", DialectFailure.FILE_NAME, "05 00000000 03800000"),
+        (VOE, "64110000 0100 01", DialectFailure.NO_RESPONSE, "64110000 0100 03000000"),
+        (VOE, "64", DialectFailure.COMMAND, "640000000000 02000000"),
     ],
 )
 def test_what_is_not_done(kind, octets, failure, answer) -> None:
@@ -155,6 +155,6 @@ def test_what_is_not_done(kind, octets, failure, answer) -> None:
 
 def test_a_slaves_own_code_goes_through() -> None:
     body = dialect.encode_failure(
-        COE, bytes.fromhex("0020 40 1810 09"), Failure.GENERAL, code=0x06090011
+        COE, bytes.fromhex("0020 40 1810 09"), DialectFailure.GENERAL, code=0x06090011
     )
     assert body == bytes.fromhex("0020 80 1810 09 11000906")

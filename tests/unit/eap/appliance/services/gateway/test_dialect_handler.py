@@ -27,7 +27,7 @@ from eap.appliance.services.gateway.dialect_handler import (
     DialectTarget,
     operation_of,
 )
-from eap.appliance.services.gateway.guard import Guard, Target
+from eap.appliance.services.gateway.guard import Guard, RuleTarget
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.slaves.access import SlaveAccess
 from eap.appliance.services.slaves.remote_slave import LONGEST_ANSWER
@@ -35,7 +35,7 @@ from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.codec.soe import Element
 from eap.gateway.dialect import (
-    Failure,
+    DialectFailure,
     ReadFile,
     ReadIdn,
     ReadSdo,
@@ -57,7 +57,7 @@ HEAD = 10
 """Octets in front of the data of an answer."""
 UPLOAD = ReadSdo(0x1018, 1, complete=False)
 MESSAGE = bytes.fromhex("5a0e0000 0100")
-BUS = Target(NetId(bytes(6)), 1001)
+BUS = RuleTarget(NetId(bytes(6)), 1001)
 HERE = Way("udp:eap0", "127.0.0.1:1")
 
 
@@ -123,20 +123,20 @@ class Failing:
 @pytest.mark.parametrize(
     ("error", "expected", "code", "cause"),
     [
-        (SdoAbortError(0x06090011, 0x1018, 9), Failure.GENERAL, 0x06090011, Cause.SERVICE),
-        (SoeError("x", code=0x1001), Failure.MISSING, None, Cause.SERVICE),
-        (SoeError("x", code=0x7004), Failure.READ_ONLY, None, Cause.SERVICE),
-        (SoeError("x", code=0x9999), Failure.GENERAL, None, Cause.SERVICE),
-        (FoeError("x", code=0x8001), Failure.MISSING, None, Cause.SERVICE),
-        (FoeError("x", code=0x8003), Failure.GENERAL, None, Cause.SERVICE),
-        (MailboxTimeoutError("x"), Failure.NO_RESPONSE, None, Cause.TIMEOUT),
-        (MailboxSizeError("x"), Failure.SIZE, None, Cause.TOO_LONG),
-        (MailboxRefusedError("x", detail=2), Failure.NOT_SUPPORTED, None, Cause.SERVICE),
-        (None, Failure.NO_RESPONSE, None, Cause.TIMEOUT),
+        (SdoAbortError(0x06090011, 0x1018, 9), DialectFailure.GENERAL, 0x06090011, Cause.SERVICE),
+        (SoeError("x", code=0x1001), DialectFailure.MISSING, None, Cause.SERVICE),
+        (SoeError("x", code=0x7004), DialectFailure.READ_ONLY, None, Cause.SERVICE),
+        (SoeError("x", code=0x9999), DialectFailure.GENERAL, None, Cause.SERVICE),
+        (FoeError("x", code=0x8001), DialectFailure.MISSING, None, Cause.SERVICE),
+        (FoeError("x", code=0x8003), DialectFailure.GENERAL, None, Cause.SERVICE),
+        (MailboxTimeoutError("x"), DialectFailure.NO_RESPONSE, None, Cause.TIMEOUT),
+        (MailboxSizeError("x"), DialectFailure.SIZE, None, Cause.TOO_LONG),
+        (MailboxRefusedError("x", detail=2), DialectFailure.NOT_SUPPORTED, None, Cause.SERVICE),
+        (None, DialectFailure.NO_RESPONSE, None, Cause.TIMEOUT),
     ],
 )
 def test_dialect_failure_of_an_error(
-    error: Exception | None, expected: Failure, code: int | None, cause: Cause
+    error: Exception | None, expected: DialectFailure, code: int | None, cause: Cause
 ) -> None:
     found = failure(UPLOAD, Failing(error), answer_s=0.01)
     assert (found.failure, found.code, found.cause) == (expected, code, cause)
@@ -145,16 +145,22 @@ def test_dialect_failure_of_an_error(
 @pytest.mark.parametrize(
     ("task", "result", "expected", "code", "cause"),
     [
-        (UPLOAD, AdsError.NOT_FOUND, Failure.GENERAL, 0x06020000, Cause.SERVICE),
-        (UPLOAD, AdsError.HOST_UNREACHABLE, Failure.GENERAL, None, Cause.UNREACHABLE),
-        (UPLOAD, AdsError.TARGET_PORT, Failure.MISSING, None, Cause.NO_SLAVE),
-        (ReadIdn(1, 0, Element.VALUE), AdsError.ACCESS, Failure.READ_ONLY, None, Cause.SERVICE),
-        (TalkVoe(MESSAGE), 0x7FF, Failure.GENERAL, None, Cause.SERVICE),
-        (ReadFile(""), 0, Failure.FILE_NAME, None, Cause.SERVICE),
+        (UPLOAD, AdsError.NOT_FOUND, DialectFailure.GENERAL, 0x06020000, Cause.SERVICE),
+        (UPLOAD, AdsError.HOST_UNREACHABLE, DialectFailure.GENERAL, None, Cause.UNREACHABLE),
+        (UPLOAD, AdsError.TARGET_PORT, DialectFailure.MISSING, None, Cause.NO_SLAVE),
+        (
+            ReadIdn(1, 0, Element.VALUE),
+            AdsError.ACCESS,
+            DialectFailure.READ_ONLY,
+            None,
+            Cause.SERVICE,
+        ),
+        (TalkVoe(MESSAGE), 0x7FF, DialectFailure.GENERAL, None, Cause.SERVICE),
+        (ReadFile(""), 0, DialectFailure.FILE_NAME, None, Cause.SERVICE),
     ],
 )
 def test_dialect_failure_of_a_remote_slave(
-    task: Task, result: int, expected: Failure, code: int | None, cause: Cause
+    task: Task, result: int, expected: DialectFailure, code: int | None, cause: Cause
 ) -> None:
     error = failure(task, Station(result=result).link())
     assert (error.failure, error.code, error.cause) == (expected, code, cause)
@@ -163,7 +169,7 @@ def test_dialect_failure_of_a_remote_slave(
 def test_dialect_station_that_does_not_answer() -> None:
     station = Station()
     station.hangs = True
-    assert failure(UPLOAD, station.link(), answer_s=0.05).failure is Failure.NO_RESPONSE
+    assert failure(UPLOAD, station.link(), answer_s=0.05).failure is DialectFailure.NO_RESPONSE
 
 
 def test_dialect_answer_has_to_fit_one_packet() -> None:
@@ -174,9 +180,15 @@ def test_dialect_answer_has_to_fit_one_packet() -> None:
 
 @pytest.mark.parametrize(
     ("name", "room", "expected"),
-    [("a.bin", 10, None), ("a.bin", 9, Failure.GENERAL), ("none.bin", 100, Failure.MISSING)],
+    [
+        ("a.bin", 10, None),
+        ("a.bin", 9, DialectFailure.GENERAL),
+        ("none.bin", 100, DialectFailure.MISSING),
+    ],
 )
-def test_dialect_file_of_a_remote_slave(name: str, room: int, expected: Failure | None) -> None:
+def test_dialect_file_of_a_remote_slave(
+    name: str, room: int, expected: DialectFailure | None
+) -> None:
     async def scene(client: busads.Client, engine: object) -> None:
         task = handler(room)._perform(ReadFile(name), Bus(client).link())
         if expected is None:
@@ -202,7 +214,7 @@ def test_dialect_file_of_a_slave_of_this_bus(size: int, room: int) -> None:
     else:
         error = failure(ReadFile("f"), slave(), room)
         assert f"more than {room} octets do not fit one packet" in str(error)
-    assert failure(ReadFile("none"), slave(), room).failure is Failure.MISSING
+    assert failure(ReadFile("none"), slave(), room).failure is DialectFailure.MISSING
 
 
 async def up_to_date(index: int) -> None:
@@ -219,10 +231,10 @@ def test_dialect_tasks_of_the_master() -> None:
     assert perform(WriteSdo(0x2000, 0, bytes(4)), one) == b""
     assert perform(ReadSdo(0x2000, 0, complete=False), one) == bytes(4)
     error = failure(ReadSdo(0x3000, 0, complete=False), one)
-    assert (error.failure, error.code) == (Failure.GENERAL, 0x06020000)
+    assert (error.failure, error.code) == (DialectFailure.GENERAL, 0x06020000)
     error = failure(ReadIdn(32, 0, Element.VALUE), one)
     assert "only a CoE dictionary" in str(error)
-    assert error.failure is Failure.NOT_SUPPORTED
+    assert error.failure is DialectFailure.NOT_SUPPORTED
 
 
 def test_dialect_request_that_is_refused_reaches_nothing() -> None:

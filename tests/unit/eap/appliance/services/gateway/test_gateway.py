@@ -291,7 +291,7 @@ def test_errors_are_counted_for_their_client() -> None:
     async def scene(desk: Desk) -> None:
         await desk.ask(COE, 1009, VENDOR)
         await desk.one(COE, 1001, VENDOR)
-        counts = desk.gateway.ledger.counts_of(HERE)
+        counts = desk.gateway.tracker.counts_of(HERE)
         assert (counts.requests, counts.errors) == (2, 1)
 
     play(scene)

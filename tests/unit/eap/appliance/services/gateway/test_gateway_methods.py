@@ -17,7 +17,7 @@ from eap.appliance.services.gateway.gateway_methods import GatewayMethods
 from eap.appliance.services.gateway.reply_encoder import GatewayStatistics
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
-from eap.gateway.ledger import Ledger
+from eap.gateway.request_tracker import RequestTracker
 from eap.ids import NetId
 from tests.support.cyclic import station
 
@@ -31,7 +31,7 @@ class Gateway:
         self.is_open = True
         self.turned_away = 0
         self.settings = Settings(NetId.parse("5.1.1.1.3.1"))
-        self.ledger = Ledger()
+        self.tracker = RequestTracker()
         self.statistics = GatewayStatistics()
 
     def start(self) -> None:
@@ -76,7 +76,7 @@ def ask(gateways):
 
 
 def test_what_is_told_of_a_gateway(ask, gateways) -> None:
-    gateways[FIRST].ledger.admit(HERE, b"request", 0)
+    gateways[FIRST].tracker.admit(HERE, b"request", 0)
     gateways[FIRST].statistics.note(1001, MailboxType.COE, [None], 2000)
     first, second = ask("status", station="left")
     assert first["served"] == ["udp://127.0.9.1:34980", "ethernet://eth0"]

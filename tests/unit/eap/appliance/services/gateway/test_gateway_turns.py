@@ -13,7 +13,7 @@ from eap.codec.mailbox import (
     encode_frame,
     encode_plain_frame,
 )
-from eap.gateway.ledger import ClientLimits
+from eap.gateway.request_tracker import ClientLimits
 from tests.unit.eap.appliance.services.gateway.test_gateway import (
     ALSO_HERE,
     COE,
@@ -49,7 +49,7 @@ def test_a_repeated_step_of_a_transfer_is_answered_and_counted() -> None:
         packet = "03 00 01000000" + "61" * 1012
         first = await desk.one(FOE, 1001, packet)
         assert await desk.one(FOE, 1001, packet) == first
-        counts = desk.gateway.ledger.counts_of(HERE)
+        counts = desk.gateway.tracker.counts_of(HERE)
         assert (counts.requests, counts.repeated) == (3, 1)
         await desk.one(FOE, 1001, "03 00 02000000")
 
@@ -149,7 +149,7 @@ def test_who_is_stopped_lets_go_of_everything() -> None:
         await desk.gateway.stop()
         assert not desk.gateway.is_open
         assert not desk.gateway.transfers()
-        assert not desk.gateway.ledger.table()
+        assert not desk.gateway.tracker.table()
         desk.gateway.start()
         assert desk.gateway.is_open
         assert (await desk.one(FOE, 1001, "01 00 00000000" + FILE)).startswith("03")
@@ -197,6 +197,6 @@ def test_the_same_octets_right_behind_the_answer_are_a_new_request(address: int)
         desk.gateway.receive(frame, HERE, ask_again)
         await desk.gateway.wait_below(HERE, 1)
         assert len(answers) == 6
-        assert desk.gateway.ledger.waiting(HERE) == 0
+        assert desk.gateway.tracker.waiting(HERE) == 0
 
     play(scene)

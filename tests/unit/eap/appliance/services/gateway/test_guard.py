@@ -9,15 +9,15 @@ from eap.aoe.ads_operation import Read, Write
 from eap.aoe.judged import AuditEntry
 from eap.aoe.spec import AccessRule, AccessService
 from eap.aoe.way import Way
-from eap.appliance.services.gateway.client_session import Reply
-from eap.appliance.services.gateway.guard import Guard, Target, reason_of_refusal, result_of
+from eap.appliance.services.gateway.client_session import GatewayReply
+from eap.appliance.services.gateway.guard import Guard, RuleTarget, reason_of_refusal, result_of
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.mailbox import MailboxType
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import refuse
 from eap.ids import NetId
 
-TARGET = Target(NetId.parse("5.1.1.1.3.1"), 1001)
+TARGET = RuleTarget(NetId.parse("5.1.1.1.3.1"), 1001)
 HERE, ELSEWHERE = Way("udp:eap0", "127.0.0.1:1"), Way("udp:eap0", "10.0.0.9:1")
 READ, WRITE = Read(IndexGroup.SDO, 0x1018_0001, 4), Write(IndexGroup.SDO, 0x6040_0000, b"1")
 
@@ -74,10 +74,10 @@ def test_guard_refuses_a_change_that_cannot_be_recorded() -> None:
     ],
 )
 def test_how_a_request_came_out(kind: MailboxType, body: str, result: int) -> None:
-    assert result_of([Reply(kind, bytes.fromhex(body))]) == result
+    assert result_of([GatewayReply(kind, bytes.fromhex(body))]) == result
 
 
 def test_how_a_request_came_out_that_the_gateway_answers() -> None:
     refusal = refuse(MailboxType.COE, bytes(10), Cause.TIMEOUT)
-    assert result_of([Reply(*refusal, reason=Cause.TIMEOUT)]) == AdsError.TIMEOUT
+    assert result_of([GatewayReply(*refusal, reason=Cause.TIMEOUT)]) == AdsError.TIMEOUT
     assert result_of([]) is None

@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 
 from eap.aoe.way import Way
-from eap.appliance.services.gateway.client_session import Reply, refusals
+from eap.appliance.services.gateway.client_session import GatewayReply, refusals
 from eap.appliance.services.gateway.reply_encoder import (
+    GatewayRequest,
     GatewayStatistics,
     RefusalLog,
     ReplyEncoder,
-    Request,
 )
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
 from eap.gateway.error_table import Cause
-from eap.gateway.ledger import Ledger
+from eap.gateway.request_tracker import RequestTracker
 
 HERE = Way("udp:eap0", "127.0.0.1:1")
 NEAR, THERE = Way("udp:eap0", "10.0.0.8:1"), Way("udp:eap0", "10.0.0.9:1")
@@ -28,18 +28,18 @@ def sent():
 
 @pytest.fixture
 def request_(sent):
-    return Request(MailboxHeader(0, 0x9000, type=COE), bytes(10), HERE, sent.append)
+    return GatewayRequest(MailboxHeader(0, 0x9000, type=COE), bytes(10), HERE, sent.append)
 
 
-def encoder(*, is_silent: bool = False) -> tuple[ReplyEncoder, Ledger]:
-    ledger = Ledger()
-    ledger.admit(HERE, b"request", 0)
-    return ReplyEncoder(ledger, "mill/bus0", is_silent=is_silent), ledger
+def encoder(*, is_silent: bool = False) -> tuple[ReplyEncoder, RequestTracker]:
+    tracker = RequestTracker()
+    tracker.admit(HERE, b"request", 0)
+    return ReplyEncoder(tracker, "mill/bus0", is_silent=is_silent), tracker
 
 
 def test_reply_encoder_counts_its_messages(request_, sent):
     gateway, _ = encoder()
-    replies = [Reply(COE, b"a"), Reply(COE, b"b"), Reply(COE, b"c")]
+    replies = [GatewayReply(COE, b"a"), GatewayReply(COE, b"b"), GatewayReply(COE, b"c")]
     gateway.answer(request_, 1001, 0x9000, replies, 1000)
     headers = [decode_frame(frame)[0] for frame in sent]
     assert [each.counter for each in headers] == [1, 2, 3]
@@ -50,15 +50,15 @@ def test_reply_encoder_counts_its_messages(request_, sent):
 
 @pytest.mark.parametrize("is_silent", [False, True])
 def test_errors_are_counted_whether_they_are_sent_or_not(request_, sent, is_silent):
-    gateway, ledger = encoder(is_silent=is_silent)
+    gateway, tracker = encoder(is_silent=is_silent)
     gateway.refuse(request_, Cause.CROWDED)
     gateway.answer(request_, 0, 0, refusals(COE, bytes(10), Cause.DENIED), 0)
     gateway.answer_dialect(request_, COE, b"no", Cause.DENIED, 0)
     assert len(sent) == (0 if is_silent else 3)
-    assert ledger.counts_of(HERE).errors == 3
+    assert tracker.counts_of(HERE).errors == 3
     gateway.answer_dialect(request_, COE, b"yes", None, 0)
     assert decode_frame(sent[-1])[1] == b"yes"
-    assert ledger.counts_of(HERE).errors == 3
+    assert tracker.counts_of(HERE).errors == 3
 
 
 def test_statistics_have_a_row_for_each_slave_and_protocol() -> None:

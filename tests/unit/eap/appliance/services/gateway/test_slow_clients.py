@@ -9,7 +9,7 @@ from eap.appliance.services.gateway.gateway import Settings
 from eap.codec.coe import CoeHeader
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import SEGMENT_MINIMUM, SdoHeader
-from eap.gateway.ledger import MemoryBudget, MemoryShare
+from eap.gateway.request_tracker import MemoryBudget, MemoryShare
 from tests.unit.eap.appliance.services.gateway.test_gateway import (
     ALSO_HERE,
     COE,

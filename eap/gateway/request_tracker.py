@@ -74,7 +74,7 @@ class MemoryShare:
         return True
 
 
-class Admission(Enum):
+class RequestAdmission(Enum):
     """What becomes of a request."""
 
     TAKEN = "taken"
@@ -101,7 +101,7 @@ class Counts:
         self.requests = self.repeated = self.errors = 0
 
 
-class _Client:
+class _TrackedClient:
     __slots__ = ("counts", "credit", "last_ns", "waiting")
 
     def __init__(self, credit: float, now_ns: int) -> None:
@@ -111,7 +111,7 @@ class _Client:
         self.last_ns = now_ns
 
 
-class Ledger:
+class RequestTracker:
     """All clients of a gateway.
 
     Args:
@@ -120,10 +120,10 @@ class Ledger:
 
     def __init__(self, limits: ClientLimits | None = None) -> None:
         self._limits = limits or ClientLimits()
-        self._clients: dict[Way, _Client] = {}
+        self._clients: dict[Way, _TrackedClient] = {}
         self._in_flight = 0
 
-    def admit(self, way: Way, frame: bytes, now_ns: int) -> Admission:
+    def admit(self, way: Way, frame: bytes, now_ns: int) -> RequestAdmission:
         """Decide on a request; one that is taken waits until :meth:`answered`.
 
         Args:
@@ -133,20 +133,20 @@ class Ledger:
         """
         client = self._client(way, now_ns)
         if client is None:
-            return Admission.CROWDED
+            return RequestAdmission.CROWDED
         if frame in client.waiting:
             client.counts.repeated += 1
-            return Admission.REPEATED
+            return RequestAdmission.REPEATED
         limits = self._limits
         is_full = len(client.waiting) >= limits.in_flight
         if is_full or self._in_flight >= limits.in_flight_in_all:
-            return Admission.CROWDED
+            return RequestAdmission.CROWDED
         if not self._pay(client, now_ns):
-            return Admission.TOO_FAST
+            return RequestAdmission.TOO_FAST
         client.waiting.add(frame)
         client.counts.requests += 1
         self._in_flight += 1
-        return Admission.TAKEN
+        return RequestAdmission.TAKEN
 
     def answered(self, way: Way, frame: bytes) -> None:
         """Note that a request waits no more, however it ended."""
@@ -175,12 +175,12 @@ class Ledger:
         """Return all clients that are known, the one that asked last at the end."""
         return {way: client.counts for way, client in self._clients.items()}
 
-    def _client(self, way: Way, now_ns: int) -> _Client | None:
+    def _client(self, way: Way, now_ns: int) -> _TrackedClient | None:
         client = self._clients.pop(way, None)
         if client is None:
             if len(self._clients) >= self._limits.clients and not self._make_room():
                 return None
-            client = _Client(self._limits.rate, now_ns)
+            client = _TrackedClient(self._limits.rate, now_ns)
         self._clients[way] = client  # at the end: who is at the front has been silent longest
         return client
 
@@ -191,7 +191,7 @@ class Ledger:
                 return True
         return False
 
-    def _pay(self, client: _Client, now_ns: int) -> bool:
+    def _pay(self, client: _TrackedClient, now_ns: int) -> bool:
         rate = self._limits.rate
         if not rate:
             return True
@@ -209,20 +209,20 @@ class Ticket:
     It has to be given back before the answer goes out: who has that may send the same octets anew.
 
     Args:
-        ledger: That took it.
+        tracker: That took it.
         way: Connection, or address, of the client.
         frame: All octets of the request.
     """
 
-    __slots__ = ("_frame", "_ledger", "_way")
+    __slots__ = ("_frame", "_tracker", "_way")
 
-    def __init__(self, ledger: Ledger, way: Way, frame: bytes) -> None:
-        self._ledger: Ledger | None = ledger
+    def __init__(self, tracker: RequestTracker, way: Way, frame: bytes) -> None:
+        self._tracker: RequestTracker | None = tracker
         self._way = way
         self._frame = frame
 
     def give_back(self) -> None:
         """The request waits no more; harmless the second time."""
-        ledger, self._ledger = self._ledger, None
-        if ledger is not None:
-            ledger.answered(self._way, self._frame)
+        tracker, self._tracker = self._tracker, None
+        if tracker is not None:
+            tracker.answered(self._way, self._frame)
