@@ -149,11 +149,11 @@ def play(
     async def run() -> Any:
         engine = FakeEngine(FakeBus(_line(name)))
         link = EngineLink(engine.services, look_s=look_s)
-        bus = BusClient(link, [PORT])
+        bus = BusClient(link, 0, PORT)
         told: list[tuple[Way, bytes]] = []
-        provider = MasterDictionaryProvider(bus, PORT, "1.2.3")
+        provider = MasterDictionaryProvider(bus, "1.2.3")
         service = BusService(
-            bus, PORT, BUS, "1.2.3", lambda way, packet: told.append((way, packet)), provider
+            bus, BUS, "1.2.3", lambda way, packet: told.append((way, packet)), provider
         )
         try:
             async with asyncio.timeout(20):

@@ -17,7 +17,7 @@ from eap.appliance.control import encode_request
 from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
 from eap.appliance.services.accepting import Listeners
-from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import open_buses
 from eap.appliance.services.bus.bus_methods import Buses
 from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.appliance.services.control_server import ControlServer
@@ -162,7 +162,7 @@ class Appliance:
         }
         link = EngineLink(engine.services)
         links = {port: SegmentLink(segment.services) for port, segment in segments.items()}
-        buses = Buses(tuple(self._specs.values()), BusClient(link, self._ports), links)
+        buses = Buses(tuple(self._specs.values()), open_buses(link, self._ports), links)
         meter = ProcessMeter()
         images = [each.image for each in self.images.values()]
 

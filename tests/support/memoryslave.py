@@ -14,9 +14,9 @@ from devicebus.mailbox.match import answers
 from devicebus.mailbox.protocol import MailboxSizes, ProtocolServer
 from eap.aoe.way import Way
 from eap.appliance.bus_request import SlaveDescription
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.appliance.services.gateway.client_session import SessionCodec
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
 from eap.codec.mailbox import MailboxType
 from eap.gateway.request_tracker import MemoryBudget, MemoryShare
@@ -27,7 +27,7 @@ CLIENT = Way("udp:eap0", "127.0.0.1:1")
 
 
 class MemoryMailbox:
-    """The bus of one slave; stands for BusMailboxes, and for its only MailboxTurn.
+    """The bus of one slave; stands for BusClient, and for its only MailboxTurn.
 
     Attributes:
         asked: Requests that the slave got.
@@ -78,7 +78,7 @@ def memory_slave(
         station=1001, name="s", vendor=1, product=2, revision=3, serial=4, alias=0, state=8,
         target=8, to_slave=sizes.to_slave, to_master=sizes.to_master, protocols=0x3F,
     )  # fmt: skip
-    return LocalSlave(cast("BusMailboxes", mailbox), slave, CLIENT), mailbox
+    return LocalSlave(cast("BusClient", mailbox), slave, CLIENT), mailbox
 
 
 def memory_share(octets: int = 1 << 20) -> MemoryShare:

@@ -32,7 +32,7 @@ from eap.appliance.runtime import ApplianceFolder
 from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.audit import Audit
 from eap.appliance.services.audit_file import AuditFile
-from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import BusClient, open_buses
 from eap.appliance.services.bus.bus_methods import Buses
 from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.appliance.services.control_server import ControlServer
@@ -113,8 +113,8 @@ class Services:
         self._resources.callback(link.close)
         devices = self._devices(images, link)
         self._startup.step("opening gateways and sockets")
-        client = BusClient(link, [bus.owner for bus in self._handover.buses])
-        providers, gateways = self._gateways(client, devices.routers)
+        clients = open_buses(link, [bus.owner for bus in self._handover.buses])
+        providers, gateways = self._gateways(clients, devices.routers)
         doors = open_doors(
             self._handover,
             devices.routers,
@@ -127,7 +127,7 @@ class Services:
         )
         brokers = self._brokers(devices.routers)
         audit = self._audit(devices.routers, gateways)
-        buses = self._buses(client, devices, providers)
+        buses = self._buses(clients, devices, providers)
         methods = self._methods(images, buses, devices, gateways, audit)
         server = ControlServer(methods, buses, audit.write_request, begin=audit.begin_request)
         async with asyncio.TaskGroup() as group:
@@ -181,14 +181,14 @@ class Services:
         return devices
 
     def _gateways(
-        self, client: BusClient, routers: Mapping[str, StationRouter]
+        self, clients: Mapping[PortName, BusClient], routers: Mapping[str, StationRouter]
     ) -> tuple[Mapping[PortName, MasterDictionaryProvider], Mapping[PortName, MailboxGateway]]:
         if not self._handover.buses:
             return {}, {}
         from eap.appliance.services.gateway.opening import open_dictionaries, open_gateways
 
-        providers = open_dictionaries(self._handover, client, RELEASE)
-        return providers, open_gateways(self._handover, client, providers, routers)
+        providers = open_dictionaries(self._handover, clients, RELEASE)
+        return providers, open_gateways(self._handover, clients, providers, routers)
 
     def _brokers(self, routers: Mapping[str, StationRouter]) -> Sequence[MqttDoor]:
         routing = self._handover.routing
@@ -278,7 +278,7 @@ class Services:
 
     def _buses(
         self,
-        client: BusClient,
+        clients: Mapping[PortName, BusClient],
         devices: Devices,
         providers: Mapping[PortName, MasterDictionaryProvider],
     ) -> Buses:
@@ -294,10 +294,14 @@ class Services:
             net_id = NetId.parse(handover.port(bus.owner).net_id)
             router = devices.routers[bus.owner.station]
             service = BusService(
-                client, bus.owner, net_id, RELEASE, router.send_notification, providers[bus.owner]
+                clients[bus.owner],
+                net_id,
+                RELEASE,
+                router.send_notification,
+                providers[bus.owner],
             )
             router.add_service(net_id, service)
-        return Buses(handover.stations, client if handover.buses else None, segments)
+        return Buses(handover.stations, clients, segments)
 
 
 def main(handover_fd: int, startup: Startup) -> int:

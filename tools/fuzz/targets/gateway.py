@@ -23,11 +23,11 @@ from eap.aoe.ads_request import take_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
 from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.bus_view import BusDescription
 from eap.appliance.services.slaves.remote_slave import RemoteSlave
 from eap.codec.mailbox import (
@@ -186,7 +186,7 @@ async def _serve(data: bytes) -> None:
     )
     link = RemoteSlave(_ask, _STATION, answer_s=1)
     gateway = MailboxGateway(
-        cast("BusMailboxes", _Link(dictionary)),
+        cast("BusClient", _Link(dictionary)),
         lambda: MasterSession(dictionary, _SETTINGS.room, _nothing, lambda index: bool(index & 1)),
         lambda: AccessList(_EVERYTHING),
         _SETTINGS,

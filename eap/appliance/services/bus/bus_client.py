@@ -1,4 +1,4 @@
-"""Client of the engine for buses: conversations, procedures and states, step by step.
+"""Client of the engine for one bus: conversations, procedures and states, step by step.
 
 Rule: the engine does single steps only.  Whole transfers, their order and their errors are handled
 here, so that the engine never waits for a file or for a client.
@@ -41,74 +41,77 @@ _S = 1_000_000_000
 
 
 class BusClient:
-    """All buses of the appliance, as services use them.
+    """One bus, as services use it.
 
     Args:
         link: To the engine.
-        ports: All bus ports in the order that numbers them.
+        number: Of the bus in requests, in the order of the handover.
+        port: Its port.
 
     Attributes:
-        views: Cached descriptions of all buses.
+        port: As given.
+        name: ``STATION/PORT``.
+        view: Its cached description.
     """
 
-    def __init__(self, link: EngineLink, ports: Sequence[PortName]) -> None:
-        self.ports = tuple(ports)
+    def __init__(self, link: EngineLink, number: int, port: PortName) -> None:
+        self.port = port
+        self.name = f"{port.station}/{port.port}"
+        self.view = BusView(link, number)
         self._link = link
-        self._numbers = {port: number for number, port in enumerate(ports)}
+        self._number = number
         self._queues = MailboxQueues()
-        self.views = {port: BusView(link, number) for port, number in self._numbers.items()}
 
-    def listen(self, port: PortName, notify: Callable[[UnsolicitedMessage], None]) -> None:
-        """Call *notify* with each message that a slave of a bus sends unasked."""
-        number = self._numbers[port]
+    def listen(self, notify: Callable[[UnsolicitedMessage], None]) -> None:
+        """Call *notify* with each message that a slave sends unasked."""
 
         def take(message: UnsolicitedMessage) -> None:
-            if message.bus == number:
+            if message.bus == self._number:
                 notify(message)
 
         self._link.on_unsolicited.append(take)
 
-    async def describe(self, port: PortName, timeout_s: float = DESCRIBE_S) -> BusReport:
-        """Return the report of a bus; raises EngineGoneError."""
-        bus = self._numbers[port]
-        reply = await self._link.request(lambda number: DescribeBus(id=number, bus=bus), timeout_s)
+    async def describe(self, timeout_s: float = DESCRIBE_S) -> BusReport:
+        """Return the report of the bus; raises EngineGoneError."""
+        reply = await self._link.request(
+            lambda number: DescribeBus(id=number, bus=self._number), timeout_s
+        )
         if reply.report is None:
-            raise BusError(f"{_name(port)}: the engine says nothing about it")
+            raise BusError(f"{self.name}: the engine says nothing about it")
         return reply.report
 
-    async def wait_up(self, port: PortName) -> BusReport:
-        """Return the report of a bus once it is up.
+    async def wait_up(self) -> BusReport:
+        """Return the report of the bus once it is up.
 
         Raises:
             BusError: it is not after PATIENCE_S, with the reason.
             EngineGoneError: there is no engine all the while.
         """
-        await self._be_up(port)
-        return await self.describe(port)
+        await self._be_up()
+        return await self.describe()
 
-    async def _be_up(self, port: PortName) -> None:
-        """Wait until a bus is up; raises as :meth:`wait_up` does."""
-        if self.views[port].latest.is_up:
+    async def _be_up(self) -> None:
+        """Wait until the bus is up; raises as :meth:`wait_up` does."""
+        if self.view.latest.is_up:
             return
         loop = asyncio.get_running_loop()
         end_s = loop.time() + PATIENCE_S
         while True:
             error: EapError
             try:
-                bus = await self.views[port].current()
+                bus = await self.view.current()
             except EngineGoneError as exc:
                 error = exc
             else:
                 if bus.is_up:
                     return
-                error = BusError(f"{_name(port)} is not up: {bus.fault or 'it begins'}")
+                error = BusError(f"{self.name} is not up: {bus.fault or 'it begins'}")
             if loop.time() >= end_s:
                 raise error
             await asyncio.sleep(_LOOK_S)
 
     async def open_turn(
         self,
-        port: PortName,
         station: int,
         kind: MailboxType,
         requester: Hashable,
@@ -120,8 +123,8 @@ class BusClient:
             MailboxBusyError: others had it all the time.
             BusError, EngineGoneError: as :meth:`wait_up` does.
         """
-        await self._be_up(port)
-        mailbox = port, station, kind
+        await self._be_up()
+        mailbox = station, kind
         try:
             async with asyncio.timeout(None if self._queues.is_free(mailbox) else turn_s):
                 await self._queues.take(mailbox, requester)
@@ -129,12 +132,12 @@ class BusClient:
             raise MailboxBusyError(
                 f"slave {station}: the {kind.name} transfers of other clients took {turn_s:g} s"
             ) from None
-        bus = self._numbers[port]
-        return MailboxTurn(self._link, bus, station, kind, lambda: self._queues.release(mailbox))
+        return MailboxTurn(
+            self._link, self._number, station, kind, lambda: self._queues.release(mailbox)
+        )
 
     async def converse(
         self,
-        port: PortName,
         station: int,
         conversation: Conversation[T],
         requester: Hashable,
@@ -153,7 +156,7 @@ class BusClient:
         async def exchange(request: MailboxRequest) -> MailboxMessage:
             nonlocal turn
             if turn is None:
-                turn = await self.open_turn(port, station, request.type, requester, turn_s)
+                turn = await self.open_turn(station, request.type, requester, turn_s)
             return await turn.exchange(request)
 
         try:
@@ -166,36 +169,34 @@ class BusClient:
             if turn is not None:
                 turn.close()
 
-    async def run(self, port: PortName, procedure: Procedure[T]) -> T:
+    async def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; return its result or raise what went wrong."""
-        await self._be_up(port)
+        await self._be_up()
 
         async def exchange(step: Step) -> StepResult:
             if isinstance(step, Sleep):
                 await asyncio.sleep(step.duration_ns / _S)
                 return StepResult((), monotonic_ns())
-            return StepResult(await self.transfer(port, step), monotonic_ns())
+            return StepResult(await self.transfer(step), monotonic_ns())
 
         return await drive_async(procedure, exchange)
 
-    async def transfer(
-        self, port: PortName, accesses: Sequence[DatagramRequest]
-    ) -> list[DatagramReply]:
+    async def transfer(self, accesses: Sequence[DatagramRequest]) -> list[DatagramReply]:
         """Send datagrams, none of them logical, and return the reply to each.
 
         Raises:
             FrameLostError: nothing came back.
             EngineGoneError: there is no engine.
         """
-        await self._be_up(port)
-        bus = self._numbers[port]
+        await self._be_up()
         datagrams = tuple(accesses)
         reply = await self._link.request(
-            lambda number: ExchangeDatagrams(id=number, bus=bus, datagrams=datagrams), TRANSFER_S
+            lambda number: ExchangeDatagrams(id=number, bus=self._number, datagrams=datagrams),
+            TRANSFER_S,
         )
         return list(reply.replies)
 
-    async def bring(self, port: PortName, station: int, target: AlState) -> None:
+    async def bring(self, station: int, target: AlState) -> None:
         """Bring a slave, or with station 0 all of them, to a state where they are kept then.
 
         Raises:
@@ -203,18 +204,19 @@ class BusClient:
             BusError: there is no such slave, or several refuse.
             EngineGoneError: there is no engine.
         """
-        await self._be_up(port)
-        bus = self._numbers[port]
+        await self._be_up()
         await self._link.request(
-            lambda number: BringSlaves(id=number, bus=bus, station=station, target=target),
+            lambda number: BringSlaves(id=number, bus=self._number, station=station, target=target),
             BRING_S,
         )
 
-    async def forget(self, port: PortName) -> None:
-        """Have the engine forget the faults of a bus that are over; raises EngineGoneError."""
-        bus = self._numbers[port]
-        await self._link.request(lambda number: ForgetFaults(id=number, bus=bus), DESCRIBE_S)
+    async def forget(self) -> None:
+        """Have the engine forget the faults that are over; raises EngineGoneError."""
+        await self._link.request(
+            lambda number: ForgetFaults(id=number, bus=self._number), DESCRIBE_S
+        )
 
 
-def _name(port: PortName) -> str:
-    return f"{port.station}/{port.port}"
+def open_buses(link: EngineLink, ports: Sequence[PortName]) -> dict[PortName, BusClient]:
+    """Return the clients of all buses; *ports* are in the order that numbers them."""
+    return {port: BusClient(link, number, port) for number, port in enumerate(ports)}

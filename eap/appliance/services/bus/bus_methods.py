@@ -33,42 +33,41 @@ class Buses:
 
     Args:
         stations: Those that run here.
-        client: Asks the engine; None if no station has a bus.
+        clients: One for each bus.
         segments: Take commands, one for each simulated bus.
     """
 
     def __init__(
         self,
         stations: Sequence[StationSpec],
-        client: BusClient | None,
+        clients: Mapping[PortName, BusClient],
         segments: Mapping[PortName, SegmentLink],
     ) -> None:
-        self._client = client
+        self._clients = clients
         self._stations = {station.name: station for station in stations}
         self._segments = segments
 
     async def reports(self, timeout_s: float) -> dict[PortName, BusReport]:
-        """Return how all buses are that the engine tells of in time."""
-        client, found = self._client, dict[PortName, BusReport]()
-        if client is None:
-            return found
-        ports = client.ports
+        """Return the reports of all buses that the engine describes in time."""
+        found: dict[PortName, BusReport] = {}
         answers = await asyncio.gather(
-            *(client.describe(port, timeout_s) for port in ports), return_exceptions=True
+            *(client.describe(timeout_s) for client in self._clients.values()),
+            return_exceptions=True,
         )
-        for port, answer in zip(ports, answers, strict=True):
+        for port, answer in zip(self._clients, answers, strict=True):
             if isinstance(answer, BusReport):
                 found[port] = answer
             elif not isinstance(answer, EapError):
                 raise answer
         return found
 
-    def find(self, wanted: BusParameters) -> tuple[BusClient, PortName]:
-        """Return the bus that is meant, and who asks it; raise ControlError that says which are."""
+    def find(self, wanted: BusParameters) -> BusClient:
+        """Return the bus that is meant; raise ControlError that names those there are."""
         station = of_station(wanted.station, self._stations)
         buses = [port.name for port in station.ports if port.kind is PortKind.BUS]
-        if wanted.port in buses and self._client is not None:
-            return self._client, PortName(station.name, wanted.port)
+        client = self._clients.get(PortName(station.name, wanted.port))
+        if client is not None:
+            return client
         known = f"its bus ports are {', '.join(buses)}" if buses else "it has no bus ports"
         if any(port.name == wanted.port for port in station.ports):
             raise _unknown(f"port {wanted.port} of station {station.name} is no bus; {known}")
@@ -136,20 +135,20 @@ class BusConnection:
 
     async def _describe(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control_bus.BusDescribeParameters)
-        client, port = self._buses.find(wanted)
-        report = await (client.wait_up(port) if wanted.wait else client.describe(port))
+        client = self._buses.find(wanted)
+        report = await (client.wait_up() if wanted.wait else client.describe())
         return dict(msgspec.to_builtins(report))
 
     async def _open(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control_bus.BusOpenParameters)
-        client, port = self._buses.find(wanted)
+        client = self._buses.find(wanted)
         if len(self._held) >= control_bus.MAX_CONVERSATIONS:
             reason = f"this connection has {control_bus.MAX_CONVERSATIONS} conversations open"
             raise ControlError(f"{reason}, which is the limit", code=ErrorCode.BUSY)
         kind = kind_of(wanted.protocol)
         try:
             async with asyncio.timeout(control_bus.TURN_S):
-                turn = await client.open_turn(port, wanted.slave, kind, id(self))
+                turn = await client.open_turn(wanted.slave, kind, id(self))
         except TimeoutError:
             reason = f"slave {wanted.slave}: others talk {kind.name} with it all the while"
             raise ControlError(reason, code=ErrorCode.BUSY) from None
@@ -177,21 +176,20 @@ class BusConnection:
 
     async def _transfer(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control_bus.BusTransferParameters)
-        client, port = self._buses.find(wanted)
+        client = self._buses.find(wanted)
         accesses = [to_access(row) for row in wanted.datagrams]
-        replies = await client.transfer(port, accesses)
+        replies = await client.transfer(accesses)
         return {"replies": [reply_row(reply) for reply in replies]}
 
     async def _bring(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control_bus.BusBringParameters)
-        client, port = self._buses.find(wanted)
-        await client.bring(port, wanted.slave, AlState[wanted.state])
+        client = self._buses.find(wanted)
+        await client.bring(wanted.slave, AlState[wanted.state])
         return {"state": wanted.state}
 
     async def _fault(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control_bus.BusFaultParameters)
-        _, port = self._buses.find(wanted)
-        segment = self._buses.segment(port)
+        segment = self._buses.segment(self._buses.find(wanted).port)
         _check_kind(wanted.command)
         try:
             await segment.command(wanted.command)
@@ -201,8 +199,8 @@ class BusConnection:
 
     async def _forget(self, params: dict[str, Any]) -> dict[str, Any]:
         wanted = parameters(params, control_bus.BusForgetParameters)
-        client, port = self._buses.find(wanted)
-        await client.forget(port)
+        client = self._buses.find(wanted)
+        await client.forget()
         return {"ok": True}
 
     def _of(self, number: int) -> _Held:

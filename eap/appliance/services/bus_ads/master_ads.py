@@ -30,11 +30,10 @@ from eap.aoe.ads_operation import (
 )
 from eap.aoe.ads_state import INIT, al_state_for, states_of
 from eap.aoe.way import Way
-from eap.appliance.handover import PortName
 from eap.appliance.services.ads.eap_ads import device_info
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.master.master_values import MasterDictionaryProvider
-from eap.appliance.services.slaves.bus_view import BusDescription
+from eap.appliance.services.slaves.bus_view import BusDescription, BusView
 from eap.appliance.services.tasks import TaskSet
 from eap.codec.ads import AdsError, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, to_filetime
@@ -66,15 +65,13 @@ class StateRequests:
     """Requests for AL states, which nobody waits for; the last one for a slave counts.
 
     Args:
-        client: Of all buses.
-        port: The bus.
+        bus: With these slaves.
     """
 
-    def __init__(self, client: BusClient, port: PortName) -> None:
-        self._client = client
-        self._port = port
+    def __init__(self, bus: BusClient) -> None:
+        self._bus = bus
         self._tasks: dict[int, asyncio.Task[None]] = {}
-        self._running = TaskSet(f"states of {port.station}/{port.port} by ADS")
+        self._running = TaskSet(f"states of {bus.name} by ADS")
 
     def request(self, station: int, state: int) -> None:
         """Bring a slave, or with station 0 all of them, to a state."""
@@ -86,11 +83,10 @@ class StateRequests:
 
     async def _bring(self, station: int, target: AlState) -> None:
         try:
-            await self._client.bring(self._port, station, target)
+            await self._bus.bring(station, target)
         except EapError as exc:
             slaves = f"slave {station}" if station else "all slaves"
-            name = f"{self._port.station}/{self._port.port}"
-            logger.warning("%s: %s to %s by ADS: %s", name, slaves, target.name, exc)
+            logger.warning("%s: %s to %s by ADS: %s", self._bus.name, slaves, target.name, exc)
 
     def _forget(self, station: int, task: asyncio.Task[None]) -> None:
         if self._tasks.get(station) is task:
@@ -101,13 +97,12 @@ class MasterStates:
     """States of the master and its slaves, for ``MasterSpace`` and ``AdsDevice``.
 
     Args:
-        client: Of all buses.
-        port: The bus.
+        view: Of the bus.
         requests: Takes requests for states.
     """
 
-    def __init__(self, client: BusClient, port: PortName, requests: StateRequests) -> None:
-        self._view = client.views[port]
+    def __init__(self, view: BusView, requests: StateRequests) -> None:
+        self._view = view
         self._requests = requests
 
     def state(self) -> int:
@@ -149,8 +144,7 @@ class MasterAds:
     """The master of a bus as an ADS device.
 
     Args:
-        client: Of all buses.
-        port: The bus.
+        bus: Of this master.
         net_id: Of the port.
         release: Of this software, such as ``0.1.0``.
         send: Sends a notification to a client.
@@ -160,23 +154,21 @@ class MasterAds:
 
     def __init__(
         self,
-        client: BusClient,
-        port: PortName,
+        bus: BusClient,
         net_id: NetId,
         release: str,
         send: Send,
         provider: MasterDictionaryProvider,
         requests: StateRequests,
     ) -> None:
-        self._client = client
-        self._port = port
-        self._view = client.views[port]
+        self._bus = bus
+        self._view = bus.view
         self._provider = provider
         self._watched: set[int] = set()
         """Indexes of objects for which there were ever notifications."""
-        states = MasterStates(client, port, requests)
+        states = MasterStates(bus.view, requests)
         self._device = AdsDevice(
-            device_info(f"{port.station}/{port.port}", release),
+            device_info(bus.name, release),
             states.states,
             [
                 MasterSpace(states),
@@ -206,8 +198,8 @@ class MasterAds:
 
     async def _send_commands(self, operation: ReadWrite) -> bytes:
         commands = RawCommands(operation.data)
-        check_up(self._port, await self._view.current())
-        replies = await self._client.transfer(self._port, commands.accesses())
+        check_up(self._bus.name, await self._view.current())
+        replies = await self._bus.transfer(commands.accesses())
         answer = commands.encode_answer(replies)
         if len(answer) > operation.length:
             raise AdsRefusedError(AdsError.SIZE)
@@ -310,10 +302,10 @@ class RawCommands:
         )
 
 
-def check_up(port: PortName, bus: BusDescription) -> None:
+def check_up(name: str, bus: BusDescription) -> None:
     """Raise AdsRefusedError if a bus is not up."""
     if not bus.is_up:
-        why = f"{port.station}/{port.port} is not up: {bus.fault or 'it begins'}"
+        why = f"{name} is not up: {bus.fault or 'it begins'}"
         raise AdsRefusedError(AdsError.HOST_UNREACHABLE, why)
 
 

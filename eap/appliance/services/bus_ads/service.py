@@ -23,14 +23,12 @@ from eap.aoe.ads_operation import (
 )
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
-from eap.appliance.handover import PortName
 from eap.appliance.services.ads.ads_requests import answer_request
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.master_ads import MasterAds, Send, StateRequests, check_up
 from eap.appliance.services.bus_ads.slave_ads import SlaveAds
 from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.appliance.services.routing.service import LocalRequest
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.codec.ads import AdsError
 from eap.codec.ams import DEVICE_PORT
 from eap.errors import EapError
@@ -51,8 +49,7 @@ class BusService:
     """The services of one bus port.
 
     Args:
-        client: Of all buses.
-        port: The bus.
+        bus: Behind the port.
         net_id: Of the port.
         release: Of this software, such as ``0.1.0``.
         send: Sends a notification to a client.
@@ -64,19 +61,18 @@ class BusService:
 
     def __init__(
         self,
-        client: BusClient,
-        port: PortName,
+        bus: BusClient,
         net_id: NetId,
         release: str,
         send: Send,
         provider: MasterDictionaryProvider,
     ) -> None:
         self.ports: Container[int] = range(1, DEVICE_PORT + 1)
-        self._port = port
-        self._view = client.views[port]
-        states = StateRequests(client, port)
-        self._master = MasterAds(client, port, net_id, release, send, provider, states)
-        self._slaves = SlaveAds(BusMailboxes(client, port), net_id, states)
+        self._name = bus.name
+        self._view = bus.view
+        states = StateRequests(bus)
+        self._master = MasterAds(bus, net_id, release, send, provider, states)
+        self._slaves = SlaveAds(bus, net_id, states)
 
     async def answer(self, request: LocalRequest) -> AmsAnswer:
         """Do what a request asks for."""
@@ -112,13 +108,13 @@ class BusService:
             slave = bus.slaves.get(ams_port)
         if slave is None:
             known = ", ".join(map(str, islice(bus.slaves, _MAX_NAMED))) or "none"
-            why = f"{self._port.station}/{self._port.port} has no slave {ams_port}"
+            why = f"{self._name} has no slave {ams_port}"
             raise AdsRefusedError(AdsError.TARGET_PORT, f"{why}; known are {known}")
         found = slave
 
         async def perform(operation: Operation) -> OperationOutcome:
             if not isinstance(operation, ReadState | ReadDeviceInfo):
-                check_up(self._port, bus)
+                check_up(self._name, bus)
             return await self._slaves.perform(found, client, operation)
 
         return perform

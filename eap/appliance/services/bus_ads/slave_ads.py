@@ -29,9 +29,9 @@ from eap.aoe.ads_operation import (
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.ads_state import DeviceDataSpace, al_state_for, states_of
 from eap.appliance.bus_request import SlaveDescription, no_mailbox
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus_ads.master_ads import StateRequests
 from eap.appliance.services.bus_ads.slave_files import SlaveFiles
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
 from eap.appliance.services.tasks import TaskSet
 from eap.codec.ads import AdsDeviceInfo, AdsError, IndexGroup, SdoPlace, SoePlace, device_name
@@ -79,12 +79,12 @@ class SlaveAds:
     """All slaves of a bus port.
 
     Args:
-        bus: Their mailboxes.
+        bus: With these slaves.
         net_id: Of the bus port.
         states: Takes requests for states.
     """
 
-    def __init__(self, bus: BusMailboxes, net_id: NetId, states: StateRequests) -> None:
+    def __init__(self, bus: BusClient, net_id: NetId, states: StateRequests) -> None:
         self._bus = bus
         self._states = states
         self._files = SlaveFiles()

@@ -24,6 +24,7 @@ from eap.aoe.ads_operation import Operation
 from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
 from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage, no_mailbox
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.client_session import (
     ClientSession,
     GatewayReply,
@@ -47,7 +48,6 @@ from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.gateway.message_codecs import codec_for
 from eap.appliance.services.gateway.reply_encoder import GatewayRequest, ReplyEncoder, Send
 from eap.appliance.services.slaves.access import SlaveAccess
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
 from eap.appliance.services.tasks import TaskSet
 from eap.codec.mailbox import MailboxHeader, MailboxType, decode_frame
@@ -109,7 +109,7 @@ class MailboxGateway:
     """A gateway.
 
     Args:
-        bus: The mailboxes of its slaves.
+        bus: With its slaves.
         open_master: Begins a session with the master's dictionary.
         access: Returns the access rules in force.
         settings: Its behaviour.
@@ -129,7 +129,7 @@ class MailboxGateway:
 
     def __init__(
         self,
-        bus: BusMailboxes,
+        bus: BusClient,
         open_master: Callable[[], MasterSession],
         access: Callable[[], AccessList],
         settings: Settings,

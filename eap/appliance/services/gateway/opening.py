@@ -12,7 +12,6 @@ from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.master.master_values import MasterDictionaryProvider
 from eap.appliance.services.routing.station_router import StationRouter
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.remote_slave import RemoteSlave
 from eap.gateway.address import AddressMap, GroupAddress, RemoteAddress, SlaveAddress
 from eap.gateway.request_tracker import ClientLimits
@@ -23,27 +22,27 @@ _MS = 1000
 
 
 def open_dictionaries(
-    handover: Handover, client: BusClient, release: str
+    handover: Handover, clients: Mapping[PortName, BusClient], release: str
 ) -> dict[PortName, MasterDictionaryProvider]:
     """Return the dictionary of the master behind each bus port.
 
     Args:
         handover: The buses.
-        client: Asks the engine for something on them.
+        clients: Of the buses.
         release: Of this software.
     """
     providers = {}
     for bus in handover.buses:
         told = _told(handover, bus.owner)
         providers[bus.owner] = MasterDictionaryProvider(
-            client, bus.owner, release, full=told.full, padded=told.padded
+            clients[bus.owner], release, full=told.full, padded=told.padded
         )
     return providers
 
 
 def open_gateways(
     handover: Handover,
-    client: BusClient,
+    clients: Mapping[PortName, BusClient],
     providers: Mapping[PortName, MasterDictionaryProvider],
     routers: Mapping[str, StationRouter],
 ) -> dict[PortName, MailboxGateway]:
@@ -51,7 +50,7 @@ def open_gateways(
 
     Args:
         handover: The stations and their buses.
-        client: Asks the engine for something on them.
+        clients: Of the buses.
         providers: Dictionaries of the masters, one for each bus.
         routers: Of the stations: they know the access rules, and the way to other buses.
     """
@@ -64,10 +63,10 @@ def open_gateways(
             answer_s=told.answer_ms / _MS,
             is_silent=told.silent,
             limits=ClientLimits(told.in_flight, told.rate, told.clients),
-            name=f"{bus.owner.station}/{bus.owner.port}",
+            name=clients[bus.owner].name,
         )
         gateway = MailboxGateway(
-            BusMailboxes(client, bus.owner),
+            clients[bus.owner],
             partial(
                 MasterSession,
                 provider.dictionary,

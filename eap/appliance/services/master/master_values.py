@@ -24,7 +24,6 @@ from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import DlStatus
 from devicebus.wire.sii import SiiProtocol
 from eap.appliance.bus_request import BusReport, SlaveDescription
-from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.master.master_registers import (
     LOOPS,
@@ -83,8 +82,7 @@ class MasterDictionaryProvider:
     """The dictionary of the master behind one bus port, and the values that it shows.
 
     Args:
-        client: Of all buses.
-        port: The bus.
+        bus: Of the master.
         release: Of this software.
         full: As the dictionary has it.
         padded: Likewise.
@@ -95,16 +93,15 @@ class MasterDictionaryProvider:
 
     def __init__(
         self,
-        client: BusClient,
-        port: PortName,
+        bus: BusClient,
         release: str,
         *,
         full: bool = False,
         padded: bool = False,
     ) -> None:
-        self._values = MasterView(client, port)
+        self._values = MasterView(bus)
         identity = DeviceIdentity(
-            device_name=f"EtherCAT master {port.station}/{port.port}",
+            device_name=f"EtherCAT master {bus.name}",
             hardware_version=os.uname().machine,
             software_version=release,
         )
@@ -176,14 +173,12 @@ class MasterView:
     """The master behind one bus port, as values of its dictionary.
 
     Args:
-        client: Of all buses.
-        port: The bus.
+        bus: Of the master.
     """
 
-    def __init__(self, client: BusClient, port: PortName) -> None:
-        self._client = client
-        self._port = port
-        self._view = client.views[port]
+    def __init__(self, bus: BusClient) -> None:
+        self._bus = bus
+        self._view = bus.view
         self._view.on_change.append(self._forget_facts)
         self._counters = AgedValue(self._read_counters, BusReport(is_up=False))
         self._registers = AgedValue(self._read_registers, dict[int, SlaveRegisters]())
@@ -199,7 +194,7 @@ class MasterView:
         self._base: dict[tuple[int, MasterLive], int] = {}
         """Counters at the last reset."""
         self._lock = asyncio.Lock()
-        self._tasks = TaskSet(f"dictionary of the master of {port.station}/{port.port}")
+        self._tasks = TaskSet(f"dictionary of the master of {bus.name}")
 
     async def refresh(self, index: int) -> None:
         """Bring what the object at *index* shows up to date; a bus that is down has no slaves."""
@@ -305,7 +300,7 @@ class MasterView:
             self._start(self._bring(station, AlState(target)))
         elif key is MasterLive.LINK_CONTROL:
             access = [fpwr(station, LOOPS, bytes((value,)))]
-            self._start(self._client.transfer(self._port, access))
+            self._start(self._bus.transfer(access))
             self._registers.expire()
         elif value:
             self._fixed.add(station)
@@ -342,14 +337,14 @@ class MasterView:
     async def _read_facts(self, slave: SlaveDescription) -> SlaveFacts:
         with suppress(EapError, TimeoutError):
             async with asyncio.timeout(FACTS_ANSWER_S):
-                return await self._client.converse(
-                    self._port, slave.station, _ask_facts(), requester="dictionary of the master"
+                return await self._bus.converse(
+                    slave.station, _ask_facts(), requester="dictionary of the master"
                 )
         return SlaveFacts()
 
     async def _read_counters(self) -> BusReport:
         try:
-            report = await self._client.describe(self._port)
+            report = await self._bus.describe()
         except EapError:
             report = BusReport(is_up=False)
         now_s, last = asyncio.get_running_loop().time(), self._rates
@@ -366,7 +361,7 @@ class MasterView:
         if not self.slaves:
             return {}
         try:
-            found = await self._client.run(self._port, read_registers(self.configured()))
+            found = await self._bus.run(read_registers(self.configured()))
         except EapError:
             return {}
         self._codes |= {at: each.al.code for at, each in found.items() if each.al.code}
@@ -374,14 +369,14 @@ class MasterView:
 
     async def _bring(self, station: int, target: AlState) -> None:
         try:
-            await self._client.bring(self._port, station, target)
+            await self._bus.bring(station, target)
         except AlStatusError as exc:
             self._codes[station] = exc.code
             raise
 
     async def _detect(self) -> None:
         try:
-            found = await self._client.run(self._port, detect_slaves())
+            found = await self._bus.run(detect_slaves())
         except BaseException:
             self._detection = self._detection._replace(status=_FAILED)
             raise
@@ -422,7 +417,7 @@ class MasterView:
         try:
             await work
         except EapError as exc:
-            logger.warning("%s/%s: %s", self._port.station, self._port.port, exc)
+            logger.warning("%s: %s", self._bus.name, exc)
 
 
 def configured_value(

@@ -10,8 +10,8 @@ from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_request import SlaveDescription, no_mailbox
+from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.slaves.access import UploadSink
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.file_stream import AHEAD, LocalFile
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
@@ -26,7 +26,7 @@ class LocalSlave:
     """A slave of an own bus, for one requester; a SlaveAccess.
 
     Args:
-        bus: The mailboxes of its bus.
+        bus: Its bus.
         slave: As the engine describes it.
         requester: Whose operations take turns with those of others.
         turn_s: Limit for the wait for a turn, which MailboxBusyError ends; None for no limit.
@@ -34,7 +34,7 @@ class LocalSlave:
 
     def __init__(
         self,
-        bus: BusMailboxes,
+        bus: BusClient,
         slave: SlaveDescription,
         requester: Hashable,
         *,

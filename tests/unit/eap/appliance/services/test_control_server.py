@@ -12,7 +12,7 @@ import pytest
 from eap.appliance.control import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.appliance.services import control_server
 from eap.appliance.services.accepting import Listeners
-from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import open_buses
 from eap.appliance.services.bus.bus_methods import Buses
 from eap.appliance.services.control_server import ControlConnection, ControlServer
 from eap.appliance.services.engine_link import EngineLink
@@ -389,7 +389,7 @@ def test_errors_of_a_bus_keep_kind_and_detail(methods):
         link = EngineLink(engine.services)
         port = PortSpec("bus0", PortKind.BUS, "sim://x.yaml", "1.1.1.1.3.1")
         station = StationSpec("left", "1.1.1.1.1.1", 10_000, (port,))
-        buses = Buses((station,), BusClient(link, [PORT]), {})
+        buses = Buses((station,), open_buses(link, [PORT]), {})
         where = {"station": "left", "port": "bus0"}
         async with Talk(ControlServer(methods, buses)) as client:
             answer = await client.ask("bus_open", **where, slave=1009, protocol="coe")

@@ -12,7 +12,7 @@ from eap.appliance.bus_request import Cancel, ExchangeMailbox
 from eap.appliance.control import ErrorCode
 from eap.appliance.control_bus import BUS_METHODS
 from eap.appliance.handover import PortName
-from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import open_buses
 from eap.appliance.services.bus.bus_methods import BusConnection, Buses
 from eap.appliance.services.bus.segment_link import SegmentLink
 from eap.appliance.services.engine_link import EngineLink
@@ -47,7 +47,7 @@ class Scene:
         self.segment = FakeSegment(line)
         self._link = EngineLink(self.engine.services, look_s=0.1)
         self._segment_link = SegmentLink(self.segment.services)
-        client = BusClient(self._link, [PORT, PortName("left", "bus1")])
+        client = open_buses(self._link, [PORT, PortName("left", "bus1")])
         self.buses = Buses(STATIONS, client, {PORT: self._segment_link})
 
     def connect(self):
@@ -253,7 +253,7 @@ def test_reports_of_those_that_answer():
 
 def test_appliance_without_buses():
     async def scene():
-        buses = Buses(STATIONS[1:], None, {})
+        buses = Buses(STATIONS[1:], {}, {})
         assert await buses.reports(1) == {}
         error = await refusal(BusConnection(buses), "bus_describe", station="right", port="bus0")
         assert "has no bus ports" in str(error)

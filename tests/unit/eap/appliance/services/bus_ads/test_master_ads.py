@@ -19,7 +19,6 @@ from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
 from eap.codec.ams import AmsCommand, decode_packet
 from tests.support.busads import BUS, DRIVE, MASTER, play, until
-from tests.support.fakeengine import PORT
 
 STATE = AddNotification(IndexGroup.SLAVE_STATES, DRIVE, 2, TransMode.SERVER_ON_CHANGE, 0, 0)
 CYCLIC = AddNotification(IndexGroup.SLAVE_STATES, DRIVE, 2, TransMode.SERVER_CYCLE, 0, 0)
@@ -28,7 +27,7 @@ WRITE = bytes.fromhex("0507 e903 2001 0200 0000 0800 0000")
 
 
 def states_of(client) -> MasterStates:
-    return MasterStates(client.bus, PORT, StateRequests(client.bus, PORT))
+    return MasterStates(client.bus.view, StateRequests(client.bus))
 
 
 def slave(station: int, state: int, fault: str = "") -> SlaveDescription:
@@ -46,7 +45,7 @@ def test_master_state_is_the_highest_of_its_slaves():
     async def scene(client, engine):
         states = states_of(client)
         assert states.state() == 1
-        view = client.bus.views[PORT]
+        view = client.bus.view
         view.latest = bus(slave(1001, 8), slave(1002, 4, "AL status"))
         assert states.state() == 8
         assert states.states() == AdsStates(AdsState.RUN, 8)

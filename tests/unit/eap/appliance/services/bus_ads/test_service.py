@@ -33,7 +33,6 @@ from eap.codec.adsnotification import AddNotification, TransMode
 from eap.codec.ams import AmsCommand
 from eap.codec.mailbox import MailboxType
 from tests.support.busads import DRIVE, MASTER, play, until
-from tests.support.fakeengine import PORT
 
 VENDOR = Read(IndexGroup.SDO, 0x1018_0001, 4)
 VENDOR_ID = b"\x5a\x0e\0\0"
@@ -255,7 +254,7 @@ def test_what_takes_too_long_is_answered_in_time(monkeypatch):
 
 def test_slaves_do_not_wait_for_each_other():
     async def scene(client, engine):
-        talk = await client.bus.open_turn(PORT, 1001, MailboxType.COE, "somebody else")
+        talk = await client.bus.open_turn(1001, MailboxType.COE, "somebody else")
         waiting = asyncio.ensure_future(client.do(1001, VENDOR))
         assert await client.good(SENSOR, VENDOR) == VENDOR_ID
         assert not waiting.done()

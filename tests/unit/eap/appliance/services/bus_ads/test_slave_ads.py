@@ -16,7 +16,6 @@ from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.codec.soe import Element, Idn
 from eap.ids import NetId
 from tests.support.busads import BUS, DRIVE, TOOL, play, until
-from tests.support.fakeengine import PORT
 
 TALKER, MUTE, OTHER_SLAVE = 1001, 1002, 1002
 SENSOR = 1003
@@ -339,12 +338,12 @@ def test_aoe_slave_that_forgot_its_address_gets_it_again():
     async def scene(client, engine):
         number = Read(IndexGroup.SDO, 0x8002_0000, 4)
         assert await client.good(TALKER, number) == b"\7\0\0\0"
-        report = await client.bus.describe(PORT)
+        report = await client.bus.describe()
         stranger = AmsHeader(OTHER, TALKER, OTHER, TALKER, AmsCommand.WRITE, length=18)
         told = AdsRange(IndexGroup.ADDRESS, 3, 6).encode() + bytes(OTHER)
         sizes = MailboxSizes(report.slaves[0].to_slave, report.slaves[0].to_master)
         renamed = aoe_client.exchange(stranger, told, sizes)
-        await client.bus.converse(PORT, TALKER, renamed, "somebody")
+        await client.bus.converse(TALKER, renamed, "somebody")
         assert await client.good(TALKER, number) == b"\7\0\0\0"
 
     play(scene, "aoe")

@@ -18,7 +18,6 @@ from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.gateway import MailboxGateway, Settings
 from eap.appliance.services.gateway.master_session import MasterSession
 from eap.appliance.services.slaves.access import SlaveAccess
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.remote_slave import LONGEST_ANSWER
 from eap.codec.ads import IndexGroup
 from eap.codec.ethercat import EtherCatHeader
@@ -74,7 +73,7 @@ class Desk:
         self._link = EngineLink(self.engine.services)
         turns = itertools.cycle((False, True))  # has to be waited for, and has not
         self.gateway = MailboxGateway(
-            BusMailboxes(BusClient(self._link, [PORT]), PORT),
+            BusClient(self._link, 0, PORT),
             lambda: MasterSession(MASTER, settings.room, nothing, lambda index: next(turns)),
             lambda: AccessList(rules),
             settings,

@@ -7,7 +7,7 @@ import asyncio
 from msgspec.structs import replace
 
 from eap.appliance.handover import BusSocket, Handover, PortName
-from eap.appliance.services.bus.bus_client import BusClient
+from eap.appliance.services.bus.bus_client import open_buses
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.opening import open_dictionaries, open_gateways
 from eap.od.model import OdState
@@ -39,9 +39,9 @@ def test_each_bus_has_one_as_the_plant_file_says() -> None:
             sockets=(), buses=tuple(BusSocket(owner=name) for name in NAMES),
         )  # fmt: skip
         try:
-            client = BusClient(link, NAMES)
-            providers = open_dictionaries(handover, client, "1.0")
-            gateways = open_gateways(handover, client, providers, {"left": router("5.1.1.1.1.1")})
+            clients = open_buses(link, NAMES)
+            providers = open_dictionaries(handover, clients, "1.0")
+            gateways = open_gateways(handover, clients, providers, {"left": router("5.1.1.1.1.1")})
             assert list(gateways) == NAMES
             first, second = gateways.values()
             assert (first.is_open, second.is_open) == (False, True)

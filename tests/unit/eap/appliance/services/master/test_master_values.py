@@ -19,7 +19,6 @@ from eap.appliance.bus_request import (
     ExchangeMailbox,
     SlaveDescription,
 )
-from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.gateway.master_session import MasterSession
@@ -55,7 +54,7 @@ def play(scene: Callable[[MasterView, FakeEngine], Awaitable[None]], bus: str = 
     async def run() -> None:
         engine = FakeEngine(FakeBus(LoopBus(bus)))
         link = EngineLink(engine.services)
-        view = MasterView(BusClient(link, [PORT]), PORT)
+        view = MasterView(BusClient(link, 0, PORT))
         try:
             await scene(view, engine)
         finally:
@@ -243,7 +242,7 @@ class ScriptedClient:
         self.asked = 0
         self.is_current = True
         self.on_change = []
-        self.views = {PORT: self}
+        self.view = self
         self.show(msgspec.structs.replace(slave, to_slave=slave.to_slave or 64))
 
     def show(self, slave: SlaveDescription) -> None:
@@ -254,13 +253,11 @@ class ScriptedClient:
     async def current(self) -> BusDescription:
         return self.latest
 
-    async def run(self, port: PortName, procedure: Any) -> dict[int, Any]:
+    async def run(self, procedure: Any) -> dict[int, Any]:
         procedure.close()
         return {}
 
-    async def converse(
-        self, port: PortName, station: int, conversation: Any, *, requester: str
-    ) -> SlaveFacts:
+    async def converse(self, station: int, conversation: Any, *, requester: str) -> SlaveFacts:
         self.asked += 1
         if not self.replies:
             conversation.close()
@@ -277,7 +274,7 @@ class ScriptedClient:
 
 def facts_of(client: ScriptedClient, times: int = 1) -> tuple[int, bool]:
     """Return what the configuration of the slave shows of its own objects."""
-    view = MasterView(client, PORT)  # type: ignore[arg-type]
+    view = MasterView(client)  # type: ignore[arg-type]
 
     async def run() -> None:
         for _ in range(times):
@@ -299,7 +296,7 @@ def test_slave_objects_are_read_once() -> None:
 
 def test_slave_objects_are_read_again_after_the_slave_was_gone() -> None:
     client = ScriptedClient(TYPE, HISTORY)
-    view = MasterView(client, PORT)  # type: ignore[arg-type]
+    view = MasterView(client)  # type: ignore[arg-type]
     slave = client.latest.slaves[1001]
 
     async def run() -> None:
@@ -378,7 +375,7 @@ def test_provider_serves_a_dictionary_that_is_fresh() -> None:
     async def run() -> None:
         engine = FakeEngine(FakeBus(LoopBus("drive")))
         link = EngineLink(engine.services)
-        provider = MasterDictionaryProvider(BusClient(link, [PORT]), PORT, "1.0")
+        provider = MasterDictionaryProvider(BusClient(link, 0, PORT), "1.0")
         try:
             await provider.refresh(DIAGNOSIS)
             read = provider.dictionary.upload

@@ -13,7 +13,6 @@ from devicebus.mailbox.conversation import MailboxRequest
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.slaves.access import SlaveAccess
-from eap.appliance.services.slaves.bus_mailboxes import BusMailboxes
 from eap.appliance.services.slaves.local_slave import LocalSlave
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import ListRequest, SdoInfoOpcode
@@ -35,7 +34,7 @@ def play(
     async def run() -> None:
         engine = FakeEngine(FakeBus(LoopBus(bus)))
         link = EngineLink(engine.services)
-        mailboxes = BusMailboxes(BusClient(link, [PORT]), PORT)
+        mailboxes = BusClient(link, 0, PORT)
         try:
             found, *_ = (await mailboxes.view.current()).slaves.values()
             slave = replace(found, **fields)
