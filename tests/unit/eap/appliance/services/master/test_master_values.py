@@ -243,6 +243,7 @@ class ScriptedClient:
         self.is_current = True
         self.on_change = []
         self.view = self
+        self.name = "left/bus0"
         self.show(msgspec.structs.replace(slave, to_slave=slave.to_slave or 64))
 
     def show(self, slave: SlaveDescription) -> None:
