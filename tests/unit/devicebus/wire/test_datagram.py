@@ -14,7 +14,7 @@ from devicebus.wire.datagram import (
 )
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 datagrams = st.lists(
     st.builds(Datagram, records(DatagramHeader), st.binary(max_size=40), st.integers(0, 0xFFFF)),

@@ -21,7 +21,7 @@ from eap.codec.ads import (
     encode_result,
 )
 from eap.errors import TruncatedError
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 RECORDS = (AdsRange, AdsReadWrite, AdsDeviceInfo, AdsStates, AdsWriteControl, AdsSystemState,
            SdoPlace, SoePlace)  # fmt: skip

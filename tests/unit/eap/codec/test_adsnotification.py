@@ -16,7 +16,7 @@ from eap.codec.adsnotification import (
     to_filetime,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 U32 = st.integers(0, 0xFFFF_FFFF)
 SAMPLES = st.builds(Sample, U32, st.binary(max_size=20))

@@ -16,7 +16,7 @@ from eap.codec.adssymbol import (
     encode_text,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 TEXTS = st.text(st.characters(codec="cp1252", exclude_characters="\0"), max_size=30)
 ENTRIES = st.builds(

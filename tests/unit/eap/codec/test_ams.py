@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from eap.codec.ams import AmsCommand, AmsHeader, StateFlags, decode_packet, encode_packet
 from eap.errors import CodecError, TruncatedError
 from eap.ids import NetId
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 headers = records(AmsHeader)
 

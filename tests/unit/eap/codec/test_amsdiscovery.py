@@ -19,7 +19,7 @@ from eap.codec.amsdiscovery import (
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
 from eap.ids import NetId
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 headers = records(DiscoveryHeader)
 tag_lists = st.lists(st.tuples(st.integers(0, 0xFFFF), st.binary(max_size=20)), max_size=5)

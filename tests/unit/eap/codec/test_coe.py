@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from eap.codec.coe import CoeHeader, CoeService, Emergency, decode_message, encode_message
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 
 def test_header_lies_as_on_the_wire() -> None:

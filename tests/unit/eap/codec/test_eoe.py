@@ -21,8 +21,8 @@ from eap.codec.eoe import (
 )
 from eap.errors import CodecError, TruncatedError
 from eap.ids import MacAddr
-from tests.support.records import records
 from tests.support.vectors import load
+from tests.support.wirerecords import records
 
 REQUEST, RESPONSE, *FRAMES = [vector.octets[6:] for vector in load("eoe_mailbox")]
 TWINCAT = IpSettings(

@@ -18,7 +18,7 @@ from eap.codec.mailbox import (
     encode_plain_frame,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 headers = records(MailboxHeader)
 

@@ -20,8 +20,8 @@ from eap.codec.sdo import (
     encode_segment_answer,
 )
 from eap.errors import TruncatedError
-from tests.support.records import records
 from tests.support.vectors import Vector, load, load_message
+from tests.support.wirerecords import records
 
 CAPTURED = load("coe_mailbox")
 REQUEST, RESPONSE = SdoRequest, SdoResponse

@@ -15,7 +15,7 @@ from eap.codec.sdoinfo import (
     SdoInfoOpcode,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 ENTRY = bytes.fromhex("1810 01 7f 0700 2000 0701 01000000 02000000 00000000 ffffff00") + b"Vendor"
 

@@ -20,8 +20,8 @@ from eap.codec.soe import (
     error_code_of,
 )
 from eap.errors import CodecError, MalformedError, TruncatedError
-from tests.support.records import records
 from tests.support.vectors import load_message
+from tests.support.wirerecords import records
 
 
 def test_read_request_lies_as_on_the_wire() -> None:

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from eap.codec.voe import VoeHeader
 from eap.errors import TruncatedError
-from tests.support.records import records
 from tests.support.vectors import load_message
+from tests.support.wirerecords import records
 
 
 def test_header_lies_as_on_the_wire() -> None:

@@ -15,7 +15,7 @@ from eap.codec.pd import PdFrameHeader, PdHeader
 from eap.codec.wire import Bits, Scalar, WireStruct, bit, bits3, bits4, net_id, u8, u16, u32, u64
 from eap.errors import CodecError, MalformedError, TruncatedError
 from eap.ids import NetId
-from tests.support.records import records
+from tests.support.wirerecords import records
 
 
 class Colour(IntEnum):
