@@ -232,7 +232,7 @@ class AmsConnection(asyncio.BufferedProtocol):
     @property
     def activity(self) -> Activity:
         """Current use, for the policy for connections."""
-        if self._window.subscriptions:
+        if self._window.subscriptions.count:
             return Activity.SUBSCRIBED
         if self._window.requests:
             return Activity.BUSY

@@ -1,7 +1,7 @@
-"""How much of one AMS/TCP connection may be under way: requests, their octets and their answers'.
+"""Window of one AMS/TCP connection: requests under way, their octets and their answers'.
 
-Whoever sends ahead of its answers waits in its own connection: what is not looked at yet stays in
-the kernel, which holds the sender up.
+A client that sends ahead of its answers waits in its own connection: packets beyond the window stay
+in the kernel, which holds the sender up.
 """
 
 from __future__ import annotations
@@ -25,25 +25,71 @@ _RESPONSE = StateFlags.RESPONSE.value
 _NOTIFICATION = AmsCommand.NOTIFICATION.value
 _READS = frozenset((AmsCommand.READ.value, AmsCommand.READ_WRITE.value))
 _ADD, _DELETE = AmsCommand.ADD_NOTIFICATION.value, AmsCommand.DELETE_NOTIFICATION.value
-_SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value.to_bytes(4, "little")
 _ABOUT_NOTIFICATIONS = frozenset((_ADD, _DELETE))
+_READ_WRITE = AmsCommand.READ_WRITE.value
+_GROUP = slice(AmsHeader.SIZE, AmsHeader.SIZE + 4)
+_SUM_ITEMS = AmsHeader.SIZE + 8
+"""Place of the items in the answer to a sum command, behind its result and length."""
+_SUM_ADD = IndexGroup.SUM_ADD_NOTIFICATION.value.to_bytes(4, "little")
+_SUM_DELETE = IndexGroup.SUM_DELETE_NOTIFICATION.value.to_bytes(4, "little")
+_ITEM_SIZES = {_SUM_ADD: 8, _SUM_DELETE: 4}
+"""Octets of one item: a result, and a handle where a notification was added."""
+_INVOKE_ID = slice(28, 32)
+_MAX_SUMS = 256
 _NO_ERROR = bytes(4)
 
 
-class AmsWindow:
-    """What is under way.
+class SubscriptionCounter:
+    """Notifications of one connection: granted by an answer, and not ended by a later one.
 
     Attributes:
-        requests: That wait for their answers.
-        subscriptions: Notifications that were granted and not ended again; those of a sum command
-            count as one, and for good.
+        count: As above.
+    """
+
+    __slots__ = ("_sums", "count")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._sums: dict[bytes, bytes] = {}
+        """Index groups of the sum commands that wait: their answers do not repeat them."""
+
+    def take_request(self, packet: bytes) -> None:
+        """Note a request that came in."""
+        group = packet[_GROUP]
+        if group in _ITEM_SIZES and packet[_COMMAND] == _READ_WRITE and len(self._sums) < _MAX_SUMS:
+            self._sums[packet[:16] + packet[_INVOKE_ID]] = group
+
+    def take_answer(self, packet: bytes) -> None:
+        """Note an answer that goes out."""
+        command = packet[_COMMAND]
+        if command in _ABOUT_NOTIFICATIONS:
+            count = int(_is_granted(packet))
+            self._add(count if command == _ADD else -count)
+        elif command == _READ_WRITE and self._sums:
+            key = packet[8:16] + packet[:8] + packet[_INVOKE_ID]
+            group = self._sums.pop(key, b"")
+            if group and _is_granted(packet):
+                starts = range(_SUM_ITEMS, len(packet) - 3, _ITEM_SIZES[group])
+                count = sum(packet[at : at + 4] == _NO_ERROR for at in starts)
+                self._add(count if group == _SUM_ADD else -count)
+
+    def _add(self, count: int) -> None:
+        self.count = max(0, self.count + count)
+
+
+class AmsWindow:
+    """Requests and octets under way on one connection.
+
+    Attributes:
+        requests: Number of requests that wait for their answers.
+        subscriptions: Notifications of the connection.
     """
 
     __slots__ = ("_octets", "requests", "subscriptions")
 
     def __init__(self) -> None:
         self.requests = 0
-        self.subscriptions = 0
+        self.subscriptions = SubscriptionCounter()
         self._octets = 0
 
     @property
@@ -63,8 +109,8 @@ class AmsWindow:
         if command in _READS and size >= AmsHeader.SIZE + _LENGTH.size:
             (asked,) = _LENGTH.unpack_from(packet, AmsHeader.SIZE)
             self._octets += min(MAX_OCTETS, asked)
-            if packet[AmsHeader.SIZE : AmsHeader.SIZE + 4] == _SUM_ADD:
-                self.subscriptions += 1
+            if packet[_GROUP] in _ITEM_SIZES:
+                self.subscriptions.take_request(packet)
         return False
 
     def take_out(self, packet: bytes) -> bool:
@@ -75,15 +121,8 @@ class AmsWindow:
         # and nothing is left when all have come.
         self._octets -= self._octets // self.requests
         self.requests -= 1
-        command = packet[_COMMAND]
-        if command in _ABOUT_NOTIFICATIONS and _is_granted(packet):
-            self.subscriptions = max(0, self.subscriptions + (1 if command == _ADD else -1))
+        self.subscriptions.take_answer(packet)
         return True
-
-
-def grants_notification(packet: bytes) -> bool:
-    """Say whether a packet that goes out grants a notification to its client."""
-    return packet[_COMMAND] == _ADD and bool(packet[_FLAGS] & _RESPONSE) and _is_granted(packet)
 
 
 def _is_granted(answer: bytes) -> bool:

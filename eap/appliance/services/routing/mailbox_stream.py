@@ -8,10 +8,11 @@ from collections.abc import Callable
 
 from eap.appliance.discards import Refusal
 from eap.appliance.services.accepting import TaskConnection, connection_name
-from eap.appliance.services.ams.ams_window import grants_notification
+from eap.appliance.services.ams.ams_window import SubscriptionCounter
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.mailbox_frames import FrameTaker, MailboxCounters, aoe_packet
 from eap.appliance.services.routing.uplink import Uplinks
+from eap.codec.ams import StateFlags
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.mailbox import MailboxHeader
 from eap.net.connections import OWN_HOST, Activity, CloseReason
@@ -24,6 +25,8 @@ MAX_UNANSWERED = 64
 """Requests of one connection that wait; what it sends ahead stays in the connection."""
 MAX_AT_GATEWAY = 16
 """Likewise, requests for slaves and the master."""
+_FLAGS, _RESPONSE = 18, StateFlags.RESPONSE.value
+"""Place of the AMS state flags, and their bit for answers."""
 _MAX_UNSENT = 1 << 20
 """Octets that wait for a client that does not take them."""
 
@@ -32,19 +35,19 @@ class StreamConnection(TaskConnection):
     """A connection of a TCP listener, from its acceptance to its end.
 
     Attributes:
-        is_subscribed: Whether a notification was granted on it.
+        subscriptions: Notifications of its client.
         waiting: Returns how many requests that came by it wait for their answers.
     """
 
     def __init__(self, host: str) -> None:
         super().__init__(host)
-        self.is_subscribed = False
+        self.subscriptions = SubscriptionCounter()
         self.waiting: Callable[[], int] = int
 
     @property
     def activity(self) -> Activity:
         """Current use."""
-        if self.is_subscribed:
+        if self.subscriptions.count:
             return Activity.SUBSCRIBED
         return Activity.BUSY if self.waiting() else super().activity
 
@@ -109,8 +112,8 @@ class MailboxStreams:
         frames = b"".join(self._counters.frame(connection, packet) for packet in packets)
         if connection not in self._streams:
             return self._uplinks.send(connection, frames)
-        if grants_notification(packets[0]):
-            self._streams[connection][1].is_subscribed = True
+        if packets[0][_FLAGS] & _RESPONSE:
+            self._streams[connection][1].subscriptions.take_answer(packets[0])
         return self.send_frame(connection, frames)
 
     def send_frame(self, connection: str, frame: bytes) -> str | None:
@@ -160,6 +163,7 @@ class MailboxStreams:
             connection.note_frame()
             packet = aoe_packet(frame) if self._is_aoe_here else None
             if packet is not None:
+                connection.subscriptions.take_request(packet)
                 self._entrance.receive(packet, name)
                 await self._entrance.wait_below(name, MAX_UNANSWERED)
             else:

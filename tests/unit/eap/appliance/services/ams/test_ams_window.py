@@ -11,7 +11,7 @@ from eap.appliance.services.ams.ams_window import (
     MAX_OCTETS,
     MAX_REQUESTS,
     AmsWindow,
-    grants_notification,
+    SubscriptionCounter,
 )
 from tests.support import aoe
 
@@ -84,17 +84,54 @@ def test_window_counts_subscriptions_until_they_are_ended() -> None:
     for packet in (granted(6), granted(6), granted(6, 0x701), granted(7), granted(7), granted(7)):
         window.take_in(request(command=packet[16]))
         window.take_out(packet)
-        seen.append(window.subscriptions)
+        seen.append(window.subscriptions.count)
     assert seen == [1, 2, 2, 1, 0, 0]
 
 
-def test_window_keeps_subscriptions_of_a_sum_command() -> None:
+def sum_request(group: int, count: int, invoke_id: int = 1) -> bytes:
+    body = struct.pack("<IIII", group, count, 8, 40)
+    return aoe.packet(TARGET, 9, body, invoke_id=invoke_id)
+
+
+def sum_answer(request: bytes, items: bytes, result: int = 0) -> bytes:
+    head = request[8:16] + request[:8] + struct.pack("<HHI", 9, 5, 8 + len(items))
+    return head + bytes(4) + request[28:32] + struct.pack("<II", result, len(items)) + items
+
+
+def test_window_counts_subscriptions_of_a_sum_command_until_they_are_ended() -> None:
     window = AmsWindow()
-    window.take_in(request(struct.pack("<IIII", 0xF085, 1, 8, 40), 9))
-    window.take_out(answer(command=9))
-    assert window.subscriptions == 1
+    seen = []
+    for invoke_id, (group, items, result) in enumerate(
+        (
+            (0xF085, struct.pack("<6I", 0, 7, 0x701, 0, 0, 8), 0),
+            (0xF085, struct.pack("<2I", 0, 9), 0x705),
+            (0xF086, struct.pack("<2I", 0, 0x714), 0),
+            (0xF080, bytes(8), 0),
+            (0xF086, bytes(4), 0),
+            (0xF086, bytes(4), 0),
+        )
+    ):
+        request = sum_request(group, 3, invoke_id)
+        window.take_in(request)
+        window.take_out(sum_answer(request, items, result))
+        seen.append(window.subscriptions.count)
+    assert seen == [2, 2, 1, 1, 0, 0]
 
 
-def test_grants_notification_needs_an_answer_without_error() -> None:
-    packets = (granted(6), granted(6, 0x701), granted(7), request(bytes(8), 6))
-    assert [grants_notification(packet) for packet in packets] == [True, False, False, False]
+def test_counter_ignores_answers_to_other_requests() -> None:
+    counter = SubscriptionCounter()
+    request = sum_request(0xF085, 1)
+    counter.take_request(request)
+    counter.take_request(request[:40])
+    counter.take_answer(sum_answer(sum_request(0xF085, 1, invoke_id=2), bytes(8)))
+    assert counter.count == 0
+    counter.take_answer(sum_answer(request, bytes(8)))
+    counter.take_answer(sum_answer(request, bytes(8)))
+    assert counter.count == 1
+
+
+def test_counter_ignores_notifications_that_are_refused() -> None:
+    counter = SubscriptionCounter()
+    for packet in (granted(6, 0x701), granted(7), answer(command=9)):
+        counter.take_answer(packet)
+    assert counter.count == 0
