@@ -1,4 +1,4 @@
-"""A connection to an MQTT broker, made again whenever it is lost (MQTT 5, else 3.1.1).
+"""Connection to an MQTT broker, made again whenever it is lost (MQTT 5, else 3.1.1).
 
 aiomqtt is an extra of this project and imported only where a plant has a broker.  MQTT 5 comes
 first because only there the broker can be told how long a message may be; to a broker of before,
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 from eap.aoe.mqtt_network import Publish, Subscribe
 from eap.aoe.spec import MqttSpec
 from eap.errors import EnvironmentalError
-from eap.net.backoff import Backoff
 from eap.net.password import read_password_text
+from eap.net.reconnecting import Pauses, ReconnectingLink
 
 if TYPE_CHECKING:
     from eap.net.mqttclient import Client
@@ -33,7 +33,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 15.0
 _STABLE_S = 10.0
 """How long a connection has to last to be a good one."""
 _GOODBYE_S = 0.3
-_KNOCK_S = 3.0
+_PROBE_S = 3.0
 _UNCONFIRMED = 16
 """Messages of QoS 1 and 2 on their way at a time."""
 
@@ -55,7 +55,7 @@ class Handlers(NamedTuple):
     """A message found no room."""
 
 
-class MqttLink:
+class MqttLink(ReconnectingLink):
     """One broker.
 
     Args:
@@ -72,6 +72,7 @@ class MqttLink:
         self, spec: MqttSpec, client_id: str, *, will: Publish, handlers: Handlers
     ) -> None:
         require_mqtt()
+        super().__init__(Pauses(FIRST_PAUSE_S, LONGEST_PAUSE_S, _STABLE_S))
         self._spec = spec
         self._client_id = client_id
         self._will = will
@@ -82,43 +83,36 @@ class MqttLink:
         self._is_connected = False
         self._is_old = False
         self._is_silent = False
-        self._connections = 0
-        self._said = ""
+        self._connections = self._connections_before = 0
 
     def send(self, message: Outgoing) -> str | None:
         """Send *message* soon and in its turn; return why not, if not."""
         if not self._is_connected:
-            return f"no connection to {self._name}: {self._said or 'not yet'}"
+            return f"no connection to {self._name}: {self.reason or 'not yet'}"
         if self._outbox.qsize() >= MAX_WAITING or self._octets > MAX_WAITING_OCTETS:
             return f"too much waits for {self._name}"
         self._octets += _size(message)
         self._outbox.put_nowait(message)
         return None
 
-    async def run(self) -> None:
-        """Keep the connection until cancelled."""
-        backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
-        loop = asyncio.get_running_loop()
-        while True:
-            began_s, count = loop.time(), self._connections
-            why = await self._connect_once()
-            if loop.time() - began_s > _STABLE_S:
-                backoff.reset()
-                self._connections = 0
-            elif self._connections > max(count, 1):
-                why += f"; has another client the name {self._client_id!r} (client_id) too?"
-            if why != self._said:  # a broker that is away for long is no flood of lines
-                logger.warning("%s: %s; trying again", self._name, why)
-                self._said = why
-            await asyncio.sleep(backoff.next_s())
+    def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
+        """Log another reason (ReconnectingLink)."""
+        if has_lasted:
+            self._connections = 0
+        elif self._connections > max(self._connections_before, 1):
+            reason += f"; has another client the name {self._client_id!r} (client_id) too?"
+        if self._is_news(reason):  # a broker that is away for long is no flood of lines
+            logger.warning("%s: %s; trying again", self._name, reason)
+        return True
 
-    async def _connect_once(self) -> str:
-        """Connect and serve until the connection is lost; return why it was."""
+    async def _connect(self) -> str:
+        """Connect and serve until the connection is lost (ReconnectingLink)."""
         from eap.net.mqttclient import MqttError, describe, is_too_new, make_client, tls_context
 
+        self._connections_before = self._connections
         try:
             if self._is_silent:
-                await self._knock()
+                await self._probe()
             client = make_client(
                 self._spec.host, self._spec.port, self._client_id,
                 login=self._login(), tls=tls_context(self._spec.tls), will=self._will,
@@ -142,13 +136,13 @@ class MqttLink:
             self._handlers.lost(f"no connection to {self._name}: {why}")
         return why
 
-    async def _knock(self) -> None:
-        """Raise OSError if nobody is there.
+    async def _probe(self) -> None:
+        """Raise OSError if nothing listens at the broker's address.
 
         This can be cancelled; paho waits in a thread, which cannot, and holds the end of the
         process up.
         """
-        async with asyncio.timeout(_KNOCK_S):
+        async with asyncio.timeout(_PROBE_S):
             _, writer = await asyncio.open_connection(self._spec.host, self._spec.port)
         writer.close()
         await writer.wait_closed()
@@ -159,7 +153,7 @@ class MqttLink:
         self._is_connected = True
         self._connections += 1  # without a good one in between
         logger.info("%s: connected as %s", self._name, self._client_id)
-        self._said = ""
+        self.reason = ""
         if self._is_old:
             logger.warning("%s speaks no MQTT 5: the longest message is its own affair", self._name)
         self._handlers.connected()

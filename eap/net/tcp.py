@@ -54,24 +54,26 @@ def open_tcp_listener(address: str, port: int = EAP_PORT) -> socket.socket:
     return sock
 
 
-def set_keepalive(sock: socket.socket, unanswered_s: float = 60.0) -> None:
-    """Have the kernel find out that a peer has vanished without a word.
+def set_stream_options(sock: socket.socket, unconfirmed_s: float = 60.0) -> None:
+    """Set options of a connection for requests and answers.
 
     Args:
         sock: Of the connection; it does not block any more.
-        unanswered_s: Time after which it is given up if the peer does not confirm what was sent;
+        unconfirmed_s: Time after which it is given up if the peer does not confirm what was sent;
             where nothing is sent it takes a minute.
     """
     sock.setblocking(False)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * unconfirmed_s))
+    set_keepalive(sock, idle_s=30, interval_s=10)
+
+
+def set_keepalive(sock: socket.socket, *, idle_s: int, interval_s: int) -> None:
+    """Have the kernel find out, by three probes, that a peer has vanished without a word."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (
-        (socket.TCP_KEEPIDLE, 30),
-        (socket.TCP_KEEPINTVL, 10),
-        (socket.TCP_KEEPCNT, 3),
-        (socket.TCP_NODELAY, 1),
-        (socket.TCP_USER_TIMEOUT, int(1000 * unanswered_s)),
-    ):
-        sock.setsockopt(socket.IPPROTO_TCP, option, value)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, idle_s)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, interval_s)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
 
 
 class TcpSender:
@@ -238,10 +240,7 @@ class TcpReceiver:
         host: str = OWN_HOST,
     ) -> None:
         self._writer = writer or TcpWriter(sock)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 5)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 2)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        set_keepalive(sock, idle_s=5, interval_s=2)
         self.takers = list(takers)
         self.name = name or f"{CONNECTION}{next(_numbers)}"
         self.host = host

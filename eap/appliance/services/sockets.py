@@ -16,7 +16,7 @@ from eap.appliance.handover import NO_DESCRIPTOR, Handover, PortName, SharedSock
 from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.ams.ams_discovery import AmsDiscovery, RouterName
 from eap.appliance.services.ams.ams_door import AmsClients, AmsDoor
-from eap.appliance.services.ams.ams_uplinks import AmsUplinks
+from eap.appliance.services.ams.ams_uplink import AmsUplinks
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.intake import FrameIntake, watch_channel
 from eap.appliance.services.routes.ams_questions import AmsQuestions

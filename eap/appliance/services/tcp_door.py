@@ -19,7 +19,7 @@ from eap.appliance.services.accepting import Listeners, ListeningSocket, wait_re
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams, StreamConnection
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.net.connections import CloseReason, Limits
-from eap.net.tcp import set_keepalive
+from eap.net.tcp import set_stream_options
 
 LIMITS = Limits()
 _PEEK_PAUSE_S = 0.02
@@ -67,7 +67,7 @@ class TcpDoor:
 
     def connection_from(self, sock: socket.socket, host: str) -> StreamConnection:
         """Return the connection on a socket that was accepted (ConnectionServer)."""
-        set_keepalive(sock)
+        set_stream_options(sock)
         return StreamConnection(host)
 
     async def serve_connection(self, connection: StreamConnection, sock: socket.socket) -> None:

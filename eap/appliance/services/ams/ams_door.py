@@ -14,7 +14,7 @@ from eap.appliance.services.ams.ams_connection import AmsConnection, ClientAddre
 from eap.appliance.services.routing.entrance import Entrance
 from eap.ids import NetId
 from eap.net.connections import CloseReason, Limits
-from eap.net.tcp import set_keepalive
+from eap.net.tcp import set_stream_options
 
 LIMITS = Limits()
 
@@ -82,7 +82,7 @@ class AmsDoor:
 
     def connection_from(self, sock: socket.socket, host: str) -> AmsConnection:
         """Return the connection on a socket that was accepted (ConnectionServer)."""
-        set_keepalive(sock)
+        set_stream_options(sock)
         return AmsConnection(
             connection_name(sock),
             sock.getpeername()[0],

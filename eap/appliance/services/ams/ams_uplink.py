@@ -1,4 +1,4 @@
-"""AMS/TCP as a client: the connection of a station to one peer, kept open and opened again.
+"""AMS/TCP as a client: the connections of a station to its peers, one for each that a route names.
 
 Rule 1: there is one connection for each peer, however many NetIDs are behind it: routers close the
 older one of two.
@@ -14,12 +14,17 @@ from collections.abc import Callable, Collection, Iterable
 from time import monotonic_ns
 from typing import NamedTuple, Protocol
 
+from eap.aoe.routes import Route
+from eap.aoe.spec import DoorKind
+from eap.aoe.way import Door, Way
 from eap.appliance.discards import Refusal
 from eap.appliance.services.ams.ams_connection import AmsConnection
 from eap.appliance.services.resolving import resolve
-from eap.net.backoff import Backoff
+from eap.appliance.services.routing.service import Carrier
+from eap.codec.amstcp import AMS_TCP_PORT
+from eap.ids import parse_host
 from eap.net.connections import OVERDUE_NS, CloseReason
-from eap.net.tcp import set_keepalive
+from eap.net.reconnecting import Pauses, ReconnectingLink, connect_tcp
 
 CONNECT_S = 3.0
 """How long a peer may take to accept a connection."""
@@ -32,6 +37,9 @@ _UNCONFIRMED_S = 10.0
 _STABLE_S = 10.0
 """A connection that lasted so long was a good one: the next is tried soon."""
 
+
+DOOR = f"{DoorKind.AMS_TCP}:"
+"""Begin of the names of doors to peers; the address of the peer follows."""
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +75,7 @@ class Peer(NamedTuple):
         return f"{self.host}:{self.port}"
 
 
-class AmsUplink:
+class AmsUplink(ReconnectingLink):
     """The connection to one peer.
 
     Args:
@@ -95,6 +103,7 @@ class AmsUplink:
         may_be_client: Callable[[], bool] = bool,
         patience_ns: int = OVERDUE_NS,
     ) -> None:
+        super().__init__(Pauses(FIRST_WAIT_S, LONGEST_WAIT_S, _STABLE_S))
         self.peer = peer
         self._may_be_client = may_be_client
         self._was_open = False
@@ -107,27 +116,6 @@ class AmsUplink:
         self._connection: AmsConnection | None = None
         self._closed: asyncio.Future[str]
         self._early: list[bytes] | None = []
-        self._said = ""
-
-    async def serve(self) -> None:
-        """Keep the connection until cancelled."""
-        loop = asyncio.get_running_loop()
-        backoff = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S)
-        while True:
-            since = loop.time()
-            why = await self._try()
-            if loop.time() - since > _STABLE_S:
-                backoff.reset()
-            self._early = None
-            self._router.hop_down(*self._way, why)
-            if why != self._said:  # it is tried again and again
-                self._said = why
-                if self._may_be_client() and not self._was_open:
-                    text = "%s: %s; a client added the route to it, and does not listen"
-                    logger.info(text, self._router.name, why)
-                else:
-                    logger.warning("%s: %s", self._router.name, why)
-            await asyncio.sleep(backoff.next_s())
 
     def send(self, connection: str, packets: Iterable[bytes]) -> str | None:
         """Send packets to the peer; return why not if that cannot be done (Carrier)."""
@@ -173,8 +161,21 @@ class AmsUplink:
             self._connection.close("")
             self.connection_closed(self._connection, "the route was removed")
 
-    async def _try(self) -> str:
-        """Connect, and wait for the end; return why there is no connection, or none any more."""
+    def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
+        """Tell the router, and the log if the reason is another one."""
+        del has_lasted
+        self._early = None
+        self._router.hop_down(*self._way, reason)
+        if self._is_news(reason):
+            if self._may_be_client() and not self._was_open:
+                text = "%s: %s; a client added the route to it, and does not listen"
+                logger.info(text, self._router.name, reason)
+            else:
+                logger.warning("%s: %s", self._router.name, reason)
+        return True
+
+    async def _connect(self) -> str:
+        """Connect, and wait for the end (ReconnectingLink)."""
         try:
             async with asyncio.timeout(CONNECT_S):
                 host = await resolve(self.peer.host)
@@ -187,14 +188,19 @@ class AmsUplink:
         if other is not self:
             return f"{self.peer} is {other.peer}, to which there is a route: name both alike"
         try:
-            return await self._connect(host)
+            return await self._connect_to(host)
         finally:
             del self._claims[key]
 
-    async def _connect(self, host: str) -> str:
+    async def _connect_to(self, host: str) -> str:
         try:
-            async with asyncio.timeout(CONNECT_S):
-                sock = await _open(host, self.peer.port, source_for(host, self._sources))
+            sock = await connect_tcp(
+                host,
+                self.peer.port,
+                source_for(host, self._sources),
+                timeout_s=CONNECT_S,
+                unconfirmed_s=_UNCONFIRMED_S,
+            )
         except TimeoutError:
             return f"{self.peer} does not answer within {CONNECT_S:g} s"
         except ConnectionRefusedError:
@@ -216,8 +222,8 @@ class AmsUplink:
                 late_ns = connection.late_since_ns
                 if late_ns is not None and monotonic_ns() - late_ns >= self._patience_ns:
                     connection.close(CloseReason.OVERDUE)
-                if self._said:
-                    self._said = ""
+                if self.reason:
+                    self.reason = ""
                     logger.info("%s: connected to %s", self._router.name, self.peer)
         finally:
             connection.close("the appliance ends")
@@ -225,22 +231,6 @@ class AmsUplink:
         if loop.time() - since < 1:
             return f"{self.peer} closes connections at once: it may have no route back ({why})"
         return f"{self.peer}: {why}"
-
-
-async def _open(host: str, port: int, source: str | None) -> socket.socket:
-    """Return a socket that is connected; raise OSError if that fails."""
-    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        set_keepalive(sock, _UNCONFIRMED_S)
-        if source is not None:
-            sock.bind((source, 0))
-        await asyncio.get_running_loop().sock_connect(sock, (host, port))
-        if sock.getsockname() == sock.getpeername():
-            raise ConnectionRefusedError  # noqa: TRY301  it met itself: nobody listens there
-    except BaseException:
-        sock.close()
-        raise
-    return sock
 
 
 def source_for(host: str, sources: Collection[str]) -> str | None:
@@ -255,3 +245,95 @@ def source_for(host: str, sources: Collection[str]) -> str | None:
         if host.rpartition(".")[0] == source.rpartition(".")[0]:
             return source
     return None
+
+
+class UplinkRouter(Hops, Protocol):
+    """What uplinks need of the router of their station.
+
+    Attributes:
+        on_routes: Called with the hop of each route that was added or removed.
+    """
+
+    on_routes: list[Callable[[Way], None]]
+
+    @property
+    def table(self) -> Iterable[Route]:
+        """All routes."""
+
+    def add_door(self, door: Door, carrier: Carrier) -> None:
+        """Let packets come and go by *door*."""
+
+    def remove_door(self, name: str) -> None:
+        """Forget a door."""
+
+
+class AmsUplinks:
+    """The uplinks of one station: they follow its routes.
+
+    Args:
+        router: Of the station.
+        sources: The station's own IPv4 addresses.
+        refuse: Counts what is not taken.
+    """
+
+    def __init__(
+        self, router: UplinkRouter, sources: Collection[str], refuse: Callable[[Refusal], None]
+    ) -> None:
+        self._router = router
+        self._sources = sources
+        self._refuse = refuse
+        self._uplinks: dict[Way, AmsUplink] = {}
+        self._tasks: dict[Way, asyncio.Task[None]] = {}
+        self._claims: dict[tuple[str, int], AmsUplink] = {}
+        self._group: asyncio.TaskGroup | None = None
+        for route in router.table:
+            self._follow(route.hop)
+        router.on_routes.append(self._follow)
+
+    async def serve(self) -> None:
+        """Keep the connections until cancelled."""
+        async with asyncio.TaskGroup() as self._group:
+            for way in self._uplinks:
+                self._start(way)
+            await asyncio.Event().wait()
+
+    def _follow(self, hop: Way) -> None:
+        """Open the connection to *hop*, or close it, as there are routes to it or none."""
+        if not hop.door.startswith(DOOR):
+            return
+        is_used = any(route.hop == hop for route in self._router.table)
+        if is_used and hop not in self._uplinks:
+            self._open(hop)
+        elif not is_used and hop in self._uplinks:
+            self._close(hop)
+
+    def _open(self, hop: Way) -> None:
+        try:
+            peer = Peer(*parse_host(hop.connection, AMS_TCP_PORT))
+        except ValueError as exc:
+            logger.warning("a route leads nowhere: %s", exc)
+            return
+        self._uplinks[hop] = uplink = AmsUplink(
+            peer,
+            *hop,
+            self._router,
+            sources=self._sources,
+            claims=self._claims,
+            refuse=self._refuse,
+            may_be_client=lambda: all(
+                route.is_client for route in self._router.table if route.hop == hop
+            ),
+        )
+        self._router.add_door(Door(hop.door, is_stream=True, is_hub=True), uplink)
+        self._start(hop)
+
+    def _close(self, hop: Way) -> None:
+        if (task := self._tasks.pop(hop, None)) is not None:
+            task.cancel()
+        self._uplinks.pop(hop).end()
+        self._router.hop_up(*hop)  # nothing is known of it any more
+        self._router.remove_door(hop.door)
+
+    def _start(self, hop: Way) -> None:
+        if self._group is not None:
+            self._tasks[hop] = self._group.create_task(self._uplinks[hop].run())

@@ -1,34 +1,33 @@
-"""Connections to other stations: made when something is to be sent, and again when they break.
+"""Connections to other stations: made when there is data to send, and again when they break.
 
-What is sent before there is one waits for it, in bounded memory.  A hop that cannot be reached is
-down, so that requests for it are answered at once, and is tried again with growing pauses for as
-long as some route leads to it.
+Data sent before there is a connection waits for it, in bounded memory.  A hop that is not reached
+is down, so that requests for it are answered at once, and is tried again with growing pauses for as
+long as a route leads to it.
 """
 
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Protocol, TypeAlias
 
 from eap.appliance.services.tasks import TaskSet
-from eap.net.backoff import Backoff
+from eap.net.reconnecting import Pauses, ReconnectingLink, connect_tcp
 
 CONNECT_S = 3.0
 """How long the other side may take to accept."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0
 _LASTING_S = 5.0
 """A connection that ends sooner counts as one that could not be made."""
+_UNCONFIRMED_S = 10.0
+"""Time for the other side to confirm what was sent, before the connection is lost."""
 _MAX_WAITING = 256 << 10
 """Octets that wait for one connection."""
 
 Write: TypeAlias = Callable[[bytes], None]
 Serve: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter, str], Awaitable[None]]
 """Takes what comes by a connection, with the address of its other end, until it ends."""
-
-logger = logging.getLogger(__name__)
 
 
 class Hops(Protocol):
@@ -48,7 +47,7 @@ class Hops(Protocol):
 
 
 class Uplinks:
-    """The connections of one door to other stations, by ``ADDRESS:PORT``.
+    """The connections of one transport to other stations, by ``ADDRESS:PORT``.
 
     Args:
         hops: Hears of those that come and go.
@@ -69,7 +68,8 @@ class Uplinks:
         if uplink is None:
             if not _is_address(address):
                 return "the connection is closed"
-            uplink = self._uplinks[address] = _Uplink()
+            uplink = _Uplink(address, self._source, self._hops, self._serve)
+            self._uplinks[address] = uplink
             self._tasks.start(self._run(address, uplink))
         return uplink.send(data)
 
@@ -78,56 +78,28 @@ class Uplinks:
         await self._tasks.close()
 
     async def _run(self, address: str, uplink: _Uplink) -> None:
-        loop = asyncio.get_running_loop()
-        backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         try:
-            while True:
-                began_s = loop.time()
-                text = await self._connect(address, uplink)
-                uplink.drop()
-                if not text and not self._hops.is_awaited(address):
-                    return  # nobody misses it
-                self._hops.hop_down(address, text or "the connection was closed")
-                if loop.time() - began_s > _LASTING_S:
-                    backoff.reset()
-                await asyncio.sleep(backoff.next_s())
-                if not self._hops.is_wanted(address):
-                    return
+            await uplink.run()
         finally:
             del self._uplinks[address]
             self._hops.hop_up(address)
 
-    async def _connect(self, address: str, uplink: _Uplink) -> str:
-        """Have a connection as long as it lasts; return why it broke, nothing if it just ended."""
-        host, _, port = address.rpartition(":")
-        source = (self._source, 0) if self._source else None
-        try:
-            async with asyncio.timeout(CONNECT_S):
-                reader, writer = await asyncio.open_connection(host, int(port), local_addr=source)
-        except TimeoutError:
-            return f"no connection within {CONNECT_S:g} s"
-        except OSError as exc:
-            return f"no connection: {exc.strerror or exc}"
-        try:
-            self._hops.hop_up(address)
-            uplink.open(writer)
-            await self._serve(reader, writer, address)
-        except (OSError, TimeoutError) as exc:
-            return f"the connection broke: {exc.strerror or 'the other side takes nothing'}"
-        finally:
-            writer.transport.abort()
-        return ""
 
+class _Uplink(ReconnectingLink):
+    """Link to one other station, and the data that waits for its connection."""
 
-class _Uplink:
-    """One connection, or what waits for it."""
-
-    def __init__(self) -> None:
+    def __init__(self, address: str, source: str, hops: Hops, serve: Serve) -> None:
+        super().__init__(Pauses(FIRST_PAUSE_S, LONGEST_PAUSE_S, _LASTING_S))
+        self._address = address
+        self._source = source or None
+        self._hops = hops
+        self._serve = serve
         self._writer: asyncio.StreamWriter | None = None
         self._waiting: deque[bytes] = deque()
         self._octets = 0
 
     def send(self, data: bytes) -> str | None:
+        """Send data, or keep it for the next connection; return why not if that cannot be."""
         if self._writer is not None:
             if self._writer.is_closing():
                 return "the connection is closed"
@@ -141,15 +113,47 @@ class _Uplink:
         self._waiting.append(data)
         return None
 
-    def open(self, writer: asyncio.StreamWriter) -> None:
-        self._writer = writer
-        for data in self._waiting:
-            writer.write(data)
-        self._forget()
+    async def _connect(self) -> str:
+        """Connect, and serve until the end (ReconnectingLink)."""
+        host, _, port = self._address.rpartition(":")
+        try:
+            sock = await connect_tcp(
+                host,
+                int(port),
+                self._source,
+                timeout_s=CONNECT_S,
+                unconfirmed_s=_UNCONFIRMED_S,
+            )
+        except TimeoutError:
+            return f"no connection within {CONNECT_S:g} s"
+        except OSError as exc:
+            return f"no connection: {exc.strerror or exc}"
+        reader, writer = await asyncio.open_connection(sock=sock)
+        try:
+            self._hops.hop_up(self._address)
+            self._writer = writer
+            writer.writelines(self._waiting)
+            self._forget()
+            await self._serve(reader, writer, self._address)
+        except (OSError, TimeoutError) as exc:
+            return f"the connection broke: {exc.strerror or 'the other side takes nothing'}"
+        finally:
+            self._writer = None
+            writer.transport.abort()
+        return ""
 
-    def drop(self) -> None:
-        self._writer = None
+    def _disconnected(self, reason: str, *, has_lasted: bool) -> bool:
+        """Tell the routers, unless nobody waits for an answer (ReconnectingLink)."""
+        del has_lasted
         self._forget()
+        if not reason and not self._hops.is_awaited(self._address):
+            return False
+        self._hops.hop_down(self._address, reason or "the connection was closed")
+        return True
+
+    def _is_wanted(self) -> bool:
+        """Say whether a route leads there (ReconnectingLink)."""
+        return self._hops.is_wanted(self._address)
 
     def _forget(self) -> None:
         self._waiting.clear()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -170,9 +171,12 @@ def test_subscribed_connection_is_known_as_such():
     seen.append(connection.activity)
     connection.waiting = lambda: 1
     seen.append(connection.activity)
-    connection.is_subscribed = True
+    granted = bytes(4) + struct.pack("<I", 7)
+    connection.subscriptions.take_answer(aoe.packet("1.1.1.1.2.1", 6, granted, flags=5))
     seen.append(connection.activity)
     assert seen == list(Activity)
+    connection.subscriptions.take_answer(aoe.packet("1.1.1.1.2.1", 7, bytes(4), flags=5))
+    assert connection.activity is Activity.BUSY, "the subscription has ended"
 
 
 @pytest.mark.parametrize("octets", [b"\x04", aoe.frame(aoe.packet(TARGET, 4, b""))[:9]])

@@ -23,7 +23,7 @@ from eap.appliance.services.ams.ams_connection import (
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from eap.net.connections import CloseReason
-from eap.net.tcp import set_keepalive
+from eap.net.tcp import set_stream_options
 from tests.support import aoe
 from tests.support.eventually import eventually
 
@@ -105,7 +105,7 @@ def talk(script: Script, *, patience_s: float = 5, is_ours: bool = False, **more
         with socket.create_server(("127.0.0.1", 0)) as listener:
             ours = socket.create_connection(listener.getsockname())
             theirs, (host, port) = listener.accept()
-        set_keepalive(theirs)
+        set_stream_options(theirs)
         connection = AmsConnection(
             f"{host}:{port}#1",
             host,
@@ -418,7 +418,7 @@ def test_who_leaves_without_taking_its_answers_is_let_go() -> None:
 
 def test_dead_peers_are_looked_for() -> None:
     with socket.socket() as sock:
-        set_keepalive(sock)
+        set_stream_options(sock)
         assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
         idle, each, count = (
             sock.getsockopt(socket.IPPROTO_TCP, option)

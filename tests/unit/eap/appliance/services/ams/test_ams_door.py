@@ -243,7 +243,7 @@ def test_connection_that_cannot_be_served_gives_its_place_back(monkeypatch):
 
     async def script(connect, door):
         with monkeypatch.context() as patch:
-            patch.setattr(ams_door, "set_keepalive", refuse)
+            patch.setattr(ams_door, "set_stream_options", refuse)
             reader, writer = await connect()
             assert await reader.read() == b""
             writer.close()

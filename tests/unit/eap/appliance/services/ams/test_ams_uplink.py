@@ -103,7 +103,7 @@ async def serving(port: int, host: str = "127.0.0.1", claims=None, **more):
         refuse=refused.append,
         **more,
     )
-    task = asyncio.ensure_future(uplink.serve())
+    task = asyncio.ensure_future(uplink.run())
     try:
         yield uplink, router, refused
     finally:

@@ -11,7 +11,7 @@ import pytest
 
 from eap.aoe.routes import Route
 from eap.aoe.way import Door, Way
-from eap.appliance.services.ams.ams_uplinks import AmsUplinks
+from eap.appliance.services.ams.ams_uplink import AmsUplinks
 from eap.ids import NetId
 from tests.support.eventually import eventually
 
