@@ -10,6 +10,7 @@ Sources of the columns:
     soe: IEC 61800-7-300, SoE error codes; those of ETG.1000.6 are the same.
     foe: ETG.1000.6, FoE error codes.
     ads: AdsDef.h, ADS and AMS results.
+    text: shown to people, by the command line and in FoE errors.
     dialect: failures of the high-nibble dialect, whose numbers are in :mod:`eap.gateway.dialect`.
 No standard relates the columns to each other, and ETG.8200 leaves open what a gateway answers that
 gets no answer itself; the rows are a choice of this project (docs/gateway.md, "Errors").
@@ -207,7 +208,7 @@ class Cause(Enum):
 
     # The slave refused the request.
     NOT_FOUND = _by_slave(
-        "there is no such object, element or file",
+        "there is no such object or entry",
         AbortCode.NO_OBJECT,
         SoeErrorCode.NO_IDN,
         FoeErrorCode.NOT_FOUND,
@@ -239,7 +240,7 @@ class Cause(Enum):
         MailboxError.SERVICE_NOT_SUPPORTED,
     )
     NO_GROUP = _by_slave(
-        "the device has no such index group",
+        "the device has no object dictionary",
         AbortCode.GENERAL,
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,
@@ -248,7 +249,7 @@ class Cause(Enum):
         AdsError.INDEX_GROUP,
     )
     ACCESS = _by_slave(
-        "read only, write only or protected",
+        "it may not be read or written so",
         AbortCode.READ_ONLY,
         SoeErrorCode.VALUE_READ_ONLY,
         FoeErrorCode.ACCESS_DENIED,
@@ -266,7 +267,7 @@ class Cause(Enum):
         FoeErrorCode.NO_RIGHTS,
     )
     LENGTH = _by_slave(
-        "too long or too short",
+        "the wrong number of octets",
         AbortCode.LENGTH,
         SoeErrorCode.VALUE_TOO_LONG,
         FoeErrorCode.NOT_DEFINED,
@@ -281,7 +282,7 @@ class Cause(Enum):
         MailboxError.INVALID_SIZE,
     )
     VALUE = _by_slave(
-        "the value is not permitted",
+        "not a value for it",
         AbortCode.VALUE,
         SoeErrorCode.INVALID_VALUE,
         FoeErrorCode.CHECKSUM,
@@ -297,7 +298,7 @@ class Cause(Enum):
         FoeErrorCode.CHECKSUM,
     )
     STATE = _by_slave(
-        "not in this state of the device",
+        "not in the state that the device is in",
         AbortCode.DEVICE_STATE,
         SoeErrorCode.COMMAND_NOT_NOW,
         FoeErrorCode.ILLEGAL,
@@ -343,7 +344,7 @@ class Cause(Enum):
         AdsError.NO_MORE_HANDLES,
     )
     GENERAL = _by_slave(
-        "any other error",
+        "the device refuses",
         AbortCode.GENERAL,
         SoeErrorCode.GENERAL,
         FoeErrorCode.NOT_DEFINED,

@@ -18,6 +18,7 @@ from eap.appliance.control_device import StateAnswer, StateError
 from eap.appliance.control_routes import AMS_ASK, SCAN, TRACE, PlantScan, TracedPath
 from eap.codec.ads import AdsError, AdsStates
 from eap.errors import CodecError, ControlError
+from eap.gateway.error_table import cause_of_result
 
 T = TypeVar("T")
 
@@ -26,16 +27,6 @@ SCAN_S = 120.0
 """Time for a scan: each station that does not answer takes its time-out."""
 _ON_THE_WAY = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsError.TIMEOUT))
 """Errors of routers between here and the device."""
-_WORDS: dict[int, str] = {
-    AdsError.ACCESS: "it may not be read or written so",
-    AdsError.SIZE: "the wrong number of octets",
-    AdsError.VALUE: "not a value for it",
-    AdsError.NOT_FOUND: "there is no such object or entry",
-    AdsError.STATE: "not in the state that the device is in",
-    AdsError.SERVICE: "the device cannot do that",
-    AdsError.INDEX_GROUP: "the device has no object dictionary",
-    AdsError.GENERAL: "the device refuses",
-}
 _NUMBERS = {"INIT": INIT, "PREOP": PREOP, "BOOT": BOOT, "SAFEOP": SAFEOP, "OP": OP}
 STATE_S = 10.0
 _PAUSE_S = 0.1
@@ -143,13 +134,15 @@ class AmsDevice:
         return outcome.data
 
     def refusal(self, result: int, what: str) -> AmsRefusedError:
-        """Return the error that tells of *result*."""
+        """Return the exception for a result of ADS."""
         if result in _ON_THE_WAY and (why := self._find_fault()):
             return AmsRefusedError(f"{self.target}: {what}: {why}", result)
-        text = _WORDS.get(result)
-        said = f"{text} (error 0x{result:x})" if text else AdsError.words_of(result)
-        hint = "" if text else f"; 'eapctl trace {self.target}' shows where"
-        return AmsRefusedError(f"{self.target}: {what}: {said}{hint}", result)
+        cause = cause_of_result(result)
+        if cause.is_from_slave and cause.ads == result:
+            text = f"{cause.text} (error 0x{result:x})"
+        else:
+            text = f"{AdsError.words_of(result)}; 'eapctl trace {self.target}' shows where"
+        return AmsRefusedError(f"{self.target}: {what}: {text}", result)
 
     def _find_fault(self) -> str:
         """Return at which router the way to the device ends, and why; empty if that is unknown."""

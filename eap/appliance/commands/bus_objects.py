@@ -21,8 +21,9 @@ from eap.codec.sdoinfo import EntryDescription
 from eap.codec.soe import Display, Element, Idn, SoeAttribute, decode_list
 from eap.codec.soevalue import SoeScalar, SoeValue, encode_value
 from eap.errors import ConfigError, EapError
+from eap.gateway.error_table import Cause, cause_of
 from eap.ids import ObjectId
-from eap.od.abort import AbortCode, SdoAbortError
+from eap.od.abort import SdoAbortError
 from eap.od.model import Access, ObjectCode
 
 _TEXT, _OCTETS = 0x09, 0x0A
@@ -221,8 +222,7 @@ def _dumped(bus: SlaveBus, unit: Slave, found: SlaveObject, subindex: int) -> Sd
             unit, lambda _: coeinfo_client.entry_description(index, subindex), name
         )
     except SdoAbortError as exc:
-        gaps = {AbortCode.NO_SUBINDEX, AbortCode.NO_OBJECT, AbortCode.NOT_STORED}
-        return None if exc.code in gaps else replace(row, error=str(exc))
+        return None if cause_of(exc) is Cause.NOT_FOUND else replace(row, error=str(exc))
     except MailboxProtocolError as exc:  # one bad description is no reason to lose all others
         return replace(row, error=str(exc))
     row = replace(row, name=entry.name, access=_access(entry))

@@ -40,6 +40,7 @@ from eap.codec import datatypes
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.sdoinfo import EntryDescription, ObjectDescription
 from eap.errors import CodecError, ControlError
+from eap.gateway.error_table import Cause, cause_of
 from eap.ids import NetId, ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.info import ListType, ValueInfo
@@ -54,7 +55,6 @@ _LIST_TYPE = 2
 _PADDED = 2
 """Octets of subindex 0 in a whole object."""
 _UNTOLD = frozenset((AdsError.NOT_FOUND, AdsError.SERVICE, AdsError.INDEX_GROUP, AdsError.GENERAL))
-_NO_ENTRY = {AbortCode.NO_SUBINDEX, AbortCode.NO_OBJECT, AbortCode.NOT_STORED}
 _OCTETS = 6
 _NOT_THERE = "is no STATION, STATION/PORT or STATION/PORT/SLAVE, and no NETID[:PORT]"
 
@@ -210,7 +210,7 @@ class SlaveOd:
         except (MailboxProtocolError, MailboxRefusedError):
             return None
         except SdoAbortError as exc:
-            if exc.code in _NO_ENTRY:
+            if cause_of(exc) is Cause.NOT_FOUND:
                 return None
             raise
         return entry_info(subindex, found)
