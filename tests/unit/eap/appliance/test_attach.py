@@ -37,6 +37,7 @@ from eap.pd.station import Station
 from eap.pd.trigger import EVENT_BIT
 from eap.pd.words import StationWord
 from tests.support.cyclic import OWN, PEER, Wire, octets
+from tests.support.eventually import wait_until
 
 pytestmark = pytest.mark.net  # threads and real time
 
@@ -70,8 +71,7 @@ class Runner:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
-        while not self.file.image.words[0]:
-            time.sleep(0.001)
+        wait_until(lambda: self.file.image.words[0])
 
     def _run(self) -> None:
         self._engine.start(time.monotonic_ns())

@@ -20,6 +20,7 @@ from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
 from tests.support.cyclic import station, written
+from tests.support.eventually import wait_until
 
 pytestmark = pytest.mark.net
 
@@ -246,9 +247,8 @@ print(file.wait_cycle(7, 15.0), words[StationWord.CYCLE])
 """
     process = spawn(path, script)
     process.stdout.readline()
-    while engine.image.words[StationWord.WAITERS] != 7:
-        time.sleep(0.001)
-    time.sleep(0.02)
+    wait_until(lambda: engine.image.words[StationWord.WAITERS] == 7)
+    wait_until(lambda: "S (sleeping)" in Path(f"/proc/{process.pid}/status").read_text())
     run_cycle(engine)
     assert ended(process) == "True 8"
 
@@ -307,8 +307,7 @@ print(file.wait_cycle(0, 15.0), file.retired)
 """
     process = spawn(path, script)
     process.stdout.readline()
-    while engine.image.words[StationWord.WAITERS] != 0:
-        time.sleep(0.001)
+    wait_until(lambda: engine.image.words[StationWord.WAITERS] == 0)
     create_image(path, WIDER).close()
     assert ended(process) == "False True"
 

@@ -18,6 +18,7 @@ from eap.aoe.spec import MqttSpec, TlsSpec
 from eap.errors import EnvironmentalError
 from eap.net import mqtt, mqttclient
 from eap.net.mqtt import Handlers, MqttLink
+from tests.support.eventually import eventually
 from tests.support.mosquitto import broker, write_certificates, write_passwords
 
 pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
@@ -54,12 +55,6 @@ class Peer:
         self.heard.append((topic, payload, is_retained))
 
 
-async def until(done: Callable[[], object]) -> None:
-    async with asyncio.timeout(15):
-        while not done():  # noqa: ASYNC110  several links and logs
-            await asyncio.sleep(0.01)
-
-
 @asynccontextmanager
 async def running(*peers: Peer):
     tasks = [asyncio.ensure_future(peer.link.run()) for peer in peers]
@@ -79,18 +74,18 @@ def test_link_subscribes_tells_and_says_goodbye(tmp_path):
     async def story():
         one, two = Peer(), Peer("two")
         async with running(two):
-            await until(lambda: two.heard)
+            await eventually(lambda: two.heard)
             async with running(one):
-                await until(lambda: ("hall/1/info", b"here", True) in one.heard)
+                await eventually(lambda: ("hall/1/info", b"here", True) in one.heard)
                 for number in range(100):
                     message = Publish("hall/2/ams", b"%d" % number, 0)
                     assert one.link.send(message) is None
-                await until(lambda: len(two.heard) >= 102)
+                await eventually(lambda: len(two.heard) >= 102)
                 numbers = [each for each in two.heard if each[0] == "hall/2/ams"]
                 assert numbers == [("hall/2/ams", b"%d" % n, False) for n in range(100)]
                 one.link.send(Publish("hall/2/ams", b"sure", 2))
-                await until(lambda: two.heard[-1] == ("hall/2/ams", b"sure", False))
-            await until(lambda: two.heard[-1] == ("hall/1/info", b"gone", False))
+                await eventually(lambda: two.heard[-1] == ("hall/2/ams", b"sure", False))
+            await eventually(lambda: two.heard[-1] == ("hall/1/info", b"gone", False))
 
     with broker(tmp_path, ADDRESS):
         play(story)
@@ -101,16 +96,16 @@ def test_link_comes_back_with_its_broker(tmp_path, caplog):
         peer = Peer()
         assert "no connection to MQTT broker 127.0.3.40:1883" in peer.link.send(HELLO)
         async with running(peer):
-            await until(lambda: "refused" in caplog.text)
+            await eventually(lambda: "refused" in caplog.text)
             server.start()
-            await until(lambda: peer.heard)
+            await eventually(lambda: peer.heard)
             server.stop()
-            await until(lambda: peer.lost)
+            await eventually(lambda: peer.lost)
             assert peer.lost == [f"no connection to {NAME}: the connection broke"]
             assert peer.link.send(HELLO).startswith("no connection")
             await asyncio.sleep(1)
             server.start()
-            await until(lambda: peer.connections == 2 and peer.heard[1:])
+            await eventually(lambda: peer.connections == 2 and peer.heard[1:])
         assert caplog.text.count("refused") <= 2  # once each time that it is away
 
     caplog.set_level(logging.INFO)
@@ -129,8 +124,8 @@ def test_user_and_password_are_asked_for_and_a_wrong_one_is_named(tmp_path, capl
         other = Peer("other", user="island", password_file=str(wrong))
         nobody, lost = Peer("nobody"), Peer("lost", user="island", password_file="/nowhere")
         async with running(known, other, nobody, lost):
-            await until(lambda: known.heard)
-            await until(lambda: caplog.text.count("trying again") >= 3)
+            await eventually(lambda: known.heard)
+            await eventually(lambda: caplog.text.count("trying again") >= 3)
         assert not other.connections + nobody.connections + lost.connections
 
     passwords = write_passwords(tmp_path, island="secret")
@@ -162,9 +157,9 @@ def test_tls_names_the_broker_and_shows_who_connects(tmp_path, caplog, monkeypat
         stranger = Peer("stranger", port=8883, tls=TlsSpec())
         nobody = Peer("nobody", port=8883, tls=TlsSpec(str(files["ca"])))
         async with running(good, stranger, nobody):
-            await until(lambda: good.heard)
-            await until(lambda: "certificate verify failed" in caplog.text)
-            await until(lambda: "certificate required" in caplog.text)
+            await eventually(lambda: good.heard)
+            await eventually(lambda: "certificate verify failed" in caplog.text)
+            await eventually(lambda: "certificate required" in caplog.text)
         assert not nobody.connections + stranger.connections
         assert "as good (p5, c1, k10, u'island-01')" in server.log.read_text()
 
@@ -181,8 +176,8 @@ def test_certificate_of_another_name_is_refused_unless_told_otherwise(tmp_path, 
         strict = Peer("strict", port=8883, tls=TlsSpec(str(files["ca"])))
         easy = Peer("easy", port=8883, tls=TlsSpec(str(files["ca"]), check_name=False))
         async with running(strict, easy):
-            await until(lambda: easy.heard)
-            await until(lambda: "IP address mismatch" in caplog.text)
+            await eventually(lambda: easy.heard)
+            await eventually(lambda: "IP address mismatch" in caplog.text)
         assert not strict.connections
 
     with broker(tmp_path, ADDRESS, *settings, port=8883):
@@ -193,10 +188,10 @@ def test_message_longer_than_any_packet_stays_with_the_broker(tmp_path):
     async def story():
         one, two = Peer(), Peer("two")
         async with running(one, two):
-            await until(lambda: one.heard and two.heard)
+            await eventually(lambda: one.heard and two.heard)
             one.link.send(Publish("hall/2/ams", bytes(1 << 21), 0))
             one.link.send(Publish("hall/2/ams", b"after", 0))
-            await until(lambda: ("hall/2/ams", b"after", False) in two.heard)
+            await eventually(lambda: ("hall/2/ams", b"after", False) in two.heard)
             assert max(len(payload) for _, payload, _ in two.heard) < 100
             assert two.connections == 1
 
@@ -224,7 +219,7 @@ def test_too_much_at_once_is_not_taken(tmp_path, monkeypatch):
     async def story():
         peer = Peer()
         async with running(peer):
-            await until(lambda: peer.heard)
+            await eventually(lambda: peer.heard)
             said = [peer.link.send(Publish("hall/2/ams", b"x", 0)) for _ in range(5)]
             assert said == [None] * 3 + ["too much waits for MQTT broker 127.0.3.40:1883"] * 2
 
@@ -282,7 +277,7 @@ def test_broker_of_before_is_spoken_to_as_it_understands(refusal, caplog, monkey
     async def story():
         peer = Peer()
         async with await asyncio.start_server(serve, ADDRESS, 1883), running(peer):
-            await until(lambda: peer.heard)
+            await eventually(lambda: peer.heard)
             assert peer.heard == [("hall/x", b"hey", False)]
 
     play(story)
@@ -303,7 +298,7 @@ def test_broker_behind_a_wall_does_not_hold_the_end_up(monkeypatch, caplog):
 
         async def story():
             async with running(Peer()):
-                await until(lambda: "timed out; trying again" in caplog.text)
+                await eventually(lambda: "timed out; trying again" in caplog.text)
                 await asyncio.sleep(0.6)  # by now it knocks, and waits
 
         began = time.monotonic()
@@ -315,9 +310,9 @@ def test_second_client_of_a_name_is_told_of(tmp_path, caplog):
     async def story():
         one, two = Peer("same"), Peer("same")
         async with running(one):
-            await until(lambda: one.heard)
+            await eventually(lambda: one.heard)
             async with running(two):
-                await until(
+                await eventually(
                     lambda: "has another client the name 'same' (client_id) too?" in caplog.text
                 )
 

@@ -7,10 +7,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+
+from tests.support.eventually import wait_until
 
 pytestmark = pytest.mark.net
 
@@ -26,11 +27,11 @@ report["affinity"] = sorted(os.sched_getaffinity(0))
 print(json.dumps(report))
 """
 CHILD = """
-import signal, sys, time
+import signal, sys
 from eap.net import realtime
 realtime.die_with_parent(int(sys.argv[1]), signal.SIGTERM)
 print("alive", flush=True)
-time.sleep(30)
+signal.pause()
 """
 PARENT = f"""
 import os, subprocess, sys
@@ -111,10 +112,7 @@ def test_child_dies_with_its_parent():
         assert parent.stdout.readline() == b"alive\n"
         parent.kill()
         parent.wait()
-        limit = time.monotonic() + 5
-        while is_alive(child) and time.monotonic() < limit:
-            time.sleep(0.01)
-        assert not is_alive(child)
+        wait_until(lambda: not is_alive(child))
 
 
 def test_child_of_a_parent_already_gone_ends_at_once():

@@ -182,7 +182,7 @@ def test_connection_that_is_closed_before_it_begins_is_not_served():
         connection.close(CloseReason.EVICTED)
         connection.begin()
         with pytest.raises(asyncio.CancelledError):
-            await asyncio.sleep(5)
+            await asyncio.Event().wait()
 
     asyncio.run(run())
 

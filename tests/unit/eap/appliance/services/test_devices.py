@@ -18,6 +18,7 @@ from eap.pd.layout import plan_layout
 from eap.pd.spec import HostSource, Measure, VariableSpec
 from eap.pd.words import StationWord
 from tests.support import aoe
+from tests.support.eventually import eventually
 from tests.support.stationengine import StationEngine
 
 
@@ -83,9 +84,7 @@ def test_sources_follow_the_configuration(devices, files, stations):
 
     async def script():
         await devices.by_station["left"].apply(spec)
-        async with asyncio.timeout(5):
-            while not files["left"].image.read("load"):  # noqa: ASYNC110
-                await asyncio.sleep(0.001)
+        await eventually(lambda: files["left"].image.read("load"))
 
     play(devices, script)
 
@@ -112,9 +111,7 @@ def test_engine_that_runs_already_is_told_what_it_may_have_missed(stations, imag
     devices = Devices("demo", (spec,), states, images, engine, "1.2")
 
     async def script():
-        async with asyncio.timeout(5):
-            while engine.state is not DeviceState.SAFEOP:  # noqa: ASYNC110
-                await asyncio.sleep(0.001)
+        await eventually(lambda: engine.state is DeviceState.SAFEOP)
 
     play(devices, script)
     assert engine.spec == spec
@@ -131,8 +128,6 @@ def test_image_that_a_dead_engine_did_not_retire_is_left(devices, files, station
 
         async def script():
             devices.engine_has_restarted()
-            async with asyncio.timeout(5):
-                while left.upload("eap0", 0xF110, 1) == bytes(8):  # noqa: ASYNC110
-                    await asyncio.sleep(0.001)
+            await eventually(lambda: left.upload("eap0", 0xF110, 1) != bytes(8))
 
         play(devices, script)

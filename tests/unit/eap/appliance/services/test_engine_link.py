@@ -10,6 +10,7 @@ from devicebus.errors import BusError
 from eap.appliance.bus_request import Cancel, DescribeBus, EngineStarted
 from eap.appliance.services.engine_link import EngineLink
 from eap.errors import EngineGoneError
+from tests.support.eventually import elapse, settle
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -37,11 +38,6 @@ def describe(bus=0):
 def tell_often(link):
     for _ in range(100_000):
         link.send(describe())
-
-
-async def settle():
-    for _ in range(5):
-        await asyncio.sleep(0)
 
 
 def test_answers_are_matched_by_number():
@@ -83,7 +79,8 @@ def test_slow_engine_that_answers_others_is_not_gone():
         asked = asyncio.ensure_future(link.request(describe(), 60))
         await settle()
         slow, engine._held, engine.holds = list(engine._held), [], False
-        await asyncio.sleep(0.2)
+        for _ in range(10):
+            await elapse(0.02)
         assert not asked.done()
         engine._held = slow
         engine.release()

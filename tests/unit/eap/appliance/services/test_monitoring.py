@@ -27,6 +27,7 @@ from eap.pd.image import Image
 from eap.pd.spec import TxFrameSpec, TxPdSpec
 from eap.pd.words import FrameWord
 from tests.support.cyclic import image_of, station, written
+from tests.support.eventually import eventually, settle
 from tests.unit.eap.net.conftest import cable as _cable
 
 pytestmark = pytest.mark.net
@@ -184,13 +185,12 @@ def test_errors_are_taken_as_they_come(way, closed):
 
     async def scenario() -> float:
         task = asyncio.get_running_loop().create_task(watch.run())
-        await asyncio.sleep(0.02)
+        await settle()
         # What the engine receives is none of its business and wakes nobody.
         way.sockets[0].sendto(b"frame", way.sockets[0].getsockname())
         started = time.monotonic()
         send(way, holder, closed, time.monotonic_ns())
-        while holder.status() != "missing":  # noqa: ASYNC110  a word in shared memory
-            await asyncio.sleep(0.001)
+        await eventually(lambda: holder.status() == "missing")
         took = time.monotonic() - started
         task.cancel()
         await asyncio.wait([task])

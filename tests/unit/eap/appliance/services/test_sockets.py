@@ -20,6 +20,7 @@ from eap.appliance.store import StationStore
 from eap.appliance.supervisor.sockets import SharedSockets
 from eap.codec.ethercat import EAP_PORT
 from tests.support import aoe
+from tests.support.eventually import eventually
 from tests.support.routing import station
 from tests.unit.eap.appliance.conftest import eap_port, left, right
 
@@ -144,9 +145,7 @@ def test_what_is_not_taken_is_counted_at_every_station_behind(script_on):
     async def script(counters):
         with client() as sock:
             sock.sendto(aoe.frame(b"x" * 10, kind=3), (LEFT, EAP_PORT))
-            async with asyncio.timeout(5):
-                while not counters.stats()["left"]:  # noqa: ASYNC110
-                    await asyncio.sleep(0.001)
+            await eventually(lambda: counters.stats()["left"])
         assert counters.stats() == {"left": {"mailbox": 1}}
 
     script_on(script, left())

@@ -22,6 +22,7 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.net import connections
 from eap.net.connections import OWN_HOST, Activity, Limits
 from tests.support import aoe
+from tests.support.eventually import settle
 from tests.support.routing import entrance, station
 
 pytestmark = pytest.mark.net
@@ -87,7 +88,7 @@ def test_type_4_goes_to_the_engine_with_its_first_frame():
         data = frame(4)
         writer.write(data[:1])
         await writer.drain()
-        await asyncio.sleep(0.05)
+        await settle()
         writer.write(data[1:])
         async with asyncio.timeout(5):
             while (taken := take_connection(scene.engine)) is None:  # noqa: ASYNC110

@@ -87,7 +87,7 @@ def test_from_start_to_end(tmp_path, monkeypatch, capfd):
 
 @pytest.mark.net
 def test_one_that_dies_before_it_is_ready(tmp_path, monkeypatch):
-    child = make(tmp_path, monkeypatch, "import time; time.sleep(60)")
+    child = make(tmp_path, monkeypatch, "import signal; signal.pause()")
     child.start(HANDOVER, [], monotonic_ns())
     assert not child.forward_output()
     child.ask_to_end(signal.SIGKILL)
@@ -105,7 +105,7 @@ def test_child_that_cannot_be_started_leaves_nothing_behind(tmp_path, monkeypatc
     def refuse(*_):
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    child = make(tmp_path, monkeypatch, "import time; time.sleep(60)")
+    child = make(tmp_path, monkeypatch, "import signal; signal.pause()")
     monkeypatch.setattr(os, call, refuse)
     before = sorted(Path("/proc/self/fd").iterdir())
     with pytest.raises(OSError, match="Too many open files"):

@@ -23,6 +23,7 @@ from eap.pd.layout import plan_layout
 from eap.pd.samples import ImageSamples, Sampler
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import StationWord
+from tests.support.eventually import eventually
 
 MS = 1_000_000
 CYCLE = 10 * MS
@@ -261,9 +262,7 @@ def test_whoever_is_added_is_told_soon(bench):
         bench.watch("ticks")
         await asyncio.sleep(0)
         bench.engine.run()
-        async with asyncio.timeout(5):
-            while not bench.sent:  # noqa: ASYNC110
-                await asyncio.sleep(0.001)
+        await eventually(lambda: bench.sent)
         serving.cancel()
 
     asyncio.run(run())

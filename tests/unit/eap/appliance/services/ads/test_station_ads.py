@@ -20,6 +20,7 @@ from eap.pd.image import Inputs
 from eap.pd.samples import Sampler
 from eap.pd.words import StationWord
 from tests.support import aoe
+from tests.support.eventually import eventually
 from tests.support.routing import KeepingCarrier
 from tests.support.stationengine import make_device
 
@@ -88,9 +89,7 @@ def test_notifications_leave_by_the_router(ads, router, carrier, stations, files
         image.words[StationWord.CYCLE_AT_NS] = ran_ns
         sampler.end_cycle(1, ran_ns)
         count = len(carrier.sent)
-        async with asyncio.timeout(5):
-            while len(carrier.sent) == count:  # noqa: ASYNC110
-                await asyncio.sleep(0.001)
+        await eventually(lambda: len(carrier.sent) != count)
         serving.cancel()
         return added, carrier.sent[-1]
 

@@ -7,6 +7,7 @@ import itertools
 import socket
 import struct
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from functools import partial
 from time import monotonic_ns
 from typing import Any, TypeAlias
@@ -25,7 +26,7 @@ from eap.ids import NetId
 from eap.net.connections import CloseReason
 from eap.net.tcp import set_stream_options
 from tests.support import aoe
-from tests.support.eventually import eventually
+from tests.support.eventually import eventually, settle
 
 pytestmark = pytest.mark.net
 
@@ -155,7 +156,7 @@ def test_requests_are_answered_however_they_are_cut() -> None:
         for begin, end in ((0, 1), (1, 7), (7, 60), (60, 900), (900, len(octets))):
             writer.write(octets[begin:end])
             await writer.drain()
-            await asyncio.sleep(0.01)
+            await settle()
         answers = [await hear(reader) for _ in range(3)]
         assert answers == [(0, 1, b"1"), (0, 2, b"2" * 3000), (0, 3, b"3")]
 
@@ -179,7 +180,7 @@ def test_who_sends_ahead_of_too_many_answers_is_not_read_from() -> None:
         for n in range(3 * count):
             writer.write(ask(b"x", n))
         await eventually(lambda: len(taker.waiting) == count)
-        await asyncio.sleep(0.05)
+        await settle()
         assert len(taker.waiting) == count
         for n in range(3 * count):
             await eventually(lambda: taker.waiting)
@@ -300,9 +301,10 @@ def test_who_wants_no_answer_gets_none() -> None:
 def test_packet_that_is_not_finished_ends_the_connection() -> None:
     async def script(reader, writer, taker):
         for octet in ask()[:30]:
-            if not taker.closed.is_set():
-                writer.write(bytes([octet]))
-                await asyncio.sleep(0.01)
+            writer.write(bytes([octet]))
+            with suppress(TimeoutError):
+                await asyncio.wait_for(taker.closed.wait(), 0.01)
+                return
 
     taker = talk(script, patience_s=0.1)
     assert taker.refused == [Refusal.AMS_SLOW]
@@ -314,9 +316,9 @@ def test_silence_between_packets_may_last() -> None:
         for number in (1, 2):
             writer.write(ask(b"x", number))
             assert (await hear(reader))[1] == number
-            await asyncio.sleep(0.2)
+            assert taker.connection.late_since_ns is None
 
-    talk(script, patience_s=0.05)
+    talk(script)
 
 
 def test_own_connection_is_not_late_while_bytes_of_a_long_answer_come() -> None:
@@ -339,7 +341,8 @@ def test_packets_that_wait_for_their_turn_are_not_slow() -> None:
         count = ams_window.MAX_REQUESTS
         writer.write(ask(b"x") * 3 * count)
         await eventually(lambda: len(taker.waiting) == count)
-        await asyncio.sleep(0.3)
+        await settle()
+        assert taker.connection.late_since_ns is None
         for _ in range(3 * count):
             await eventually(lambda: taker.waiting)
             taker.answer()

@@ -23,6 +23,7 @@ from eap.appliance.services.engine_link import EngineLink
 from eap.codec.mailbox import MailboxType
 from eap.errors import EngineGoneError
 from eap.od.abort import SdoAbortError
+from tests.support.eventually import settle
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -155,11 +156,11 @@ def test_who_leaves_in_the_middle_of_a_file_leaves_the_slave_usable():
         writing = asyncio.ensure_future(client.converse(DRIVE, write, "file"))
         await engine.wait_for(20)
         engine.holds = True
-        await asyncio.sleep(0.01)
+        await settle()
         writing.cancel()
         with pytest.raises(asyncio.CancelledError):
             await writing
-        await asyncio.sleep(0.01)
+        await settle()
         asked = [each for each in engine.requests if isinstance(each, (ExchangeMailbox, Cancel))]
         assert isinstance(asked[-2], Cancel)
         assert (asked[-1].request.type, asked[-1].request.expects_reply) == (MailboxType.FOE, False)
@@ -224,7 +225,7 @@ def test_bus_that_is_not_up_is_waited_for(monkeypatch):
         assert await client.converse(SENSOR, vendor(), 1) == b"\x5a\x0e\0\0"
         engine.buses[0].is_up = False
         engine.say_hello()
-        await asyncio.sleep(0.01)
+        await settle()
         monkeypatch.setattr(bus_client, "PATIENCE_S", 0.1)
         with pytest.raises(BusError, match="left/bus0 is not up: no frame comes back"):
             await client.converse(SENSOR, vendor(), 1)

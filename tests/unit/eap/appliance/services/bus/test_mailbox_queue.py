@@ -15,6 +15,7 @@ from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.services.bus.mailbox_queue import MailboxQueues, MailboxTurn
 from eap.appliance.services.engine_link import EngineLink
 from eap.codec.mailbox import MailboxType
+from tests.support.eventually import settle
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -76,7 +77,7 @@ def test_mailbox_turn_abandoned_ends_the_transfer(kind, farewells):
         turn.abandon()
         turn.abandon()
         assert given == [1]
-        await asyncio.sleep(0.01)
+        await settle()
         assert len(engine.of(ExchangeMailbox)) == 1 + farewells
 
     play(scene, kind)

@@ -9,6 +9,7 @@ import pytest
 
 from devicebus.errors import BusError
 from eap.appliance.services.bus.segment_link import SegmentLink
+from tests.support.eventually import settle
 from tests.support.fakeengine import FakeSegment
 from tests.support.loopbus import LoopBus
 
@@ -68,7 +69,7 @@ def test_pair_that_is_closed():
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         link = SegmentLink(ours)
         theirs.close()
-        await asyncio.sleep(0.01)
+        await settle()
         with pytest.raises(BusError):
             await link.command(CUT)
         return link

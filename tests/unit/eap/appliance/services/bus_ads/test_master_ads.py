@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 
 import pytest
@@ -19,6 +18,7 @@ from eap.codec.ads import AdsError, AdsState, AdsStates, IndexGroup
 from eap.codec.adsnotification import AddNotification, TransMode, decode_notification
 from eap.codec.ams import AmsCommand, decode_packet
 from tests.support.busads import BUS, DRIVE, MASTER, play, until
+from tests.support.eventually import elapse, settle
 
 STATE = AddNotification(IndexGroup.SLAVE_STATES, DRIVE, 2, TransMode.SERVER_ON_CHANGE, 0, 0)
 CYCLIC = AddNotification(IndexGroup.SLAVE_STATES, DRIVE, 2, TransMode.SERVER_CYCLE, 0, 0)
@@ -124,9 +124,9 @@ def test_notification_sends_each_state_of_a_slave_until_it_is_deleted():
         await client.good(DRIVE, WriteControl(AdsState.INIT, 0, b""))
         await until(lambda: has(2, 1))
         await client.good(MASTER, DeleteNotification(handle))
-        await asyncio.sleep(0.01)
+        await settle()
         looks = len(engine.of(Ping))
-        await asyncio.sleep(0.02)
+        await elapse(1)
         assert len(engine.of(Ping)) == looks  # nobody looks when nobody wants to know
 
     play(scene)
@@ -136,7 +136,7 @@ def test_notification_ends_with_its_connection():
     async def scene(client, engine):
         await client.good(MASTER, CYCLIC)
         client.service.client_gone(client.way)
-        await asyncio.sleep(0.02)
+        await elapse(1)
         assert not client.told
 
     play(scene)
@@ -146,7 +146,7 @@ def test_notification_waits_for_an_engine_that_is_gone():
     async def scene(client, engine):
         await client.good(MASTER, STATE)
         engine.holds = True
-        await asyncio.sleep(0.2)
+        await elapse(0.2)
         assert not client.told
         engine.release()
 

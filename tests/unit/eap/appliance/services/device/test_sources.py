@@ -14,6 +14,7 @@ from eap.appliance.services.device.sources import SourcePlayer, fit, play_source
 from eap.codec import datatypes
 from eap.errors import WriterConflictError
 from eap.pd.spec import CsvSource, HostSource, Measure, Writer
+from tests.support.eventually import eventually
 from tests.unit.eap.appliance.conftest import left
 
 
@@ -49,10 +50,12 @@ def test_a_column_is_replayed_from_the_start_again(images, tmp_path):
         station = msgspec.structs.replace(left(), sources=(source,))
         async with asyncio.timeout(5), asyncio.TaskGroup() as group:
             task = group.create_task(play_sources(station, image))
-            while seen != {17, 18}:
-                await asyncio.sleep(0.001)
+
+            def has_seen_both() -> bool:
                 seen.add(image.image.read("load"))
-                seen.discard(0)
+                return seen - {0} == {17, 18}
+
+            await eventually(has_seen_both)
             task.cancel()
 
     asyncio.run(run())
@@ -105,9 +108,7 @@ def test_other_sources_take_over_and_the_same_ones_go_on(images, tmp_path):
     image = images["left"]
 
     async def wait_for(matches):
-        async with asyncio.timeout(5):
-            while not matches(image.image.read("load")):  # noqa: ASYNC110
-                await asyncio.sleep(0.001)
+        await eventually(lambda: matches(image.image.read("load")))
 
     async def run():
         player = SourcePlayer(playing("a"), image)

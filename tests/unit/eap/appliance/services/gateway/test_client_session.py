@@ -39,7 +39,7 @@ from eap.errors import EapError, EngineGoneError
 from eap.gateway.error_table import Cause
 from eap.gateway.refusal import GatewayError
 from tests.support.elsewhere import Station
-from tests.support.eventually import eventually
+from tests.support.eventually import elapse, eventually
 from tests.support.memoryslave import memory_share
 
 COE, SOE, FOE, VOE, AOE, EOE = (
@@ -198,7 +198,7 @@ class Codec:
     async def answer(self, body: bytes) -> list[bytes]:
         if self._error is not None:
             raise self._error
-        await asyncio.sleep(0.1)
+        await elapse(0.1)
         return [b"done"]
 
     def is_step(self, body: bytes) -> bool:

@@ -36,6 +36,7 @@ from eap.codec.mailbox import MailboxType
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.master1100 import MasterLive
+from tests.support.eventually import elapse, eventually
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -62,14 +63,6 @@ def play(scene: Callable[[MasterView, FakeEngine], Awaitable[None]], bus: str = 
             engine.close()
 
     asyncio.run(run())
-
-
-async def soon(condition: Callable[[], bool]) -> None:
-    for _ in range(5000):
-        if condition():
-            return
-        await asyncio.sleep(0.001)
-    pytest.fail("it does not happen")
 
 
 def test_view_shows_configured_and_detected_slaves() -> None:
@@ -112,7 +105,7 @@ def test_view_reads_registers_once_for_all_clients_until_they_are_old() -> None:
         looks = len(engine.of(ExchangeDatagrams))
         await view.refresh(DIAGNOSIS)
         assert len(engine.of(ExchangeDatagrams)) == looks
-        await asyncio.sleep(FRESH_S + 0.01)
+        await elapse(FRESH_S)
         await view.refresh(LISTS)
         await view.refresh(CONFIGURED)  # links of the configuration
         assert len(engine.of(ExchangeDatagrams)) == looks
@@ -128,7 +121,7 @@ def test_view_scans_the_bus_after_a_write() -> None:
         view.write_master(MasterLive.DETECT_REQUEST, b"\1\0")
         view.write_master(MasterLive.DETECT_REQUEST, b"\1\0")
         assert view.of_master(MasterLive.DETECT_STATUS) == 255
-        await soon(lambda: view.of_master(MasterLive.DETECT_STATUS) == 1)
+        await eventually(lambda: view.of_master(MasterLive.DETECT_STATUS) == 1)
         assert view.of_master(MasterLive.DETECT_RESPONSE) == bytes((1, 0, 0, 0, 4, 0))
         assert view.of_detected(1001, MasterLive.ADDRESS) == 1001
         assert view.of_detected(1001, MasterLive.PRODUCT) == view.of_configured(
@@ -142,7 +135,7 @@ def test_view_requests_states_and_sets_loops() -> None:
     async def scene(view: MasterView, engine: FakeEngine) -> None:
         await view.refresh(DIAGNOSIS)
         view.write_slave(1001, MasterLive.AL_CONTROL, 1)
-        await soon(lambda: bool(engine.of(BringSlaves)))
+        await eventually(lambda: bool(engine.of(BringSlaves)))
         assert engine.of(BringSlaves)[0].target == 1
         assert view.of_diagnosis(1001, MasterLive.AL_CONTROL) == 1
         for value in (0, 5, 99):
@@ -168,7 +161,7 @@ def test_view_counts_frame_errors_from_a_reset_on() -> None:
 
         engine.buses[0].line.fault(kind="corrupt", slave="inputs", every=3)
         await view.refresh(DIAGNOSIS)
-        await asyncio.sleep(FRESH_S + 0.01)
+        await elapse(FRESH_S)
         await view.refresh(DIAGNOSIS)
         view.write_master(MasterLive.RESET, b"\0")
         assert total() > 0, "only a rising edge resets"
@@ -183,7 +176,7 @@ def test_view_counts_faults_of_slaves_from_a_reset_on() -> None:
         past = (MasterLive.ABSENCES, MasterLive.ABNORMAL_CHANGES, MasterLive.AL_STATUS_CODE)
 
         async def shown() -> list[int]:
-            await asyncio.sleep(FRESH_S + 0.01)
+            await elapse(FRESH_S)
             await view.refresh(DIAGNOSIS)
             return [view.of_diagnosis(1002, key) for key in past]
 
@@ -213,7 +206,7 @@ def test_view_reads_the_device_type_of_slaves_once() -> None:
         assert view.of_configured(1001, MasterLive.DEVICE_TYPE) == 0x0002_0192
         assert view.of_configured(1001, MasterLive.TYPE) == "drive"
         asked = len(engine.of(ExchangeMailbox))
-        await asyncio.sleep(FRESH_S + 0.01)
+        await elapse(FRESH_S)
         await view.refresh(CONFIGURED)
         assert view.is_fresh(CONFIGURED)
         assert view.is_fresh(CONFIGURED + 9), "there is none that could be asked"

@@ -12,6 +12,7 @@ from eap.appliance.services.routes.route_probe import find_target, probe_target
 from eap.errors import ControlError
 from eap.ids import NetId
 from tests.support.ams import Ams
+from tests.support.eventually import settle
 from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 
@@ -61,7 +62,7 @@ def probe(
         if down:
             left.router.hop_down("udp:eap0", None, down)
         task = asyncio.ensure_future(probe_target(left.router, target, 0.2))
-        await asyncio.sleep(0.01)
+        await settle()
         if data is not None:
             for way, packet in list(left.carrier.sent):
                 answer: Ams = packet.answer(data, error)

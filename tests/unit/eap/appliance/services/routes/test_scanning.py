@@ -21,6 +21,7 @@ from eap.appliance.services.routes.scanning import scan, stations_of
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, device_name
 from eap.codec.ams import IO_PORT
 from eap.ids import NetId
+from tests.support.eventually import elapse
 from tests.support.tracedplant import Line, Station, to
 
 NOBODY = Client(Way("x", "1"), NetId(bytes(6)), 1)
@@ -188,7 +189,7 @@ def test_a_station_that_takes_its_time_is_given_up(monkeypatch: pytest.MonkeyPat
 
     class Slow(Station):
         async def ask(self, *args: Any, **more: Any) -> AmsAnswer:
-            await asyncio.sleep(0.02)
+            await elapse(0.02)
             return await super().ask(*args, **more)
 
     line = Line()

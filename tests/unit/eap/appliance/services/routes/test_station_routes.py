@@ -13,6 +13,7 @@ from eap.appliance.services.routes.station_routes import LEARNED_NS, MAX_ADDED, 
 from eap.appliance.store import StationFile, StationStore
 from eap.errors import ControlError
 from eap.ids import NetId
+from tests.support.eventually import settle
 
 OWN = NetId.parse("10.0.0.1.1.1")
 STATIC = RouteSpec(
@@ -272,7 +273,7 @@ def test_packets_do_not_wait_for_the_disk_but_changes_and_who_asked_do():
             asyncio.ensure_future(house.routes.add(replace(PLC, name="b", net_id="6.1.2.3.1.1"))),
             asyncio.ensure_future(house.routes.remove("plc")),
         ]
-        await asyncio.sleep(0.02)  # others have their turns
+        await settle()
         assert not any(each.done() for each in changes)
         assert house.names() == {"mill": Origin.STATIC}
         changes[0].cancel()  # who asked has gone: what was begun is finished

@@ -6,6 +6,7 @@ import asyncio
 
 from eap.aoe.way import Door, Way
 from eap.appliance.services.routing.link_watch import LinkWatch
+from tests.support.eventually import eventually
 from tests.support.routing import KeepingCarrier, station, while_serving
 
 HOP = Way("door", "hop")
@@ -37,8 +38,7 @@ def test_it_looks_again_and_again():
 
     async def script():
         looking = asyncio.ensure_future(watch.serve())
-        while len(looks) < 2:  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
+        await eventually(lambda: len(looks) >= 2)
         looking.cancel()
 
     asyncio.run(while_serving(script(), there))

@@ -17,6 +17,7 @@ from eap.appliance.services.routing.mailbox_stream import MailboxStreams, Stream
 from eap.ids import NetId
 from eap.net.connections import OWN_HOST
 from tests.support import aoe
+from tests.support.eventually import settle
 from tests.support.routing import entrance, station, while_serving
 
 pytestmark = pytest.mark.net
@@ -62,7 +63,7 @@ def test_frames_are_cut_by_their_length():
             following = {0: 1, 1: 5, 5: 60, 60: 700, 700: len(octets)}[at]
             writer.write(octets[at:following])
             await writer.drain()
-            await asyncio.sleep(0.01)
+            await settle()
         assert [(await hear(reader)).invoke_id for _ in range(3)] == [1, 2, 3]
 
     assert talk(script) == []
@@ -70,7 +71,7 @@ def test_frames_are_cut_by_their_length():
 
 def test_who_has_only_closed_its_sending_side_is_still_answered():
     async def slow(request) -> AmsAnswer:
-        await asyncio.sleep(0.05)
+        await settle()
         return AmsAnswer(bytes(4) + request.body)
 
     async def script(reader, writer):

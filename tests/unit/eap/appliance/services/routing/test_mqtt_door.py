@@ -16,6 +16,8 @@ from eap.appliance.services.routing.mqtt_door import MqttDoor, open_mqtt_doors
 from eap.codec.ams import AmsCommand
 from eap.ids import NetId
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
+from tests.support.busads import until
+from tests.support.eventually import eventually
 from tests.support.mosquitto import broker
 from tests.support.mqttclient import PahoPeer
 from tests.support.routing import KeepingCarrier, station
@@ -67,12 +69,6 @@ async def running(*places: Place):
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def until(done) -> None:
-    async with asyncio.timeout(20):
-        while not done():  # noqa: ASYNC110  what others do, in other processes too
-            await asyncio.sleep(0.01)
-
-
 @pytest.mark.parametrize("no_retain", [False, True])
 def test_stations_that_know_nothing_of_each_other_meet(tmp_path, no_retain):
     async def story():
@@ -80,7 +76,7 @@ def test_stations_that_know_nothing_of_each_other_meet(tmp_path, no_retain):
         async with running(one):
             assert (await one.read(TWO)).error_code == 7
             async with running(two):
-                await until(lambda: one.knows(TWO) and two.knows(ONE))
+                await eventually(lambda: one.knows(TWO) and two.knows(ONE))
                 (route,) = one.router.table
                 assert (route.name, route.origin) == ("of 6", Origin.LEARNED)
                 answers = await asyncio.gather(*[one.read(TWO, b"%d" % n) for n in range(50)])
@@ -88,7 +84,7 @@ def test_stations_that_know_nothing_of_each_other_meet(tmp_path, no_retain):
                                    for n in range(50)]  # fmt: skip
                 assert (await two.read(ONE)).data == b"\0\0\0\0\2cba"
                 assert not one.refused + two.refused
-            await until(lambda: one.router.is_down(route.hop))
+            await eventually(lambda: one.router.is_down(route.hop))
             assert (await one.read(TWO)).error_code == 0x1B
 
     with broker(tmp_path, ADDRESS):
@@ -99,15 +95,17 @@ def test_service_resumes_when_the_broker_does(tmp_path):
     async def story(server):
         one, two = Place(ONE), Place(TWO)
         async with running(one, two):
-            await until(lambda: one.knows(TWO) and two.knows(ONE))
+            await eventually(lambda: one.knows(TWO) and two.knows(ONE))
             server.stop()
             hop = Way("mqtt:hall", "6.1.1.1.1.1")
-            await until(lambda: one.router.is_down(hop))
+            await eventually(lambda: one.router.is_down(hop))
             assert (await one.read(TWO)).error_code == 0x1B
             server.start()
-            async with asyncio.timeout(10):
-                while (await one.read(TWO)).error_code:  # noqa: ASYNC110
-                    await asyncio.sleep(0.05)
+
+            async def is_answered() -> bool:
+                return not (await one.read(TWO)).error_code
+
+            await until(is_answered)
 
     with broker(tmp_path, ADDRESS) as server:
         asyncio.run(story(server))
@@ -122,7 +120,7 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
         one.router.add_door(Door("ams-tcp", is_stream=True, is_hub=True), carrier)
         asked = []
         async with running(two), running(one):
-            await until(lambda: one.knows(TWO))
+            await eventually(lambda: one.knows(TWO))
             (service,) = two.router._services._services[TWO]
             service._reply = lambda request: (
                 asked.append(request)
@@ -130,7 +128,7 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
             )
             request = Ams(f"{TWO}:65535", tool, command=ADD_NOTIFICATION, body=bytes(40))
             one.router.receive(request.octets(), "ams-tcp", "10.0.0.9:1#1")
-            await until(lambda: carrier.sent)
+            await eventually(lambda: carrier.sent)
             assert carrier.sent[0][1] == request.answer(bytes(4) + b"M\0\0\0")
             (there,) = asked
             assert str(there.header.source) == "5.1.1.1.1.1"
@@ -139,11 +137,11 @@ def test_client_behind_one_station_asks_the_other_and_is_told_news(tmp_path):
             news = Ams(f"{there.header.source}:{there.header.source_port}", request.target,
                        command=NOTIFICATION, body=body)  # fmt: skip
             two.router.send_notification(there.came_by, news.octets())
-            await until(lambda: len(carrier.sent) == 2)
+            await eventually(lambda: len(carrier.sent) == 2)
             assert carrier.sent[1] == ("10.0.0.9:1#1", news._replace(target=tool))
             one_is_gone = [Way("mqtt:hall", "5.1.1.1.1.1")]
             one.doors[0]._link.send(one.doors[0]._network.will())
-            await until(lambda: service.gone == one_is_gone)
+            await eventually(lambda: service.gone == one_is_gone)
 
     with broker(tmp_path, ADDRESS):
         asyncio.run(story())
@@ -159,11 +157,11 @@ def test_client_of_another_make_asks_and_is_asked(tmp_path, is_prefixed):
                 asked = Ams(f"{ONE}:65535", f"{PEER}:800", body=b"abc", invoke_id=9)
                 answer = await asyncio.to_thread(peer.ask, "5.1.1.1.1.1", asked)
                 assert answer == asked.answer(b"\0\0\0\0\2cba")
-                await until(lambda: place.knows(NetId.parse(PEER)))
+                await eventually(lambda: place.knows(NetId.parse(PEER)))
                 assert (await place.read(NetId.parse(PEER))).data == b"peer was asked"
                 assert peer.forms == {is_prefixed}
             hop = Way("mqtt:hall", PEER)
-            await until(lambda: place.router.is_down(hop))
+            await eventually(lambda: place.router.is_down(hop))
 
     with broker(tmp_path, ADDRESS):
         asyncio.run(story())
@@ -179,8 +177,8 @@ def test_two_brokers_are_two_doors_and_a_station_between_them_passes_on(tmp_path
             route = Route(target, "through", hop, is_probed=False)
             place.router.add_route(route)
         async with running(one, middle, two):
-            await until(lambda: middle.knows(ONE) and middle.knows(TWO))
-            await until(lambda: not one.router.is_down(Way("mqtt:near", "8.1.1.1.1.1")))
+            await eventually(lambda: middle.knows(ONE) and middle.knows(TWO))
+            await eventually(lambda: not one.router.is_down(Way("mqtt:near", "8.1.1.1.1.1")))
             assert (await one.read(TWO)).data == b"\0\0\0\0\2cba"
             assert (await two.read(ONE)).data == b"\0\0\0\0\2cba"
 
@@ -192,7 +190,7 @@ def test_nothing_is_learned_that_is_not_to_be(tmp_path):
     async def story():
         one, two = Place(ONE, learns=False), Place(TWO)
         async with running(one, two):
-            await until(lambda: two.knows(ONE))
+            await eventually(lambda: two.knows(ONE))
             assert (await two.read(ONE)).data == b"\0\0\0\0\2cba"
             assert not one.knows(TWO)
 
@@ -224,7 +222,7 @@ def test_packets_may_be_sent_with_more_care(tmp_path, qos):
     async def story():
         one, two = Place(ONE, spec(qos=qos)), Place(TWO, spec(qos=qos))
         async with running(one, two):
-            await until(lambda: one.knows(TWO) and two.knows(ONE))
+            await eventually(lambda: one.knows(TWO) and two.knows(ONE))
             answers = await asyncio.gather(*[one.read(TWO, b"%d" % n) for n in range(100)])
             assert {each.error_code for each in answers} == {0}
 
@@ -258,8 +256,8 @@ def test_mqtt_door_learns_in_the_networks_that_the_plant_file_names(tmp_path):
             doors = open_mqtt_doors({"a": told}, {"a": one}, counters)
             tasks = [asyncio.ensure_future(door.serve()) for door in doors]
             async with running(two):
-                await until(lambda: len([*one.table]) == 1)
-                await until(lambda: len([*two.router.table]) == 2)
+                await eventually(lambda: len([*one.table]) == 1)
+                await eventually(lambda: len([*two.router.table]) == 2)
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)

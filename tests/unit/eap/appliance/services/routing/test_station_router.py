@@ -18,6 +18,7 @@ from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 from tests.support import aoe
 from tests.support.ams import ADD_NOTIFICATION, NOTIFICATION, Ams
+from tests.support.eventually import eventually, settle
 from tests.support.routing import KeepingCarrier, StubService, while_serving
 
 ROUTER, DEVICE = NetId.parse("1.1.1.1.1.1"), NetId.parse("1.1.1.1.2.1")
@@ -120,7 +121,7 @@ def test_what_is_at_hand_does_not_overtake_what_its_client_asked_before(scene):
         scene.ask(f"{DEVICE}:1001", body=b"fast")
         scene.ask(f"{DEVICE}:1001", other, body=b"fast of another")
         gate.set()
-        await asyncio.sleep(0.01)
+        await settle()
 
     asyncio.run(while_serving(script(), scene.station))
     assert [each.body for each in scene.sent] == [b"now fast of another", b"slow", b"fast"]
@@ -205,8 +206,7 @@ def test_time_is_up_at_a_hop_and_at_a_service():
     async def script():
         scene.ask(FAR)
         scene.ask(f"{ROUTER}:1", invoke_id=2)
-        while len(scene.sent) < 3:  # noqa: ASYNC110
-            await asyncio.sleep(0.001)
+        await eventually(lambda: len(scene.sent) >= 3)
 
     asyncio.run(while_serving(script(), scene.station))
     assert [(each.error, each.invoke_id) for each in scene.sent[1:]] == [(0x719, 1), (0x719, 2)]
@@ -216,8 +216,7 @@ def test_hops_are_asked_for_life_from_the_moment_there_is_a_route(scene):
     async def script():
         await asyncio.sleep(0)
         scene.station.add_route(Route(NetId.parse("7.7.7.7.1.1"), "far", HOP))
-        while not scene.sent:  # noqa: ASYNC110
-            await asyncio.sleep(0.001)
+        await eventually(lambda: scene.sent)
         assert scene.station.remove_route(NetId.parse("7.7.7.7.1.1"), HOP)
 
     asyncio.run(while_serving(script(), scene.station))

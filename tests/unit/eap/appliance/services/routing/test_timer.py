@@ -6,6 +6,7 @@ import asyncio
 from time import monotonic_ns
 
 from eap.appliance.services.routing.timer import RouterTimer
+from tests.support.eventually import elapse
 
 MS = 1_000_000
 
@@ -71,7 +72,7 @@ def test_a_moment_is_the_same_for_all_that_ask_for_one():
             clock.timer.set_soon()
             clock.set(1)  # it is looked up after the moment
         await clock.rang.wait()
-        await asyncio.sleep(0.05)
+        await elapse(0.05)
         assert len(clock.rang_ns) == 1
 
     play(script)
@@ -81,12 +82,12 @@ def test_it_is_silent_before_it_begins_and_after_its_end():
     async def script(clock):
         clock.set(1)
         clock.timer.set_soon()
-        await asyncio.sleep(0.05)
+        await elapse(0.05)
         assert not clock.rang_ns
         clock.timer.start()
         clock.timer.stop()
         clock.set(1)
-        await asyncio.sleep(0.05)
+        await elapse(0.05)
         assert not clock.rang_ns
 
     play(script)

@@ -9,6 +9,7 @@ import pytest
 
 from eap.appliance.services.routing import uplink
 from eap.appliance.services.routing.uplink import Uplinks
+from tests.support.eventually import eventually
 
 pytestmark = pytest.mark.net
 
@@ -66,8 +67,7 @@ class Scene:
         return self.connections[-1]
 
     async def said(self, *texts):
-        while self.hops.said != list(texts):  # noqa: ASYNC110
-            await asyncio.sleep(0.001)
+        await eventually(lambda: self.hops.said == list(texts))
         self.hops.said.clear()
 
 
@@ -99,8 +99,7 @@ def test_what_is_sent_makes_a_connection_and_waits_for_it():
         assert await reader.readexactly(5) == b"three"
         writer.write(b"back")
         await scene.said("up")
-        while not scene.heard:  # noqa: ASYNC110
-            await asyncio.sleep(0.001)
+        await eventually(lambda: scene.heard)
 
     assert play(script).heard == [b"back"]
 
@@ -110,14 +109,12 @@ def test_hop_that_refuses_is_down_until_it_accepts():
         address = scene.listener.getsockname()
         scene.listener.close()
         scene.uplinks.send(scene.address, b"lost")
-        while len(scene.hops.said) < 3:  # noqa: ASYNC110
-            await asyncio.sleep(0.001)
+        await eventually(lambda: len(scene.hops.said) >= 3)
         assert set(scene.hops.said) == {"no connection: Connect call failed " + str(address)}
         scene.listener = socket.create_server(address)
         with scene.listener:
             reader, _ = await scene.accept()
-            while scene.hops.said[-1] != "up":  # noqa: ASYNC110
-                await asyncio.sleep(0.001)
+            await eventually(lambda: scene.hops.said[-1] == "up")
             scene.uplinks.send(scene.address, b"next")
             assert await reader.readexactly(4) == b"next"
 
@@ -156,8 +153,7 @@ def test_hop_without_a_route_is_tried_no_more():
         scene.hops.wanted = False
         scene.listener.close()
         scene.uplinks.send(scene.address, b"x")
-        while scene.hops.said[-1:] != ["up"]:  # noqa: ASYNC110
-            await asyncio.sleep(0.001)
+        await eventually(lambda: scene.hops.said[-1:] == ["up"])
         assert len(scene.hops.said) == 2
 
     play(script)

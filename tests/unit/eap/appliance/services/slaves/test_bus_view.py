@@ -20,6 +20,7 @@ from eap.appliance.bus_request import (
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.slaves.bus_view import BusView
 from eap.errors import EngineGoneError
+from tests.support.eventually import elapse
 from tests.support.fakeengine import FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -91,11 +92,11 @@ def test_view_confirmed_has_changes_that_nobody_requested():
 def test_view_of_a_silent_engine_is_confirmed_before_it_is_used():
     async def scene(view, engine, link):
         await view.current()
-        await asyncio.sleep(2 * LOOK_S)
+        await elapse(2 * LOOK_S)
         await view.current()
         assert len(engine.of(Ping)) == 1
         engine.holds = True
-        await asyncio.sleep(2 * LOOK_S)
+        await elapse(2 * LOOK_S)
         with pytest.raises(EngineGoneError):
             await view.current()
         engine.release()
