@@ -8,7 +8,7 @@ slave.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 from devicebus.errors import MailboxProtocolError
 from devicebus.mailbox.conversation import Conversation, MailboxRequest, Progress, reading
@@ -40,6 +40,13 @@ MAX_SHORT = 1_000
 """Segments of less than seven octets that a slave may send before it only keeps us busy."""
 
 
+class UploadStart(NamedTuple):
+    """First answer of an upload: the size of the object, and as much of it as one message holds."""
+
+    size: int
+    data: bytes
+
+
 def upload(
     index: int,
     subindex: int,
@@ -47,31 +54,45 @@ def upload(
     complete: bool = False,
     progress: Progress | None = None,
     max_size: int = MAX_SIZE,
-    sink: Callable[[int, bytes], object] | None = None,
 ) -> Conversation[bytes]:
     """Read an entry, or with *complete* a whole object from subindex 0 or 1 on.
-
-    *sink* is called with the size and each piece as it comes, for who need not wait for the rest.
 
     Raises:
         SdoAbortError: the slave refuses.
         MailboxProtocolError: its answer is no answer, or longer than *max_size*.
     """
+    start = yield from begin_upload(index, subindex, complete=complete, max_size=max_size)
+    return (yield from continue_upload(index, subindex, start, progress=progress))
+
+
+def begin_upload(
+    index: int, subindex: int, *, complete: bool = False, max_size: int = MAX_SIZE
+) -> Conversation[UploadStart]:
+    """Do the first step of upload(); raises as that does."""
     sdo = _Sdo(index, subindex)
     plain = encode_plain(SdoRequest.UPLOAD, index, subindex, complete=complete)
     head, rest = yield from sdo.ask(plain)
     if head.expedited:
-        if sink is not None:
-            sink(len(head.data), head.data)
-        return head.data
+        return UploadStart(len(head.data), head.data)
     size = head.value
     if size > max_size:
         yield from sdo.give_up(AbortCode.OUT_OF_MEMORY, f"{size} octets, taken are {max_size}")
-    content = bytearray(rest[:size])
+    return UploadStart(size, rest[:size])
+
+
+def continue_upload(
+    index: int,
+    subindex: int,
+    start: UploadStart,
+    *,
+    progress: Progress | None = None,
+    sink: Callable[[bytes], object] | None = None,
+) -> Conversation[bytes]:
+    """Do the other steps of upload(), if any; each piece goes to *sink* as it comes."""
+    sdo, size = _Sdo(index, subindex), start.size
+    content = bytearray(start.data)
     progress = progress or Progress()
     progress.done, progress.total = len(content), size
-    if sink is not None:
-        sink(size, bytes(content))
     toggle = short = 0
     while len(content) < size:
         asked = encode_segment_answer(SdoRequest.UPLOAD_SEGMENT, toggle=toggle)
@@ -89,7 +110,7 @@ def upload(
             yield from sdo.give_up(AbortCode.GENERAL, reason)
         progress.done = len(content)
         if sink is not None:
-            sink(size, data)
+            sink(data)
         toggle ^= 1
     return bytes(content)
 

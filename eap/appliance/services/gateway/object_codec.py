@@ -8,11 +8,9 @@ client that pauses in the middle of one would keep the slave from all others).
 
 from __future__ import annotations
 
-import asyncio
-
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.services.slaves.access import SlaveAccess
-from eap.appliance.services.tasks import TaskSet
+from eap.appliance.services.slaves.object_stream import ObjectStream
 from eap.codec.coe import CoeHeader, CoeService, encode_message
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdo import (
@@ -46,48 +44,12 @@ _QUERIES = frozenset(
 
 
 class _Upload:
-    """An object on its way from the slave, and from here to the client.
+    """An object on its way to the client; *toggle* is the toggle bit of the next segment."""
 
-    Attributes:
-        size: Octets of all of it, None until the slave has told.
-        sent: Octets that the client has.
-        toggle: Toggle bit of the next segment.
-    """
-
-    def __init__(self, access: SlaveAccess, head: SdoHeader) -> None:
+    def __init__(self, head: SdoHeader, stream: ObjectStream) -> None:
         self.head = head
-        self.size: int | None = None
-        self.sent = self.toggle = 0
-        self._data = bytearray()
-        self._changed = asyncio.Event()
-        reading = access.read_object(
-            head.index, head.subindex, complete=bool(head.complete), sink=self._take
-        )
-        self._task = TaskSet(f"upload of 0x{head.index:04X}").start_awaited(reading)
-        self._task.add_done_callback(lambda _: self._changed.set())
-
-    async def next(self, size: int) -> bytes:
-        """Return the next *size* octets, fewer only at the end; raise what has ended the upload."""
-        end = self.sent + size
-        while self.size is None or len(self._data) < min(end, self.size):
-            if self._task.done():
-                self._task.result()
-                break
-            self._changed.clear()
-            await self._changed.wait()
-        return bytes(self._data[self.sent : end])
-
-    def close(self) -> None:
-        """End the upload, at the slave too if it is not complete there."""
-        if not self._task.done():
-            self._task.cancel()
-        elif not self._task.cancelled():
-            self._task.exception()  # the client has its error, or does not want it any more
-
-    def _take(self, size: int, piece: bytes) -> None:
-        self.size = size
-        self._data += piece
-        self._changed.set()
+        self.stream = stream
+        self.toggle = 0
 
 
 class _Download:
@@ -148,7 +110,7 @@ class ObjectCodec:
         """End the SDO that is under way."""
         transfer, self._transfer = self._transfer, None
         if isinstance(transfer, _Upload):
-            transfer.close()
+            transfer.stream.close()
         self._memory.hold(0)
 
     async def answer(self, body: bytes) -> list[bytes]:
@@ -194,22 +156,17 @@ class ObjectCodec:
         return encode_plain(SdoResponse.DOWNLOAD, index, subindex, complete=complete)
 
     async def _upload(self, head: SdoHeader) -> bytes:
-        self._transfer = upload = _Upload(self._access, head)
-        room = self.sizes.to_master - INITIATE_OVERHEAD
-        first = await upload.next(max(room, EXPEDITED_SIZE))
-        size = upload.size or len(first)
-        if size == len(first):
+        where, complete = (head.index, head.subindex), bool(head.complete)
+        stream = await self._access.open_object(*where, complete=complete)
+        self._transfer = _Upload(head, stream)
+        size, room = stream.size, self.sizes.to_master - INITIATE_OVERHEAD
+        if size <= max(room, EXPEDITED_SIZE):
+            data = await stream.read(size)
             self.reset()
-            return encode_initiate(
-                SdoResponse.UPLOAD, head.index, head.subindex, first,
-                complete=bool(head.complete), room=size,
-            )  # fmt: skip
+            return encode_initiate(SdoResponse.UPLOAD, *where, data, complete=complete, room=size)
         self._hold(head, size)
-        upload.sent = room
-        answer = SdoHeader(
-            1, 0, 0, head.complete, SdoResponse.UPLOAD, head.index, head.subindex, size
-        )
-        return answer.encode() + first[:room]
+        answer = SdoHeader(1, 0, 0, head.complete, SdoResponse.UPLOAD, *where, size)
+        return answer.encode() + await stream.read(room)
 
     async def _download(self, head: SdoHeader, data: bytes) -> None:
         where, complete = (head.index, head.subindex), bool(head.complete)
@@ -247,11 +204,10 @@ class ObjectCodec:
         return encode_segment_answer(SdoResponse.DOWNLOAD_SEGMENT, toggle=head.toggle)
 
     async def _upload_segment(self, upload: _Upload) -> bytes:
-        toggle = upload.toggle
-        data = await upload.next(self.sizes.to_master - SEGMENT_OVERHEAD)
-        upload.sent += len(data)
+        stream, toggle = upload.stream, upload.toggle
+        data = await stream.read(self.sizes.to_master - SEGMENT_OVERHEAD)
         upload.toggle ^= 1
-        last = upload.sent == upload.size
+        last = stream.done == stream.size
         if last:
             self.reset()
         return encode_segment(SdoResponse.UPLOAD_SEGMENT, data, toggle=toggle, last=last)

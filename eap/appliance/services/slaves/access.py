@@ -7,21 +7,18 @@ not served, and RemoteAccessError for the way to another station.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 from devicebus.mailbox.conversation import MailboxMessage
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.services.slaves.file_stream import AHEAD, FileStream
+from eap.appliance.services.slaves.object_stream import ObjectStream
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsHeader
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import SdoInfoOpcode
 from eap.errors import EapError
 from eap.gateway.error_table import cause_of_result
-
-UploadSink: TypeAlias = Callable[[int, bytes], object]
-"""Called with the size of an object and each piece of it, in their order, as the slave sends it."""
 
 
 class RemoteAccessError(EapError):
@@ -51,10 +48,13 @@ class SlaveAccess(Protocol):
     async def probe(self) -> None:
         """Raise RemoteAccessError if the slave's station does not answer."""
 
-    async def read_object(
-        self, index: int, subindex: int, *, complete: bool = False, sink: UploadSink | None = None
-    ) -> bytes:
+    async def read_object(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Read an entry, or with *complete* an object from subindex 0 or 1 on."""
+
+    async def open_object(
+        self, index: int, subindex: int, *, complete: bool = False
+    ) -> ObjectStream:
+        """Begin to read as :meth:`read_object` does; the stream is closed by the caller."""
 
     async def write_object(
         self, index: int, subindex: int, data: bytes, *, complete: bool = False

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Hashable
 from functools import partial
 from typing import TypeVar
 
+from devicebus.drive import drive_async
 from devicebus.mailbox import aoe_client, coe_client, coeinfo_client, soe_client, voe_client
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.appliance.bus_request import SlaveDescription, no_mailbox
 from eap.appliance.services.bus.bus_client import BusClient
-from eap.appliance.services.slaves.access import UploadSink
+from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.appliance.services.slaves.file_stream import AHEAD, LocalFile
+from eap.appliance.services.slaves.object_stream import ObjectStream
 from eap.codec.ams import AmsHeader, StateFlags, encode_packet
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import SdoInfoOpcode
@@ -52,13 +55,35 @@ class LocalSlave:
     async def probe(self) -> None:
         """Do nothing: the engine answers for its slaves."""
 
-    async def read_object(
-        self, index: int, subindex: int, *, complete: bool = False, sink: UploadSink | None = None
-    ) -> bytes:
+    async def read_object(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Read an entry, or with *complete* an object from subindex 0 or 1 on."""
-        return await self._converse(
-            coe_client.upload(index, subindex, complete=complete, sink=sink)
+        return await self._converse(coe_client.upload(index, subindex, complete=complete))
+
+    async def open_object(
+        self, index: int, subindex: int, *, complete: bool = False
+    ) -> ObjectStream:
+        """Begin to read as :meth:`read_object` does; the stream is closed by the caller."""
+        turn = await self.bus.open_turn(
+            self._slave.station, MailboxType.COE, self._requester, self._turn_s
         )
+        try:
+            begin = coe_client.begin_upload(index, subindex, complete=complete)
+            start = await drive_async(begin, turn.exchange)
+        except asyncio.CancelledError:
+            turn.abandon()
+            raise
+        except BaseException:
+            turn.close()
+            raise
+        stream = ObjectStream(*start)
+        if len(start.data) == start.size:
+            turn.close()
+        else:
+            rest = coe_client.continue_upload(index, subindex, start, sink=stream.take)
+            task = stream.follow(drive_async(rest, turn.exchange))
+            # Not within the coroutine: one that is cancelled before its first step never runs.
+            task.add_done_callback(partial(_end_turn, turn))
+        return stream
 
     async def write_object(
         self, index: int, subindex: int, data: bytes, *, complete: bool = False
@@ -128,6 +153,12 @@ class LocalSlave:
     async def _converse(self, conversation: Conversation[T]) -> T:
         station = self._slave.station
         return await self.bus.converse(station, conversation, self._requester, self._turn_s)
+
+
+def _end_turn(turn: MailboxTurn, task: asyncio.Task[object]) -> None:
+    if task.cancelled():
+        turn.abandon()
+    turn.close()
 
 
 def _single(ask: MailboxRequest) -> Conversation[MailboxMessage]:

@@ -14,8 +14,9 @@ from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.ads_operation import Operation, Read, ReadState, ReadWrite, Write
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.answer import AmsAnswer, response_to
-from eap.appliance.services.slaves.access import RemoteAccessError, UploadSink
+from eap.appliance.services.slaves.access import RemoteAccessError
 from eap.appliance.services.slaves.file_stream import AHEAD
+from eap.appliance.services.slaves.object_stream import ObjectStream
 from eap.appliance.services.slaves.remote_file import RemoteFile
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
@@ -106,9 +107,7 @@ class RemoteSlave:
             if exc.is_of_way:
                 raise
 
-    async def read_object(
-        self, index: int, subindex: int, *, complete: bool = False, sink: UploadSink | None = None
-    ) -> bytes:
+    async def read_object(self, index: int, subindex: int, *, complete: bool = False) -> bytes:
         """Read an entry, or with *complete* an object from subindex 0 or 1 on."""
         offset = _sdo_offset(index, subindex, complete=complete)
         try:
@@ -117,9 +116,14 @@ class RemoteSlave:
             raise _sdo_error(exc, index, subindex) from None
         if complete and subindex:
             data = data[2:]  # by ADS an object comes from subindex 0 on, which is 16 bits wide
-        if sink is not None:
-            sink(len(data), data)
         return data
+
+    async def open_object(
+        self, index: int, subindex: int, *, complete: bool = False
+    ) -> ObjectStream:
+        """Read as :meth:`read_object` does: by ADS all of an object comes at once."""
+        data = await self.read_object(index, subindex, complete=complete)
+        return ObjectStream(len(data), data)
 
     async def write_object(
         self, index: int, subindex: int, data: bytes, *, complete: bool = False

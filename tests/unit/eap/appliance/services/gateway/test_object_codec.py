@@ -18,6 +18,7 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from tests.support.elsewhere import Station
+from tests.support.eventually import eventually
 from tests.support.memoryslave import MemoryMailbox, lead, memory_share, memory_slave
 
 COE = MailboxType.COE
@@ -143,8 +144,7 @@ def test_object_codec_is_given_up_by_an_abort() -> None:
         assert codec.is_running
         assert await ask(codec, "0020 80 0020 00 00000000") == []
         assert not codec.is_running
-        await asyncio.sleep(0)
-        assert mailbox.is_abandoned
+        await eventually(lambda: mailbox.is_abandoned)
 
     play(scene)
 

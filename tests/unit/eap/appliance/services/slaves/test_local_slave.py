@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from devicebus.errors import MailboxBusyError, NoMailboxError, SoeError
 from devicebus.mailbox.conversation import MailboxRequest
+from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.engine_link import EngineLink
 from eap.appliance.services.slaves.access import SlaveAccess
@@ -17,11 +18,14 @@ from eap.appliance.services.slaves.local_slave import LocalSlave
 from eap.codec.mailbox import MailboxType
 from eap.codec.sdoinfo import ListRequest, SdoInfoOpcode
 from eap.codec.soe import Element, Idn
+from eap.errors import EngineGoneError
 from eap.od.abort import AbortCode, SdoAbortError
+from tests.support.eventually import eventually
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
-CONTROLWORD, NO_OBJECT = 0x6040, 0x5555
+CONTROLWORD, NO_OBJECT, CALIBRATION = 0x6040, 0x5555, 0x8001
+ABORT = 4
 
 
 def play(
@@ -48,16 +52,51 @@ def play(
 
 def test_local_slave_reads_and_writes_objects() -> None:
     async def scene(slave: SlaveAccess, engine: FakeEngine) -> None:
-        pieces: list[tuple[int, bytes]] = []
-        vendor = await slave.read_object(0x1018, 1, sink=lambda *piece: pieces.append(piece))
+        vendor = await slave.read_object(0x1018, 1)
         assert vendor == bytes.fromhex("5a0e0000")
-        assert pieces == [(4, vendor)]
+        stream = await slave.open_object(0x1018, 1)
+        assert (stream.size, await stream.read(9)) == (4, vendor)
         await slave.write_object(CONTROLWORD, 0, b"\6\0")
         await slave.write_unsized(CONTROLWORD, 0, b"\7\0\0\0")
         assert await slave.read_object(CONTROLWORD, 0) == b"\7\0"
         assert (await slave.sizes()).to_slave == 1024
 
     play(scene)
+
+
+def test_local_slave_reads_a_long_object_beside_its_reader() -> None:
+    async def scene(slave: SlaveAccess, engine: FakeEngine) -> None:
+        stream = await slave.open_object(CALIBRATION, 0)
+        assert stream.size == 2048
+        assert await stream.read(500) == bytes(500)
+        assert await slave.read_object(0x1018, 1), "another operation had its turn"
+        assert await stream.read(5000) == bytes(1548)
+        assert await stream.read(1) == b""
+        stream.close()
+
+    play(scene, bus="coe", station=1003)
+
+
+def test_local_slave_upload_that_is_closed_is_aborted_at_the_slave() -> None:
+    async def scene(slave: SlaveAccess, engine: FakeEngine) -> None:
+        stream = await slave.open_object(CALIBRATION, 0)
+        stream.close()
+        await eventually(lambda: engine.of(ExchangeMailbox)[-1].request.request[2] >> 5 == ABORT)
+        assert await slave.read_object(0x1018, 1)
+
+    play(scene, bus="coe", station=1003)
+
+
+def test_local_slave_upload_that_fails_ends_with_its_error() -> None:
+    async def scene(slave: SlaveAccess, engine: FakeEngine) -> None:
+        stream = await slave.open_object(CALIBRATION, 0)
+        engine.buses[0].is_up = False
+        engine.say_hello()
+        with pytest.raises(EngineGoneError):
+            await stream.read(5000)
+        stream.close()
+
+    play(scene, bus="coe", station=1003)
 
 
 def test_local_slave_refusals_keep_the_slaves_codes() -> None:
