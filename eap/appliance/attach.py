@@ -84,7 +84,7 @@ class AttachedStation(Closing):
         """
         image = self._current()
         for name in values:
-            place = image.places[self._known(name)]
+            place = image.slots[self._known(name)]
             if place.writer is not Writer.APPLICATION:
                 raise WriterConflictError(
                     f"station {self.name}: {name} is written by the {place.writer}, "
@@ -154,7 +154,7 @@ class AttachedStation(Closing):
         return max(_GONE_AFTER_S, _GONE_AFTER_CYCLES * self.cycle_s)
 
     def _known(self, name: str) -> str:
-        places = self._file.image.places
+        places = self._file.image.slots
         if name in places:
             return name
         raise ImageError(f"station {self.name} has no variable {name!r}{near(name, places)}")

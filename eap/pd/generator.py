@@ -39,14 +39,14 @@ class Generators:
 
 
 def _step(image: Image, source: EngineSource) -> Callable[[int], None]:
-    place = image.places[source.variable]
-    kind = datatypes.parse(place.type)
+    slot = image.slots[source.variable]
+    kind = datatypes.parse(slot.type)
     if isinstance(source, RandomSource):
-        return _random_step(image, source, place.bit_offset // 8, kind.size)
+        return _random_step(image, source, slot.bit_offset // 8, kind.size)
     limits = kind.scalar_range
     whole = limits is not None and isinstance(limits[0], int)
     value = _function(source, image.layout.cycle_us, finish=round if whole else float)
-    store = image.storer(place.name)
+    store = image.storer(slot.name)
     if limits is None or not whole:
         return lambda tick: store(value(tick))
     low, span = int(limits[0]), int(limits[1]) - int(limits[0]) + 1

@@ -20,7 +20,7 @@ from eap.codec import datatypes
 from eap.codec.pd import PdHeader
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
-from eap.pd.layout import ImageLayout, RxPlace
+from eap.pd.layout import ImageLayout, RxSlot
 from eap.pd.monitor import SubscriberPresence
 from eap.pd.spec import PortSpec, StationSpec, Writer
 from eap.pd.words import (
@@ -164,28 +164,28 @@ class _Received:
         self._old_column, self._new_column = _column(old.layout), _column(new.layout)
         self._shared: list[int] = old.words[self._old_column].tolist()
         before = {
-            place.name: (place, tracker or place.words)
-            for place, tracker in zip(old.layout.rx, self._shared, strict=True)
+            slot.name: (slot, tracker or slot.words)
+            for slot, tracker in zip(old.layout.rx, self._shared, strict=True)
         }
         self._heirs = [
-            (index, *before[place.name], place)
-            for index, place in enumerate(new.layout.rx)
-            if place.name in before
+            (index, *before[slot.name], slot)
+            for index, slot in enumerate(new.layout.rx)
+            if slot.name in before
         ]
         self._runs = _joined(
-            _WordRun(was.words, place.words, RxWord.SIZE) for _, was, _, place in self._heirs
+            _WordRun(was.words, slot.words, RxWord.SIZE) for _, was, _, slot in self._heirs
         )
         self._owners = array("q", [0] * len(new.layout.rx))
         """By RxPD of the new image: where its tracker is, as in RxWord.TRACKER."""
         self._from_elsewhere = [
-            place.words
-            for _, was, _, place in self._heirs
-            if (was.publisher, was.port, was.source) != (place.publisher, place.port, place.source)
+            slot.words
+            for _, was, _, slot in self._heirs
+            if (was.publisher, was.port, was.source) != (slot.publisher, slot.port, slot.source)
         ]
         first_of: dict[object, int] = {}
-        for index, was, tracker, place in self._heirs:
-            judged = tracker, _begins_anew(was, place), _judged(place)
-            self._owners[index] = first_of.setdefault(judged, place.words)
+        for index, was, tracker, slot in self._heirs:
+            judged = tracker, _begins_anew(was, slot), _judged(slot)
+            self._owners[index] = first_of.setdefault(judged, slot.words)
         self._plan_trackers()
 
     @property
@@ -212,10 +212,10 @@ class _Received:
     def _plan_trackers(self) -> None:
         sources: dict[int, int] = {}
         self._strangers: set[int] = set()
-        for index, was, tracker, place in self._heirs:
+        for index, was, tracker, slot in self._heirs:
             owner = self._owners[index]
             sources[owner] = tracker
-            if _begins_anew(was, place):
+            if _begins_anew(was, slot):
                 self._strangers.add(owner)
         size = RxWord.SIZE - TRACKER_START
         self._trackers = [
@@ -229,24 +229,24 @@ def _schedules(layout: ImageLayout, frame: str) -> set[tuple[str, bool, bool]]:
     return {(pd.name, pd.by_schedule, pd.cyclic) for pd in layout.tx if pd.frame == frame}
 
 
-def _begins_anew(was: RxPlace, place: RxPlace) -> bool:
+def _begins_anew(was: RxSlot, slot: RxSlot) -> bool:
     """Whether the next frame cannot be compared with the last one.
 
     It comes from another sender, or from one that changes its rate: whether the gap between these
     two is of the old rate or of the new one, nobody knows.
     """
-    return (was.publisher, was.port, was.step) != (place.publisher, place.port, place.step)
+    return (was.publisher, was.port, was.step) != (slot.publisher, slot.port, slot.step)
 
 
-def _judged(place: RxPlace) -> tuple[object, ...]:
+def _judged(slot: RxSlot) -> tuple[object, ...]:
     """Return what must be the same for all subscriptions of a tracker."""
     return (
-        place.port,
-        place.publisher,
-        place.step,
-        place.sender_cycle_us,
-        place.timeout_ms,
-        place.poll_request,
+        slot.port,
+        slot.publisher,
+        slot.step,
+        slot.sender_cycle_us,
+        slot.timeout_ms,
+        slot.poll_request,
     )
 
 
@@ -262,14 +262,14 @@ def _plan_values(old: Image, new: Image) -> tuple[CopyPlan, CopyPlan]:
     """Return what is copied of what the engine writes, and of what others do."""
     engine: list[Move] = []
     others: list[Move] = []
-    for name, place in new.places.items():
-        was = old.places.get(name)
-        if was is None or datatypes.parse(was.type) != datatypes.parse(place.type):
+    for name, slot in new.slots.items():
+        was = old.slots.get(name)
+        if was is None or datatypes.parse(was.type) != datatypes.parse(slot.type):
             continue
-        bits = datatypes.parse(place.type).bit_length
+        bits = datatypes.parse(slot.type).bit_length
         moves = engine if was.writer is Writer.ENGINE else others
-        moves.append(Move(was.bit_offset, place.bit_offset, bits))
-    before = {place.name: place for place in old.layout.rx}
+        moves.append(Move(was.bit_offset, slot.bit_offset, bits))
+    before = {slot.name: slot for slot in old.layout.rx}
     for pd in new.layout.rx:
         if pd.name in before:  # its header holds the quality
             move = Move(8 * before[pd.name].offset, 8 * pd.offset, 8 * PdHeader.SIZE)

@@ -23,7 +23,7 @@ import msgspec
 
 from eap.codec import datatypes
 from eap.errors import ImageError, TornReadError
-from eap.pd.layout import HEADER, LAYOUT_VERSION, MAGIC, WORDS_OFFSET, ImageLayout, VariablePlace
+from eap.pd.layout import HEADER, LAYOUT_VERSION, MAGIC, WORDS_OFFSET, ImageLayout, VariableSlot
 from eap.pd.spec import Writer
 from eap.pd.words import StationWord
 
@@ -59,17 +59,17 @@ class Image:
         self.memory = memory
         self.layout = layout
         self.words = memory[WORDS_OFFSET : WORDS_OFFSET + 8 * layout.word_count].cast("q")
-        self.places = {place.name: place for place in layout.variables}
+        self.slots = {slot.name: slot for slot in layout.variables}
         self._pause = pause
 
     def region(self, writer: Writer) -> memoryview:
         """Return the variables of *writer*, live."""
-        place = self.layout.regions[writer]
-        return self.memory[place.offset : place.offset + place.size]
+        slot = self.layout.regions[writer]
+        return self.memory[slot.offset : slot.offset + slot.size]
 
     def read(self, name: str) -> Any:
         """Return one variable's value; raise ImageError if there is none of that name."""
-        return datatypes.parse(self._place(name).type).decode(self.load(name), 0)
+        return datatypes.parse(self._slot(name).type).decode(self.load(name), 0)
 
     def load(self, name: str, *, attempts: int = READ_ATTEMPTS) -> bytes:
         """Return one variable's octets, as :meth:`encode` does those of a value.
@@ -77,9 +77,9 @@ class Image:
         Raises:
             ImageError: there is none of that name; TornReadError, if it is only for now.
         """
-        place = self._place(name)
-        first, last = place.bit_offset // 8, _end_octet(place)
-        return take(place, self._stable_copy(place.writer, first, last, attempts), 8 * first)
+        slot = self._slot(name)
+        first, last = slot.bit_offset // 8, _end_octet(slot)
+        return take(slot, self._stable_copy(slot.writer, first, last, attempts), 8 * first)
 
     def read_all(self, writers: Collection[Writer] = tuple(Writer)) -> dict[str, Any]:
         """Return all variables of *writers*; those of one writer belong to one moment."""
@@ -88,10 +88,10 @@ class Image:
         for writer in writers:
             region = self.layout.regions[writer]
             copies[writer] = self._stable_copy(writer, region.offset, region.offset + region.size)
-        for place in self.layout.variables:
-            if place.writer in copies:
-                region = self.layout.regions[place.writer]
-                values[place.name] = _decode(place, copies[place.writer], 8 * region.offset)
+        for slot in self.layout.variables:
+            if slot.writer in copies:
+                region = self.layout.regions[slot.writer]
+                values[slot.name] = _decode(slot, copies[slot.writer], 8 * region.offset)
         return values
 
     def try_snapshot(self) -> Image | None:
@@ -130,24 +130,24 @@ class Image:
 
     def encode(self, name: str, value: Any) -> bytes:
         """Return the octets of *value* for :meth:`store`; raise ValueError if it does not fit."""
-        return datatypes.parse(self._place(name).type).encode(value)
+        return datatypes.parse(self._slot(name).type).encode(value)
 
     def store(self, name: str, octets: bytes) -> None:
         """Put encoded octets in a variable's place; the caller stands inside :meth:`writing`."""
-        place = self._place(name)
-        put(self.memory, place.bit_offset, datatypes.parse(place.type).bit_length, octets)
+        slot = self._slot(name)
+        put(self.memory, slot.bit_offset, datatypes.parse(slot.type).bit_length, octets)
 
     def storer(self, name: str) -> Callable[[Any], None]:
         """Return what stores numbers that are known to fit in one variable, again and again."""
-        place = self._place(name)
-        kind = datatypes.parse(place.type)
+        slot = self._slot(name)
+        kind = datatypes.parse(slot.type)
         limits = kind.scalar_range
         code = "" if limits is None or kind.is_bits else _CODES.get((type(limits[0]), kind.size))
         if not code:
             return lambda value: self.store(name, kind.encode(value))
         if limits is not None and limits[0] >= 0:
             code = code.upper()
-        return partial(struct.Struct(f"<{code}").pack_into, self.memory, place.bit_offset // 8)
+        return partial(struct.Struct(f"<{code}").pack_into, self.memory, slot.bit_offset // 8)
 
     @contextmanager
     def writing(self, writer: Writer) -> Iterator[None]:
@@ -162,18 +162,18 @@ class Image:
 
     def release(self) -> None:
         """Let go of the places, one by one; nothing can be read or written any more."""
-        while self.places:
-            self.places.popitem()
+        while self.slots:
+            self.slots.popitem()
 
     def set_defaults(self) -> None:
         """Store the default of every variable that has one; for a fresh image."""
-        for place in self.layout.variables:
-            if place.default is not None:
-                self.write(place.name, default_value(place))
+        for slot in self.layout.variables:
+            if slot.default is not None:
+                self.write(slot.name, default_value(slot))
 
-    def _place(self, name: str) -> VariablePlace:
+    def _slot(self, name: str) -> VariableSlot:
         try:
-            return self.places[name]
+            return self.slots[name]
         except KeyError:
             raise ImageError(f"station {self.layout.station} has no variable {name!r}") from None
 
@@ -258,28 +258,28 @@ def read_generation(memory: memoryview) -> int:
     return int(HEADER.unpack_from(memory)[2])
 
 
-def default_value(place: VariablePlace) -> Any:
-    """Return the value that *place* starts with; zero if it names none."""
-    kind = datatypes.parse(place.type)
-    return kind.zero if place.default is None else kind.from_plain(place.default)
+def default_value(slot: VariableSlot) -> Any:
+    """Return the value that *slot* starts with; zero if it names none."""
+    kind = datatypes.parse(slot.type)
+    return kind.zero if slot.default is None else kind.from_plain(slot.default)
 
 
-def _end_octet(place: VariablePlace) -> int:
-    return -(-(place.bit_offset + datatypes.parse(place.type).bit_length) // 8)
+def _end_octet(slot: VariableSlot) -> int:
+    return -(-(slot.bit_offset + datatypes.parse(slot.type).bit_length) // 8)
 
 
-def take(place: VariablePlace, data: bytes, first_bit: int) -> bytes:
+def take(slot: VariableSlot, data: bytes, first_bit: int) -> bytes:
     """Return the octets of a variable out of *data*, a copy of the image from *first_bit* on."""
-    kind = datatypes.parse(place.type)
-    offset, bit = divmod(place.bit_offset - first_bit, 8)
+    kind = datatypes.parse(slot.type)
+    offset, bit = divmod(slot.bit_offset - first_bit, 8)
     if not kind.is_bits:
         return data[offset : offset + kind.size]
     word = int.from_bytes(data[offset : offset + 2], "little") >> bit
     return bytes((word & (1 << kind.bit_length) - 1,))
 
 
-def _decode(place: VariablePlace, data: bytes, first_bit: int) -> Any:
-    return datatypes.parse(place.type).decode(take(place, data, first_bit), 0)
+def _decode(slot: VariableSlot, data: bytes, first_bit: int) -> Any:
+    return datatypes.parse(slot.type).decode(take(slot, data, first_bit), 0)
 
 
 _TORN = int(StationWord.TORN)
@@ -300,9 +300,9 @@ class Inputs:
         self._words = image.words
         self.memory = memoryview(bytearray(image.layout.samples.last))
         self._regions = [
-            (place.sequence, slice(place.offset, place.offset + place.size))
-            for writer, place in image.layout.regions.items()
-            if writer is not Writer.ENGINE and place.size
+            (slot.sequence, slice(slot.offset, slot.offset + slot.size))
+            for writer, slot in image.layout.regions.items()
+            if writer is not Writer.ENGINE and slot.size
         ]
         self._seen = [-1] * len(self._regions)
         self._settled: tuple[int, ...] = ()

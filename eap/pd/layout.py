@@ -59,7 +59,7 @@ FRAME_CTRL = ".FrameCtrl"
 """Suffix of the control variable of a TxFrame: bit 0 suppresses it."""
 
 
-class VariablePlace(SpecRecord, frozen=True):
+class VariableSlot(SpecRecord, frozen=True):
     """One variable: *bit_offset* counts from the start of the image."""
 
     name: str
@@ -71,7 +71,7 @@ class VariablePlace(SpecRecord, frozen=True):
     default: bool | int | float | str | list[bool | int | float] | None = None
 
 
-class RegionPlace(SpecRecord, frozen=True):
+class RegionSlot(SpecRecord, frozen=True):
     """The variables of one writer, and the word that guards them; offsets in octets."""
 
     offset: int
@@ -79,7 +79,7 @@ class RegionPlace(SpecRecord, frozen=True):
     sequence: int
 
 
-class SamplePlace(SpecRecord, frozen=True):
+class SampleSlot(SpecRecord, frozen=True):
     """Samples of all regions, one a cycle; offsets and sizes in octets.
 
     The sample of a cycle lies at ``offset + cycle % count * size``: the cycle and its time, which
@@ -93,7 +93,7 @@ class SamplePlace(SpecRecord, frozen=True):
     last: int
 
 
-class PortPlace(SpecRecord, frozen=True):
+class ImagePort(SpecRecord, frozen=True):
     """What a reader wants to know of a port."""
 
     name: str
@@ -102,7 +102,7 @@ class PortPlace(SpecRecord, frozen=True):
     interface: str
 
 
-class FramePlace(SpecRecord, frozen=True):
+class FrameSlot(SpecRecord, frozen=True):
     """A TxFrame: *words* is the index of its first word."""
 
     name: str
@@ -118,7 +118,7 @@ class FramePlace(SpecRecord, frozen=True):
         return self.port, self.destination, self.monitor_interval_ms, self.monitor_ip
 
 
-class TxPlace(SpecRecord, frozen=True):
+class TxSlot(SpecRecord, frozen=True):
     """A TxPD; *frame_words* is the index of its frame's first word, *size* the data's octets."""
 
     name: str
@@ -140,7 +140,7 @@ class TxPlace(SpecRecord, frozen=True):
     """The RxPD that asks for it."""
 
 
-class RxPlace(SpecRecord, frozen=True):
+class RxSlot(SpecRecord, frozen=True):
     """An RxPD: its PD header lies at octet *offset*, its data behind it."""
 
     name: str
@@ -158,7 +158,7 @@ class RxPlace(SpecRecord, frozen=True):
     substitute: Substitute
     poll_request: str = ""
     """The TxPD that asks for it."""
-    alternates: tuple[AlternatePlace, ...] = ()
+    alternates: tuple[AlternateSlot, ...] = ()
     source: str = ""
     """Address that its frames must come from; empty takes any."""
 
@@ -169,13 +169,13 @@ class ImageLayout(SpecRecord, frozen=True):
     station: str
     net_id: str
     cycle_us: int
-    ports: tuple[PortPlace, ...]
-    variables: tuple[VariablePlace, ...]
-    regions: dict[Writer, RegionPlace]
-    frames: tuple[FramePlace, ...]
-    tx: tuple[TxPlace, ...]
-    rx: tuple[RxPlace, ...]
-    samples: SamplePlace
+    ports: tuple[ImagePort, ...]
+    variables: tuple[VariableSlot, ...]
+    regions: dict[Writer, RegionSlot]
+    frames: tuple[FrameSlot, ...]
+    tx: tuple[TxSlot, ...]
+    rx: tuple[RxSlot, ...]
+    samples: SampleSlot
     word_count: int
     directory_offset: int
 
@@ -197,37 +197,37 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
     """
     words = _Allocator(0)
     words.take(StationWord.SIZE)
-    frames = tuple(_frame_place(frame, words) for frame in spec.frames)
+    frames = tuple(_frame_slot(frame, words) for frame in spec.frames)
     types = {variable.name: datatypes.parse(variable.type) for variable in spec.variables}
-    tx = tuple(_tx_places(spec, frames, types, words))
+    tx = tuple(_tx_slots(spec, frames, types, words))
     rx_words = [words.take(RxWord.SIZE) for _ in spec.subscriptions]
 
     octets = _Allocator(WORDS_OFFSET + 8 * words.used)
     start = octets.used
-    places: dict[str, VariablePlace] = {}
-    rx = tuple(_rx_places(spec, rx_words, places, octets))
+    slots: dict[str, VariableSlot] = {}
+    rx = tuple(_rx_slots(spec, rx_words, slots, octets))
     regions = {}
     for writer in Writer:
-        _place_on_bus(spec, writer, types, places, octets)
-        _place_variables(
-            (v for v in spec.variables if v.writer is writer and v.name not in places),
-            places,
+        _lay_out_on_bus(spec, writer, types, slots, octets)
+        _lay_out_variables(
+            (v for v in spec.variables if v.writer is writer and v.name not in slots),
+            slots,
             octets,
         )
         if writer is Writer.APPLICATION:
-            _place_variables(_control_variables(spec), places, octets)
+            _lay_out_variables(_control_variables(spec), slots, octets)
         octets.align()
         sequence = StationWord[f"{writer.name}_SEQUENCE"]
-        regions[writer] = RegionPlace(start, octets.used - start, sequence)
+        regions[writer] = RegionSlot(start, octets.used - start, sequence)
         start = octets.used
-    samples = _sample_place(regions[Writer.ENGINE].offset, octets, spec.cycle_us)
+    samples = _sample_slot(regions[Writer.ENGINE].offset, octets, spec.cycle_us)
 
     return ImageLayout(
         station=spec.name,
         net_id=spec.net_id,
         cycle_us=spec.cycle_us,
-        ports=tuple(PortPlace(p.name, p.kind, p.net_id, p.interface) for p in spec.ports),
-        variables=tuple(places.values()),
+        ports=tuple(ImagePort(p.name, p.kind, p.net_id, p.interface) for p in spec.ports),
+        variables=tuple(slots.values()),
         regions=regions,
         frames=frames,
         tx=tx,
@@ -253,13 +253,13 @@ class _Allocator:
         self.used += -self.used % 8
 
 
-def _sample_place(first: int, octets: _Allocator, cycle_us: int) -> SamplePlace:
+def _sample_slot(first: int, octets: _Allocator, cycle_us: int) -> SampleSlot:
     """Keep enough samples for whoever looks now and then, in not too much memory."""
     last = octets.used
     size = SAMPLE_HEAD + last - first
     count = min(SAMPLES_FOR_US // cycle_us, MAX_SAMPLES, SAMPLES_SIZE // size)
     count = max(count, MIN_SAMPLES)
-    return SamplePlace(octets.take(count * size), count, size, first, last)
+    return SampleSlot(octets.take(count * size), count, size, first, last)
 
 
 def _control_variables(spec: StationSpec) -> Iterable[VariableSpec]:
@@ -271,19 +271,19 @@ def _control_variables(spec: StationSpec) -> Iterable[VariableSpec]:
             )
 
 
-def _place_variables(
-    variables: Iterable[VariableSpec], places: dict[str, VariablePlace], octets: _Allocator
+def _lay_out_variables(
+    variables: Iterable[VariableSpec], slots: dict[str, VariableSlot], octets: _Allocator
 ) -> None:
     for variable in variables:
         offset = octets.take(datatypes.parse(variable.type).size)
-        places[variable.name] = _place(variable, 8 * offset)
+        slots[variable.name] = _variable_slot(variable, 8 * offset)
 
 
-def _place_on_bus(
+def _lay_out_on_bus(
     spec: StationSpec,
     writer: Writer,
     types: dict[str, datatypes.DataType],
-    places: dict[str, VariablePlace],
+    slots: dict[str, VariableSlot],
     octets: _Allocator,
 ) -> None:
     """Place what *writer* writes of the slaves' process data: all inputs, then outputs."""
@@ -297,11 +297,11 @@ def _place_on_bus(
             plan = mirror(entries, types)
             first_bit = 8 * octets.take(plan.size)
             for name in own:
-                places[name] = _place(named[name], first_bit + plan.bit_offsets[name])
+                slots[name] = _variable_slot(named[name], first_bit + plan.bit_offsets[name])
 
 
-def _place(variable: VariableSpec, bit_offset: int) -> VariablePlace:
-    return VariablePlace(
+def _variable_slot(variable: VariableSpec, bit_offset: int) -> VariableSlot:
+    return VariableSlot(
         variable.name,
         variable.type,
         variable.writer,
@@ -312,8 +312,8 @@ def _place(variable: VariableSpec, bit_offset: int) -> VariablePlace:
     )
 
 
-def _frame_place(frame: TxFrameSpec, words: _Allocator) -> FramePlace:
-    return FramePlace(
+def _frame_slot(frame: TxFrameSpec, words: _Allocator) -> FrameSlot:
+    return FrameSlot(
         name=frame.name,
         port=frame.port,
         destination=frame.destination,
@@ -323,16 +323,16 @@ def _frame_place(frame: TxFrameSpec, words: _Allocator) -> FramePlace:
     )
 
 
-def _tx_places(
+def _tx_slots(
     spec: StationSpec,
-    frames: tuple[FramePlace, ...],
+    frames: tuple[FrameSlot, ...],
     types: dict[str, datatypes.DataType],
     words: _Allocator,
-) -> Iterable[TxPlace]:
-    for frame, place in zip(spec.frames, frames, strict=True):
+) -> Iterable[TxSlot]:
+    for frame, slot in zip(spec.frames, frames, strict=True):
         for pd in frame.pds:
             trigger = pd.trigger
-            yield TxPlace(
+            yield TxSlot(
                 name=pd.name,
                 frame=frame.name,
                 port=frame.port,
@@ -341,7 +341,7 @@ def _tx_places(
                 size=pdo.layout([types[name] for name in pd.variables]).size,
                 variables=pd.variables,
                 words=words.take(TxWord.SIZE),
-                frame_words=place.words,
+                frame_words=slot.words,
                 by_schedule=not (trigger.on_change or trigger.event or pd.poll_request),
                 event=trigger.event,
                 cyclic=bool(trigger.cycle_us) or not (trigger.divider or frame.divider),
@@ -349,12 +349,12 @@ def _tx_places(
             )
 
 
-def _rx_places(
+def _rx_slots(
     spec: StationSpec,
     words: list[int],
-    places: dict[str, VariablePlace],
+    slots: dict[str, VariableSlot],
     octets: _Allocator,
-) -> Iterable[RxPlace]:
+) -> Iterable[RxSlot]:
     named = {variable.name: variable for variable in spec.variables}
     for pd, first_word in zip(spec.subscriptions, words, strict=True):
         kinds = [datatypes.parse(named[name].type) for name in pd.variables]
@@ -363,8 +363,8 @@ def _rx_places(
         data = 8 * (offset + PdHeader.SIZE)
         bits = [data + bit_offset for bit_offset in plan.bit_offsets]
         for name, bit_offset in zip(pd.variables, bits, strict=True):
-            places[name] = _place(named[name], bit_offset)
-        yield RxPlace(
+            slots[name] = _variable_slot(named[name], bit_offset)
+        yield RxSlot(
             name=pd.name,
             port=pd.port,
             pd_id=pd.pd_id,
@@ -379,7 +379,7 @@ def _rx_places(
             timeout_ms=pd.timeout_ms,
             substitute=pd.substitute,
             poll_request=pd.poll_request,
-            alternates=place_alternates(pd, kinds, bits, offset),
+            alternates=lay_out_alternates(pd, kinds, bits, offset),
             source=pd.source,
         )
 
@@ -389,7 +389,7 @@ _QUALITY_BITS = 16
 _QUALITY = 8 * PdHeader.SIZE - _QUALITY_BITS
 
 
-class AlternatePlace(SpecRecord, frozen=True):
+class AlternateSlot(SpecRecord, frozen=True):
     """Another layout: *size* octets of data."""
 
     version: int
@@ -404,9 +404,9 @@ class AlternatePlace(SpecRecord, frozen=True):
         return CopyPlan(self.moves, used=self.untouched)
 
 
-def place_alternates(
+def lay_out_alternates(
     pd: RxPdSpec, kinds: Sequence[DataType], bits: Sequence[int], offset: int
-) -> tuple[AlternatePlace, ...]:
+) -> tuple[AlternateSlot, ...]:
     """Return where the alternates of *pd* go.
 
     Args:
@@ -425,7 +425,7 @@ def place_alternates(
     layouts = {(pd.version, pdo.layout(kinds).size)}
     found = []
     for alternate in pd.alternates:
-        found.append(_place_alternate(pd, alternate, own, 8 * offset))
+        found.append(_lay_out_alternate(pd, alternate, own, 8 * offset))
         key = found[-1].version, found[-1].size
         if key in layouts:
             problem = f"has {key[1]} octets like another layout of that version"
@@ -434,9 +434,9 @@ def place_alternates(
     return tuple(found)
 
 
-def _place_alternate(
+def _lay_out_alternate(
     pd: RxPdSpec, alternate: RxAlternateSpec, own: Mapping[str, tuple[DataType, int]], header: int
-) -> AlternatePlace:
+) -> AlternateSlot:
     theirs = [datatypes.parse(each.type) for each in alternate.variables]
     plan = pdo.layout(theirs)
     moves = [Move(_QUALITY, header + _QUALITY, _QUALITY_BITS)]
@@ -451,7 +451,7 @@ def _place_alternate(
             raise _refusal(pd, alternate, problem, f"each of {shown} at most once")
         moves.append(Move(8 * PdHeader.SIZE + start, bit, kind.bit_length))
     untouched = tuple((bit, kind.bit_length) for kind, bit in missing.values())
-    return AlternatePlace(alternate.version, plan.size, tuple(moves), untouched)
+    return AlternateSlot(alternate.version, plan.size, tuple(moves), untouched)
 
 
 def _refusal(pd: RxPdSpec, alternate: RxAlternateSpec, problem: str, expected: str) -> ValueError:

@@ -20,7 +20,7 @@ from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
-from eap.pd.layout import VariablePlace
+from eap.pd.layout import VariableSlot
 from eap.pd.spec import LinkSpec, Writer
 from eap.pd.words import StationWord
 
@@ -30,14 +30,14 @@ _HELD = int(StationWord.LINKS_HELD)
 class _End(NamedTuple):
     """One end of a link."""
 
-    place: VariablePlace
+    slot: VariableSlot
     kind: DataType
     memory: memoryview
 
     @property
     def octets(self) -> slice:
         """Where the variable lies; for those that are no bit fields."""
-        first = self.place.bit_offset // 8
+        first = self.slot.bit_offset // 8
         return slice(first, first + self.kind.size)
 
 
@@ -74,8 +74,8 @@ class Links:
         self, image: Image, memory_of: Callable[[Writer], memoryview], links: Iterable[LinkSpec]
     ) -> None:
         def end(name: str) -> _End:
-            place = image.places[name]
-            return _End(place, datatypes.parse(place.type), memory_of(place.writer))
+            slot = image.slots[name]
+            return _End(slot, datatypes.parse(slot.type), memory_of(slot.writer))
 
         ways = [_way(link, end(link.source), end(link.target)) for link in links]
         self._steps = [step for stage in _stages(ways) for step in _steps(image, stage)]
@@ -92,7 +92,7 @@ class Links:
 
 
 def _way(link: LinkSpec, source: _End, target: _End) -> _Way:
-    first, where = source.place.bit_offset, target.place.bit_offset
+    first, where = source.slot.bit_offset, target.slot.bit_offset
     length, room = source.kind.bit_length, target.kind.bit_length
     way = _Way(link, source, target, range(first, first + length), range(where, where + room))
     if way.is_computed or link.swap:
@@ -131,7 +131,7 @@ def _steps(image: Image, stage: Iterable[_Way]) -> Iterator[Callable[[], None]]:
         elif way.link.swap:
             yield _swapped(image.memory, way)
         else:
-            writer = source.place.writer
+            writer = source.slot.writer
             memories[writer] = source.memory
             move = Move(way.reads.start, way.writes.start, len(way.writes))
             moves.setdefault(writer, []).append(move)
@@ -152,7 +152,7 @@ def _swapped(memory: memoryview, way: _Way) -> Callable[[], None]:
 def _computed(image: Image, way: _Way) -> Callable[[], None]:
     read = _reader(way.source, swap=way.link.swap)
     value = _function(way.link, way.source.kind, way.target.kind)
-    store = image.storer(way.target.place.name)
+    store = image.storer(way.target.slot.name)
     words = image.words
 
     def compute() -> None:
@@ -167,7 +167,7 @@ def _computed(image: Image, way: _Way) -> Callable[[], None]:
 
 def _reader(source: _End, *, swap: bool) -> Callable[[], Any]:
     memory, kind = source.memory, source.kind
-    first, shift = divmod(source.place.bit_offset, 8)
+    first, shift = divmod(source.slot.bit_offset, 8)
     if kind.is_bits:
         mask = (1 << kind.bit_length) - 1
         two = memory[first : first + 2]

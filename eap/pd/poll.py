@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from eap.pd.image import Image
-from eap.pd.layout import TxPlace
+from eap.pd.layout import TxSlot
 from eap.pd.spec import StationSpec
 from eap.pd.words import FrameWord, TxWord
 
@@ -59,15 +59,15 @@ class PollQuestion:
 
     Args:
         words: The words of the station's image.
-        place: The TxPD.
+        slot: The TxPD.
         answers: The RxPDs that answer it.
     """
 
-    __slots__ = ("_answers", "_before_ns", "_place", "_sent_at_ns", "_state", "_waiting", "_words")
+    __slots__ = ("_answers", "_before_ns", "_sent_at_ns", "_slot", "_state", "_waiting", "_words")
 
-    def __init__(self, words: memoryview, place: TxPlace, answers: Iterable[str]) -> None:
+    def __init__(self, words: memoryview, slot: TxSlot, answers: Iterable[str]) -> None:
         self._words = words
-        self._place = place
+        self._slot = slot
         self._answers = tuple(answers)
         self._sent_at_ns = 0
         self._before_ns = 0
@@ -111,9 +111,9 @@ class PollQuestion:
         return at_ns - asked_ns
 
     def _read_state(self) -> tuple[int, int]:
-        words, place = self._words, self._place
-        whole = words[place.frame_words + FrameWord.WHOLE] if place.by_schedule else 0
-        return whole, words[place.words + TxWord.SENT_AT_NS]
+        words, slot = self._words, self._slot
+        whole = words[slot.frame_words + FrameWord.WHOLE] if slot.by_schedule else 0
+        return whole, words[slot.words + TxWord.SENT_AT_NS]
 
 
 class PollAnswer(NamedTuple):
@@ -134,11 +134,11 @@ def requests_at(spec: StationSpec, port: str) -> Requests:
 def questions_of(image: Image) -> dict[str, PollQuestion]:
     """Return what a station asks, by the TxPD that does it."""
     answers: dict[str, list[str]] = {}
-    for place in image.layout.rx:
-        if place.poll_request:
-            answers.setdefault(place.poll_request, []).append(place.name)
+    for slot in image.layout.rx:
+        if slot.poll_request:
+            answers.setdefault(slot.poll_request, []).append(slot.name)
     return {
-        place.name: PollQuestion(image.words, place, answers[place.name])
-        for place in image.layout.tx
-        if place.name in answers
+        slot.name: PollQuestion(image.words, slot, answers[slot.name])
+        for slot in image.layout.tx
+        if slot.name in answers
     }

@@ -9,7 +9,7 @@ from eap.ids import NetId
 from eap.pd.address import from_word, net_id_of, to_word
 from eap.pd.frame_status import enter_refused, enter_sent, enter_skipped, enter_suppressed
 from eap.pd.image import Image, Inputs
-from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FramePlace, TxPlace
+from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FrameSlot, TxSlot
 from eap.pd.link import Channel, OutFrame
 from eap.pd.poll import Requests
 from eap.pd.spec import TriggerSpec, TxFrameSpec
@@ -17,7 +17,7 @@ from eap.pd.trigger import EVENT_BIT, SUPPRESS_BIT, Schedule, Trigger, plan_sche
 from eap.pd.txframe import Gather, Selection, TxFrame, TxPd, build_frame
 from eap.pd.words import REASON_INDEX, FrameWord, Reason
 
-FrameRow: TypeAlias = tuple[TxFrameSpec, FramePlace, tuple[TxPlace, ...]]
+FrameRow: TypeAlias = tuple[TxFrameSpec, FrameSlot, tuple[TxSlot, ...]]
 """A TxFrame with its place and the places of its PDs."""
 
 
@@ -33,7 +33,7 @@ class _Group:
         self.out = [frame.whole.out for frame in frames]
         self.patches = [frame.whole.patch for frame in frames]
         self.counters = [
-            (frame.place.words + FrameWord.WHOLE, frame.place.words + FrameWord.SENT_AT_NS)
+            (frame.slot.words + FrameWord.WHOLE, frame.slot.words + FrameWord.SENT_AT_NS)
             for frame in frames
         ]
 
@@ -64,7 +64,7 @@ class Publisher:
         """Frames that go to a NetID, by that NetID: :meth:`learn` wants its address."""
         cycle_us = image.layout.cycle_us
         self.frames: list[TxFrame] = []
-        for spec, place, places in frames:
+        for spec, slot, slots in frames:
             gate = (spec.divider, spec.modulo)
             pds = tuple(
                 TxPd(
@@ -72,13 +72,13 @@ class Publisher:
                     Trigger(pd.trigger, plan_schedule(pd.trigger, cycle_us, gate)),
                     Gather(image, inputs, pd.variables),
                 )
-                for pd, where in zip(spec.pds, places, strict=True)
+                for pd, where in zip(spec.pds, slots, strict=True)
             )
             destination = spec.mac or spec.destination
             net_id = net_id_of(destination)
             if net_id is not None:  # what an earlier engine learned will do until it is heard anew
-                destination = str(from_word(self._words[place.words + FrameWord.ADDRESS]) or "")
-            frame = TxFrame(place, publisher, pds, gate, channel, destination)
+                destination = str(from_word(self._words[slot.words + FrameWord.ADDRESS]) or "")
+            frame = TxFrame(slot, publisher, pds, gate, channel, destination)
             self.frames.append(frame)
             self._note_target(frame, net_id)
         self._controls: dict[str, int] = {}
@@ -105,15 +105,15 @@ class Publisher:
         self._note_address(frame)
 
     def _note_address(self, frame: TxFrame) -> None:
-        self._words[frame.place.words + FrameWord.ADDRESS] = to_word(frame.destination)
+        self._words[frame.slot.words + FrameWord.ADDRESS] = to_word(frame.destination)
 
     def read_controls(self) -> None:
         """Follow the control variables; called when the application has written."""
         for frame in self.frames:
-            control = read_control(self._image, self._inputs, frame.place.name + FRAME_CTRL)
+            control = read_control(self._image, self._inputs, frame.slot.name + FRAME_CTRL)
             frame.suppressed = bool(control & SUPPRESS_BIT)
             for pd in frame.pds:
-                name = pd.place.name + VAR_CTRL
+                name = pd.slot.name + VAR_CTRL
                 control = read_control(self._image, self._inputs, name)
                 before = self._controls.get(name, control)  # a bit left set is no rising bit
                 self._controls[name] = control
@@ -165,10 +165,10 @@ class Publisher:
         """Yield the PDs that do not just follow the clock: what goes where, and the trigger."""
         for frame in self.frames:
             for pd in frame.pds:
-                if not pd.place.by_schedule:
-                    place = pd.place
-                    content = place.pd_id, place.version, place.variables, frame.place.destination
-                    yield place.name, (content, pd.trigger)
+                if not pd.slot.by_schedule:
+                    slot = pd.slot
+                    content = slot.pd_id, slot.version, slot.variables, frame.slot.destination
+                    yield slot.name, (content, pd.trigger)
 
     def release(self) -> None:
         """Let go of all frames, one by one: freeing many at once keeps others from running."""
@@ -221,10 +221,10 @@ class Publisher:
                 words[sent_at] = now_ns
         for frame, selection in sending:
             if failed and selection.out in failed:
-                enter_refused(words, frame.place, selection.out, now_ns)
-                enter_skipped(words, (pd.place for pd in selection.pds), now_ns)
+                enter_refused(words, frame.slot, selection.out, now_ns)
+                enter_skipped(words, (pd.slot for pd in selection.pds), now_ns)
                 continue
-            first = frame.place.words
+            first = frame.slot.words
             words[first + FrameWord.SENT_AT_NS] = now_ns
             if frame.schedule is not None and selection is frame.whole:
                 words[first + FrameWord.WHOLE] += 1
@@ -234,13 +234,13 @@ class Publisher:
 
     def _count(self, selection: Selection, now_ns: int) -> None:
         for pd in selection.pds:
-            enter_sent(self._words, pd.place, pd.reason, now_ns)
+            enter_sent(self._words, pd.slot, pd.reason, now_ns)
             pd.trigger.sent(pd.reason, now_ns, pd.data)
 
     def _skip(self, frame: TxFrame, pds: Sequence[TxPd], now_ns: int) -> None:
         if frame.is_held:
-            enter_suppressed(self._words, frame.place, now_ns)
-        enter_skipped(self._words, (pd.place for pd in pds), now_ns)
+            enter_suppressed(self._words, frame.slot, now_ns)
+        enter_skipped(self._words, (pd.slot for pd in pds), now_ns)
         for pd in pds:
             if frame.suppressed or pd.trigger.suppressed:  # else it waits for the address
                 pd.trigger.use_up_event()
@@ -248,8 +248,8 @@ class Publisher:
 
 def read_control(image: Image, inputs: Inputs, name: str) -> int:
     """Return the control variable *name* as this cycle sees it."""
-    place = image.places[name]
-    return int.from_bytes(inputs.memory[place.bit_offset // 8 :][:2], "little")
+    slot = image.slots[name]
+    return int.from_bytes(inputs.memory[slot.bit_offset // 8 :][:2], "little")
 
 
 ANSWERS_KEPT = 64
@@ -260,8 +260,8 @@ _POLL = REASON_INDEX[Reason.POLL]
 class _AnswerFrame:
     """The polled PDs of one TxFrame, and a buffer for each requester."""
 
-    def __init__(self, place: FramePlace, pds: tuple[TxPd, ...]) -> None:
-        self.place = place
+    def __init__(self, slot: FrameSlot, pds: tuple[TxPd, ...]) -> None:
+        self.slot = slot
         self.pds = pds
         self.suppressed = False
         self._kept: dict[tuple[str, tuple[TxPd, ...]], Selection] = {}
@@ -310,13 +310,13 @@ class Answerer:
         self._requests = requests
         self._frames = [
             _AnswerFrame(
-                place,
+                slot,
                 tuple(
                     TxPd(where, Trigger(TriggerSpec(), None), Gather(image, inputs, pd.variables))
-                    for pd, where in zip(spec.pds, places, strict=True)
+                    for pd, where in zip(spec.pds, slots, strict=True)
                 ),
             )
-            for spec, place, places in frames
+            for spec, slot, slots in frames
         ]
         self._sending: list[tuple[_AnswerFrame, Selection]] = []
         self.read_controls()
@@ -324,10 +324,10 @@ class Answerer:
     def read_controls(self) -> None:
         """Follow the control variables; called when the application has written."""
         for frame in self._frames:
-            control = read_control(self._image, self._inputs, frame.place.name + FRAME_CTRL)
+            control = read_control(self._image, self._inputs, frame.slot.name + FRAME_CTRL)
             frame.suppressed = bool(control & SUPPRESS_BIT)
             for pd in frame.pds:
-                control = read_control(self._image, self._inputs, pd.place.name + VAR_CTRL)
+                control = read_control(self._image, self._inputs, pd.slot.name + VAR_CTRL)
                 pd.trigger.suppressed = bool(control & SUPPRESS_BIT)
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
@@ -335,10 +335,10 @@ class Answerer:
         self._sending.clear()
         for sender, names in self._requests.take().items():
             for frame in self._frames:
-                due = [pd for pd in frame.pds if pd.place.poll_request in names]
+                due = [pd for pd in frame.pds if pd.slot.poll_request in names]
                 chosen = tuple(p for p in due if not (frame.suppressed or p.trigger.suppressed))
                 if len(chosen) < len(due):
-                    self._skip(frame, [pd.place for pd in due if pd not in chosen], now_ns)
+                    self._skip(frame, [pd.slot for pd in due if pd not in chosen], now_ns)
                 if chosen:
                     selection = frame.select(sender, chosen, self._publisher, self._channel)
                     selection.patch(cycle)
@@ -350,15 +350,15 @@ class Answerer:
         words = self._image.words
         for frame, selection in self._sending:
             if failed and selection.out in failed:
-                enter_refused(words, frame.place, selection.out, now_ns)
-                enter_skipped(words, (pd.place for pd in selection.pds), now_ns)
+                enter_refused(words, frame.slot, selection.out, now_ns)
+                enter_skipped(words, (pd.slot for pd in selection.pds), now_ns)
                 continue
-            words[frame.place.words + FrameWord.SENT_AT_NS] = now_ns
-            words[frame.place.words + FrameWord.PARTIAL] += 1
+            words[frame.slot.words + FrameWord.SENT_AT_NS] = now_ns
+            words[frame.slot.words + FrameWord.PARTIAL] += 1
             for pd in selection.pds:
-                enter_sent(words, pd.place, _POLL, now_ns)
+                enter_sent(words, pd.slot, _POLL, now_ns)
 
-    def _skip(self, frame: _AnswerFrame, pds: Iterable[TxPlace], now_ns: int) -> None:
+    def _skip(self, frame: _AnswerFrame, pds: Iterable[TxSlot], now_ns: int) -> None:
         if frame.suppressed:
-            enter_suppressed(self._image.words, frame.place, now_ns)
+            enter_suppressed(self._image.words, frame.slot, now_ns)
         enter_skipped(self._image.words, pds, now_ns)

@@ -15,7 +15,7 @@ from eap.pd.address import source_text
 from eap.pd.device import DeviceState
 from eap.pd.frame_status import frame_state, frame_status, presence, tx_var_state
 from eap.pd.image import Image
-from eap.pd.layout import RxPlace, TxPlace
+from eap.pd.layout import RxSlot, TxSlot
 from eap.pd.words import (
     DISCARDS,
     HISTOGRAM_BINS,
@@ -87,10 +87,10 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
             for p in layout.ports
         ],
         "discarded": _discarded(image, StationWord.DISCARDED),
-        "frames": [frame_status(image, place) for place in layout.frames],
+        "frames": [frame_status(image, slot) for slot in layout.frames],
         "pd": {
-            "tx": [tx_status(image, place) for place in layout.tx],
-            "rx": [_rx(image, place, now_ns, wall_ns) for place in layout.rx],
+            "tx": [tx_status(image, slot) for slot in layout.tx],
+            "rx": [_rx(image, slot, now_ns, wall_ns) for slot in layout.rx],
         },
     }
 
@@ -101,42 +101,40 @@ def pd_list(image: Image) -> list[PdRow]:
     net_ids = {port.name: port.net_id for port in layout.ports}
     destinations = {frame.name: frame.destination for frame in layout.frames}
 
-    def row(place: TxPlace | RxPlace, **direction: Any) -> PdRow:
-        places = (image.places[name] for name in place.variables)
+    def row(slot: TxSlot | RxSlot, **direction: Any) -> PdRow:
+        slots = (image.slots[name] for name in slot.variables)
         return PdRow(
             station=layout.station,
-            name=place.name,
-            id=place.pd_id,
-            version=place.version,
-            length=place.size,
-            port=place.port,
-            poll=place.poll_request or None,
-            variables=[PdRowVariable(p.name, p.type, p.unit, p.writer) for p in places],
+            name=slot.name,
+            id=slot.pd_id,
+            version=slot.version,
+            length=slot.size,
+            port=slot.port,
+            poll=slot.poll_request or None,
+            variables=[PdRowVariable(p.name, p.type, p.unit, p.writer) for p in slots],
             **direction,
         )
 
     sent = [
         row(
-            place,
+            slot,
             direction="tx",
-            publisher=net_ids[place.port],
-            frame=place.frame,
-            destination=destinations[place.frame],
+            publisher=net_ids[slot.port],
+            frame=slot.frame,
+            destination=destinations[slot.frame],
         )
-        for place in layout.tx
+        for slot in layout.tx
     ]
-    received = [
-        row(place, direction="rx", publisher=place.publisher or None) for place in layout.rx
-    ]
+    received = [row(slot, direction="rx", publisher=slot.publisher or None) for slot in layout.rx]
     return sent + received
 
 
-def tracker_word(image: Image, place: RxPlace) -> int:
+def tracker_word(image: Image, slot: RxSlot) -> int:
     """Return the index of the first word of the block that holds a subscription's tracker."""
-    return int(image.words[place.words + RxWord.TRACKER]) or place.words
+    return int(image.words[slot.words + RxWord.TRACKER]) or slot.words
 
 
-def quality(image: Image, place: RxPlace) -> int:
+def quality(image: Image, slot: RxSlot) -> int:
     """Return the age of a subscription's data in units of 100 us, saturated at 65535.
 
     It is the Quality that the frame carried plus the receiver's own cycles since, and with polled
@@ -144,20 +142,20 @@ def quality(image: Image, place: RxPlace) -> int:
     to cycle.
     """
     words = image.words
-    first = tracker_word(image, place)
+    first = tracker_word(image, slot)
     cycles = words[StationWord.CYCLE] - words[first + RxWord.ARRIVED_IN_CYCLE]
-    own_ns = max(cycles, 0) * image.layout.cycle_us * 1000 + words[place.words + RxWord.RESPONSE_NS]
-    sent = PdHeader.decode(image.memory, place.offset).quality
+    own_ns = max(cycles, 0) * image.layout.cycle_us * 1000 + words[slot.words + RxWord.RESPONSE_NS]
+    sent = PdHeader.decode(image.memory, slot.offset).quality
     return min(sent + own_ns // _QUALITY_NS, _QUALITY_MAX)
 
 
-def var_state(image: Image, place: RxPlace) -> int:
+def var_state(image: Image, slot: RxSlot) -> int:
     """Return VarState: bit 0 version, bit 1 length differ in what arrives now; 0 is well."""
     words = image.words
-    first = tracker_word(image, place)
-    if words[place.words + RxWord.MISMATCH_AT_NS] <= words[first + RxWord.ARRIVED_AT_NS]:
+    first = tracker_word(image, slot)
+    if words[slot.words + RxWord.MISMATCH_AT_NS] <= words[first + RxWord.ARRIVED_AT_NS]:
         return 0
-    return int(words[place.words + RxWord.MISMATCH])
+    return int(words[slot.words + RxWord.MISMATCH])
 
 
 def _spread(bins: list[int], largest: int) -> dict[str, int | None]:
@@ -173,67 +171,67 @@ def _discarded(image: Image, first: int) -> dict[str, int]:
     return {reason.value: count for reason, count in zip(DISCARDS, counts, strict=True) if count}
 
 
-def tx_status(image: Image, place: TxPlace) -> dict[str, Any]:
+def tx_status(image: Image, slot: TxSlot) -> dict[str, Any]:
     """Return the entry of one PD to send in the status of the station."""
     words = image.words
-    counts = words[place.words + TxWord.REASON : place.words + TxWord.SIZE].tolist()
-    whole = 0 if place.poll_request else words[place.frame_words + FrameWord.WHOLE]
-    scheduled = REASON_INDEX[Reason.CYCLE if place.cyclic else Reason.DIVIDER]
+    counts = words[slot.words + TxWord.REASON : slot.words + TxWord.SIZE].tolist()
+    whole = 0 if slot.poll_request else words[slot.frame_words + FrameWord.WHOLE]
+    scheduled = REASON_INDEX[Reason.CYCLE if slot.cyclic else Reason.DIVIDER]
     counts[scheduled] += whole
-    last = words[place.words + TxWord.LAST_REASON] if not whole else scheduled
+    last = words[slot.words + TxWord.LAST_REASON] if not whole else scheduled
     return {
-        "name": place.name,
-        "port": place.port,
-        "frame": place.frame,
+        "name": slot.name,
+        "port": slot.port,
+        "frame": slot.frame,
         "sent": sum(counts),
-        "skipped": words[place.words + TxWord.SKIPPED],
+        "skipped": words[slot.words + TxWord.SKIPPED],
         "reason": {r.value: n for r, n in zip(REASONS, counts, strict=True) if n},
         "last_reason": REASONS[last].value if sum(counts) else None,
-        "var_state": tx_var_state(words, place),
-        "frame_state": frame_state(image, place.frame_words),
-        "subscriber": presence(image, place.frame_words),
+        "var_state": tx_var_state(words, slot),
+        "frame_state": frame_state(image, slot.frame_words),
+        "subscriber": presence(image, slot.frame_words),
     }
 
 
-def _rx(image: Image, place: RxPlace, now_ns: int, wall_ns: int | None) -> dict[str, Any]:
+def _rx(image: Image, slot: RxSlot, now_ns: int, wall_ns: int | None) -> dict[str, Any]:
     words = image.words
-    first = tracker_word(image, place)
+    first = tracker_word(image, slot)
     received = words[first + RxWord.RECEIVED]
     bins = words[first + RxWord.JITTER : first + RxWord.JITTER + HISTOGRAM_BINS].tolist()
     age_ns = now_ns - words[first + RxWord.ARRIVED_AT_NS]
     spread = _spread(bins, words[first + RxWord.JITTER_MAX_US])
-    response_ns = words[place.words + RxWord.RESPONSE_NS]
+    response_ns = words[slot.words + RxWord.RESPONSE_NS]
     last_us = response_ns // 1000 if response_ns else None
     return {
-        "name": place.name,
-        "port": place.port,
+        "name": slot.name,
+        "port": slot.port,
         "received": received,
-        "lost": words[first + RxWord.LOST] if place.step else None,
+        "lost": words[first + RxWord.LOST] if slot.step else None,
         "duplicated": words[first + RxWord.DUPLICATED],
         "reordered": words[first + RxWord.REORDERED],
         "late": words[first + RxWord.LATE],
         "timeouts": words[first + RxWord.TIMEOUTS],
-        "discarded": _discarded(image, place.words + RxWord.DISCARDED),
-        "quality": quality(image, place) if received else None,
+        "discarded": _discarded(image, slot.words + RxWord.DISCARDED),
+        "quality": quality(image, slot) if received else None,
         "cycle_index": words[first + RxWord.LAST_CYCLE] & 0xFFFF if received else None,
-        "var_state": var_state(image, place),
+        "var_state": var_state(image, slot),
         "age_us": max(age_ns, 0) // 1000 if received else None,
         "last_good": round((wall_ns - age_ns) / 1e9, 3) if received and wall_ns else None,
-        "jitter_us": _spread([], 0) if place.poll_request else spread,
-        "response_us": {"last": last_us, **spread} if place.poll_request else None,
-        "source": source_text(words[place.words + RxWord.SOURCE]),
-        "other_source": _seen(words, place, RxWord.OTHER_SOURCE, RxWord.OTHER_SOURCE_AT_NS, now_ns),
-        "wrong_source": _seen(words, place, RxWord.WRONG_SOURCE, RxWord.WRONG_SOURCE_AT_NS, now_ns),
+        "jitter_us": _spread([], 0) if slot.poll_request else spread,
+        "response_us": {"last": last_us, **spread} if slot.poll_request else None,
+        "source": source_text(words[slot.words + RxWord.SOURCE]),
+        "other_source": _seen(words, slot, RxWord.OTHER_SOURCE, RxWord.OTHER_SOURCE_AT_NS, now_ns),
+        "wrong_source": _seen(words, slot, RxWord.WRONG_SOURCE, RxWord.WRONG_SOURCE_AT_NS, now_ns),
         "state": RxState(words[first + RxWord.STATE]).name.lower(),
     }
 
 
 def _seen(
-    words: memoryview, place: RxPlace, address: RxWord, at: RxWord, now_ns: int
+    words: memoryview, slot: RxSlot, address: RxWord, at: RxWord, now_ns: int
 ) -> dict[str, Any] | None:
     """Return an address that frames came from and how long ago, None if there was none."""
-    text = source_text(words[place.words + address])
+    text = source_text(words[slot.words + address])
     if text is None:
         return None
-    age_ns = now_ns - words[place.words + at]
+    age_ns = now_ns - words[slot.words + at]
     return {"address": text, "age_us": max(age_ns, 0) // 1000}

@@ -32,11 +32,11 @@ class Sampler:
         self._words = image.words
         self._memory = image.memory
         self._inputs = inputs
-        self._place = place = image.layout.samples
+        self._slot = slot = image.layout.samples
         self._heads = _heads(image)
         engine = image.layout.regions[Writer.ENGINE]
         self._engine = slice(engine.offset, engine.offset + engine.size)
-        self._others = slice(engine.offset + engine.size, place.last)
+        self._others = slice(engine.offset + engine.size, slot.last)
 
     def end_cycle(self, cycle: int, now_ns: int) -> None:
         """Keep the variables as they are after *cycle*, which ran at *now_ns*, if wanted."""
@@ -44,15 +44,15 @@ class Sampler:
             self._take(cycle, now_ns)
 
     def _take(self, cycle: int, now_ns: int) -> None:
-        place, memory = self._place, self._memory
-        number = cycle % place.count
-        head = number * (place.size // 8)
+        slot, memory = self._slot, self._memory
+        number = cycle % slot.count
+        head = number * (slot.size // 8)
         self._heads[head] = _NO_CYCLE
         self._heads[head + 1] = now_ns
-        start = place.offset + number * place.size + SAMPLE_HEAD
+        start = slot.offset + number * slot.size + SAMPLE_HEAD
         middle = start + self._engine.stop - self._engine.start
         memory[start:middle] = memory[self._engine]
-        memory[middle : start - SAMPLE_HEAD + place.size] = self._inputs[self._others]
+        memory[middle : start - SAMPLE_HEAD + slot.size] = self._inputs[self._others]
         self._heads[head] = cycle
 
 
@@ -68,7 +68,7 @@ class ImageSamples:
 
     def __init__(self, image: Image) -> None:
         self.image = image
-        self._place = image.layout.samples
+        self._slot = image.layout.samples
         self._heads = _heads(image)
 
     @property
@@ -85,7 +85,7 @@ class ImageSamples:
         newest = self.newest
         if self._heads[self._head(newest)] != newest:
             newest -= 1  # it runs right now
-        return range(max(cycle, newest - self._place.count) + 1, newest + 1)
+        return range(max(cycle, newest - self._slot.count) + 1, newest + 1)
 
     def ran_at_ns(self, cycle: int) -> int | None:
         """Return when *cycle* ran, on the monotonic clock; None if there is no sample of it."""
@@ -95,15 +95,15 @@ class ImageSamples:
 
     def read(self, cycle: int) -> bytes | None:
         """Return the variables at the end of *cycle*; None if there is no sample of it."""
-        start = self._place.offset + cycle % self._place.count * self._place.size + SAMPLE_HEAD
-        data = bytes(self.image.memory[start : start - SAMPLE_HEAD + self._place.size])
+        start = self._slot.offset + cycle % self._slot.count * self._slot.size + SAMPLE_HEAD
+        data = bytes(self.image.memory[start : start - SAMPLE_HEAD + self._slot.size])
         return data if self._heads[self._head(cycle)] == cycle else None
 
     def _head(self, cycle: int) -> int:
-        return cycle % self._place.count * (self._place.size // 8)
+        return cycle % self._slot.count * (self._slot.size // 8)
 
 
 def _heads(image: Image) -> memoryview:
     """Return the samples as words, which are stored and loaded whole."""
-    place = image.layout.samples
-    return image.memory[place.offset : place.offset + place.count * place.size].cast("q")
+    slot = image.layout.samples
+    return image.memory[slot.offset : slot.offset + slot.count * slot.size].cast("q")

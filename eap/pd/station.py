@@ -110,7 +110,7 @@ class Station:
 
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
-        own = [(pd, place) for pd, place in rows if pd.port == port]
+        own = [(pd, slot) for pd, slot in rows if pd.port == port]
         return Subscriber(self.image, own, self.cycle_ns, self._requests[port], self._questions)
 
     def connect(self, port: str, channel: Channel) -> None:
@@ -120,8 +120,8 @@ class Station:
         """
         layout = self.image.layout
         frames = [
-            (frame, place, tuple(pd for pd in layout.tx if pd.frame == frame.name))
-            for frame, place in zip(self.spec.frames, layout.frames, strict=True)
+            (frame, slot, tuple(pd for pd in layout.tx if pd.frame == frame.name))
+            for frame, slot in zip(self.spec.frames, layout.frames, strict=True)
             if frame.port == port
         ]
         if any(pd.port == port for pd in self.spec.subscriptions):
@@ -367,10 +367,10 @@ def _supervise(bus: CyclicBus, now_ns: int) -> None:
 def _pds_of(frames: Iterable[FrameRow], *, polled: bool) -> list[FrameRow]:
     """Return the frames with those of their PDs that are polled, or those that are not."""
     rows: list[FrameRow] = []
-    for spec, place, places in frames:
+    for spec, slot, slots in frames:
         kept = [index for index, pd in enumerate(spec.pds) if bool(pd.poll_request) is polled]
         if kept:
             pds = tuple(spec.pds[index] for index in kept)
             own = msgspec.structs.replace(spec, pds=pds)
-            rows.append((own, place, tuple(places[index] for index in kept)))
+            rows.append((own, slot, tuple(slots[index] for index in kept)))
     return rows

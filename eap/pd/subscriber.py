@@ -16,7 +16,7 @@ from eap.ids import NetId
 from eap.pd.address import SourceWatch
 from eap.pd.frame_plan import FramePlan, RefusedPd, TakenPd, walk
 from eap.pd.image import Image
-from eap.pd.layout import RxPlace
+from eap.pd.layout import RxSlot
 from eap.pd.link import FrameOrigin
 from eap.pd.poll import PollQuestion, Requests
 from eap.pd.sequence import SequenceTracker, Timing
@@ -59,7 +59,7 @@ class Subscriber:
     def __init__(
         self,
         image: Image,
-        subscriptions: Iterable[tuple[RxPdSpec, RxPlace]],
+        subscriptions: Iterable[tuple[RxPdSpec, RxSlot]],
         own_cycle_ns: int,
         requests: Requests,
         questions: Mapping[str, PollQuestion] = MappingProxyType({}),
@@ -193,7 +193,7 @@ class SubscriptionTable:
     def __init__(
         self,
         image: Image,
-        subscriptions: Iterable[tuple[RxPdSpec, RxPlace]],
+        subscriptions: Iterable[tuple[RxPdSpec, RxSlot]],
         own_cycle_ns: int,
         requests: Requests,
         questions: Mapping[str, PollQuestion],
@@ -203,17 +203,17 @@ class SubscriptionTable:
         self.words = image.words
         self.subscriptions = [
             RxSubscription(
-                spec, place, SubstituteValue(image, place), questions.get(spec.poll_request)
+                spec, slot, SubstituteValue(image, slot), questions.get(spec.poll_request)
             )
-            for spec, place in subscriptions
+            for spec, slot in subscriptions
         ]
         self._by_key: dict[tuple[bytes, int], list[RxSubscription]] = {}
         self._by_id: dict[int, list[RxSubscription]] = {}
         for subscription in self.subscriptions:
-            place = subscription.place
-            publisher = NetId.parse(place.publisher) if place.publisher else b""
-            self._by_key.setdefault((publisher, place.pd_id), []).append(subscription)
-            self._by_id.setdefault(place.pd_id, []).append(subscription)
+            slot = subscription.slot
+            publisher = NetId.parse(slot.publisher) if slot.publisher else b""
+            self._by_key.setdefault((publisher, slot.pd_id), []).append(subscription)
+            self._by_id.setdefault(slot.pd_id, []).append(subscription)
         timeouts = [s.timeout_ns for s in self.subscriptions if s.timeout_ns]
         self.shortest_timeout_ns = min(timeouts, default=_NEVER)
         self._sources = frozenset(s.source for s in self.subscriptions if s.source)
@@ -275,10 +275,10 @@ class SubscriptionTable:
             refused,
             watch=self._watch(publisher, source, at_ns, taking, refused),
             requests=[
-                (s.tracker, s.place.name) for s in taking if s.place.name in self._requests.names
+                (s.tracker, s.slot.name) for s in taking if s.slot.name in self._requests.names
             ],
             answers=[(s.tracker, s.answer) for s in taking if s.answer is not None],
-            roaming={s.tracker for s in taking if not s.place.publisher},
+            roaming={s.tracker for s in taking if not s.slot.publisher},
             publisher=publisher,
         )
         if self._pds_planned > _PDS_PLANNED:
@@ -307,7 +307,7 @@ class SubscriptionTable:
         if source != watch.source:
             watch.includes(source, at_ns)
         watch.follow(
-            (subscription.place.words for subscription in taking),
+            (subscription.slot.words for subscription in taking),
             (first for pd in refused for first in pd.wrong_source),
         )
         return watch
@@ -371,40 +371,40 @@ class SubscriptionTable:
         sender = origin.sender_of(data)
         if not sender or not self._requests.add(sender, names):
             reason = Discard.TOO_MANY_REQUESTS if sender else Discard.NO_SENDER
-            refused = [s.place.words for s in self.subscriptions if s.place.name in names]
+            refused = [s.slot.words for s in self.subscriptions if s.slot.name in names]
             self.discard(reason, len(names), refused)
 
     def _open_trackers(self, own_cycle_ns: int) -> None:
         """Find the trackers that an earlier engine left in the image, or start new ones."""
         trackers: dict[object, SequenceTracker] = {}
         for subscription in self.subscriptions:
-            place = subscription.place
-            first_word = self.words[place.words + RxWord.TRACKER]
+            slot = subscription.slot
+            first_word = self.words[slot.words + RxWord.TRACKER]
             timing = Timing(
-                step=place.step,
-                sender_cycle_ns=place.sender_cycle_us * 1000,
+                step=slot.step,
+                sender_cycle_ns=slot.sender_cycle_us * 1000,
                 own_cycle_ns=own_cycle_ns,
-                polled=bool(place.poll_request),
+                polled=bool(slot.poll_request),
             )
             # Only PDs that are judged alike can share; with any publisher nothing is known.
             history: object = first_word or (
                 (
-                    place.publisher,
-                    place.step,
-                    place.sender_cycle_us,
+                    slot.publisher,
+                    slot.step,
+                    slot.sender_cycle_us,
                     subscription.timeout_ns,
-                    place.poll_request,
+                    slot.poll_request,
                 )
-                if place.publisher
-                else place.name
+                if slot.publisher
+                else slot.name
             )
             if history not in trackers:
-                trackers[history] = SequenceTracker(self.words, first_word or place.words, timing)
+                trackers[history] = SequenceTracker(self.words, first_word or slot.words, timing)
             self._assign(subscription, trackers[history])
 
     def _assign(self, subscription: RxSubscription, tracker: SequenceTracker) -> None:
         subscription.tracker = tracker
-        self.words[subscription.place.words + RxWord.TRACKER] = tracker.first_word
+        self.words[subscription.slot.words + RxWord.TRACKER] = tracker.first_word
 
     def _part_trackers(self, arriving: set[RxSubscription]) -> bool:
         """Give PDs that arrive without the others of their tracker one of their own."""
@@ -416,9 +416,9 @@ class SubscriptionTable:
                 continue
             parted = True
             # Whoever owns the block keeps it; the others move to the block of their first.
-            owner_arrives = any(s.place.words == tracker.first_word for s in here)
+            owner_arrives = any(s.slot.words == tracker.first_word for s in here)
             leaving = [s for s in members if s not in arriving] if owner_arrives else here
-            new = tracker.part(self.words, leaving[0].place.words)
+            new = tracker.part(self.words, leaving[0].slot.words)
             for subscription in leaving:
                 self._assign(subscription, new)
         return parted
@@ -430,10 +430,10 @@ _VAR_STATE = {Discard.VERSION: 1, Discard.LENGTH: 2}
 
 def _take(subscription: RxSubscription, header: PdHeader, offset: int) -> TakenPd:
     """Return how *subscription* takes the PD with *header* at *offset* of the frame."""
-    place = subscription.place
+    slot = subscription.slot
     alternate = subscription.alternates.get((header.version, header.length))
-    size = PdHeader.SIZE + place.size
-    return TakenPd(subscription.tracker, place.words, offset, place.offset, size, alternate)
+    size = PdHeader.SIZE + slot.size
+    return TakenPd(subscription.tracker, slot.words, offset, slot.offset, size, alternate)
 
 
 def _refuse_all(reasons: list[tuple[RxSubscription, Discard]]) -> RefusedPd:
@@ -441,7 +441,7 @@ def _refuse_all(reasons: list[tuple[RxSubscription, Discard]]) -> RefusedPd:
     if not reasons:
         return _UNKNOWN_ID
     counters = [StationWord.DISCARDED + DISCARD_INDEX[reasons[0][1]]]
-    counters += [s.place.words + RxWord.DISCARDED + DISCARD_INDEX[why] for s, why in reasons]
-    mismatches = [(s.place.words, _VAR_STATE[why]) for s, why in reasons if why in _VAR_STATE]
-    wrong_source = [s.place.words for s, why in reasons if why is Discard.WRONG_SOURCE]
+    counters += [s.slot.words + RxWord.DISCARDED + DISCARD_INDEX[why] for s, why in reasons]
+    mismatches = [(s.slot.words, _VAR_STATE[why]) for s, why in reasons if why in _VAR_STATE]
+    wrong_source = [s.slot.words for s, why in reasons if why is Discard.WRONG_SOURCE]
     return RefusedPd(tuple(counters), tuple(mismatches), tuple(wrong_source))

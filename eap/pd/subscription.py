@@ -6,7 +6,7 @@ from eap.codec import datatypes
 from eap.codec.pd import PdHeader
 from eap.pd.address import source_octets
 from eap.pd.image import Image, default_value, put
-from eap.pd.layout import RxPlace
+from eap.pd.layout import RxSlot
 from eap.pd.poll import PollAnswer, PollQuestion
 from eap.pd.sequence import SequenceTracker
 from eap.pd.spec import RxPdSpec, Substitute
@@ -18,7 +18,7 @@ class RxSubscription:
 
     Args:
         spec: What is expected.
-        place: Where it goes.
+        slot: Where it goes.
         substitute: What its variables hold after the time-out.
         question: What asks for it; None if it comes by itself.
 
@@ -33,7 +33,7 @@ class RxSubscription:
         "alternates",
         "answer",
         "ignore_version",
-        "place",
+        "slot",
         "source",
         "substitute",
         "timeout_ns",
@@ -43,13 +43,13 @@ class RxSubscription:
     def __init__(
         self,
         spec: RxPdSpec,
-        place: RxPlace,
+        slot: RxSlot,
         substitute: SubstituteValue,
         question: PollQuestion | None = None,
     ) -> None:
-        self.place = place
-        self.answer = None if question is None else PollAnswer(spec.name, question, place.words)
-        self.alternates = {(each.version, each.size): each.copy_plan() for each in place.alternates}
+        self.slot = slot
+        self.answer = None if question is None else PollAnswer(spec.name, question, slot.words)
+        self.alternates = {(each.version, each.size): each.copy_plan() for each in slot.alternates}
         self.ignore_version = spec.ignore_version
         self.timeout_ns = spec.timeout_ms * 1_000_000
         self.substitute = substitute
@@ -62,9 +62,9 @@ class RxSubscription:
             return Discard.WRONG_SOURCE
         if (version, length) in self.alternates:
             return None
-        if version != self.place.version and not self.ignore_version:
+        if version != self.slot.version and not self.ignore_version:
             return Discard.VERSION
-        if length != self.place.size:
+        if length != self.slot.size:
             return Discard.LENGTH
         return None
 
@@ -79,11 +79,11 @@ class RxSubscription:
 class SubstituteValue:
     """The octets that replace a PD's data after its time-out; with HOLD there are none."""
 
-    def __init__(self, image: Image, place: RxPlace) -> None:
-        start = place.offset + PdHeader.SIZE
+    def __init__(self, image: Image, slot: RxSlot) -> None:
+        start = slot.offset + PdHeader.SIZE
         self._memory = image.memory
-        self._data = slice(start, start + place.size)
-        self._octets = _octets(image, place)
+        self._data = slice(start, start + slot.size)
+        self._octets = _octets(image, slot)
 
     def apply(self) -> None:
         """Put the substitute in the place of the data."""
@@ -91,15 +91,15 @@ class SubstituteValue:
             self._memory[self._data] = self._octets
 
 
-def _octets(image: Image, place: RxPlace) -> bytes | None:
-    if place.substitute is Substitute.HOLD:
+def _octets(image: Image, slot: RxSlot) -> bytes | None:
+    if slot.substitute is Substitute.HOLD:
         return None
-    if place.substitute is Substitute.ZERO:
-        return bytes(place.size)
-    octets = memoryview(bytearray(place.size))
-    start = 8 * (place.offset + PdHeader.SIZE)
-    for name in place.variables:
-        variable = image.places[name]
+    if slot.substitute is Substitute.ZERO:
+        return bytes(slot.size)
+    octets = memoryview(bytearray(slot.size))
+    start = 8 * (slot.offset + PdHeader.SIZE)
+    for name in slot.variables:
+        variable = image.slots[name]
         kind = datatypes.parse(variable.type)
         value = kind.encode(default_value(variable))
         put(octets, variable.bit_offset - start, kind.bit_length, value)

@@ -16,7 +16,7 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdFrameHeader, PdHeader
 from eap.ids import NetId
 from eap.pd.image import Image, Inputs
-from eap.pd.layout import FramePlace, TxPlace
+from eap.pd.layout import FrameSlot, TxSlot
 from eap.pd.link import Channel, OutFrame
 from eap.pd.spec import Writer
 from eap.pd.trigger import Schedule, Trigger
@@ -35,18 +35,18 @@ class Gather:
     """
 
     def __init__(self, image: Image, inputs: Inputs, variables: Sequence[str]) -> None:
-        places = [image.places[name] for name in variables]
-        kinds = [datatypes.parse(place.type) for place in places]
+        slots = [image.slots[name] for name in variables]
+        kinds = [datatypes.parse(slot.type) for slot in slots]
         plan = pdo.layout(kinds)
         self.size = plan.size
         runs: list[Run] = []
         self._bits: list[Run] = []
-        for place, kind, target in zip(places, kinds, plan.bit_offsets, strict=True):
-            memory = image.memory if place.writer is Writer.ENGINE else inputs.memory
+        for slot, kind, target in zip(slots, kinds, plan.bit_offsets, strict=True):
+            memory = image.memory if slot.writer is Writer.ENGINE else inputs.memory
             if kind.is_bits:
-                self._bits.append((memory, place.bit_offset, target, kind.bit_length))
+                self._bits.append((memory, slot.bit_offset, target, kind.bit_length))
                 continue
-            run = (memory, place.bit_offset // 8, target // 8, kind.size)
+            run = (memory, slot.bit_offset // 8, target // 8, kind.size)
             if runs and _continues(runs[-1], run):
                 _, source, first, size = runs.pop()
                 run = (memory, source, first, size + kind.size)
@@ -100,10 +100,10 @@ _put_u16 = struct.Struct("<H").pack_into
 class TxPd:
     """One TxPD at run time."""
 
-    __slots__ = ("data", "gather", "place", "reason", "trigger")
+    __slots__ = ("data", "gather", "reason", "slot", "trigger")
 
-    def __init__(self, place: TxPlace, trigger: Trigger, gather: Gather) -> None:
-        self.place = place
+    def __init__(self, slot: TxSlot, trigger: Trigger, gather: Gather) -> None:
+        self.slot = slot
         self.trigger = trigger
         self.gather = gather
         self.data: bytes | None = None
@@ -152,14 +152,14 @@ class TxFrame:
 
     def __init__(
         self,
-        place: FramePlace,
+        slot: FrameSlot,
         publisher: NetId,
         pds: tuple[TxPd, ...],
         gate: tuple[int, int],
         channel: Channel,
         destination: str,
     ) -> None:
-        self.place = place
+        self.slot = slot
         self.destination = destination
         """Where it goes now; empty while that is not known, and then it does not go."""
         self.pds = pds
@@ -222,8 +222,8 @@ def build_frame(
     header = channel.link_header(destination)
     body = PdFrameHeader(publisher, len(pds), 0).encode()
     for pd in pds:
-        body += PdHeader(pd.place.pd_id, pd.place.version, pd.place.size).encode()
-        body += bytes(pd.place.size)
+        body += PdHeader(pd.slot.pd_id, pd.slot.version, pd.slot.size).encode()
+        body += bytes(pd.slot.size)
     octets = header + EtherCatHeader(len(body)).encode() + body
     buffer = bytearray(octets.ljust(channel.minimum_size, b"\0"))
     return OutFrame(buffer, len(header), destination)
@@ -234,9 +234,9 @@ def _data_offsets(pds: tuple[TxPd, ...], headroom: int) -> Iterator[int]:
     for pd in pds:
         offset += PdHeader.SIZE
         yield offset
-        offset += pd.place.size
+        offset += pd.slot.size
 
 
 def _common_schedule(pds: tuple[TxPd, ...]) -> Schedule | None:
-    schedules = {pd.trigger.schedule if pd.place.by_schedule else None for pd in pds}
+    schedules = {pd.trigger.schedule if pd.slot.by_schedule else None for pd in pds}
     return schedules.pop() if len(schedules) == 1 else None

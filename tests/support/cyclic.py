@@ -8,7 +8,7 @@ from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import NetId
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image, format_image
-from eap.pd.layout import RxPlace, VariablePlace, plan_layout
+from eap.pd.layout import RxSlot, VariableSlot, plan_layout
 from eap.pd.link import OutFrame, Taker
 from eap.pd.poll import Requests
 from eap.pd.spec import (
@@ -115,22 +115,22 @@ class Receiver:
     def give(self, frame: bytes, at_ns: int, source: bytes = b"") -> None:
         give(self.subscriber.receive_frame, frame, at_ns, source=source)
 
-    def place(self, name: str) -> RxPlace:
-        return next(place for place in self.image.layout.rx if place.name == name)
+    def slot(self, name: str) -> RxSlot:
+        return next(slot for slot in self.image.layout.rx if slot.name == name)
 
     def word(self, name: str, word: RxWord) -> int:
         """A word of the subscription *name*, of its account if it belongs there."""
-        place = self.place(name)
-        first = place.words
+        slot = self.slot(name)
+        first = slot.words
         if word >= RxWord.RECEIVED:
-            first = self.image.words[place.words + RxWord.TRACKER]
+            first = self.image.words[slot.words + RxWord.TRACKER]
         return self.image.words[first + word]
 
     def discarded(self, name: str | None = None) -> dict[str, int]:
         """What the station, or one subscription, refused, by reason."""
         first = StationWord.DISCARDED
         if name is not None:
-            first = self.place(name).words + RxWord.DISCARDED
+            first = self.slot(name).words + RxWord.DISCARDED
         counts = self.image.words[first : first + len(DISCARDS)].tolist()
         return {why.value: count for why, count in zip(DISCARDS, counts, strict=True) if count}
 
@@ -204,11 +204,11 @@ class FakeBus:
     """
 
     def __init__(self, made: Station, *, only: int = 0, log: list[str] | None = None) -> None:
-        places = made.image.places
+        slots = made.image.slots
         slaves = [port.bus for port in made.spec.ports if port.bus][only].slaves
         self._image = made.image
-        self._inputs, input_size = _plan([each.inputs for each in slaves], places)
-        self._outputs, output_size = _plan([each.outputs for each in slaves], places)
+        self._inputs, input_size = _plan([each.inputs for each in slaves], slots)
+        self._outputs, output_size = _plan([each.outputs for each in slaves], slots)
         self._memory_of = made.memory_of
         self.inputs = bytearray(input_size)
         self.outputs = bytearray(output_size)
@@ -244,7 +244,7 @@ class FakeBus:
 
 
 def _plan(
-    sides: Iterable[Sequence[BusEntrySpec]], places: Mapping[str, VariablePlace]
+    sides: Iterable[Sequence[BusEntrySpec]], slots: Mapping[str, VariableSlot]
 ) -> tuple[dict[Writer, list[Move]], int]:
     """Moves to the image by writer, and the octets of all sides one behind the other."""
     moves: dict[Writer, list[Move]] = {}
@@ -253,9 +253,9 @@ def _plan(
         bit = 8 * start
         for entry in side:
             if entry.variable:
-                place = places[entry.variable]
-                move = Move(bit, place.bit_offset, entry.bit_length)
-                moves.setdefault(place.writer, []).append(move)
+                slot = slots[entry.variable]
+                move = Move(bit, slot.bit_offset, entry.bit_length)
+                moves.setdefault(slot.writer, []).append(move)
             bit += entry.bit_length
         start = -(-bit // 8)
     return moves, start

@@ -189,6 +189,6 @@ class BusStates:
         values = [lowest, int(seen[2])]
         values += [units[at].al_state if at in units else 0 for at in self._stations]
         for name, value, shown in zip(self._names, values, self._shown, strict=True):
-            if value != shown and name in self._image.places:
+            if value != shown and name in self._image.slots:
                 self._image.store(name, bytes((value,)))
         self._shown = values

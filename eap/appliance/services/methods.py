@@ -19,7 +19,7 @@ from eap.codec import datatypes
 from eap.errors import ControlError, WriterConflictError
 from eap.near import near
 from eap.pd.image import Image
-from eap.pd.layout import VariablePlace
+from eap.pd.layout import VariableSlot
 from eap.pd.report import PdRow, pd_list, quality, tracker_word
 from eap.pd.spec import Writer
 from eap.pd.words import RxWord, StationWord
@@ -181,7 +181,7 @@ class Watch:
         return control.ValuesEvent(now.station, now.cycle, values, quality, skipped)
 
 
-def _snapshot(image: Image, places: list[VariablePlace]) -> control.Values:
+def _snapshot(image: Image, places: list[VariableSlot]) -> control.Values:
     """Return the values of *places*; those of one writer belong to one moment.
 
     Values that the engine writes are those of the cycle that is named.
@@ -208,22 +208,22 @@ def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
     return qualities
 
 
-def _places(image: Image, names: Iterable[str]) -> list[VariablePlace]:
+def _places(image: Image, names: Iterable[str]) -> list[VariableSlot]:
     """Return the places of *names*, of all variables when there are none."""
     chosen = list(names)
     if not chosen:
         return list(image.layout.variables)
-    unknown = [name for name in chosen if name not in image.places]
+    unknown = [name for name in chosen if name not in image.slots]
     if unknown:
         raise ControlError(
             f"station {image.layout.station} has no variable {unknown[0]!r}"
-            f"{near(unknown[0], image.places)}",
+            f"{near(unknown[0], image.slots)}",
             code=ErrorCode.UNKNOWN_NAME,
         )
-    return [image.places[name] for name in chosen]
+    return [image.slots[name] for name in chosen]
 
 
-def _checked(place: VariablePlace, value: Any) -> Any:
+def _checked(place: VariableSlot, value: Any) -> Any:
     if place.writer is not Writer.APPLICATION:
         raise ControlError(
             f"variable {place.name} is written by the {place.writer}; only variables of the"

@@ -21,7 +21,7 @@ from eap.ids import Destination, DestinationKind, MacAddr
 from eap.net.arpprobe import ArpProber
 from eap.pd.address import from_word
 from eap.pd.image import Image
-from eap.pd.layout import FramePlace
+from eap.pd.layout import FrameSlot
 from eap.pd.monitor import (
     Evidence,
     MonitorTarget,
@@ -48,7 +48,7 @@ class ImageHolder(Protocol):
 class _Row:
     """One monitored frame, and where it went when somebody looked last."""
 
-    def __init__(self, port: PortName, place: FramePlace, image: Image) -> None:
+    def __init__(self, port: PortName, place: FrameSlot, image: Image) -> None:
         self.name = f"{port.station}/{place.name}"
         self.port = port
         self.place = place

@@ -19,7 +19,7 @@ from eap.codec.ads import AdsError
 from eap.codec.values import String
 from eap.errors import ImageError, TornReadError, WriterConflictError
 from eap.pd.image import Image, take
-from eap.pd.layout import VariablePlace
+from eap.pd.layout import VariableSlot
 from eap.pd.spec import Writer
 
 _ATTEMPTS = 10
@@ -52,7 +52,7 @@ class ImageVariables:
     def read(self, name: str) -> bytes:
         """Return the octets of a value; refuse with BUSY while its writer is in the middle."""
         if self._sample is not None:
-            return take(self._image.places[name], self._sample, self._first_bit)
+            return take(self._image.slots[name], self._sample, self._first_bit)
         try:
             return self._image.load(name, attempts=_ATTEMPTS)
         except TornReadError as exc:
@@ -60,7 +60,7 @@ class ImageVariables:
 
     def write(self, name: str, octets: bytes) -> None:
         """Store a value; refuse with BUSY while another program writes, with VALUE what is none."""
-        kind = datatypes.parse(self._image.places[name].type)
+        kind = datatypes.parse(self._image.slots[name].type)
         # A text of a client with another encoding than ours: its octets go on as they are.
         value = bytes(octets) if isinstance(kind, String) else kind.decode(octets, 0)
         try:
@@ -126,7 +126,7 @@ class StationSymbols(AdsSpace):
         return SymbolTable(variables, self._file.generation)
 
 
-def _variable(place: VariablePlace) -> Variable:
+def _variable(place: VariableSlot) -> Variable:
     unit = f"[{place.unit}]" if place.unit else ""
     return Variable(
         place.name,

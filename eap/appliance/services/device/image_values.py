@@ -21,10 +21,10 @@ from eap.pd.image import Image
 from eap.pd.layout import (
     FRAME_CTRL,
     VAR_CTRL,
-    FramePlace,
+    FrameSlot,
     ImageLayout,
-    RxPlace,
-    TxPlace,
+    RxSlot,
+    TxSlot,
 )
 from eap.pd.report import quality, tracker_word, tx_status, var_state
 from eap.pd.words import (
@@ -112,7 +112,7 @@ def _applied(function: Callable[[Image, Any], int], image: Image, place: Any) ->
 
 
 def _value(image: Image, name: str) -> bytes | None:
-    place = image.places.get(name)
+    place = image.slots.get(name)
     if place is None:
         return None
     kind = datatypes.parse(place.type)
@@ -127,41 +127,41 @@ def _encode(kind: DataType, number: int) -> bytes:
     return kind.encode(number)
 
 
-def _frame_word(word: FrameWord) -> Callable[[Image, FramePlace], int]:
+def _frame_word(word: FrameWord) -> Callable[[Image, FrameSlot], int]:
     return lambda image, place: int(image.words[place.words + word])
 
 
-def _tx_word(word: TxWord) -> Callable[[Image, TxPlace], int]:
+def _tx_word(word: TxWord) -> Callable[[Image, TxSlot], int]:
     return lambda image, place: int(image.words[place.words + word])
 
 
-def _sent(reason: Reason) -> Callable[[Image, TxPlace], int]:
+def _sent(reason: Reason) -> Callable[[Image, TxSlot], int]:
     return lambda image, place: int(tx_status(image, place)["reason"].get(reason.value, 0))
 
 
-def _last_reason(image: Image, place: TxPlace) -> int:
+def _last_reason(image: Image, place: TxSlot) -> int:
     last = tx_status(image, place)["last_reason"]
     return 0 if last is None else REASON_INDEX[Reason(last)]
 
 
-def _control(suffix: str) -> Callable[[Image, FramePlace | TxPlace], int]:
+def _control(suffix: str) -> Callable[[Image, FrameSlot | TxSlot], int]:
     return lambda image, place: int(image.read(place.name + suffix))
 
 
-def _tracked(word: RxWord) -> Callable[[Image, RxPlace], int]:
+def _tracked(word: RxWord) -> Callable[[Image, RxSlot], int]:
     return lambda image, place: int(image.words[tracker_word(image, place) + word])
 
 
-def _discarded(reason: Discard) -> Callable[[Image, RxPlace], int]:
+def _discarded(reason: Discard) -> Callable[[Image, RxSlot], int]:
     offset = RxWord.DISCARDED + DISCARD_INDEX[reason]
     return lambda image, place: int(image.words[place.words + offset])
 
 
-def _quality(image: Image, place: RxPlace) -> int:
+def _quality(image: Image, place: RxSlot) -> int:
     return quality(image, place) if _tracked(RxWord.RECEIVED)(image, place) else _NEVER
 
 
-def _cycle_index(image: Image, place: RxPlace) -> int:
+def _cycle_index(image: Image, place: RxSlot) -> int:
     last = _tracked(RxWord.LAST_CYCLE)(image, place)
     return last & 0xFFFF if _tracked(RxWord.RECEIVED)(image, place) else 0
 
@@ -179,20 +179,20 @@ _OF_STATION: dict[str, int] = {
     for reason in Discard
     if (key := f"station_discarded_{reason}") in _KINDS
 }
-_OF_FRAME: dict[str, Callable[[Image, FramePlace], int]] = {
+_OF_FRAME: dict[str, Callable[[Image, FrameSlot], int]] = {
     EapLive.FRAME_STATE: lambda image, place: frame_state(image, place.words),
     EapLive.FRAME_CTRL: _control(FRAME_CTRL),
     EapLive.FRAME_WHOLE: _frame_word(FrameWord.WHOLE),
     EapLive.FRAME_PARTIAL: _frame_word(FrameWord.PARTIAL),
     EapLive.FRAME_SKIPPED: _frame_word(FrameWord.SKIPPED),
 }
-_OF_TX: dict[str, Callable[[Image, TxPlace], int]] = {
+_OF_TX: dict[str, Callable[[Image, TxSlot], int]] = {
     EapLive.TX_VAR_STATE: lambda image, place: tx_var_state(image.words, place),
     EapLive.TX_VAR_CTRL: _control(VAR_CTRL),
     EapLive.TX_LAST_REASON: _last_reason,
     EapLive.TX_SKIPPED: _tx_word(TxWord.SKIPPED),
 } | {key: _sent(reason) for reason in Reason if (key := f"tx_sent_{reason}") in _KINDS}
-_OF_RX: dict[str, Callable[[Image, RxPlace], int]] = {
+_OF_RX: dict[str, Callable[[Image, RxSlot], int]] = {
     EapLive.RX_QUALITY: _quality,
     EapLive.RX_CYCLE_INDEX: _cycle_index,
     EapLive.RX_VAR_STATE: var_state,

@@ -51,7 +51,7 @@ def test_moves_to_the_newest_image(station, move):
     before = station.image
     assert station.image is before
     move()
-    assert "more0" in station.image.places
+    assert "more0" in station.image.slots
     assert station.file.generation == 2
     before.read("setpoint")  # what somebody still holds stays as it was
 
@@ -66,14 +66,14 @@ def test_newest_image_that_cannot_be_opened_is_told(station, move, path):
 def test_right_to_write_moves_too(station, move, path):
     station.acquire_writer(Writer.SERVICES)
     move()
-    assert "more0" in station.image.places
+    assert "more0" in station.image.slots
     with open_image(path) as other:
         with pytest.raises(WriterConflictError):
             other.acquire_writer(Writer.SERVICES)
         station.release_writer(Writer.SERVICES)
         other.acquire_writer(Writer.SERVICES)
     move(2)
-    assert "more1" in station.image.places
+    assert "more1" in station.image.slots
 
 
 def test_lost_right_to_write_is_told_and_the_old_image_kept(station, move, path):
@@ -83,7 +83,7 @@ def test_lost_right_to_write_is_told_and_the_old_image_kept(station, move, path)
         other.acquire_writer(Writer.APPLICATION)
         with pytest.raises(WriterConflictError):
             _ = station.image
-    assert "more0" in station.image.places
+    assert "more0" in station.image.slots
 
 
 def test_values_are_written_at_once_or_not_at_all(station):
@@ -107,7 +107,7 @@ def test_values_written_while_the_image_changes_are_in_the_new_one(station, move
 
     monkeypatch.setattr(station.image, "store", store_late)
     station.write(Writer.APPLICATION, {"running": True})
-    assert "more0" in station.image.places
+    assert "more0" in station.image.slots
     assert station.image.read("running") is True
 
 

@@ -75,7 +75,7 @@ def walked(data: bytes, size: int | None = None):
     return walk(memoryview(data), len(data) if size is None else size)
 
 
-def test_each_pd_with_its_place():
+def test_each_pd_with_its_slot():
     found = walked(FRAME + b"padding", len(FRAME))
     assert [(pd.pd_id, pd.version, pd.length, at) for pd, at in found] == [
         (7, 0, 2, FIRST_PD),

@@ -14,7 +14,7 @@ from eap.pd.frame_status import (
     unsent_state,
 )
 from eap.pd.image import Image
-from eap.pd.layout import TxPlace
+from eap.pd.layout import TxSlot
 from eap.pd.link import OutFrame
 from eap.pd.monitor import SubscriberPresence
 from eap.pd.spec import RxPdSpec, TxFrameSpec, TxPdSpec
@@ -79,7 +79,7 @@ def test_nobody_is_looked_for_where_nothing_is_monitored(image: Image) -> None:
 CHANGE = REASON_INDEX[Reason.CHANGE]
 
 
-def outcome_image() -> tuple[Image, TxPlace, TxPlace]:
+def outcome_image() -> tuple[Image, TxSlot, TxSlot]:
     """A frame of a PD that is pushed and one that is polled."""
     made = image_of(
         station(

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from eap.pd.handover import ImageHandover, needs_new_start
 from eap.pd.image import Image
-from eap.pd.layout import RxPlace, TxPlace
+from eap.pd.layout import RxSlot, TxSlot
 from eap.pd.monitor import SubscriberPresence
 from eap.pd.report import station_status, tracker_word
 from eap.pd.spec import (
@@ -132,13 +132,13 @@ def used(image: Image, seed: int) -> Image:
         for word in range(RxWord.MISMATCH, RxWord.SIZE):
             words[rx.words + word] = rest.randint(1, 1000)
         words[rx.words + RxWord.STATE] = 1
-    for place in image.layout.variables:
-        if place.type in VALUES:
-            image.write(place.name, rest.choice(VALUES[place.type]))
+    for slot in image.layout.variables:
+        if slot.type in VALUES:
+            image.write(slot.name, rest.choice(VALUES[slot.type]))
     return image
 
 
-def all_scheduled(own: list[TxPlace]) -> bool:
+def all_scheduled(own: list[TxSlot]) -> bool:
     return all(tx.by_schedule for tx in own)
 
 
@@ -177,8 +177,8 @@ def test_what_has_the_same_name_goes_on(before, after, seed):
 
 def check_values(old: Image, new: Image, fresh: Image) -> None:
     then, now, first = old.read_all(), new.read_all(), fresh.read_all()
-    for name, place in new.places.items():
-        stays = name in old.places and old.places[name].type == place.type
+    for name, slot in new.slots.items():
+        stays = name in old.slots and old.slots[name].type == slot.type
         assert now[name] == (then if stays else first)[name]
 
 
@@ -198,30 +198,30 @@ def check_pds(
 def check_trackers(old: Image, new: Image) -> None:
     """They are shared by those who shared them and are judged alike, and by nobody else."""
     then, now = shared(old), shared(new)
-    before = {place.name: place for place in old.layout.rx}
-    for place in new.layout.rx:
+    before = {slot.name: slot for slot in old.layout.rx}
+    for slot in new.layout.rx:
         for other in new.layout.rx:
-            if {place.name, other.name} <= before.keys():
+            if {slot.name, other.name} <= before.keys():
                 together = (
-                    then[place.name] == then[other.name]
-                    and judged(place) == judged(other)
-                    and stays(before[place.name], place) == stays(before[other.name], other)
+                    then[slot.name] == then[other.name]
+                    and judged(slot) == judged(other)
+                    and stays(before[slot.name], slot) == stays(before[other.name], other)
                 )
-                assert (now[place.name] == now[other.name]) == together
-            elif place.name in before:
-                assert now[place.name] != now[other.name]
-        if place.name in before:
-            last = new.words[now[place.name] + RxWord.LAST_CYCLE]
-            known = old.words[then[place.name] + RxWord.LAST_CYCLE]
-            assert last == (known if stays(before[place.name], place) else -1)
+                assert (now[slot.name] == now[other.name]) == together
+            elif slot.name in before:
+                assert now[slot.name] != now[other.name]
+        if slot.name in before:
+            last = new.words[now[slot.name] + RxWord.LAST_CYCLE]
+            known = old.words[then[slot.name] + RxWord.LAST_CYCLE]
+            assert last == (known if stays(before[slot.name], slot) else -1)
 
 
-def stays(was: RxPlace, place: RxPlace) -> bool:
-    return (was.publisher, was.step) == (place.publisher, place.step)
+def stays(was: RxSlot, slot: RxSlot) -> bool:
+    return (was.publisher, was.step) == (slot.publisher, slot.step)
 
 
-def judged(place: RxPlace) -> tuple[object, ...]:
-    return place.publisher, place.step, place.sender_cycle_us, place.timeout_ms
+def judged(slot: RxSlot) -> tuple[object, ...]:
+    return slot.publisher, slot.step, slot.sender_cycle_us, slot.timeout_ms
 
 
 def test_trackers_that_have_parted_are_noticed():
@@ -384,7 +384,7 @@ def test_what_was_replaced_can_be_taken_apart():
     made.cycle(MS, MS)
     after = succeed_with_values(made, made.spec)
     made.release()
-    assert made.image.places == {}
+    assert made.image.slots == {}
     wire.sent.clear()
     wire.waiting.append((octets([(7, b"\6\0")], cycle=2), 2 * MS))
     after.cycle(2 * MS, 2 * MS)

@@ -114,7 +114,7 @@ def test_defaults_are_there_from_the_start():
         )
     )
     assert image.read_all() == {"s": "abc", "raw": b"\xbe\xef", "a": (1, -2), "zero": 0.0}
-    assert default_value(image.places["zero"]) == 0.0
+    assert default_value(image.slots["zero"]) == 0.0
 
 
 def test_a_region_is_live():
@@ -330,7 +330,7 @@ def put(image: Image, writer: Writer, name: str, value: int) -> None:
 
 
 def seen(image: Image, inputs: Inputs, name: str) -> int:
-    at = image.places[name].bit_offset // 8
+    at = image.slots[name].bit_offset // 8
     return int.from_bytes(inputs.memory[at : at + 2], "little")
 
 

@@ -16,9 +16,9 @@ from eap.pd.layout import (
     FRAME_CTRL,
     VAR_CTRL,
     WORDS_OFFSET,
-    AlternatePlace,
+    AlternateSlot,
     ImageLayout,
-    RxPlace,
+    RxSlot,
     mirror,
     plan_layout,
 )
@@ -67,7 +67,7 @@ def test_received_pds_follow_each_other_as_in_a_frame_header_included():
     first, second = layout.rx
     assert (first.size, second.size) == (3, 4)
     assert second.offset == first.offset + 8 + first.size
-    bits = {place.name: place.bit_offset - 8 * (first.offset + 8) for place in layout.variables}
+    bits = {slot.name: slot.bit_offset - 8 * (first.offset + 8) for slot in layout.variables}
     assert bits == {"a": 0, "b": 16, "c": 17, "d": 8 * (3 + 8)}
 
 
@@ -78,12 +78,12 @@ def test_every_frame_and_pd_of_a_station_gets_a_control_variable():
             frames=(TxFrameSpec("f", "eap0", "10.0.0.1", (TxPdSpec("p", 1, ("x",)),)),),
         )
     )
-    controls = {place.name: place for place in layout.variables if "Ctrl" in place.name}
+    controls = {slot.name: slot for slot in layout.variables if "Ctrl" in slot.name}
     assert set(controls) == {"f" + FRAME_CTRL, "p" + VAR_CTRL}
-    assert all(place.writer is Writer.APPLICATION for place in controls.values())
+    assert all(slot.writer is Writer.APPLICATION for slot in controls.values())
 
 
-def test_a_tx_place_knows_whether_the_clock_alone_sends_it():
+def test_a_tx_slot_knows_whether_the_clock_alone_sends_it():
     triggers = {
         "each": TriggerSpec(),
         "cyclic": TriggerSpec(cycle_us=2000),
@@ -107,7 +107,7 @@ def test_a_tx_place_knows_whether_the_clock_alone_sends_it():
             ),
         )
     )
-    assert {place.name: (place.by_schedule, place.cyclic) for place in layout.tx} == {
+    assert {slot.name: (slot.by_schedule, slot.cyclic) for slot in layout.tx} == {
         "each": (True, True),
         "cyclic": (True, True),
         "divided": (True, False),
@@ -139,19 +139,19 @@ def test_nothing_overlaps(pd_types, others):
         )
     )
     bits: set[int] = set()
-    for place in layout.variables:
-        region = layout.regions[place.writer]
-        length = datatypes.parse(place.type).bit_length
-        own = set(range(place.bit_offset, place.bit_offset + length))
+    for slot in layout.variables:
+        region = layout.regions[slot.writer]
+        length = datatypes.parse(slot.type).bit_length
+        own = set(range(slot.bit_offset, slot.bit_offset + length))
         assert own.isdisjoint(bits)
         assert 8 * region.offset <= min(own) <= max(own) < 8 * (region.offset + region.size)
         bits |= own
     assert min(bits) >= 8 * (WORDS_OFFSET + 8 * layout.word_count)
     assert max(bits) < 8 * layout.directory_offset
     blocks = [(0, StationWord.SIZE)]
-    blocks += [(place.words, FrameWord.SIZE) for place in layout.frames]
-    blocks += [(place.words, TxWord.SIZE) for place in layout.tx]
-    blocks += [(place.words, RxWord.SIZE) for place in layout.rx]
+    blocks += [(slot.words, FrameWord.SIZE) for slot in layout.frames]
+    blocks += [(slot.words, TxWord.SIZE) for slot in layout.tx]
+    blocks += [(slot.words, RxWord.SIZE) for slot in layout.rx]
     words = [word for first, size in blocks for word in range(first, first + size)]
     assert sorted(words) == list(range(layout.word_count))
 
@@ -179,7 +179,7 @@ def test_slaves_lie_in_the_image_as_in_their_process_data():
             subscriptions=(RxPdSpec("r", "eap0", 1, ("r",)),),
         )
     )
-    bits = {place.name: place.bit_offset for place in layout.variables}
+    bits = {slot.name: slot.bit_offset for slot in layout.variables}
     first = bits["r"] + 16
     assert bits["state"] == first + 40
     assert {name: bits[name] - first for name in "abcde"} == {
@@ -196,7 +196,7 @@ def test_each_writer_of_a_slaves_outputs_has_a_mirror_of_them():
             variables=(*written("x:UINT", "b:BOOL"), *received("a:BOOL", "c:INT", "i:USINT")),
         )
     )
-    bits = {place.name: place.bit_offset for place in layout.variables}
+    bits = {slot.name: slot.bit_offset for slot in layout.variables}
     engine, application = (
         layout.regions[w].offset * 8 for w in (Writer.ENGINE, Writer.APPLICATION)
     )
@@ -218,7 +218,7 @@ def alternate(version: int, *variables: str) -> RxAlternateSpec:
     return RxAlternateSpec(version, tuple(rows))
 
 
-def places(*alternates: RxAlternateSpec) -> RxPlace:
+def slots(*alternates: RxAlternateSpec) -> RxSlot:
     """The place of an RxPD of version 1, with a UINT and a BOOL, behind another one."""
     pds = (
         RxPdSpec("first", "eap0", 1, ("x",)),
@@ -228,17 +228,17 @@ def places(*alternates: RxAlternateSpec) -> RxPlace:
     return plan_layout(station(variables=variables, subscriptions=pds)).rx[1]
 
 
-def test_without_alternates_there_are_no_places():
-    assert places().alternates == ()
+def test_without_alternates_there_are_no_slots():
+    assert slots().alternates == ()
 
 
 def test_each_alternate_knows_what_it_brings_and_what_it_does_not():
-    place = places(alternate(0, "on:BOOL", ":REAL"), alternate(2, ":BIT3", "n:uint16"))
-    data = 8 * (place.offset + 8)
+    slot = slots(alternate(0, "on:BOOL", ":REAL"), alternate(2, ":BIT3", "n:uint16"))
+    data = 8 * (slot.offset + 8)
     quality = (48, data - 16, 16)
-    assert place.alternates == (
-        AlternatePlace(0, 5, (quality, (64, data + 16, 1)), ((data, 16),)),
-        AlternatePlace(2, 3, (quality, (72, data, 16)), ((data + 16, 1),)),
+    assert slot.alternates == (
+        AlternateSlot(0, 5, (quality, (64, data + 16, 1)), ((data, 16),)),
+        AlternateSlot(2, 3, (quality, (72, data, 16)), ((data + 16, 1),)),
     )
 
 
@@ -258,13 +258,11 @@ def test_each_alternate_knows_what_it_brings_and_what_it_does_not():
 )  # fmt: skip
 def test_what_does_not_belong_to_the_pd_is_refused(alternates, told):
     with pytest.raises(ValueError, match=re.escape(told)):
-        places(*alternates)
+        slots(*alternates)
 
 
 def test_one_version_can_have_several_sizes():
-    sizes = [
-        each.size for each in places(alternate(1, "n:UINT"), alternate(1, ":LREAL")).alternates
-    ]
+    sizes = [each.size for each in slots(alternate(1, "n:UINT"), alternate(1, ":LREAL")).alternates]
     assert sizes == [2, 8]
 
 
@@ -293,18 +291,18 @@ def test_any_alternate_brings_its_variables_and_nothing_else(pair, random):
     )  # fmt: skip
     variables = received(*(f"{name}:{kind}" for name, kind in own), "after:UINT")
     image = image_of(station(variables=variables, subscriptions=(pd,)))
-    place = image.layout.rx[0]
-    first, end = place.offset, place.offset + PdHeader.SIZE + place.size
+    slot = image.layout.rx[0]
+    first, end = slot.offset, slot.offset + PdHeader.SIZE + slot.size
     image.memory[first:end] = random.randbytes(end - first)
     before = bytes(image.memory)
 
     plan = pdo.layout([datatypes.parse(kind) for _, kind in brought])
     sent = random.randbytes(PdHeader.SIZE + plan.size)
-    place.alternates[0].copy_plan().run(sent, image.memory)
+    slot.alternates[0].copy_plan().run(sent, image.memory)
 
     came = {name: 64 + bit for (name, _), bit in zip(brought, plan.bit_offsets, strict=True)}
     for name, kind in own:
-        where, count = image.places[name].bit_offset, datatypes.parse(kind).bit_length
+        where, count = image.slots[name].bit_offset, datatypes.parse(kind).bit_length
         source = (sent, came[name]) if name in came else (before, where)
         assert bits(bytes(image.memory), where, count) == bits(*source, count)
     assert image.memory[first : first + 6] == before[first : first + 6]
@@ -397,7 +395,7 @@ def test_a_sender_that_changes_over_in_the_middle_of_a_run_is_followed(
     for row in status["pd"]["rx"]:
         assert (row["received"], row["lost"], row["duplicated"], row["late"]) == (40, 0, 0, 0)
         assert (row["state"], row["timeouts"], row["var_state"]) == ("running", 0, 0)
-    firsts = {receiving.image.words[place.words] for place in receiving.image.layout.rx}
+    firsts = {receiving.image.words[slot.words] for slot in receiving.image.layout.rx}
     assert len(firsts) == 1, "the tracker is shared as before"
 
 
@@ -409,7 +407,7 @@ def bus_entries(*rows: tuple[str, int]) -> list[BusEntrySpec]:
     return [BusEntrySpec(name, 0x6000, at, bits) for at, (name, bits) in enumerate(rows, 1)]
 
 
-def test_bits_and_padding_keep_their_places():
+def test_bits_and_padding_keep_their_slots():
     plan = mirror(bus_entries(("BOOL", 1), ("", 2), ("BIT3", 3), ("", 10), ("UINT", 16)), BUS_TYPES)
     assert plan.bit_offsets == {"BOOL": 0, "BIT3": 3, "UINT": 16}
     assert plan.size == 4

@@ -12,7 +12,7 @@ from eap.pd.station import Station
 from tests.support.cyclic import MS, eap_port, image_of, station, written
 
 
-def test_a_frame_is_patched_in_place_and_seen_through_its_view():
+def test_a_frame_is_patched_in_slot_and_seen_through_its_view():
     buffer = bytearray(b"headerframe")
     frame = OutFrame(buffer, 6, "01:01:05:04:00:00")
     buffer[6:] = b"FRAME"

@@ -23,7 +23,7 @@ def linked(*links: LinkSpec, variables: tuple[VariableSpec, ...], **values: obje
     """The image after one run of *links*, with what it held before."""
     image = image_of(station(variables=variables))
     for name, value in values.items():
-        with image.writing(image.places[name].writer):
+        with image.writing(image.slots[name].writer):
             image.write(name, value)
     run(image, links)
     return image
@@ -178,17 +178,17 @@ def bits_of(memory: memoryview | bytes, first: int, bits: int) -> int:
 def run_one_by_one(image: Image, links: list[LinkSpec], others: bytes) -> None:
     """The model: each link by itself."""
     for link in links:
-        place, goal = image.places[link.source], image.places[link.target]
-        kind, target = datatypes.parse(place.type), datatypes.parse(goal.type)
-        memory = bytes(image.memory) if place.writer is Writer.ENGINE else others
+        slot, goal = image.slots[link.source], image.slots[link.target]
+        kind, target = datatypes.parse(slot.type), datatypes.parse(goal.type)
+        memory = bytes(image.memory) if slot.writer is Writer.ENGINE else others
         if link.bits:
             for bit in range(link.bits):
                 where = goal.bit_offset + link.target_bit + bit
-                what = bits_of(memory, place.bit_offset + link.source_bit + bit, 1)
+                what = bits_of(memory, slot.bit_offset + link.source_bit + bit, 1)
                 cleared = image.memory[where // 8] & ~(1 << where % 8)
                 image.memory[where // 8] = cleared | what << where % 8
             continue
-        octets = bits_of(memory, place.bit_offset, kind.bit_length).to_bytes(kind.size, "little")
+        octets = bits_of(memory, slot.bit_offset, kind.bit_length).to_bytes(kind.size, "little")
         octets = octets[::-1] if link.swap else octets
         is_same = kind == target or (link.swap and kind.size == target.size)
         if is_same and link.scale == 1.0 and link.offset == 0.0:

@@ -59,14 +59,14 @@ class Asked:
     def __init__(self, trigger: TriggerSpec) -> None:
         spec = desk(trigger, answers=("a", "b"))
         self.image = image_of(spec)
-        (self.place,) = self.image.layout.tx
+        (self.slot,) = self.image.layout.tx
         self.question: PollQuestion = questions_of(self.image)["request"]
 
     def send(self, now_ns: int) -> None:
-        if self.place.by_schedule:
-            self.image.words[self.place.frame_words + FrameWord.WHOLE] += 1
+        if self.slot.by_schedule:
+            self.image.words[self.slot.frame_words + FrameWord.WHOLE] += 1
         else:
-            self.image.words[self.place.words + TxWord.SENT_AT_NS] = now_ns
+            self.image.words[self.slot.words + TxWord.SENT_AT_NS] = now_ns
         self.question.look(now_ns)
 
 
@@ -128,7 +128,7 @@ def test_a_question_goes_on_when_the_station_is_configured_anew():
     before, after = Asked(TriggerSpec(event=True)), Asked(TriggerSpec(event=True))
     before.send(10 * MS)
     before.question.answered("b", 11 * MS)
-    words, first = after.image.words, after.place.words
+    words, first = after.image.words, after.slot.words
     words[first + TxWord.SENT_AT_NS] = 10 * MS  # carried over with all other words
     after.question.follow(before.question)
     after.question.look(12 * MS)  # nothing was sent in that cycle

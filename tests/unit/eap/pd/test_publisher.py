@@ -28,8 +28,8 @@ class Sender:
         self.wire = Wire()
         layout = self.image.layout
         frames = [
-            (frame, place, tuple(pd for pd in layout.tx if pd.frame == frame.name))
-            for frame, place in zip(spec.frames, layout.frames, strict=True)
+            (frame, slot, tuple(pd for pd in layout.tx if pd.frame == frame.name))
+            for frame, slot in zip(spec.frames, layout.frames, strict=True)
         ]
         self.publisher = Publisher(self.image, self.inputs, NetId.parse(PEER), self.wire, frames)
 
@@ -253,8 +253,8 @@ class Server:
             NetId.parse(PEER),
             self.wire,
             [
-                (frame, place, tuple(pd for pd in layout.tx if pd.frame == frame.name))
-                for frame, place in zip(self.spec.frames, layout.frames, strict=True)
+                (frame, slot, tuple(pd for pd in layout.tx if pd.frame == frame.name))
+                for frame, slot in zip(self.spec.frames, layout.frames, strict=True)
             ],
             self.requests,
         )

@@ -72,29 +72,29 @@ def test_quality_is_what_counting_in_every_cycle_gives(cycle_us, steps, idle):
             arrived = True
         words[StationWord.ENGINE_SEQUENCE] += 1
         assert arrived
-        assert quality(r.image, r.place("r")) == naive.value
+        assert quality(r.image, r.slot("r")) == naive.value
 
 
 def test_quality_saturates():
     r = receiver()
     r.give(octets([(7, b"ab", 0, 65_000)]), 0)
     r.image.words[StationWord.CYCLE] += 53
-    assert quality(r.image, r.place("r")) == 65_000 + 520
+    assert quality(r.image, r.slot("r")) == 65_000 + 520
     r.image.words[StationWord.CYCLE] += 2
-    assert quality(r.image, r.place("r")) == 65_535
+    assert quality(r.image, r.slot("r")) == 65_535
     r.image.words[StationWord.CYCLE] += 10**9
-    assert quality(r.image, r.place("r")) == 65_535
+    assert quality(r.image, r.slot("r")) == 65_535
 
 
 def test_what_arrives_between_two_cycles_is_fresh_in_the_next():
     r = receiver()
     r.image.words[StationWord.CYCLE] = 5
     r.give(octets([(7, b"ab", 0, 30)]), 0)
-    assert quality(r.image, r.place("r")) == 30
+    assert quality(r.image, r.slot("r")) == 30
     r.image.words[StationWord.CYCLE] = 6
-    assert quality(r.image, r.place("r")) == 30
+    assert quality(r.image, r.slot("r")) == 30
     r.image.words[StationWord.CYCLE] = 7
-    assert quality(r.image, r.place("r")) == 40
+    assert quality(r.image, r.slot("r")) == 40
 
 
 def test_a_subscription_that_waits_knows_nothing():
@@ -158,7 +158,7 @@ def test_members_of_one_tracker_report_the_same_counters_and_their_own_discards(
         variables=received("x:UINT", "y:UINT"),
     )
     r.give(octets([(1, b"ab"), (2, b"cd")], cycle=3), MS)
-    assert r.image.words[r.place("s").words + RxWord.TRACKER] == r.place("r").words
+    assert r.image.words[r.slot("s").words + RxWord.TRACKER] == r.slot("r").words
     r.give(octets([(2, b"toolong")], cycle=4), MS)
     rows = station_status(r.image, MS)["pd"]["rx"]
     assert [row["received"] for row in rows] == [1, 1]

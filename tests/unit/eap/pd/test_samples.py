@@ -30,8 +30,8 @@ def counting(**more):
 def values(image, data):
     first = image.layout.samples.first
     return {
-        name: parse(place.type).decode(take(place, data, 8 * first), 0)
-        for name, place in image.places.items()
+        name: parse(slot.type).decode(take(slot, data, 8 * first), 0)
+        for name, slot in image.slots.items()
     }
 
 
@@ -79,7 +79,7 @@ def test_sample_holds_all_variables_as_the_cycle_saw_them(running):
     assert values(image, samples.read(2)) == {"n": 2, **expected}
 
 
-def test_later_samples_take_the_place_of_the_oldest(running):
+def test_later_samples_take_the_slot_of_the_oldest(running):
     made, samples = running
     count = made.image.layout.samples.count
     samples.want(10 * count)
@@ -114,9 +114,9 @@ def test_sample_that_is_being_taken_is_none_yet():
 def test_samples_reach_back_a_quarter_of_a_second_if_there_is_room(cycle_us, octets, count):
     variables = written(f"x:BLOCK({octets})") if octets else ()
     layout = plan_layout(station(cycle_us=cycle_us, variables=variables))
-    place = layout.samples
-    assert abs(place.count - count) <= 1
-    assert place.size == 16 + place.last - place.first
-    assert place.size % 8 == place.offset % 8 == 0
-    assert place.offset == place.last
-    assert layout.directory_offset == place.offset + place.count * place.size
+    slot = layout.samples
+    assert abs(slot.count - count) <= 1
+    assert slot.size == 16 + slot.last - slot.first
+    assert slot.size % 8 == slot.offset % 8 == 0
+    assert slot.offset == slot.last
+    assert layout.directory_offset == slot.offset + slot.count * slot.size

@@ -213,11 +213,11 @@ class PairMachine(RuleBasedStateMachine):
     @invariant()
     def what_was_received_is_what_was_sent_last(self) -> None:
         layout = self.into.image.layout
-        for place in layout.rx:
-            if place.pd_id in self.delivered:
-                start = place.offset + 8
-                data = bytes(self.into.image.memory[start : start + place.size])
-                assert data == self.delivered[place.pd_id]
+        for slot in layout.rx:
+            if slot.pd_id in self.delivered:
+                start = slot.offset + 8
+                data = bytes(self.into.image.memory[start : start + slot.size])
+                assert data == self.delivered[slot.pd_id]
 
     @invariant()
     def every_cyclic_pd_was_received_or_lost(self) -> None:

@@ -107,9 +107,9 @@ def test_an_alternate_is_told_by_version_and_length():
     other = RxAlternateSpec(2, (TakenVariableSpec("", "BOOL"), TakenVariableSpec("x", "UINT")))
     r = receiver(alternates=(other,))
     r.give(octets([(7, b"\xff\x34\x12", 2, 50)], cycle=1), MS)
-    assert (r.image.read("x"), quality(r.image, r.place("r"))) == (0x1234, 50)
+    assert (r.image.read("x"), quality(r.image, r.slot("r"))) == (0x1234, 50)
     r.give(octets([(7, b"\x35\x12", 3, 0)], cycle=2), 2 * MS)
-    assert (r.image.read("x"), quality(r.image, r.place("r"))) == (0x1235, 0)
+    assert (r.image.read("x"), quality(r.image, r.slot("r"))) == (0x1235, 0)
     for version, data in ((2, b"ab"), (3, b"abc"), (4, b"abc")):
         r.give(octets([(7, data, version)], cycle=3), 3 * MS)
     assert (r.word("r", RxWord.RECEIVED), r.word("r", RxWord.LOST)) == (2, 0)

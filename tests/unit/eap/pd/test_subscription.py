@@ -20,11 +20,11 @@ def subscription(*, polled: bool = False, **options: object) -> tuple[RxSubscrip
             subscriptions=(spec,),
         )
     )
-    (place,) = image.layout.rx
+    (slot,) = image.layout.rx
     question = PollQuestion(image.words, image.layout.tx[0], ["in"]) if polled else None
-    made = RxSubscription(spec, place, SubstituteValue(image, place), question)
+    made = RxSubscription(spec, slot, SubstituteValue(image, slot), question)
     timing = Timing(step=1, sender_cycle_ns=MS, own_cycle_ns=MS)
-    made.tracker = SequenceTracker(image.words, place.words, timing)
+    made.tracker = SequenceTracker(image.words, slot.words, timing)
     return made, image.words
 
 
@@ -52,7 +52,7 @@ def test_an_answer_is_too_old_when_it_was_asked_for_so_long_ago():
     made, words = subscription(polled=True)
     made.tracker.arrived(1, 10 * MS, 1)
     assert made.deadline_ns() is None
-    words[made.answer.question._place.frame_words + FrameWord.WHOLE] += 1
+    words[made.answer.question._slot.frame_words + FrameWord.WHOLE] += 1
     made.answer.question.look(40 * MS)
     assert made.deadline_ns() == 45 * MS
     made.answer.question.answered("in", 41 * MS)
@@ -83,9 +83,9 @@ def test_substitute_replaces_the_data_and_nothing_else(substitute, values):
         variables=variables,
     )
     r.give(octets([(1, DATA, 0, 77)]), 0)
-    place = r.place("r")
-    header = bytes(r.image.memory[place.offset : place.offset + 8])
-    SubstituteValue(r.image, place).apply()
+    slot = r.slot("r")
+    header = bytes(r.image.memory[slot.offset : slot.offset + 8])
+    SubstituteValue(r.image, slot).apply()
     assert r.image.read_all() | values == r.image.read_all()
     assert r.image.read("next") == 9
-    assert bytes(r.image.memory[place.offset : place.offset + 8]) == header
+    assert bytes(r.image.memory[slot.offset : slot.offset + 8]) == header

@@ -37,14 +37,14 @@ def build(*triggers: TriggerSpec, gate=(0, 0), wire: Wire | None = None) -> tupl
     inputs = Inputs(image)
     run_time = tuple(
         TxPd(
-            place,
+            slot,
             Trigger(pd.trigger, plan_schedule(pd.trigger, 1000, gate)),
             Gather(image, inputs, pd.variables),
         )
-        for pd, place in zip(pds, image.layout.tx, strict=True)
+        for pd, slot in zip(pds, image.layout.tx, strict=True)
     )
-    place = image.layout.frames[0]
-    return TxFrame(place, NetId.parse(PEER), run_time, gate, wire or Wire(), "10.0.0.9"), image
+    slot = image.layout.frames[0]
+    return TxFrame(slot, NetId.parse(PEER), run_time, gate, wire or Wire(), "10.0.0.9"), image
 
 
 def ids(selection) -> list[int]:
@@ -141,7 +141,7 @@ def test_frame_without_an_address_is_held_and_says_what_was_due():
     assert not frame.is_plain
     chosen, held = frame.select(1, 0)
     assert chosen is None
-    assert [pd.place.name for pd in held] == ["p1"]
+    assert [pd.slot.name for pd in held] == ["p1"]
     frame.retarget("10.0.0.9")
     assert not frame.is_held
 
