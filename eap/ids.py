@@ -40,6 +40,20 @@ class NetId(bytes):
         return f"NetId.parse({str(self)!r})"
 
 
+def encode_value(value: object) -> str:
+    """Return the text of an address in a record (msgspec's ``enc_hook``)."""
+    if isinstance(value, NetId):
+        return str(value)
+    raise NotImplementedError(f"{type(value).__name__} in a record")
+
+
+def decode_value(kind: type, text: object) -> NetId:
+    """Read an address of a record (msgspec's ``dec_hook``); raise ValueError if it is none."""
+    if kind is NetId and isinstance(text, str):
+        return NetId.parse(text)
+    raise NotImplementedError(f"{kind.__name__} in a record")
+
+
 def prefix_text(prefix: bytes) -> str:
     """Return what all NetIDs that begin with *prefix* look like: ``5.23.91.23.x.x``."""
     return ".".join([*map(str, prefix), *["x"] * (6 - len(prefix))])

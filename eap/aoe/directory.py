@@ -30,12 +30,11 @@ class Directory:
     def __init__(self, stations: Sequence[DirectoryStation]) -> None:
         self.stations = {station.name: station for station in stations}
         self._names = {
-            AmsAddress(NetId.parse(station.net_id), SYSTEM_PORT): station.name
-            for station in stations
+            AmsAddress(station.net_id, SYSTEM_PORT): station.name for station in stations
         }
-        self._net_ids = {NetId.parse(station.net_id): station.name for station in stations}
+        self._net_ids = {station.net_id: station.name for station in stations}
         for station in stations:
-            own = AmsAddress(NetId.parse(station.net_id), DEVICE_PORT)
+            own = AmsAddress(station.net_id, DEVICE_PORT)
             self._names[own] = f"{station.name}/{ROUTER}"
             for port in station.ports:
                 self._enter(f"{station.name}/{port.name}", port)
@@ -56,17 +55,17 @@ class Directory:
         if station is None:
             raise ValueError(f"no station {name!r} in this plant{near(name, self.stations)}")
         if not rest:
-            return AmsAddress(NetId.parse(station.net_id), SYSTEM_PORT)
+            return AmsAddress(station.net_id, SYSTEM_PORT)
         port_name, slash, slave = rest.partition("/")
         ports = {port.name: port for port in station.ports}
         port = ports.get(port_name)
         if port is None and rest == ROUTER:
-            return AmsAddress(NetId.parse(station.net_id), DEVICE_PORT)
+            return AmsAddress(station.net_id, DEVICE_PORT)
         if port is None:
             hint = near(port_name, ports) or f"; it has {', '.join(ports) or 'none'}"
             raise ValueError(f"station {name} has no port {port_name!r}{hint}")
         number = _slave(f"{name}/{port_name}", port, slave) if slash else DEVICE_PORT
-        return AmsAddress(NetId.parse(port.net_id), number)
+        return AmsAddress(port.net_id, number)
 
     def find_device(self, text: str) -> AmsAddress:
         """As :meth:`find`, but a station stands for its first EAP port, if it has one."""
@@ -88,7 +87,7 @@ class Directory:
         return self._net_ids.get(net_id, "").partition("/")[0]
 
     def _enter(self, name: str, port: DirectoryPort) -> None:
-        net_id = NetId.parse(port.net_id)
+        net_id = port.net_id
         self._net_ids.setdefault(net_id, name)
         self._names[AmsAddress(net_id, DEVICE_PORT)] = name
         for slave, number in port.slaves.items():

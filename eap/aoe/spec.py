@@ -11,6 +11,8 @@ from ipaddress import IPv4Address, IPv4Network
 
 import msgspec
 
+from eap.ids import NetId
+
 DEFAULT_TARGET = "default"
 """Name of a route that takes what no other one does."""
 
@@ -261,7 +263,7 @@ class DirectoryPort(Record, frozen=True):
 
     name: str
     is_bus: bool
-    net_id: str
+    net_id: NetId
     interface: str
     slaves: dict[str, int] = {}
 
@@ -270,5 +272,5 @@ class DirectoryStation(Record, frozen=True):
     """A station by name, whether it runs here or not."""
 
     name: str
-    net_id: str
+    net_id: NetId
     ports: tuple[DirectoryPort, ...]

@@ -78,7 +78,7 @@ def _hop(mine: DirectoryPort, there: DirectoryPort) -> HopSpec | None:
     if here.scheme in _IP and target.scheme in _IP:
         return ip_hop(mine.name, here, target)
     if here.scheme == target.scheme == "ethernet" and here.host == target.host:
-        return HopSpec(DoorKind.ETHERNET, mine.name, there.net_id)
+        return HopSpec(DoorKind.ETHERNET, mine.name, str(there.net_id))
     return None
 
 
@@ -138,8 +138,9 @@ def _by_ethernet(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
 def _by_mqtt(rest: str, net_id: str, directory: Directory) -> HopSpec:
     network, _, router = rest.partition("/")
     known = directory.stations.get(router)
-    router = known.net_id if known else router or net_id
-    return HopSpec(DoorKind.MQTT, network, str(NetId.parse(router)))
+    if known:
+        return HopSpec(DoorKind.MQTT, network, str(known.net_id))
+    return HopSpec(DoorKind.MQTT, network, str(NetId.parse(router or net_id)))
 
 
 _READERS: dict[str, Callable[[str, Sequence[DirectoryPort]], HopSpec]] = {

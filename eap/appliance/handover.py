@@ -13,6 +13,7 @@ from typing import Self
 import msgspec
 
 from eap.aoe.spec import DirectoryStation, RoutingSpec
+from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortSpec, SpecRecord, StationSpec
 
@@ -94,7 +95,7 @@ class Handed(SpecRecord, frozen=True):
         """Return the descriptor of a file that holds this; the caller closes it."""
         fd = os.memfd_create("eap-handover", os.MFD_CLOEXEC)
         with os.fdopen(os.dup(fd), "wb") as file:
-            file.write(msgspec.json.encode(self))
+            file.write(msgspec.json.encode(self, enc_hook=encode_value))
         return fd
 
     @classmethod
@@ -102,7 +103,7 @@ class Handed(SpecRecord, frozen=True):
         """Read what ``to_descriptor`` wrote, and close *fd*."""
         with os.fdopen(fd, "rb") as file:
             file.seek(0)
-            return msgspec.json.decode(file.read(), type=cls)
+            return msgspec.json.decode(file.read(), type=cls, dec_hook=decode_value)
 
 
 class SegmentHandover(Handed, frozen=True):

@@ -31,11 +31,7 @@ _VIA = click.option(
     short_help="List stations, ports and slaves of the whole plant.",
     epilog=examples("eapctl scan", "eapctl scan --via island-02 --json"),
 )
-@click.option(
-    "--via",
-    metavar="STATION",
-    help="Station whose router sends the requests; the first one without.",
-)
+@_VIA
 @plant_option
 @json_option("Print one object: stations, with their ports and slaves.")
 def scan(via: str | None, plant: str | None, output: Output) -> None:
@@ -64,11 +60,7 @@ def scan(via: str | None, plant: str | None, output: Output) -> None:
     ),
 )
 @click.argument("targets", nargs=-1, required=True, metavar="TARGET…")
-@click.option(
-    "--via",
-    metavar="STATION",
-    help="Station whose router sends the requests; the first one without.",
-)
+@_VIA
 @plant_option
 @json_option("Print one object for each target; docs/trace.md explains its fields.")
 @click.pass_context

@@ -14,7 +14,7 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.routes import WHOLE, MisfitError, net_ids_of, without_prefix
 from eap.config.structs import AccessSection, PortSection, StationSection
-from eap.ids import STATION_OCTETS, MacAddr, NetId, ObjectId
+from eap.ids import STATION_OCTETS, MacAddr, ObjectId
 from eap.near import near
 from eap.pd.spec import PortKind
 
@@ -138,7 +138,7 @@ def _targets(index: Index, text: str, loose: set[str]) -> list[AccessTarget]:
         names = [each.name for each in station.ports]
         message = f"station {name} has no port {port_name!r}{near(port_name, names)}"
         raise MisfitError("", message, one_of(names))
-    net_id = str(NetId.parse(port.net_id))
+    net_id = str(port.net_id)
     if not slave:
         return [AccessTarget(net_id)]
     return [AccessTarget(net_id, _slave(index, station, port, slave))]

@@ -144,18 +144,11 @@ def _check_owners(
 ) -> None:
     for prefix in keys:
         for owner in index.plant.stations:
-            texts = [owner.net_id, *(port.net_id for port in owner.ports)]
-            if any(_begins(text, prefix) for text in texts):
+            owned = [owner.net_id, *(port.net_id for port in owner.ports)]
+            if any(net_id.startswith(prefix) for net_id in owned):
                 whose = "this station" if owner is station else f"station {owner.name}"
                 report.add(path, f"NetID {prefix_text(prefix)} is one of {whose}", _OTHER_NET_ID)
                 return
-
-
-def _begins(text: str, prefix: bytes) -> bool:
-    try:
-        return NetId.parse(text).startswith(prefix)
-    except ValueError:
-        return False
 
 
 def follow_routes(
@@ -210,10 +203,9 @@ class _Plant:
         self._routers = {}
         self._tables: dict[str, RouteTable] = {}
         for station in index.plant.stations:
-            router = NetId.parse(station.net_id)
-            self._routers[str(router)] = station.name
-            self.owners[router] = station.name
-            self.owners |= {NetId.parse(port.net_id): station.name for port in station.ports}
+            self._routers[str(station.net_id)] = station.name
+            self.owners[station.net_id] = station.name
+            self.owners |= {port.net_id: station.name for port in station.ports}
 
     def next_station(self, router: str) -> str:
         """Return the station that has a router, empty if that is not of this plant."""

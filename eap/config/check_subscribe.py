@@ -184,7 +184,7 @@ def _check_once(
     report: FindingReport,
 ) -> None:
     source = subscription.source
-    keys = [(subscription.port, sent.port.net_id, sent.pd.id) for sent in publishers]
+    keys = [(subscription.port, str(sent.port.net_id), sent.pd.id) for sent in publishers]
     if isinstance(source, FromSection):
         keys = [(subscription.port, source.publisher, source.id)]
     for key in keys:

@@ -15,7 +15,8 @@ from msgspec import inspect
 
 from eap.config.document import Node, ScalarNode
 from eap.config.finding import FindingReport, one_of
-from eap.config.structs import PlantFile, Section
+from eap.config.structs import NO_NET_ID, PlantFile, Section
+from eap.ids import NetId
 from eap.near import near, nearest
 
 T = TypeVar("T")
@@ -249,6 +250,9 @@ class _Converter:
                     return float(value)
             case inspect.EnumType() if value in [each.value for each in kind.cls]:
                 return kind.cls(value)
+            case inspect.CustomType(cls=cls) if cls is NetId:
+                if isinstance(node, ScalarNode) and value is not None:
+                    return read_net_id(node.text, path, self._report)
         raise self._refuse(node, path, key, _describe(kind, key))
 
     def _plain(self, node: Node, path: str, key: str) -> Any:
@@ -258,6 +262,15 @@ class _Converter:
         if node.value is None or isinstance(node.value, dict):
             raise self._refuse(node, path, key, "a value, or a list of values for an array")
         return node.value
+
+
+def read_net_id(text: str, path: str, report: FindingReport) -> NetId:
+    """Return the NetID of a station or port; report at *path* why it is none, and go on."""
+    try:
+        return NetId.parse(text)
+    except ValueError as exc:
+        report.add(path, f"net_id: {exc}", "an AMS NetID such as 5.23.91.23.1.1")
+        return NO_NET_ID
 
 
 def _title(given: dict[str, Node], key: str) -> str:

@@ -89,7 +89,7 @@ def _phase(index: Index, station: StationSection, position: int, count: int) -> 
 def _station(index: Index, station: StationSection, phase_us: int, folder: Path) -> StationSpec:
     return StationSpec(
         name=station.name,
-        net_id=str(NetId.parse(station.net_id)),
+        net_id=str(station.net_id),
         cycle_us=index.cycle_us(station),
         ports=tuple(
             _bus_port(index, station, port, folder)
@@ -204,7 +204,7 @@ def _subscription(index: Index, subscription: SubscribeSection) -> RxPdSpec:
     if publishers:
         sent = publishers[0]
         pd_id, version = sent.pd.id, sent.pd.version
-        publisher = str(NetId.parse(sent.port.net_id))
+        publisher = str(sent.port.net_id)
         step, sender_cycle_us = _pace(index, publishers)
     if isinstance(source, FromSection):
         pd_id = source.id
@@ -264,7 +264,7 @@ def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
         name=port.name,
         kind=port.kind,
         interface=str(InterfaceUri.parse(port.interface)),
-        net_id=str(NetId.parse(port.net_id)),
+        net_id=str(port.net_id),
         vlan_id=port.vlan.id if port.vlan else 0,
         vlan_priority=port.vlan.priority if port.vlan else 0,
         join=tuple(dict.fromkeys(groups)),
@@ -286,7 +286,7 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
         name=port.name,
         kind=port.kind,
         interface=str(InterfaceUri("sim", path) if uri.scheme == "sim" else uri),
-        net_id=str(NetId.parse(port.net_id)),
+        net_id=str(port.net_id),
         bus=BusPortSpec(
             path,
             slaves,
@@ -338,12 +338,12 @@ def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
     return tuple(
         DirectoryStation(
             name=station.name,
-            net_id=str(NetId.parse(station.net_id)),
+            net_id=station.net_id,
             ports=tuple(
                 DirectoryPort(
                     name=port.name,
                     is_bus=port.kind is PortKind.BUS,
-                    net_id=str(NetId.parse(port.net_id)),
+                    net_id=port.net_id,
                     interface=str(InterfaceUri.parse(port.interface)),
                     slaves=_slaves(index, station, port.name),
                 )

@@ -85,16 +85,9 @@ def find_net_id(text: str, index: Index) -> list[tuple[str, str]]:
     """Return station and name of the EAP port of NetID *text*, or of all ports of that router."""
     wanted = NetId.parse(text)
     eap = [key for key, port in index.ports.items() if port.kind is PortKind.EAP]
-    return [key for key in eap if _has(index.ports[key].net_id, wanted)] or [
-        key for key in eap if _has(index.stations[key[0]].net_id, wanted)
+    return [key for key in eap if index.ports[key].net_id == wanted] or [
+        key for key in eap if index.stations[key[0]].net_id == wanted
     ]
-
-
-def _has(text: str, net_id: NetId) -> bool:
-    try:
-        return NetId.parse(text) == net_id
-    except ValueError:
-        return False
 
 
 def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
@@ -109,7 +102,7 @@ def _of_port(text: str, uri: InterfaceUri, index: Index) -> Destination:
     if target.scheme == uri.scheme == "udp":
         return Destination.parse(address)
     if target.scheme == uri.scheme == "ethernet" and port.kind is PortKind.EAP:
-        return Destination(DestinationKind.NET_ID, str(NetId.parse(port.net_id)))
+        return Destination(DestinationKind.NET_ID, str(port.net_id))
     if uri.scheme in {"udp", "tcp"} and takes_tcp(port, target):
         return Destination.parse(f"tcp://{address}")
     raise ValueError(f"{text} ({target}) has no address that is known for frames from {uri}")
@@ -133,8 +126,8 @@ def reaches(
     if sender[1].scheme == "loop" or uri.scheme == "loop":
         return (sender[1].scheme, sender[1].host) == (uri.scheme, uri.host)
     if destination.kind in {DestinationKind.MAC, DestinationKind.NET_ID}:
-        is_for_it = destination.kind is DestinationKind.MAC or _has(
-            port.net_id, NetId.parse(destination.host)
+        is_for_it = destination.kind is DestinationKind.MAC or port.net_id == NetId.parse(
+            destination.host
         )
         return uri.scheme == "ethernet" and _vid(sender[0]) == _vid(port) and is_for_it
     if (destination.port or EAP_PORT) != (uri.port or EAP_PORT):

@@ -10,7 +10,6 @@ from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.routes import MisfitError
 from eap.config.structs import Plain, PortSection, StationSection
-from eap.ids import NetId
 from eap.near import near
 from eap.pd.spec import BusSlaveSpec, GatewayAddress, GatewaySpec, PortKind
 
@@ -93,7 +92,7 @@ def resolve(
     number = _slave(index, other, there, names[2]) if len(names) == 3 else MASTER_PORT
     if there is port and number != MASTER_PORT:
         return GatewayAddress(address, station=number)
-    return GatewayAddress(address, net_id=str(NetId.parse(there.net_id)), port=number)
+    return GatewayAddress(address, net_id=str(there.net_id), port=number)
 
 
 def _member(

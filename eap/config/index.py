@@ -177,7 +177,7 @@ def parse_types(texts: list[str | None]) -> list[DataType] | None:
 
 
 def _matches(source: FromSection, sent: SentPd) -> bool:
-    return source.id == sent.pd.id and source.publisher in ("any", sent.port.net_id)
+    return source.id == sent.pd.id and source.publisher in ("any", str(sent.port.net_id))
 
 
 def _interface(text: str) -> InterfaceUri | None:

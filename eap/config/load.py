@@ -16,7 +16,7 @@ from eap.config.check_publish import check_polls, check_publish
 from eap.config.check_routes import check_routes, follow_routes
 from eap.config.check_subscribe import check_subscribe
 from eap.config.check_variables import check_variables
-from eap.config.convert import convert
+from eap.config.convert import convert, read_net_id
 from eap.config.derive import derive, derive_directory, derive_routing
 from eap.config.document import read
 from eap.config.finding import Finding, FindingReport
@@ -106,12 +106,13 @@ def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
         net_id: Of the port.
         cycle_us: Device cycle.
     """
-    port = PortSection(at=_PORT, name=PORT, kind=PortKind.EAP, interface=interface, net_id=net_id)
+    report = FindingReport("")
+    own = read_net_id(net_id, NET_ID_PATHS[-1], report)
+    port = PortSection(at=_PORT, name=PORT, kind=PortKind.EAP, interface=interface, net_id=own)
     station = StationSection(
-        at=_ROUTER, name=name, net_id=_router(net_id), ports=(port,), cycle_us=cycle_us
+        at=_ROUTER, name=name, net_id=_router(own), ports=(port,), cycle_us=cycle_us
     )
     index = Index(PlantFile(plant="blank", stations=(station,)))
-    report = FindingReport("")
     check_ports(index, report)
     if findings := report.findings():
         return LoadResult(None, findings)
@@ -121,10 +122,9 @@ def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
     return LoadResult(plant, ())
 
 
-def _router(net_id: str) -> str:
-    try:
-        octets = bytearray(NetId.parse(net_id))
-    except ValueError:
-        return net_id  # wrong there as it is wrong at the port
+def _router(net_id: NetId) -> NetId:
+    if not net_id:
+        return net_id
+    octets = bytearray(net_id)
     octets[4] = (octets[4] - 1) & 0xFF
-    return str(NetId(octets))
+    return NetId(octets)

@@ -107,7 +107,7 @@ def _direct(index: Index, station: StationSection, route: RouteSection) -> NextH
     if hop is None:
         message = f"{station.name} and {target.name} share no interface"
         raise MisfitError("to", message, "via: a station between them, or ams_tcp:")
-    return NextHop(hop, _net_id(target))
+    return NextHop(hop, str(target.net_id))
 
 
 def _other_port(
@@ -134,7 +134,7 @@ def _by_station(index: Index, station: StationSection, route: RouteSection) -> N
         own = f"port {route.port}" if route.port else "any port"
         message = f"{route.via} cannot be reached from {own} of {station.name}"
         raise MisfitError("via", message, "ports that are both of IP, or both of Ethernet")
-    return NextHop(hop, _net_id(other))
+    return NextHop(hop, str(other.net_id))
 
 
 def _by_ams_tcp(index: Index, station: StationSection, route: RouteSection) -> NextHop:
@@ -144,13 +144,13 @@ def _by_ams_tcp(index: Index, station: StationSection, route: RouteSection) -> N
         if uri is None or uri.scheme not in {"udp", "tcp"} or not index.ports[other.name, port].ams:
             message = f"{route.ams_tcp} does not serve AMS/TCP"
             raise MisfitError("ams_tcp", message, "a port on udp:// or tcp:// without ams: false")
-        return NextHop(_ams_tcp(uri.host, AMS_TCP_PORT), _net_id(other))
+        return NextHop(_ams_tcp(uri.host, AMS_TCP_PORT), str(other.net_id))
     try:
         host, number = parse_host(route.ams_tcp, AMS_TCP_PORT)
     except ValueError as exc:
         raise MisfitError("ams_tcp", f"ams_tcp: {exc}", f"{HOST}, or STATION/PORT") from None
     target = target_of(index, route)
-    return NextHop(_ams_tcp(host, number), _net_id(target) if target else "")
+    return NextHop(_ams_tcp(host, number), str(target.net_id) if target else "")
 
 
 def _ams_tcp(host: str, port: int) -> HopSpec:
@@ -171,7 +171,7 @@ def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> Next
     if other is not None and find_network(other, network) is None:
         message = f"station {other.name} is in no MQTT network {network!r}"
         raise MisfitError("via", message, "a network that both are in")
-    router = _net_id(other) if other is not None else _foreign_router(route)
+    router = str(other.net_id) if other is not None else _foreign_router(route)
     return NextHop(HopSpec(DoorKind.MQTT, network, router), router)
 
 
@@ -207,7 +207,7 @@ def _by_address(index: Index, station: StationSection, route: RouteSection) -> N
     if destination.kind in {DestinationKind.IP, DestinationKind.TCP}:
         address += f":{destination.port or EAP_PORT}"
     hop = HopSpec(_KINDS[destination.kind], port, address)
-    return NextHop(hop, _net_id(target) if target else "")
+    return NextHop(hop, str(target.net_id) if target else "")
 
 
 def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: RouteSection) -> str:
@@ -219,13 +219,6 @@ def _nearest(ports: dict[str, InterfaceUri], destination: Destination, route: Ro
         message = f"route {route.to!r} does not say by which Ethernet interface"
         raise MisfitError("port", message, one_of(ports))
     return next(iter(ports))
-
-
-def _net_id(station: StationSection) -> str:
-    try:
-        return str(NetId.parse(station.net_id))
-    except ValueError:
-        return ""  # a finding of its own
 
 
 WHOLE = 6
@@ -248,10 +241,10 @@ def reach(index: Index, route: RouteSection, loose: set[str]) -> list[tuple[str,
 
 def net_ids_of(station: StationSection, loose: set[str]) -> list[tuple[str, int]]:
     """Return by which NetIDs, and octets of them, everything at *station* is reached."""
-    router = str(NetId.parse(station.net_id))
+    router = str(station.net_id)
     if station.name not in loose:
         return [(router, STATION_OCTETS)]
-    return [(router, WHOLE), *((str(NetId.parse(port.net_id)), WHOLE) for port in station.ports)]
+    return [(router, WHOLE), *((str(port.net_id), WHOLE) for port in station.ports)]
 
 
 def without_prefix(index: Index) -> set[str]:
@@ -266,13 +259,8 @@ def without_prefix(index: Index) -> set[str]:
 
 def prefixes(station: StationSection) -> set[bytes]:
     """Return the first four octets of each NetID of *station* that is one."""
-    found = set()
-    for text in [station.net_id, *(port.net_id for port in station.ports)]:
-        try:
-            found.add(NetId.parse(text).station)
-        except ValueError:
-            continue  # a finding of its own
-    return found
+    owned = [station.net_id, *(port.net_id for port in station.ports)]
+    return {net_id.station for net_id in owned if net_id}
 
 
 _IP_SCHEMES = {"udp", "tcp"}
@@ -341,7 +329,7 @@ def _hop(
     if uri.scheme == target.scheme == "ethernet":
         port, there = index.ports[own], index.ports[other]
         if is_wanted or (uri.host == target.host and _vid(port) == _vid(there)):
-            address = MacAddr.parse(there.mac) if there.mac else NetId.parse(there.net_id)
+            address = MacAddr.parse(there.mac) if there.mac else there.net_id
             return HopSpec(DoorKind.ETHERNET, own[1], str(address)), 0
     return None
 

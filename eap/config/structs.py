@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, TypeAlias
 import msgspec
 from msgspec import Meta
 
+from eap.ids import NetId
 from eap.pd.spec import (
     BusTarget,
     OnChangeSpec,
@@ -37,6 +38,10 @@ MAX_PATIENCE_MS = 600_000
 """How long an answer may take at most."""
 BitOffset = Annotated[int, Meta(ge=0, le=MAX_BITS - 1)]
 Plain: TypeAlias = bool | int | float | str | list[bool | int | float]
+
+
+NO_NET_ID = NetId(b"")
+"""In place of a NetID that cannot be read, which is a finding of its own."""
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,7 +92,7 @@ class PortSection(Section, frozen=True):
     name: str
     kind: PortKind
     interface: str
-    net_id: str
+    net_id: NetId
     vlan: VlanSection | None = None
     join: tuple[str, ...] = ()
     broadcast: bool = False
@@ -323,7 +328,7 @@ class StationSection(Section, frozen=True):
     """A router with its ports, and what the station sends and receives."""
 
     name: str
-    net_id: str
+    net_id: NetId
     ports: tuple[PortSection, ...]
     cycle_us: DeviceCycle | None = None
     phase_us: Annotated[int, Meta(ge=0, le=60_000_000)] | None = None

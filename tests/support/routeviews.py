@@ -24,8 +24,8 @@ from tests.support.routing import KeepingCarrier, StubService
 
 DIRECTORY = Directory([
     DirectoryStation(
-        name, f"127.0.9.{number}.1.1",
-        (DirectoryPort("eap0", False, f"127.0.9.{number}.2.1", f"udp://127.0.9.{number}"),),
+        name, NetId.parse(f"127.0.9.{number}.1.1"),
+        (DirectoryPort("eap0", False, NetId.parse(f"127.0.9.{number}.2.1"), f"udp://127.0.9.{number}"),),
     )
     for number, name in ((1, "left"), (2, "right"), (3, "third"))
 ])  # fmt: skip
@@ -50,8 +50,8 @@ class Left:
 
     def __init__(self) -> None:
         station = DIRECTORY.stations["left"]
-        net_ids = [NetId.parse(port.net_id) for port in station.ports]
-        net_id = NetId.parse(station.net_id)
+        net_ids = [port.net_id for port in station.ports]
+        net_id = station.net_id
         self.router = StationRouter("left", net_id, net_ids)
         self.router.add_service(net_id, StubService(_run, SYSTEM_PORT))
         self.carrier = KeepingCarrier()

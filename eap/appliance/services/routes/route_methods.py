@@ -180,7 +180,7 @@ class RouteMethods:
             net_id=net_id,
             hop=hop,
             octets=wanted.octets,
-            router=beside.net_id if beside else "",
+            router=str(beside.net_id) if beside else "",
             virtual=wanted.virtual,
             is_unidirectional=wanted.unidirectional,
             timeout_ms=wanted.timeout_ms,
@@ -195,7 +195,7 @@ class RouteMethods:
         if not wanted.octets:
             return str(_ANY)
         if wanted.name in stations:
-            return stations[wanted.name].net_id
+            return str(stations[wanted.name].net_id)
         raise ValueError(
             f"a NetID is needed: {wanted.name!r} is no station of the plant"
             f"{near(wanted.name, stations)}"

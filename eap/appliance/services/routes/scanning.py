@@ -55,8 +55,7 @@ class Known(NamedTuple):
 def stations_of(directory: Directory, routes: Iterable[Route]) -> list[Known]:
     """Return the stations of the plant, then those that only routes tell of."""
     found = {
-        NetId.parse(each.net_id): Known(each.name, NetId.parse(each.net_id), each)
-        for each in directory.stations.values()
+        each.net_id: Known(each.name, each.net_id, each) for each in directory.stations.values()
     }
     for route in routes:
         is_known = route.net_id in found or directory.station_of(route.net_id)
@@ -90,7 +89,7 @@ class _Look:
         self._asker = asker
         self._known = known
         ports = known.planned.ports if known.planned else ()
-        self._planned = {NetId.parse(port.net_id): port for port in ports}
+        self._planned = {port.net_id: port for port in ports}
 
     async def station(self) -> StationEntry:
         """Return the station with its ports and slaves."""
@@ -175,7 +174,7 @@ class _Look:
 
 def _planned_port(port: DirectoryPort) -> PortEntry:
     kind = "bus" if port.is_bus else "eap"
-    return PortEntry(port.name, kind, port.net_id, port.interface, _planned_slaves(port), "")
+    return PortEntry(port.name, kind, str(port.net_id), port.interface, _planned_slaves(port), "")
 
 
 def _planned_slaves(port: DirectoryPort | None) -> list[SlaveEntry]:

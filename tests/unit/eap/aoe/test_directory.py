@@ -9,16 +9,18 @@ from eap.aoe.spec import DirectoryPort, DirectoryStation
 from eap.ids import NetId
 
 PORTS = (
-    DirectoryPort("eap0", is_bus=False, net_id="5.1.1.1.2.1", interface="udp://127.0.1.1"),
+    DirectoryPort(
+        "eap0", is_bus=False, net_id=NetId.parse("5.1.1.1.2.1"), interface="udp://127.0.1.1"
+    ),
     DirectoryPort(
         "bus0",
         is_bus=True,
-        net_id="5.1.1.1.3.1",
+        net_id=NetId.parse("5.1.1.1.3.1"),
         interface="sim://x.yaml",
         slaves={"drive": 1001, "io": 1002},
     ),
 )
-HERE = Directory([DirectoryStation("island-01", "5.1.1.1.1.1", PORTS)])
+HERE = Directory([DirectoryStation("island-01", NetId.parse("5.1.1.1.1.1"), PORTS)])
 
 
 @pytest.mark.parametrize(
@@ -81,7 +83,7 @@ def test_station_of_a_net_id() -> None:
 def test_devices() -> None:
     assert str(HERE.find_device("island-01")) == "5.1.1.1.2.1:65535"
     assert str(HERE.find_device("island-01/bus0/drive")) == "5.1.1.1.3.1:1001"
-    alone = Directory([DirectoryStation("x", "5.1.1.2.1.1", ())])
+    alone = Directory([DirectoryStation("x", NetId.parse("5.1.1.2.1.1"), ())])
     assert str(alone.find_device("x")) == "5.1.1.2.1.1:10000"
     with pytest.raises(ValueError, match="no station 'y'"):
         alone.find_device("y")

@@ -5,17 +5,18 @@ import pytest
 from eap.aoe.directory import Directory
 from eap.aoe.spec import DirectoryPort, DirectoryStation, DoorKind, HopSpec
 from eap.aoe.via import parse_via
+from eap.ids import NetId
 
 FAR = "9.1.1.1.1.1"
 
 
 def station(number: int, *interfaces: str) -> DirectoryStation:
     ports = [
-        DirectoryPort(f"eap{index}", False, f"5.1.1.{number}.{index + 2}.1", interface)
+        DirectoryPort(f"eap{index}", False, NetId.parse(f"5.1.1.{number}.{index + 2}.1"), interface)
         for index, interface in enumerate(interfaces)
     ]
-    bus = DirectoryPort("bus0", True, f"5.1.1.{number}.9.1", "sim://x.yaml")
-    return DirectoryStation(f"s{number}", f"5.1.1.{number}.1.1", (*ports, bus))
+    bus = DirectoryPort("bus0", True, NetId.parse(f"5.1.1.{number}.9.1"), "sim://x.yaml")
+    return DirectoryStation(f"s{number}", NetId.parse(f"5.1.1.{number}.1.1"), (*ports, bus))
 
 
 OWN = station(1, "udp://10.0.0.1", "ethernet://eth0", "tcp://127.0.0.1")

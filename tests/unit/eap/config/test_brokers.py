@@ -16,12 +16,16 @@ from eap.config.brokers import (
     why_unreadable,
 )
 from eap.config.structs import RouteSection, StationSection, TlsSection
+from eap.ids import NetId
 
 
 def station(*networks):
     routes = tuple(RouteSection(mqtt=f"mqtt://{name}", network=name) for name in networks)
     return StationSection(
-        name="x", net_id="1.2.3.4.5.6", ports=(), routes=(RouteSection(to="y"), *routes)
+        name="x",
+        net_id=NetId.parse("1.2.3.4.5.6"),
+        ports=(),
+        routes=(RouteSection(to="y"), *routes),
     )
 
 

@@ -11,6 +11,7 @@ from eap.aoe.spec import (
     HopSpec,
     RouteSpec,
 )
+from eap.ids import NetId
 from eap.pd.spec import LinkSpec, OnChangeSpec, Substitute, TriggerSpec, Wake, Writer
 
 PD = "id: 1, version: 3,"
@@ -290,10 +291,12 @@ def test_the_directory_names_all_ports_and_slaves(plant):
     left = plant((LEFT_EAP_PORT, f"{LEFT_EAP_PORT}\n      - {BUS}")).directory[0]
     assert left == DirectoryStation(
         "left",
-        "127.0.9.1.1.1",
+        NetId.parse("127.0.9.1.1.1"),
         (
-            DirectoryPort("eap0", False, "127.0.9.1.2.1", "udp://127.0.9.1"),
-            DirectoryPort("bus0", True, "127.0.9.1.3.1", "sim://line.yaml", {"valves": 1001}),
+            DirectoryPort("eap0", False, NetId.parse("127.0.9.1.2.1"), "udp://127.0.9.1"),
+            DirectoryPort(
+                "bus0", True, NetId.parse("127.0.9.1.3.1"), "sim://line.yaml", {"valves": 1001}
+            ),
         ),
     )
 

@@ -4,13 +4,17 @@ import pytest
 
 from eap.config.destination import group_of, reaches, resolve
 from eap.config.structs import PortSection, VlanSection
-from eap.ids import Destination, InterfaceUri
+from eap.ids import Destination, InterfaceUri, NetId
 from eap.pd.spec import PortKind
 
 
 def port(interface, **options):
     made = PortSection(
-        name="p", kind=PortKind.EAP, interface=interface, net_id="1.1.1.1.1.1", **options
+        name="p",
+        kind=PortKind.EAP,
+        interface=interface,
+        net_id=NetId.parse("1.1.1.1.1.1"),
+        **options,
     )
     return made, InterfaceUri.parse(interface)
 

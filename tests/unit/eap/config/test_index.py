@@ -4,6 +4,7 @@ import pytest
 
 from eap.config.index import parse_types
 from eap.config.structs import FromSection
+from eap.ids import NetId
 
 PD = "id: 1, version: 3,"
 PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'
@@ -20,7 +21,7 @@ def test_parts_are_found_by_name(index):
 
 def test_of_two_with_one_name_the_first_counts(index):
     plant = index(("name: right", "name: left"))
-    assert plant.stations["left"].net_id == "127.0.9.1.1.1"
+    assert plant.stations["left"].net_id == NetId.parse("127.0.9.1.1.1")
 
 
 def test_a_publisher_is_found_by_name_by_numbers_or_by_id_alone(index):

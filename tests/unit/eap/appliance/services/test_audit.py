@@ -29,8 +29,8 @@ NAMES = Directory(
     [
         DirectoryStation(
             "island-01",
-            "5.1.1.1.1.1",
-            (DirectoryPort("bus0", True, "5.1.1.1.3.1", "sim://x", {"drive": 1001}),),
+            NetId.parse("5.1.1.1.1.1"),
+            (DirectoryPort("bus0", True, NetId.parse("5.1.1.1.3.1"), "sim://x", {"drive": 1001}),),
         )
     ]
 )

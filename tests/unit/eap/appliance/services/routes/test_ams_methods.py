@@ -19,7 +19,7 @@ from eap.ids import NetId
 from tests.support.routing import StubService
 
 NET_ID = NetId.parse("5.1.1.1.1.1")
-PLANT = Directory([DirectoryStation("island-01", str(NET_ID), ())])
+PLANT = Directory([DirectoryStation("island-01", NET_ID, ())])
 
 
 def call(method: str, **params: Any) -> Any:

@@ -81,10 +81,14 @@ class Devices:
 def planned(number: int) -> DirectoryStation:
     return DirectoryStation(
         f"island-{number:02}",
-        f"5.1.1.{number}.1.1",
+        NetId.parse(f"5.1.1.{number}.1.1"),
         (
-            DirectoryPort("eap0", False, f"5.1.1.{number}.2.1", f"udp://127.0.1.{number}"),
-            DirectoryPort("bus0", True, f"5.1.1.{number}.3.1", "sim://io.yaml", {"drive": 1001}),
+            DirectoryPort(
+                "eap0", False, NetId.parse(f"5.1.1.{number}.2.1"), f"udp://127.0.1.{number}"
+            ),
+            DirectoryPort(
+                "bus0", True, NetId.parse(f"5.1.1.{number}.3.1"), "sim://io.yaml", {"drive": 1001}
+            ),
         ),
     )
 
