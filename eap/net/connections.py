@@ -13,7 +13,9 @@ connections even afterwards; and one of a program of this host never does, unles
 accepted.  In use is a connection with requests under way or a subscription, used within the last
 10 s, or accepted within 3 s.
 If rule 3 finds none, the oldest of those that were just accepted from the newcomer's own host
-loses its place: a burst of connections does not lock out the host that it comes from.
+loses its place: a burst of connections does not lock out the host that it comes from.  For a
+newcomer of this host the last resort is one in use of this host, the least active that has been
+silent longest: no program locks the others of its host out by connections that it uses.
 Rule 4: a peer that leaves a frame unfinished, or takes no answers, is overdue after 10 s.
 """
 
@@ -251,6 +253,8 @@ def _find_victim(
                 order = 1
             elif is_fresh and each.host == newcomer_host:
                 order = 2
+            elif each.host == newcomer_host == OWN_HOST:
+                order = 3
             else:
                 continue
         elif each.host == newcomer_host or count > mine:

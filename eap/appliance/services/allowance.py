@@ -7,14 +7,9 @@ from typing import NamedTuple
 
 
 class Allowance:
-    """Room for *burst* at once, which comes back at *per_s* a second.
-
-    Attributes:
-        skipped: How often there was none, as its owner counts it.
-    """
+    """Room for *burst* at once, which comes back at *per_s* a second."""
 
     def __init__(self, burst: int, per_s: float, now_s: float) -> None:
-        self.skipped = 0
         self._burst = burst
         self._per_s = per_s
         self._left = float(burst)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -24,24 +23,29 @@ from eap.aoe.access import host_of, place_of
 from eap.aoe.ads_operation import Operation, WriteControl
 from eap.aoe.directory import Directory
 from eap.aoe.judged import AddRoute, AuditedOperation, AuditEntry
-from eap.appliance.services.allowance import Allowance
+from eap.appliance.services.allowance import Rate, SourceRateLimiter, SourceRates
 from eap.appliance.services.audit_file import AuditFile
 from eap.codec.ads import AdsError, IndexGroup
 from eap.ids import ObjectId
 
 BURST, PER_S = 500, 50
 """Lines that a client may cause at once, and in each second for long."""
-DOOR_BURST, DOOR_PER_S = 5000, 500
-"""Likewise, of all clients of a door, whose addresses may be made up."""
+DOOR_RATE = Rate(5000, 500)
+"""Likewise, of all clients of a transport."""
+NEW_RATE = Rate(500, 50)
+"""Likewise, of all its clients that were never seen: their addresses can be invented."""
 CONTROL = "control"
 """Stands for a door in lines about clients of the control socket."""
 TOO_MANY = f"the audit is required, and records {PER_S} changes a second of a client for long"
 _MAX_CLIENTS = 1024
+"""More than can be new at once: invented addresses do not make known clients forgotten."""
 _PLAIN = 8
 """Octets of a value that is written as it is; of longer ones there is a digest."""
 _TELL_AFTER_S = 1.0
 _COMPLETE = 0x100
 
+_CONTROL_RATES = SourceRates(Rate(BURST, PER_S), known=DOOR_RATE, new=DOOR_RATE, local=DOOR_RATE)
+_RATES = SourceRates(Rate(BURST, PER_S), known=DOOR_RATE, new=NEW_RATE, local=DOOR_RATE)
 _Client: TypeAlias = tuple[str, str, str]
 """Station, door, and address without its TCP port."""
 
@@ -90,8 +94,8 @@ class Audit:
         self._directory = directory
         self._clock = clock
         self._now = now
-        self._clients: OrderedDict[_Client, Allowance] = OrderedDict()
-        self._doors: dict[tuple[str, str], Allowance] = {}
+        self._limiters: dict[tuple[str, str], SourceRateLimiter] = {}
+        self._skipped: dict[_Client, int] = {}
         self._untold = 0
         self._untold_since = 0.0
 
@@ -117,10 +121,8 @@ class Audit:
 
     def begin(self, station: str, entry: AuditEntry) -> str:
         """Write down what a station is going to change; return why that cannot be done."""
-        client = self._client(station, entry.way.door, host_of(entry.way))
-        door = self._door(station, entry.way.door)
-        now = self._clock()
-        if not all(client.take(now) and door.take(now) for _ in entry.operations):
+        client = station, entry.way.door, host_of(entry.way)
+        if not all(self._take(client) for _ in entry.operations):
             return TOO_MANY
         head = self._head(station, entry)
         lines = [head | _begins(each) for each in entry.operations]
@@ -135,7 +137,7 @@ class Audit:
         if not self.is_required:
             return ""
         why = TOO_MANY
-        if self._client(station, CONTROL, who).take(self._clock()):
+        if self._take((station, CONTROL, who)):
             line = self._request_head(who, station) | words | {"begins": True}
             if self._append([line], are_counted=False):
                 return ""
@@ -148,17 +150,15 @@ class Audit:
 
     def write(self, station: str, entry: AuditEntry) -> None:
         """Write down what a station did, or refused."""
-        client = self._client(station, entry.way.door, host_of(entry.way))
-        door = self._door(station, entry.way.door)
+        client = station, entry.way.door, host_of(entry.way)
         head = self._head(station, entry)
-        now = self._clock()
         lines = []
         for each in entry.operations:
             has_begun = self.is_required and each.verdict.is_allowed
-            if has_begun or (client.take(now) and door.take(now)):
+            if has_begun or self._take(client):
                 lines.append(head | _words(each))
             else:
-                client.skipped += 1
+                self._skip(client)
         if lines:
             self._append(lines)
 
@@ -173,40 +173,41 @@ class Audit:
             self._write_limited(who, station, words)
 
     def _write_limited(self, who: str, station: str, words: dict[str, Any]) -> None:
-        client = self._client(station, CONTROL, who)
-        now = self._clock()
-        if client.take(now) and self._door(station, CONTROL).take(now):
+        client = station, CONTROL, who
+        if self._take(client):
             self._append([self._request_head(who, station) | words])
         else:
-            client.skipped += 1
+            self._skip(client)
 
     def _request_head(self, who: str, station: str) -> dict[str, Any]:
         return {"time": self._time(), "station": station, "door": CONTROL, "from": who}
 
     def tell_skipped(self) -> None:
         """Write how many lines were left out, for each client that had some."""
-        lines = []
-        for (station, door, address), allowance in self._clients.items():
-            if allowance.skipped:
-                head = {"time": self._time(), "station": station, "door": door, "from": address}
-                lines.append(head | {"skipped": allowance.skipped})
-                allowance.skipped = 0
+        skipped, self._skipped = self._skipped, {}
+        lines = [
+            {"time": self._time(), "station": station, "door": door, "from": who, "skipped": count}
+            for (station, door, who), count in skipped.items()
+        ]
         if lines:
             self._append(lines)
 
-    def _client(self, station: str, door: str, address: str) -> Allowance:
-        key = station, door, address
-        client = self._clients.pop(key, None) or Allowance(BURST, PER_S, self._clock())
-        if len(self._clients) >= _MAX_CLIENTS:
-            self.tell_skipped()
-            self._clients.popitem(last=False)
-        self._clients[key] = client
-        return client
+    def _take(self, client: _Client) -> bool:
+        """Take one line for a client; return whether its rate and that of its door allow it."""
+        station, door, who = client
+        now = self._clock()
+        limiter = self._limiters.get((station, door))
+        if limiter is None:
+            # Each command is a process of its own, and a new client of the control socket.
+            rates = _CONTROL_RATES if door == CONTROL else _RATES
+            limiter = self._limiters[station, door] = SourceRateLimiter(rates, _MAX_CLIENTS, now)
+        return limiter.take(who, now)
 
-    def _door(self, station: str, name: str) -> Allowance:
-        if (station, name) not in self._doors:
-            self._doors[station, name] = Allowance(DOOR_BURST, DOOR_PER_S, self._clock())
-        return self._doors[station, name]
+    def _skip(self, client: _Client) -> None:
+        """Count a line that is left out."""
+        if client not in self._skipped and len(self._skipped) >= _MAX_CLIENTS:
+            self.tell_skipped()
+        self._skipped[client] = self._skipped.get(client, 0) + 1
 
     def _head(self, station: str, entry: AuditEntry) -> dict[str, Any]:
         header = entry.header

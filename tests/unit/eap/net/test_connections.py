@@ -75,9 +75,9 @@ def test_foreign_hosts_leave_the_reserve_to_this_host() -> None:
     scene = Scene()
     scene.fill(*(Peer(host, BUSY) for host in (A, B, C, D)))
     assert scene.admit(Peer("10.0.0.5")) == (False, None)
-    scene.fill(Peer(OWN_HOST, BUSY), Peer(OWN_HOST, BUSY))
-    assert scene.admit(Peer(OWN_HOST)) == (False, None)
-    assert scene.listener.stats == ("here", 6, 6, 2, 0, 0, 100 * S)
+    oldest, _ = scene.fill(Peer(OWN_HOST, BUSY), Peer(OWN_HOST, BUSY, 2))
+    assert scene.admit(Peer(OWN_HOST)) == (True, oldest), "and nothing more than the reserve"
+    assert scene.listener.stats == ("here", 6, 6, 1, 1, 0, 100 * S)
 
 
 def test_this_host_may_take_all_places() -> None:
@@ -145,6 +145,25 @@ def test_burst_of_silent_connections_does_not_lock_out_its_own_host() -> None:
     scene = Scene(total=6, reserved=0, per_host=6)
     oldest, *_ = scene.fill(*(Peer(OWN_HOST, at_ns=100 * S - 6 + n) for n in range(6)))
     assert scene.admit(Peer(OWN_HOST, at_ns=100 * S)) == (True, oldest)
+
+
+@pytest.mark.parametrize(
+    ("second", "third", "number"),
+    [
+        ((Activity.IDLE, 99 * S), (Activity.IDLE, 98 * S), 2),
+        ((BUSY, 2 * S), (Activity.SUBSCRIBED, 1 * S), 1),
+        ((Activity.SUBSCRIBED, 2 * S), (Activity.SUBSCRIBED, 1 * S), 2),
+    ],
+    ids=["longest silent", "busy before subscribed", "oldest subscription"],
+)
+def test_connections_in_use_do_not_lock_other_programs_of_this_host_out(
+    second: tuple[Activity, int], third: tuple[Activity, int], number: int
+) -> None:
+    scene = Scene(total=3, reserved=0)
+    last = Peer(OWN_HOST, Activity.SUBSCRIBED, 99 * S)
+    held = scene.fill(last, Peer(OWN_HOST, *second), Peer(OWN_HOST, *third))
+    assert scene.admit(Peer(A)) == (False, None), "other hosts displace nothing in use here"
+    assert scene.admit(Peer(OWN_HOST)) == (True, held[number])
 
 
 def test_host_with_many_connections_does_not_displace_those_of_others() -> None:
@@ -240,6 +259,7 @@ class Use(RuleBasedStateMachine):
         if refusal:
             self.refused += 1
             mine = [e for e in at_listener if e.host == host]
+            assert not mine or host != OWN_HOST
             assert not any(not self.in_use(e) or self.is_fresh(e) for e in mine)
         else:
             self.open[peer] = listener
@@ -253,7 +273,7 @@ class Use(RuleBasedStateMachine):
         if self.in_use(victim):
             assert not any(not self.in_use(e) and e.host == victim.host for e in at_listener)
             if victim.host == host:
-                assert self.is_fresh(victim)
+                assert self.is_fresh(victim) or host == OWN_HOST
                 return
             assert victim.host != OWN_HOST or self.is_fresh(victim)
             assert held[victim.host] > held[host] + 1

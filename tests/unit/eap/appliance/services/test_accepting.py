@@ -85,7 +85,9 @@ def is_served(sock):
     return sock.recv(1) == b"x"
 
 
-def test_listener_serves_as_many_as_it_has_places():
+def test_listener_serves_as_many_as_it_has_places(monkeypatch):
+    monkeypatch.setattr(accepting, "host_of", lambda peer, own: "10.0.0.1")
+
     def script(connect, echo, listeners):
         served = [connect() for _ in range(2)]
         assert all(map(is_served, served))
@@ -95,6 +97,18 @@ def test_listener_serves_as_many_as_it_has_places():
         assert is_served(connect())
 
     assert serve(script).refused == ["all 2 places are taken"]
+
+
+def test_program_of_this_host_takes_the_place_of_the_one_silent_longest():
+    def script(connect, echo, listeners):
+        first, second = connect(), connect()
+        assert is_served(first)
+        assert is_served(second)
+        assert is_served(connect())
+        assert first.recv(1) == b""
+        assert is_served(second)
+
+    assert serve(script).refused == []
 
 
 def test_crowd_that_comes_at_once_is_counted_before_it_runs():

@@ -178,7 +178,20 @@ def test_a_flood_from_many_addresses_is_bounded_by_its_door(audit: Audit) -> Non
         way = Way("udp:eap0", f"10.0.0.{number}:34980")
         audit.write("island-01", entry(way=way, count=BURST))
     audit.write("island-01", entry())
-    assert len(lines(audit)) == module.DOOR_BURST + 1
+    # The first line of each client counts among those of new ones.
+    assert len(lines(audit)) == module.DOOR_RATE.burst + 12 + 1
+
+
+def test_flood_from_invented_addresses_leaves_known_clients_their_lines(audit: Audit) -> None:
+    known = Way("udp:eap0", "10.0.0.5:34980")
+    audit.write("island-01", entry(way=known))
+    for number in range(module.NEW_RATE.burst + 10):
+        way = Way("udp:eap0", f"10.1.{number >> 8}.{number & 255}:34980")
+        audit.write("island-01", entry(way=way))
+    audit.write("island-01", entry(way=known))
+    found = [line["from"] for line in lines(audit)]
+    assert found.count(known.connection) == 2
+    assert len(found) == module.NEW_RATE.burst + 1, "one of the new ones is the known client"
 
 
 def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None:
@@ -186,7 +199,11 @@ def test_addresses_are_forgotten_but_not_what_was_left_out(audit: Audit) -> None
     for number in range(1100):
         way = Way("ams-tcp", f"10.1.{number // 250}.{number % 250}:1")
         audit.write("island-01", entry(way=way))
-    assert [line["skipped"] for line in lines(audit) if "skipped" in line] == [1]
+    audit.tell_skipped()
+    skipped = {line["from"]: line["skipped"] for line in lines(audit) if "skipped" in line}
+    assert skipped["10.0.0.5"] == 1
+    assert len(lines(audit)) - len(skipped) == BURST + module.NEW_RATE.burst - 1
+    assert sum(skipped.values()) == 1 + 1100 - (module.NEW_RATE.burst - 1)
 
 
 def test_old_files_go(audit: Audit, monkeypatch: pytest.MonkeyPatch) -> None:

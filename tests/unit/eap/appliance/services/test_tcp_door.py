@@ -13,7 +13,7 @@ from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
 from eap.appliance.handover import PortName
 from eap.appliance.passing import take_connection
-from eap.appliance.services import tcp_door
+from eap.appliance.services import accepting, tcp_door
 from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.gateway.door import GatewayDoor
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams, StreamConnection
@@ -147,6 +147,7 @@ def test_a_fault_ends_one_connection_only(monkeypatch, caplog):
 def test_connection_with_a_frame_goes_before_silent_ones(monkeypatch):
     monkeypatch.setattr(tcp_door, "LIMITS", Limits(total=2, reserved=0))
     monkeypatch.setattr(connections, "FRESH_NS", 0)
+    monkeypatch.setattr(accepting, "host_of", lambda peer, own: "10.0.0.1")
     question = aoe.frame(aoe.packet(TARGET, 4, b""))
 
     async def script(scene):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import pytest
 
 from eap.appliance.discards import Refusal
+from eap.appliance.services import accepting
 from eap.appliance.services.accepting import Listeners
 from eap.appliance.services.ams import ams_door
 from eap.appliance.services.ams.ams_door import AmsClients, AmsDoor
@@ -169,6 +170,7 @@ def test_client_that_dies_leaves_the_others_alone():
 
 
 def test_silent_connections_make_room_for_others(monkeypatch):
+    monkeypatch.setattr(accepting, "host_of", lambda peer, own: "10.0.0.1")
     monkeypatch.setattr(ams_door, "LIMITS", Limits(total=3, reserved=0))
 
     async def script(connect, door):
