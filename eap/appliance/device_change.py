@@ -23,7 +23,7 @@ from eap.pd.spec import LinkSpec, PortKind, Source, StationSpec, VariableSpec
 
 
 class Plan(NamedTuple):
-    """What another configuration would change."""
+    """Changes that another configuration would make."""
 
     spec: StationSpec
     changes: list[tuple[str, EntryChange]]
@@ -37,7 +37,7 @@ class Plan(NamedTuple):
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing would change."""
+        """True if nothing would change."""
         return not (self.changes or self.station)
 
     def objects(self) -> dict[str, Any]:

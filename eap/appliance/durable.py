@@ -111,7 +111,7 @@ def whole_file(target: Path) -> Iterator[BinaryIO]:
 
 
 def put_aside(path: Path, aside: Path) -> None:
-    """Rename a file that nobody can use; that it cannot be done is a warning."""
+    """Rename a file that cannot be used; a failure is a warning."""
     try:
         path.replace(aside)
     except OSError as exc:

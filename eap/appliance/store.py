@@ -1,4 +1,4 @@
-"""What is kept of a station that was changed while it ran: records, and one file for each.
+"""Store of a station that was changed while it ran: records, and one file for each.
 
 Rule 1: a station that was never changed while it ran has no files.
 Rule 2: a file is written beside the old one, synced and renamed, so that whatever happens one of
@@ -85,7 +85,7 @@ class AppliedRouting(AoeRecord, frozen=True, kw_only=True):
 
 
 class Effective(NamedTuple):
-    """What a station is to run."""
+    """Specification and state in which a station starts."""
 
     spec: StationSpec
     state: DeviceState
@@ -216,7 +216,7 @@ class StationStore:
     """Everything that is kept of one station.
 
     Attributes:
-        configuration: What its devices were told.
+        configuration: Specification and objects of its devices.
         routes: Routes that were added to those of its router.
         routing: Routes and access rules that were applied.
     """

@@ -1,6 +1,6 @@
 """Bus of a plant file as it is expected: its slaves, and the variables of a station on it.
 
-A plant file names a bus file; whoever calls ``load`` brings the function that reads it, because
+A plant file names a bus file; the caller of ``load`` brings the function that reads it, because
 this package knows plants and not devices.
 """
 

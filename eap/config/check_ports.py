@@ -189,7 +189,7 @@ def _check_addresses(index: Index, report: FindingReport) -> None:
 
 
 def _own_keys(station: str, port: PortSection, uri: InterfaceUri) -> Iterator[tuple[str, ...]]:
-    """Yield what nobody else may have of what *port* needs."""
+    """Yield the resources of *port* that no other port may have."""
     if uri.scheme == "udp":
         yield "UDP", uri.host, str(uri.port or EAP_PORT)
     if port.kind is PortKind.EAP and takes_tcp(port, uri):

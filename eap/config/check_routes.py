@@ -61,7 +61,7 @@ def _check_route(
         return
     _check_net_id(index, route, report)
     if not (route.via or route.ams_tcp or route.net_id or _is_known(index, route)):
-        return  # told already, and what it leads to would say how
+        return  # reported already
     try:
         next_hop(index, station, route)
     except MisfitError as exc:
@@ -110,7 +110,7 @@ def _check_claims(
     loose: set[str],
     report: FindingReport,
 ) -> None:
-    """Report NetIDs that belong to somebody else, or to another route of the station."""
+    """Report NetIDs that belong to another station, or to another route of the station."""
     station, route = sent
     try:
         claims = reach(index, route, loose)
@@ -158,7 +158,7 @@ def follow_routes(
 
     Args:
         index: A plant without findings.
-        routing: What its routers are told.
+        routing: Specifications of its routers.
         report: Of the plant file, for its lines.
     """
     plant = _Plant(index, routing)

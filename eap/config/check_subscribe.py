@@ -143,7 +143,7 @@ def _check_arrival(
     for sent in index.publishers(subscription):
         sender_uri = index.uris.get((sent.station.name, sent.port.name))
         if sender_uri is None or sent.frame.to == REQUESTER:
-            return  # an answer finds its way, and who asked is checked elsewhere
+            return  # an answer goes back to its requester, which is checked with the polls
         try:
             destination = resolve(sent.frame.to, sender_uri, index)
         except ValueError:

@@ -121,8 +121,8 @@ def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
         else:
             sent = index.publishers(subscription)[0]
             for name, text in index.received(subscription).items():
-                told = sent.station.variables.get(name.removeprefix(f"{subscription.name}."))
-                unit, comment = (told.unit, told.comment) if told else ("", "")
+                original = sent.station.variables.get(name.removeprefix(f"{subscription.name}."))
+                unit, comment = (original.unit, original.comment) if original else ("", "")
                 copy = VariableSection(type=text, unit=unit, comment=comment)
                 yield _variable(name, copy, Writer.ENGINE)
     for name, on_bus in index.bus_variables(station).items():
@@ -315,7 +315,7 @@ def _heard(index: Index, station: StationSection, port: PortSection) -> Iterator
 
 
 def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
-    """Return by its name what the router of each station is told; files are in *folder*."""
+    """Return the routing of each station by its name; files are in *folder*."""
     loose = without_prefix(index)
     known = {each.name: net_ids_of(each, loose) for each in index.plant.stations}
     return {

@@ -215,7 +215,7 @@ def check_monitoring(
 ) -> None:
     """Report monitoring of what cannot be monitored, and addresses that are none.
 
-    *destination* is None for frames to who asks.
+    *destination* is None for frames to the requester.
     """
     spec = frame.spec(str(destination))
     if frame.monitor_ip and uri.scheme == "ethernet" and not _is_host(frame.monitor_ip):

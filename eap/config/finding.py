@@ -36,8 +36,8 @@ class Finding(msgspec.Struct, frozen=True):
 class FindingReport:
     """Collects findings and knows the line of every path of the file.
 
-    *broken* holds the names of items that could not be read: whoever refers to one of them is not
-    blamed for it.  *stations* are the names of the stations, as far as they are known.
+    *broken* holds the names of items that could not be read: a reference to one of them is no
+    finding of its own.  *stations* are the names of the stations, as far as they are known.
 
     A part of the file that is used in several places, by an anchor, is wrong once: the finding of
     its first place says how many more there are.

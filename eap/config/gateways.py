@@ -23,7 +23,7 @@ _LAST = 0xFFFE
 
 
 def gateway_spec(index: Index, station: StationSection, port: PortSection) -> GatewaySpec:
-    """Return what the gateway of a bus port is told; the checks have passed it."""
+    """Return the specification of the gateway of a bus port; the checks have passed it."""
     said = port.gateway
     return GatewaySpec(
         enabled=said.enabled,
@@ -73,7 +73,7 @@ def parse_address(text: str) -> int:
 def resolve(
     index: Index, station: StationSection, port: PortSection, address: int, target: Plain
 ) -> GatewayAddress:
-    """Return whom *address* stands for; raise MisfitError if there is no such one."""
+    """Return the target of *address*; raise MisfitError if there is no such one."""
     if isinstance(target, list):
         known = _virtual(port)
         members = tuple(_member(index, station, port, each, known) for each in target)
@@ -123,7 +123,7 @@ def _slave(index: Index, station: StationSection, port: PortSection, slave: obje
     if text.isdecimal() or isinstance(slave, int):
         number = int(text, 0)
         if not slaves and 0 < number <= _LAST:
-            return number  # nothing describes the bus: anybody may be there
+            return number  # nothing describes the bus: any slave may be there
         last = f"; its last one is {slaves[-1].station}" if slaves else ""
         raise MisfitError("", f"{name} has no slave {number}{last}", TARGET)
     hint = near(text, [each.name for each in slaves])

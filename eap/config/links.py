@@ -37,7 +37,7 @@ class Span(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """What a link reads and what it writes."""
+    """Source and target of a link, in bits."""
 
     source: Span
     target: Span
@@ -135,7 +135,7 @@ _KEYS = ("from_bit", "to_bit", "bits", "scale", "offset", "swap")
 
 
 def check_links(index: Index, report: FindingReport) -> None:
-    """Report every link that cannot run, or that would write what somebody else writes."""
+    """Report every link that cannot run, or whose target has another writer."""
     for station in index.plant.stations:
         known: list[tuple[LinkSection, Ends]] = []
         for link in station.links:

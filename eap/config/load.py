@@ -34,7 +34,7 @@ class Plant(msgspec.Struct, frozen=True):
     name: str
     stations: tuple[StationSpec, ...]
     routing: Mapping[str, RoutingSpec] = {}
-    """What the router of each station is told."""
+    """Specification of the router of each station."""
     directory: tuple[DirectoryStation, ...] = ()
     """The names of everything in the plant."""
     audit_required: bool = False
@@ -55,7 +55,7 @@ class LoadResult(msgspec.Struct, frozen=True):
 def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     """Read, check and complete the plant file at *path*; never raises for what the file holds.
 
-    *describe_bus* reads the bus files that it names; their findings are told after its own.
+    *describe_bus* reads the bus files that it names; their findings follow its own.
     """
     report = FindingReport(str(path))
     root = read(path, report)
@@ -96,7 +96,7 @@ NET_ID_PATHS = f"{_PORT}.net_id", f"{_ROUTER}.net_id"
 def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
     """Return a plant called *name* that has one station of that name.
 
-    A plant file's rules hold, and findings are told by their paths above.  *net_id* is that of the
+    A plant file's rules hold, and findings have paths as above.  *net_id* is that of the
     port: publisher ID of its frames and address of its dictionary.  The router of a station has a
     NetID of its own, which here is the port's with its fifth octet one less.
 

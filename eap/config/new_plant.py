@@ -34,7 +34,7 @@ _INTERFACE = re.compile(r"[\w.@-]{1,15}", re.ASCII)
 
 
 class Shape(StrEnum):
-    """Who tells whom."""
+    """Direction of process data between stations."""
 
     RING = "ring"
     """Each station the next one."""
@@ -75,7 +75,7 @@ def plant_text(
     Args:
         name: The plant's.
         count: Of stations, 2 to 250.
-        shape: Who tells whom.
+        shape: Direction of process data between stations.
         address: An IPv4 address or an interface; ``{n}`` in it is the station's number, and an
             IPv4 address without it is that of the first station, the others follow.
         cycle_us: Device cycle.

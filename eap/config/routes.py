@@ -58,7 +58,7 @@ class MisfitError(ValueError):
 
 
 class NextHop(NamedTuple):
-    """Where a route leads first, and the NetID of the router there, empty if it is not known."""
+    """First hop of a route, and the NetID of the router there, empty if it is not known."""
 
     hop: HopSpec
     router: str
@@ -319,7 +319,7 @@ def _hop(
 ) -> tuple[HopSpec, int] | None:
     """Return the hop from port to port, and how many bits of their addresses differ.
 
-    With *is_wanted* somebody said that it is there, whatever the names of the interfaces are.
+    With *is_wanted* the file says that it is there, whatever the names of the interfaces are.
     """
     uri, target = index.uris[own], index.uris[other]
     if uri.scheme in _IP_SCHEMES and target.scheme in _IP_SCHEMES:

@@ -61,7 +61,7 @@ class VlanSection(Section, frozen=True):
 
 
 class GatewayLimits(Section, frozen=True):
-    """How much a mailbox gateway takes on."""
+    """Limits of a mailbox gateway."""
 
     in_flight: Annotated[int, Meta(ge=1, le=1024)] = 32
     rate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
@@ -250,7 +250,7 @@ class LinkSection(Section, frozen=True):
 
 
 class TlsSection(Section, frozen=True):
-    """How a connection is kept secret; files by their paths from the plant file on."""
+    """TLS of a connection; files by their paths from the plant file on."""
 
     ca: str = ""
     certificate: str = ""
@@ -305,7 +305,7 @@ class RouteSection(Section, frozen=True):
 
 
 class AccessSection(Section, frozen=True):
-    """A rule: who may do what, or may not."""
+    """Rule that allows or denies access."""
 
     name: str = ""
     allow: tuple[str, ...] = ()
@@ -318,7 +318,7 @@ class AccessSection(Section, frozen=True):
 
 
 class UserSection(Section, frozen=True):
-    """Who may add routes from elsewhere."""
+    """User that may add routes from other hosts."""
 
     name: str
     password_file: str
@@ -345,7 +345,7 @@ class StationSection(Section, frozen=True):
 
 
 class Defaults(Section, frozen=True):
-    """What stations take that do not say it themselves."""
+    """Defaults of stations."""
 
     cycle_us: DeviceCycle = 10_000
 

@@ -1,4 +1,4 @@
-"""What differs between two dictionaries of one port, in an order in which it can be written.
+"""Differences between two dictionaries of one port, in an order in which they can be written.
 
 What refers to others is let go before they go, and set after they are there: that takes writes
 which a person need not see.  Written one after the other into the old dictionary in PreOp, the
@@ -28,7 +28,7 @@ _PDS = (profile.TX_PD, profile.RX_PD)
 
 
 class ChangeKind(StrEnum):
-    """What becomes of an entry."""
+    """Kind of change of an entry."""
 
     ADDED = "added"
     REMOVED = "removed"
@@ -185,7 +185,7 @@ class _Comparison:
         after = self._new.get(index, {})
         for subindex in sorted(after)[1:]:
             if not any(after[subindex]):
-                continue  # a hole in one that is being written; nobody can write it
+                continue  # a hole in one that is being written; no client can write it
             is_same = self._old.get(index, {}).get(subindex) == after[subindex]
             yield self._change(index, subindex, interim=is_same)
         if after and after[0] != _NONE:

@@ -31,7 +31,7 @@ from eap.pd.spec import StationSpec
 
 
 class EapDictionary(EapObjects):
-    """What one EAP port of a station is and does, for clients to read and to write.
+    """Dictionary of one EAP port of a station, for clients to read and to write.
 
     Args:
         station: The station as it was started: its port is taken from it, nothing else is.

@@ -74,9 +74,9 @@ class _Filling:
         wanted = {name for pd in self._tx for name in pd.variables}
         first = next(port for port in station.ports if port.kind is PortKind.EAP)
         if first.name == self._dictionary.port.name:
-            elsewhere = {name for pd in station.subscriptions for name in pd.variables}
-            elsewhere |= bus_variables(station)
-            wanted |= {each.name for each in station.variables} - elsewhere
+            others = {name for pd in station.subscriptions for name in pd.variables}
+            others |= bus_variables(station)
+            wanted |= {each.name for each in station.variables} - others
         wanted -= received
         return [each.name for each in station.variables if each.name in wanted]
 
@@ -106,13 +106,13 @@ class _Filling:
             self._fill_frame(frames[frame.name], frame, tx)
 
     def _assign(self, rows: tuple[ObjectRow, ...], names: list[str]) -> dict[str, int]:
-        """Return an index of *rows* for each name: that which it has elsewhere, or another."""
+        """Return an index of *rows* for each name: that of *like*, or another."""
         like = self._like
         before = {like.name_of(i): i for i in like.members(*rows)} if like is not None else {}
         return self._choose(rows, names, before)
 
     def _mappings(self, rows: tuple[ObjectRow, ...], pds: Mapping[str, int]) -> dict[str, int]:
-        """Return the index of each PD's mapping: the one it has elsewhere, or its own number."""
+        """Return the index of each PD's mapping: that of *like*, or its own number."""
         before: dict[str, int] = {}
         if self._like is not None:
             members = set(self._like.members(*rows))

@@ -74,7 +74,7 @@ class NothingRuns:
 
 
 class DeviceIdentity(NamedTuple):
-    """What a device says of itself."""
+    """Identity of a device."""
 
     module_profile: int = profile.MODULE_PROFILE
     device_name: str = "EAP appliance"

@@ -128,8 +128,8 @@ def _variables(station: StationSpec, readers: list[PortReader]) -> list[Variable
         own: set[str] = set()
         for index, variable in reader.variables():
             if variable.name in own or merged.get(variable.name, variable) != variable:
-                elsewhere = "" if variable.name in own else ", and differs there"
-                detail = f"{variable.name} exists in the station{elsewhere}"
+                differs = "" if variable.name in own else ", and differs there"
+                detail = f"{variable.name} exists in the station{differs}"
                 raise reader.fault(FaultCode.NAME_TWICE, detail, index, Var.NAME)
             own.add(variable.name)
             merged[variable.name] = variable
@@ -336,7 +336,7 @@ class PortReader:
 
 
 def _known_mac(octets: bytes) -> str:
-    """Return the address behind a NetID; empty if it is to be learned, as a group is nobody's."""
+    """Return the address behind a NetID; empty if it is to be learned, as a group has no owner."""
     address = MacAddr(octets)
     return str(address) if any(address) and not address.is_group else ""
 

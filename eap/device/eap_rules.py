@@ -154,7 +154,7 @@ class MappingEntry(NamedTuple):
 
 
 class MappingLayout(NamedTuple):
-    """What a whole mapping amounts to."""
+    """Variables and size of a whole mapping."""
 
     indexes: tuple[int, ...]
     """Objects of the variables, in order."""

@@ -1,4 +1,4 @@
-"""The EAP state machine: who may ask for which state, what is checked, what is kept of a refusal.
+"""EAP state machine: states that can be requested, checks on the way, and the last refusal.
 
 Rule 1: Init is left at the start and never asked for again.
 Rule 2: a request goes through the states in between; where one refuses, the device stays in the
@@ -32,7 +32,7 @@ _REQUESTS = {
 
 
 class StateActions(Protocol):
-    """What transitions do; each may raise DeviceFault to refuse, the stops may not."""
+    """Actions of transitions; each may raise DeviceFault to refuse, the stops may not."""
 
     def start_sending(self, spec: StationSpec) -> None:
         """PreOp to SafeOp: run *spec*; it is what was read back from the dictionaries."""
@@ -48,7 +48,7 @@ class StateActions(Protocol):
 
 
 class StateResult(NamedTuple):
-    """Where the device stands after a request; *fault* is why it is not where it was asked to."""
+    """State of the device after a request; *fault* is the reason if it is not the requested one."""
 
     state: DeviceState
     fault: DeviceFault | None

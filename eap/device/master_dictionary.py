@@ -1,6 +1,6 @@
-"""The object dictionary of an EtherCAT master: what is configured, what is there, and how it is.
+"""Object dictionary of an EtherCAT master: slaves configured, slaves detected, and diagnosis.
 
-Objects of slaves and lists are made whenever somebody looks, for slaves come and go.
+Objects of slaves and lists are made on each access, for slaves come and go.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class MasterValues(Protocol):
 
 
 class MasterDictionary(ObjectDictionary):
-    """What a master tells.
+    """Dictionary of a master.
 
     Args:
         values: Where live entries get theirs.

@@ -10,7 +10,7 @@ from eap.pd.spec import PortKind, StationSpec, TxPdSpec
 
 
 class PdKey(NamedTuple):
-    """What a PD is known by: the NetID of the port that sends it, and its id."""
+    """Key of a PD: the NetID of the port that sends it, and its id."""
 
     publisher: str
     pd_id: int

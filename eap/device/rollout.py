@@ -1,9 +1,9 @@
-"""In which order stations change over, so that nobody ever receives what it does not expect.
+"""Order in which stations change over, so that none receives a PD that it does not expect.
 
 Rule 1: who receives a PD whose layout is about to change takes the old and the new one side by
 side.  If nobody depends on the rest of what is new for such a station, it has that at once, too.
 Rule 2: then the senders change over, those first that receive nothing old any more.
-Rule 3: at the end nobody takes an old layout any longer.
+Rule 3: at the end no station takes an old layout any longer.
 Rule 4: where that leaves a choice, a new PD is taken before it is sent, and one that ends is taken
 until it is not sent any more.  Who receives a PD expects the smaller of two rates while it changes:
 that counts no PD as lost that never was to be sent.
@@ -53,7 +53,7 @@ def without_alternates(spec: StationSpec) -> StationSpec:
 
 
 class _Wire:
-    """What all stations send at one moment."""
+    """PDs that all stations send at one moment."""
 
     def __init__(self, specs: Mapping[str, StationSpec]) -> None:
         self._sent: dict[str, dict[PdKey, list[PdLayout]]] = {}
@@ -203,7 +203,7 @@ class _Rollout:
         """Return what *pd* of *name* calls each variable that its sender names, by name and type.
 
         That is known from a layout that both are made for, now or later; None if there is none.
-        What nobody sends yet has no names, as there is nothing to keep up to date.
+        A PD that no station sends yet has no names, as there is nothing to keep up to date.
         """
         for wire in (self._now, self._later):
             for _, _, layout in wire.heard(name, pd):

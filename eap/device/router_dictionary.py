@@ -1,6 +1,6 @@
-"""The object dictionary of a station's router: its ports, its routes, and what became of packets.
+"""Object dictionary of a station's router: its ports, its routes, and counters of packets.
 
-All of it is read only.  The objects of routes are made whenever somebody looks, for routes come and
+All of it is read only.  The objects of routes are made on each access, for routes come and
 go by themselves.
 """
 
@@ -48,7 +48,7 @@ class RouterValues(Protocol):
 
 
 class RouterDictionary(ObjectDictionary):
-    """What a station's router is, for clients to read.
+    """Dictionary of a station's router, for clients to read.
 
     Args:
         station: Whose router it is.

@@ -27,7 +27,7 @@ Configuration: TypeAlias = dict[int, dict[int, bytes]]
 
 
 class StoredError(ConfigError):
-    """What was stored is not a configuration of this dictionary."""
+    """Stored data that is no configuration of this dictionary."""
 
 
 class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,4 +1,4 @@
-"""The object dictionary: one model for every device of the house.
+"""The object dictionary: one model for every device of this project.
 
 Stations, the type-1 master, the router and the simulated slaves all serve their objects through
 :class:`eap.od.dictionary.ObjectDictionary`, which alone decides what an SDO may read and write.

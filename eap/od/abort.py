@@ -1,4 +1,4 @@
-"""SDO abort codes: why a dictionary refuses (ETG.1000.6, SDO abort codes)."""
+"""SDO abort codes: reasons of a dictionary to refuse (ETG.1000.6, SDO abort codes)."""
 
 from __future__ import annotations
 

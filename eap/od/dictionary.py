@@ -1,4 +1,4 @@
-"""SDO semantics in one place: what may be read and written, in which state, with which refusal.
+"""SDO semantics: entries that may be read and written, in which state, with which refusal.
 
 Every method raises :class:`eap.od.abort.SdoAbortError` and leaves the dictionary as it was, or
 succeeds.  Data is in the form in which CoE transfers it (ETG.1000.6).
@@ -82,7 +82,7 @@ class ObjectDictionary:
     ) -> None:
         """Refuse what can be refused before the data of a download is there.
 
-        A transfer in segments is so turned away at its first message, not at its last.
+        A transfer in segments is so refused at its first message, not at its last.
         """
         if complete:
             chosen = self._whole(index, subindex, count=0xFF)

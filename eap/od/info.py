@@ -15,7 +15,7 @@ from eap.od.model import Access, Entry, OdObject
 
 
 class ListType(IntEnum):
-    """Which objects a list names."""
+    """Kind of a list of objects."""
 
     COUNTS = 0
     ALL = 1
@@ -26,7 +26,7 @@ class ListType(IntEnum):
 
 
 class ValueInfo(IntFlag):
-    """What an entry description is to hold."""
+    """Parts of an entry description."""
 
     ACCESS = 0x01
     CATEGORY = 0x02

@@ -1,6 +1,6 @@
-"""Objects and entries: what a dictionary holds.
+"""Objects and entries of a dictionary.
 
-An entry either stores its octets or shows something that lives elsewhere (*read*); a hook (*write*)
+An entry either stores its octets or shows the octets of another source (*read*); a hook (*write*)
 may check and act on a download before it is stored.
 """
 
@@ -109,7 +109,7 @@ class Entry:
 
     @property
     def is_text(self) -> bool:
-        """Whether it may be shorter than its type (VISIBLE_STRING)."""
+        """True if it may be shorter than its type (VISIBLE_STRING)."""
         return self.kind.is_text
 
     @property
@@ -171,7 +171,7 @@ class OdObject:
 
     @property
     def max_subindex(self) -> int:
-        """What subindex 0 says, or 0 for a VAR."""
+        """Value of subindex 0, or 0 for a VAR."""
         return 0 if self.code is ObjectCode.VAR else self.entries[0].octets[0]
 
 

@@ -17,7 +17,7 @@ _OCTETS = 0x0A
 
 
 class _Known(NamedTuple):
-    """What an entry of a type and a name is, and what its text looks like."""
+    """Form of entries of a type and a name, and the pattern of its text."""
 
     form: Form
     type: str

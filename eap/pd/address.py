@@ -109,8 +109,8 @@ class SourceWatch:
 
     Args:
         words: Of the process image.
-        expected: The address that is this class; empty for all that nobody expects.
-        named: The addresses that somebody expects.
+        expected: The address that is this class; empty for all that are not expected.
+        named: The addresses that subscriptions expect.
 
     Attributes:
         source: The address of the last frame.

@@ -69,7 +69,7 @@ class CopyPlan:
 
     @property
     def operations(self) -> int:
-        """How many copies a run makes."""
+        """Number of copies of a run."""
         return len(self._slices) + len(self._bits) + len(self._shifts)
 
     def run(self, source: Buffer, target: memoryview) -> None:
@@ -133,7 +133,7 @@ def _merge(moves: Iterable[Move]) -> list[Move]:
 
 
 def _bridge(runs: Iterable[Move], used: _Used) -> list[Move]:
-    """Widen runs to whole octets, and join them, over bits that nobody uses."""
+    """Widen runs to whole octets, and join them, over unused bits."""
     wide: list[Move] = []
     for run in runs:
         begin, end = run.target_bit, run.target_bit + run.bits

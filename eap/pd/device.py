@@ -1,6 +1,6 @@
 """States of the EAP device, and faults: reasons for which it does not change its state.
 
-Rule 1: every transition is in TRANSITIONS; whoever asks for another is told what was possible.
+Rule 1: every transition is in TRANSITIONS; the refusal of another one names the possible ones.
 Rule 2: PreOp exchanges no process data, SafeOp sends, Op sends and receives (ETG.1005).
 Rule 3: fault codes of transitions are those of the AL status (ETG.1000.6); those of configuration
 start where that leaves room for the device's own.
@@ -24,17 +24,17 @@ class DeviceState(IntEnum):
 
     @property
     def sends(self) -> bool:
-        """Whether TxFrames are sent."""
+        """True if TxFrames are sent."""
         return self in {DeviceState.SAFEOP, DeviceState.OP}
 
     @property
     def receives(self) -> bool:
-        """Whether RxPDs are taken."""
+        """True if RxPDs are taken."""
         return self is DeviceState.OP
 
 
 class StateRequest(Enum):
-    """What can be asked of a device."""
+    """States that can be requested of a device."""
 
     START = auto()
     """From Init to PreOp; only the device itself asks for it."""
@@ -148,14 +148,14 @@ FAULT_TEXTS = {
     FaultCode.MODULO: "modulo never comes up",
     FaultCode.GATE: "PD is due when its frame is not",
     FaultCode.RECEIVED_TWICE: "received twice",
-    FaultCode.WRITER: "somebody else would have to write the variable",
+    FaultCode.WRITER: "variable has another writer",
     FaultCode.TIME_OUT: "time-out is too short",
     FaultCode.DEFAULT: "default is no value of the type",
     FaultCode.PORT: "port cannot do this",
     FaultCode.IN_USE: "station uses what is not there any more",
     FaultCode.POLL: "request and answer do not fit together",
     FaultCode.NO_ROOM: "does not fit into the dictionary",
-    FaultCode.MONITORING: "nobody can be looked for",
+    FaultCode.MONITORING: "subscriber cannot be monitored",
 }
 
 

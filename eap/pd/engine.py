@@ -1,4 +1,4 @@
-"""The cycles of all stations of one process, and the timers of their buses: who is due when."""
+"""Schedule of the cycles of all stations of one process, and of the timers of their buses."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Engine:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether every station has run a cycle since the start, or has one beyond SOON_NS."""
+        """True if every station has run a cycle since the start, or has one beyond SOON_NS."""
         return all(each.has_run or each.cycle_ns > SOON_NS for each in self._stations)
 
     def replace(self, old: Station, new: Station, now_ns: int) -> None:
@@ -72,7 +72,7 @@ class Engine:
     def handle_timeout(self, now_ns: int) -> None:
         """Run the station that is due first, else the bus; early calls are harmless.
 
-        One a call, so that whoever calls reads the clock again before the next.  A station runs
+        One a call, so that the caller reads the clock again before the next.  A station runs
         the timers of its own buses in its cycle, so a bus is late for no longer than that.
         """
         due_ns, index = self._due[0]

@@ -39,7 +39,7 @@ class TakenPd(NamedTuple):
 
 
 class RefusedPd(NamedTuple):
-    """A PD that nobody takes: the counters to add one to, and the VarState words to set."""
+    """A PD that no subscription takes: counters to add one to, and VarState words to set."""
 
     counters: tuple[int, ...]
     mismatches: tuple[tuple[int, int], ...] = ()
@@ -60,7 +60,7 @@ class FramePlan:
         taken_words: First words of the RxPDs that take one of its PDs.
         has_more: Whether there is anything of the next four.
         alternates: PDs that are laid out otherwise: tracker, offset in the frame, copy to make.
-        refused: The PDs that nobody takes.
+        refused: The PDs that no subscription takes.
         requests: RxPDs that ask this station for something, with their trackers.
         answers: RxPDs that this station asked for, likewise.
         roaming: Trackers that follow any publisher.

@@ -74,7 +74,7 @@ def frame_state(image: Image, first_word: int) -> int:
 
 
 def presence(image: Image, first_word: int) -> str:
-    """Return whether the subscriber of that frame is there; ``unknown`` too if nobody looks."""
+    """Return whether the subscriber of that frame is there; ``unknown`` too without monitoring."""
     return SubscriberPresence(image.words[first_word + FrameWord.PRESENCE]).name.lower()
 
 

@@ -69,7 +69,7 @@ class ImageHandover:
 
     Args:
         old: The image that is in use.
-        new: A fresh one that nobody uses yet.
+        new: A fresh one that is not in use yet.
     """
 
     def __init__(self, old: Image, new: Image) -> None:
@@ -82,7 +82,7 @@ class ImageHandover:
 
     @property
     def is_current(self) -> bool:
-        """Whether subscriptions still share trackers as they did when this was planned."""
+        """True if subscriptions still share trackers as they did when this was planned."""
         return self._received.is_current
 
     def carry_words(self) -> None:
@@ -109,9 +109,9 @@ class ImageHandover:
 class _Sent:
     """The words of TxFrames and TxPDs.
 
-    Where a frame goes is forgotten when it is sent elsewhere, and then, or when it is monitored in
-    another way, who is there.  A frame that is no more what it was gives the count of its cycles as
-    a whole to its old PDs.
+    The address of a frame is forgotten when its destination changes; the presence of its subscriber
+    then, too, and when it is monitored in another way.  A frame that is no more what it was gives
+    the count of its cycles as a whole to its old PDs.
     """
 
     def __init__(self, old: ImageLayout, new: ImageLayout) -> None:
@@ -232,8 +232,8 @@ def _schedules(layout: ImageLayout, frame: str) -> set[tuple[str, bool, bool]]:
 def _begins_anew(was: RxSlot, slot: RxSlot) -> bool:
     """Whether the next frame cannot be compared with the last one.
 
-    It comes from another sender, or from one that changes its rate: whether the gap between these
-    two is of the old rate or of the new one, nobody knows.
+    It comes from another sender, or from one that changes its rate: the gap between these
+    two may be of the old rate or of the new one.
     """
     return (was.publisher, was.port, was.step) != (slot.publisher, slot.port, slot.step)
 

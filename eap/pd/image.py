@@ -311,7 +311,7 @@ class Inputs:
             self.memory[region] = image.memory[region]
 
     def reload(self) -> None:
-        """Take what has been put into the image before anybody writes there."""
+        """Take what has been put into the image before its writers write there."""
         for index, (sequence, region) in enumerate(self._regions):
             if self.memory[region] == self._image.memory[region]:
                 self._seen[index] = self._words[sequence]

@@ -94,7 +94,7 @@ class SampleSlot(SpecRecord, frozen=True):
 
 
 class ImagePort(SpecRecord, frozen=True):
-    """What a reader wants to know of a port."""
+    """Facts on a port for readers of the image."""
 
     name: str
     kind: str
@@ -114,7 +114,7 @@ class FrameSlot(SpecRecord, frozen=True):
 
     @property
     def target(self) -> tuple[str, str, int, str]:
-        """Whose presence is monitored, and how."""
+        """Subscriber whose presence is monitored."""
         return self.port, self.destination, self.monitor_interval_ms, self.monitor_ip
 
 
@@ -254,7 +254,7 @@ class _Allocator:
 
 
 def _sample_slot(first: int, octets: _Allocator, cycle_us: int) -> SampleSlot:
-    """Keep enough samples for whoever looks now and then, in not too much memory."""
+    """Keep enough samples for a reader that looks now and then, in not too much memory."""
     last = octets.used
     size = SAMPLE_HEAD + last - first
     count = min(SAMPLES_FOR_US // cycle_us, MAX_SAMPLES, SAMPLES_SIZE // size)

@@ -78,7 +78,7 @@ class Channel(Protocol):
 class CyclicBus(Protocol):
     """The slaves of one bus port, as a station's cycle sees them.
 
-    An exchange takes a cycle and is waited for by nobody: its frames leave at the end of one cycle,
+    An exchange takes a cycle, and no call waits for it: its frames leave at the end of one cycle,
     with the outputs of that cycle, and what they bring is taken at the start of the next.  No call
     waits or raises: a bus that cannot work counts that and says why where it is asked, and the
     cycles of all stations go on.
@@ -113,7 +113,7 @@ TOGGLE_BIT = 0x20
 class StateChannel:
     """A channel that writes the EAP SM octet, the state of its device, into all that it sends.
 
-    Off unless a port is told to: older receivers take the octet for a reserved one that is 0.
+    Off unless a port has ``eap_sm``: older receivers take the octet for a reserved one that is 0.
     Where its bits lie is not public (ETG.1005); they are placed as those of the AL status.  It is
     ignored on receive.
 

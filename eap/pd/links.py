@@ -36,7 +36,7 @@ class _End(NamedTuple):
 
     @property
     def octets(self) -> slice:
-        """Where the variable lies; for those that are no bit fields."""
+        """Bytes of a variable that is no bit field."""
         first = self.slot.bit_offset // 8
         return slice(first, first + self.kind.size)
 
@@ -52,7 +52,7 @@ class _Way(NamedTuple):
 
     @property
     def is_computed(self) -> bool:
-        """Whether a number comes out that has to be computed."""
+        """True if a number comes out that has to be computed."""
         link, source, target = self.link, self.source.kind, self.target.kind
         if link.scale != 1.0 or link.offset:
             return True
@@ -82,7 +82,7 @@ class Links:
 
     @property
     def steps(self) -> int:
-        """How many calls a run makes."""
+        """Number of calls of a run."""
         return len(self._steps)
 
     def run(self) -> None:

@@ -1,4 +1,4 @@
-"""Subscriber monitoring: is there anybody where unicast frames go?  ETG.1005, FrameState bit 2.
+"""Subscriber monitoring: presence of the receivers of unicast frames (ETG.1005, FrameState bit 2).
 
 A target is asked for once an interval, sooner while the answer is in doubt, and all targets
 together at most so often a second.  Whoever drives this asks, and hands over what comes of it.
@@ -23,7 +23,7 @@ _SECOND_NS = 1_000_000_000
 
 
 class SubscriberPresence(IntEnum):
-    """Whether the subscriber of a frame is there; the word of a frame in the process image."""
+    """Presence of the subscriber of a frame; the word of a frame in the process image."""
 
     UNKNOWN = 0
     PRESENT = 1
@@ -31,22 +31,22 @@ class SubscriberPresence(IntEnum):
 
 
 class Evidence(Enum):
-    """What one question, or something heard without one, says."""
+    """Evidence from one question, or from traffic without one."""
 
     SEEN = auto()
-    """It answered, or somebody who checks says that it is there."""
+    """It answered, or another process that monitors it says that it is there."""
     MISSED = auto()
     """It did not answer this time."""
     ABSENT = auto()
-    """Its host refuses what is sent, or somebody has already asked often enough, in vain."""
+    """Its host refuses what is sent, or another process has already asked often enough, in vain."""
     PENDING = auto()
-    """Nothing new; somebody is still asking."""
+    """Nothing new; another process is still asking."""
     BLIND = auto()
     """It cannot be told by this way."""
 
 
 class PresencePolicy(NamedTuple):
-    """How quickly to believe."""
+    """Number of rounds after which evidence counts."""
 
     misses: int = 3
     """Rounds without an answer until it is missing, or rounds blind until it is unknown."""
@@ -76,12 +76,12 @@ class PresenceTracker:
         self._verdict: Evidence | None = None  # of this round
 
     def begin_round(self) -> None:
-        """Take note that somebody asks anew."""
+        """Note that a new question is under way."""
         self._verdict = None
 
     @property
     def in_doubt(self) -> bool:
-        """Whether the next round may change something: it had better come soon."""
+        """True if the next round may change something: it had better come soon."""
         return bool(self._hits if self.presence is SubscriberPresence.MISSING else self._misses)
 
     def take(self, evidence: Evidence, now_ns: int) -> SubscriberPresence:
@@ -134,7 +134,7 @@ _NOT_PLANNED = -1
 
 
 class MonitorTarget(NamedTuple):
-    """Whom to ask for."""
+    """Host whose presence is monitored."""
 
     name: str
     """Unique within the monitor."""
@@ -144,7 +144,7 @@ class MonitorTarget(NamedTuple):
 
 
 class MonitorPolicy(NamedTuple):
-    """How often to ask."""
+    """Rates and times of questions."""
 
     answer_ns: int = 500_000_000
     """How long an answer may take; never longer than the interval."""
@@ -219,7 +219,7 @@ class _Watch:
 
 
 class SubscriberMonitor:
-    """Decides whom to ask when, and what to make of the answers.
+    """Decides which target is asked when, and evaluates the answers.
 
     The driver's turn: hand over all that was heard, then :meth:`probes_to_send`, ask for each of
     those, and come again at :meth:`next_timeout`.  What cannot be asked gets Evidence.BLIND; who

@@ -1,4 +1,4 @@
-"""Polled exchange, both sides of it: who asked this station, and what this station asked.
+"""Polled exchange: requests of other stations, and requests of this station.
 
 A request is an ordinary PD and so is its answer (ETG.1005): what makes them so is configuration on
 both sides.  An answer carries nothing of the request, so it belongs to the last one sent before.
@@ -19,7 +19,7 @@ REQUESTERS_PER_CYCLE = 32
 
 
 class Requests:
-    """Who asked for what at one port since the last answers.
+    """Requests that came to one port since the last answers.
 
     Args:
         names: The RxPDs that are requests.
@@ -97,7 +97,7 @@ class PollQuestion:
         return self._waiting.get(answer)
 
     def answered(self, answer: str, at_ns: int) -> int | None:
-        """Return how long the RxPD *answer* took that arrived at *at_ns*; None if nobody asked.
+        """Return how long the RxPD *answer* took that arrived at *at_ns*; None without a request.
 
         What arrived before the last request, and is taken only now, answers the one before.
         """

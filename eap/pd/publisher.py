@@ -253,7 +253,7 @@ def read_control(image: Image, inputs: Inputs, name: str) -> int:
 
 
 ANSWERS_KEPT = 64
-"""Buffers of a frame for those who asked last; another requester costs building one."""
+"""Buffers of a frame for the latest requesters; another one costs building a buffer."""
 _POLL = REASON_INDEX[Reason.POLL]
 
 

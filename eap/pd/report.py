@@ -1,4 +1,4 @@
-"""The counters of a process image in words that people and programs read.
+"""Status and lists for people and programs, from the counters of a process image.
 
 The shapes are a contract: docs/control.md describes them.
 """

@@ -1,4 +1,4 @@
-"""Rules of what a station sends and receives, for the plant file and for its dictionaries alike.
+"""Rules for what a station sends and receives, of plant file and dictionaries alike.
 
 Each function yields the breaches of a few rules that belong together.  A breach names the key of
 the plant file; the table of the profile says which entry of the dictionary that is.

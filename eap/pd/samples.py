@@ -1,8 +1,8 @@
-"""Samples: what all variables of a station were at the end of each of its latest cycles.
+"""Samples: values of all variables of a station at the end of each of its latest cycles.
 
-The engine takes them as long as somebody says that they are wanted, and waits for nobody: who looks
+The engine takes them as long as a reader says that they are wanted, and never waits: who looks
 too late finds that the place of a sample holds a later one.  A sample is taken with the copies that
-the cycle itself has read, so that its values belong to one moment, whoever writes them.
+the cycle itself has read, so that its values belong to one moment, for all writers.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Rule 1: PDs that have always arrived together share one tracker; they part when 
 apart.  All members of a tracker have the same history, so the copy that starts the new tracker
 is exact, and a frame of a hundred PDs costs one tracker, not a hundred.
 Rule 2: an older counter is a reordered frame and not taken, since newer data is here already; what
-was counted as lost because of it is not lost any more.  The third in a row that nobody missed is a
+was counted as lost because of it is not lost any more.  The third in a row that fills no gap is a
 sender that counts anew, and is taken.
 Rule 3: the same counter again counts as duplicated and is taken: some terminals never count.
 """
@@ -47,7 +47,7 @@ RESTARTED_AFTER = 3
 
 
 class Timing:
-    """What is known of the sender, and of the receiver's own cycle; 0 where unknown.
+    """Timing of the sender, and the receiver's own cycle; 0 where unknown.
 
     Attributes:
         step: Sender cycles between two frames, 0 when it sends on change or event.
@@ -99,12 +99,12 @@ class SequenceTracker:
 
     @property
     def state(self) -> RxState:
-        """Where the subscriptions of this tracker stand."""
+        """State of the subscriptions of this tracker."""
         return RxState(self._words[_STATE])
 
     @property
     def arrived_at_ns(self) -> int:
-        """When the last frame taken arrived."""
+        """Arrival of the last frame taken."""
         return int(self._words[_ARRIVED_AT_NS])
 
     def has_taken(self, cycle: int) -> bool:

@@ -1,4 +1,4 @@
-"""What one station is asked to do, complete and checked: the input of the engine.
+"""Specification of one station, complete and checked: the input of the engine.
 
 A plant file and, later, an object dictionary both end in these records.  They hold names and plain
 values only, so that they cross from the supervisor to the engine as JSON; times and sizes are in
@@ -13,7 +13,7 @@ import msgspec
 
 
 class Writer(StrEnum):
-    """Who may write a variable; each has a region of the process image to itself."""
+    """Writer of a variable; each has a region of the process image to itself."""
 
     ENGINE = "engine"
     """Received process data and the generators that run in the cycle."""
@@ -24,7 +24,7 @@ class Writer(StrEnum):
 
 
 class Substitute(StrEnum):
-    """What a subscriber's variables hold after its time-out."""
+    """Content of a subscription's variables after its time-out."""
 
     HOLD = "hold"
     ZERO = "zero"
@@ -83,7 +83,7 @@ class RandomSource(SpecRecord, frozen=True, tag="random", tag_field="kind"):
 
 
 class Measure(StrEnum):
-    """What a host can be asked for; docs/plant-file.md gives the units."""
+    """Measurement of this host; docs/plant-file.md gives the units."""
 
     LOAD1 = "load1"
     LOAD5 = "load5"
@@ -143,7 +143,7 @@ class OnChangeSpec(SpecRecord, frozen=True):
 
 
 class TriggerSpec(SpecRecord, frozen=True):
-    """When a TxPD is sent; docs/triggers.md has the truth table.  All off: each device cycle."""
+    """Triggers of a TxPD; docs/triggers.md has the truth table.  All off: each device cycle."""
 
     cycle_us: int = 0
     divider: int = 0
@@ -154,7 +154,7 @@ class TriggerSpec(SpecRecord, frozen=True):
 
 
 REQUESTER = "requester"
-"""Destination of a frame that only answers: whoever asked."""
+"""Destination of a frame that only answers: the requester."""
 
 
 class TxPdSpec(SpecRecord, frozen=True):
@@ -176,7 +176,7 @@ class TxFrameSpec(SpecRecord, frozen=True):
 
     *destination* is a MAC address, an IPv4 address (``address[:port]``), ``tcp://address[:port]``
     or, on Ethernet, the NetID of a port; when all PDs are polled it is REQUESTER.  Polled PDs go in
-    frames of their own, to who asked.
+    frames of their own, to the requester.
     """
 
     name: str
@@ -190,7 +190,7 @@ class TxFrameSpec(SpecRecord, frozen=True):
     mac: str = ""
     """MAC address behind a NetID; empty if it is to be learned from what that port sends."""
     monitor_interval_ms: int = 0
-    """How often to look whether anybody is at a unicast destination; 0 never."""
+    """Interval of looking for the host at a unicast destination; 0 never."""
     monitor_ip: str = ""
     """Ethernet: IPv4 address of the subscriber, to probe for by ARP; empty leaves it unknown."""
 
@@ -246,14 +246,14 @@ class RxPdSpec(SpecRecord, frozen=True):
 
 
 class PortKind(StrEnum):
-    """What a port speaks: EAP to other stations or type 1 down to slaves."""
+    """Kind of a port: EAP to other stations or type 1 down to slaves."""
 
     EAP = "eap"
     BUS = "bus"
 
 
 class Wake(StrEnum):
-    """When received frames are taken."""
+    """Moment at which received frames are taken."""
 
     CYCLE = "cycle"
     """At the start of the station's next cycle: the fewest wake-ups."""
@@ -298,7 +298,7 @@ class BusTarget(StrEnum):
 
 
 class BusPortSpec(SpecRecord, frozen=True):
-    """What a bus port has beside an interface."""
+    """Bus of a bus port: its slaves, their target state, and time-outs of frames."""
 
     file: str = ""
     """Absolute path of the bus file that describes it; empty if nothing is expected."""
@@ -334,7 +334,7 @@ class LinkSpec(SpecRecord, frozen=True):
 
 
 class GatewayAddress(SpecRecord, frozen=True):
-    """Whom a virtual mailbox address stands for: one of the three."""
+    """Target of a virtual mailbox address: one of the three."""
 
     address: int
     station: int = 0
@@ -350,7 +350,7 @@ class GatewaySpec(SpecRecord, frozen=True):
     """The mailbox gateway of a bus port (ETG.8200)."""
 
     enabled: bool = True
-    """Whether it answers before somebody starts it."""
+    """Whether it answers before a command starts it."""
     port: int = 0
     """UDP and TCP port of its own at each address of the station; 0 for none."""
     answer_ms: int = 900

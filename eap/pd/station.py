@@ -77,7 +77,7 @@ class Station:
         self._generate = Generators(image, generated).run
         self._run_links = Links(image, self.memory_of, spec.links).run if spec.links else None
         self._computes = bool(generated or spec.links)
-        """Whether anything follows from what was received."""
+        """True if anything follows from what was received."""
         self._has_own_variables = self._computes
         self.buses: list[CyclicBus] = []
         self._publishers: list[tuple[Publisher | Answerer, Channel]] = []
@@ -143,7 +143,7 @@ class Station:
         self._teach(port)
 
     def _teach(self, port: str) -> None:
-        """Have the publisher of *port* told which addresses its NetIDs have."""
+        """Have the publisher of *port* learn the addresses of its NetIDs."""
         publisher = self._ports[port][1]
         if learner := self._learners.get(port):
             learner.sought = () if publisher is None else publisher.sought
@@ -203,7 +203,7 @@ class Station:
 
     @property
     def has_run(self) -> bool:
-        """Whether a cycle has run since :meth:`start`."""
+        """True if a cycle has run since :meth:`start`."""
         return bool(self._words[_CYCLE_AT_NS] > self._words[_STARTED_AT_NS])
 
     def go(self, state: DeviceState, now_ns: int) -> None:
@@ -321,7 +321,7 @@ class Station:
             words[_LATENESS_MAX_NS] = late_ns
         self._samples.end_cycle(cycle, now_ns)
         words[_FUTEX] = cycle & 0xFFFFFFFF
-        # Never cleared here: whoever comes between the look and the clearing would sleep on.
+        # Never cleared here: a program that comes between the look and the clearing would sleep on.
         if cycle - words[_WAITERS] <= WAKE_FOR_CYCLES:
             self._wake()
 

@@ -139,7 +139,7 @@ class Subscriber:
 
     @property
     def has_timeouts(self) -> bool:
-        """Whether any subscription has one: otherwise handle_timeout() need not be called."""
+        """True if any subscription has one: otherwise handle_timeout() need not be called."""
         return self._table.shortest_timeout_ns != _NEVER
 
     def next_timeout(self) -> int | None:
@@ -338,7 +338,7 @@ class SubscriptionTable:
             self.words[first_word + RxWord.DISCARDED + index] += 1
 
     def refuse(self, plan: FramePlan, at_ns: int) -> None:
-        """Count the PDs of a frame that nobody takes."""
+        """Count the PDs of a frame that no subscription takes."""
         words = self.words
         for pd in plan.refused:
             for counter in pd.counters:
@@ -364,7 +364,7 @@ class SubscriptionTable:
     def note_requests(
         self, plan: FramePlan, cycle: int, data: memoryview, origin: FrameOrigin
     ) -> None:
-        """Note who asks with a frame."""
+        """Note the requests in a frame, and their sender."""
         names = [name for tracker, name in plan.requests if tracker.has_taken(cycle)]
         if not names:
             return

@@ -69,7 +69,7 @@ class RxSubscription:
         return None
 
     def deadline_ns(self) -> int | None:
-        """Return when its data is too old, None while that cannot be: nobody asked again."""
+        """Return when its data is too old, None as long as it was not requested again."""
         since_ns: int | None = self.tracker.arrived_at_ns
         if self.answer is not None:
             since_ns = self.answer.question.waiting_since(self.answer.name)

@@ -1,4 +1,4 @@
-"""When a TxPD is sent, and why.  docs/triggers.md holds the truth table that this file follows.
+"""Triggers of TxPDs.  docs/triggers.md holds the truth table that this file follows.
 
 Rule 1: a frame's divider is a gate; nothing of the frame is sent while it is closed.  Events and
 changes of that time wait for it; cycle time and divider only count in the cycles that it lets by.
@@ -86,7 +86,7 @@ class Trigger:
 
     @property
     def wants_data(self) -> bool:
-        """Whether :meth:`reason` has to see the data."""
+        """True if :meth:`reason` has to see the data."""
         return self._on_change
 
     def raise_event(self) -> None:
@@ -135,7 +135,7 @@ class Trigger:
     def follow(self, before: Trigger, *, is_same: bool) -> None:
         """Go on where *before* was; *is_same* tells that the PD is still sent as it was.
 
-        If it is not, nobody has its data yet, and an on-change trigger sends it.
+        If it is not, no subscriber has its data yet, and an on-change trigger sends it.
         """
         self._event = before._event and self.takes_events
         self._sent_at_ns = before._sent_at_ns

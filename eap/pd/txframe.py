@@ -58,7 +58,7 @@ class Gather:
 
     @property
     def has_bits(self) -> bool:
-        """Whether :meth:`bits_into` has anything to do."""
+        """True if :meth:`bits_into` has anything to do."""
         return bool(self._bits)
 
     def copies(self, offset: int) -> list[tuple[slice, memoryview]]:
@@ -174,7 +174,7 @@ class TxFrame:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the frame goes whole by its schedule and nothing holds it back."""
+        """True if the frame goes whole by its schedule and nothing holds it back."""
         return (
             self.schedule is not None
             and not self.is_held
@@ -183,7 +183,7 @@ class TxFrame:
 
     @property
     def is_held(self) -> bool:
-        """Whether it does not go at all: suppressed, or nobody knows where to."""
+        """True if it does not go at all: suppressed, or without a known address."""
         return self.suppressed or not self.destination
 
     def retarget(self, destination: str) -> None:

@@ -1,4 +1,4 @@
-"""The counters of a process image: which 64-bit word means what.
+"""Counters of a process image: meaning of its 64-bit words.
 
 One station's image ends in an array of signed 64-bit words.  It starts with the station's own
 block, followed by one block for each TxFrame, TxPD and RxPD.  Counters are incremented in place,
@@ -12,7 +12,7 @@ from itertools import accumulate
 
 
 class Discard(StrEnum):
-    """Why a PD, or a whole frame, was seen and not taken."""
+    """Reason for which a PD, or a whole frame, was dropped."""
 
     WRONG_PUBLISHER = auto()
     UNKNOWN_ID = auto()
@@ -29,13 +29,13 @@ class Discard(StrEnum):
     TOO_MANY_REQUESTS = auto()
     """The data was taken, but more stations asked in one cycle than are answered in one."""
     NO_SENDER = auto()
-    """The data was taken, but its frame does not tell whom to answer."""
+    """The data was taken, but its frame has no address to answer."""
     WRONG_SOURCE = auto()
     """The frame came from another address than the publisher's."""
 
 
 class Reason(StrEnum):
-    """Why a PD was sent."""
+    """Reason for which a PD was sent."""
 
     CYCLE = auto()
     DIVIDER = auto()
@@ -63,7 +63,7 @@ class StationWord(IntEnum):
     FUTEX = 2
     """Low half: the cycle again when it has ended, as the word that waiting programs sleep on."""
     WAITERS = 3
-    """The cycle in which a program last went to sleep: whether anybody has to be woken."""
+    """The cycle in which a program last went to sleep: waiting programs have to be woken."""
     ENGINE_SEQUENCE = 4
     """Odd while the engine writes its region; likewise the next two."""
     SERVICES_SEQUENCE = 5
@@ -150,7 +150,7 @@ class RxWord(IntEnum):
     """VarState: bit 0 version, bit 1 length, of the last PD refused."""
     MISMATCH_AT_NS = 2
     RESPONSE_NS = 3
-    """From a request to its answer: of the one that was taken last; 0 if nobody asked."""
+    """From a request to its answer: of the one that was taken last; 0 without a request."""
     SOURCE = 4
     """Address that the last frame taken came from, as ``eap.pd.address`` puts it; 0 unknown."""
     OTHER_SOURCE = 5
@@ -191,7 +191,7 @@ TRACKER_START = RxWord.RECEIVED
 
 
 class RxState(IntEnum):
-    """Where a subscription stands."""
+    """State of a subscription."""
 
     WAITING = 0
     """Nothing received yet."""

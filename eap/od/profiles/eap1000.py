@@ -34,7 +34,7 @@ MODULE_PROFILE = 1000
 
 
 class EapLive(StrEnum):
-    """What the running device is asked for; the object's name says of which one."""
+    """Keys of live entries; the name of the object says of which variable, frame or PD."""
 
     VALUE = auto()
     """Of the variable, as it lies in the process image."""
@@ -85,7 +85,7 @@ class EapLive(StrEnum):
 
 
 class Derived(StrEnum):
-    """What the dictionary computes from other entries."""
+    """Keys of entries that the dictionary computes from others."""
 
     BIT_LENGTH = auto()
     TYPE_CODE = auto()
@@ -218,7 +218,7 @@ class PortEntry(IntEnum):
 
 
 class AddressMode(IntEnum):
-    """How a TxFrame names its destination."""
+    """Form of the destination of a TxFrame."""
 
     MAC = 0
     NET_ID = 1
@@ -241,7 +241,7 @@ class RxFlag(IntEnum):
 
 
 class WrittenBy(IntEnum):
-    """Who writes a Tx variable."""
+    """Writer of a Tx variable."""
 
     APPLICATION = 0
     ENGINE = 1
@@ -249,7 +249,7 @@ class WrittenBy(IntEnum):
 
 
 class Substituted(IntEnum):
-    """What the variables of an RxPD hold after its time-out."""
+    """Content of the variables of an RxPD after its time-out."""
 
     HOLD = 0
     ZERO = 1
@@ -257,7 +257,7 @@ class Substituted(IntEnum):
 
 
 class Waking(IntEnum):
-    """When a port takes frames."""
+    """Moment at which a port takes frames."""
 
     CYCLE = 0
     ARRIVAL = 1
@@ -336,7 +336,7 @@ TX_FRAME = ObjectRow(
         config(FrameEntry.ENABLED, "Enabled", "BOOL",
                "A frame that is not is left alone altogether."),
         config(FrameEntry.ADDRESS_MODE, "Address mode", "USINT",
-               "0 MAC, 1 NetID, 2 IP by UDP, 3 IP by TCP, 4 whoever asked for its PDs.",
+               "0 MAC, 1 NetID, 2 IP by UDP, 3 IP by TCP, 4 the requester of its PDs.",
                maximum=4, changeable=True, key="to"),
         config(FrameEntry.DESTINATION_MAC, "Destination MAC", "BLOCK(6)",
                "Address mode 0; in mode 1 that of the NetID, and all zero or a group if it is to "
@@ -361,7 +361,7 @@ TX_FRAME = ObjectRow(
                 key="divider"),
         setting(FrameEntry.MODULO, "Modulo", "UINT", "Less than the divider.", key="modulo"),
         setting(FrameEntry.MONITOR_IP, "Monitor IP", "BLOCK(4)",
-                "Whom to probe for on Ethernet; all zero nobody.", form=Form.IP, key="monitor_ip"),
+                "Host to probe for on Ethernet; all zero none.", form=Form.IP, key="monitor_ip"),
         setting(FrameEntry.CHANGEABLE, "Changeable", "BOOL",
                 "Whether the destination may be written in SafeOp and Op.", key="changeable"),
         live(FrameEntry.FRAME_CONTROL, "Frame control", "UINT", EapLive.FRAME_CTRL,
@@ -491,7 +491,7 @@ RX_PD = ObjectRow(
                 "Writing another publisher empties it.", changeable=True, key="source",
                 rule=Rule.SOURCE),
     ),
-    "One PD to receive: from whom, and into which PDO.", dynamic=True, companion=0xC000,
+    "One PD to receive: its sender, and its PDO.", dynamic=True, companion=0xC000,
     section="subscribe",
 )  # fmt: skip
 RX_DIAGNOSIS = ObjectRow(
@@ -571,7 +571,7 @@ DEVICE = (
            live(12, "Too many requests", "ULINT", EapLive.STATION_DISCARDED_TOO_MANY_REQUESTS,
                  "Requests left without an answer."),
            live(13, "No sender", "ULINT", EapLive.STATION_DISCARDED_NO_SENDER,
-                 "Requests that do not tell whom to answer.")),
+                 "Requests without an address to answer.")),
     single(0xF200, "EAP control", "What the device is asked to do.",
            EntryRow(1, "Requested state", "UINT", RW, "2 PreOp, 4 SafeOp, 8 Op; the status says "
                     "what came of it.", rule=Rule.STATE)),

@@ -22,7 +22,7 @@ _RECORD, _ARRAY = ObjectCode.RECORD, ObjectCode.ARRAY
 
 
 class MasterLive(StrEnum):
-    """What the running master is asked for; of a slave, where its object says so."""
+    """Keys of live entries, of the master or of the slave of the object."""
 
     ADDRESS = auto()
     TYPE = auto()

@@ -23,7 +23,7 @@ _RECORD, _ARRAY = ObjectCode.RECORD, ObjectCode.ARRAY
 
 
 class RouterLive(StrEnum):
-    """What the running router is asked for."""
+    """Keys of live entries of the router."""
 
     DEVICE_STATE = auto()
     DEVICE_MAC = auto()
@@ -108,7 +108,7 @@ DIAGNOSIS = single(
     live(3, "Denied", "ULINT", RouterLive.DENIED,
          "Requests that access rules refused, in part or all."),
     live(4, "Loops", "ULINT", RouterLive.LOOPS, "Packets that ran in a circle."),
-    live(5, "Late", "ULINT", RouterLive.LATE, "Answers that nobody waited for any more."),
+    live(5, "Late", "ULINT", RouterLive.LATE, "Answers after their requests had timed out."),
     live(6, "Dropped", "ULINT", RouterLive.DROPPED, "Packets that were left without an answer."),
     live(7, "Waiting", "UDINT", RouterLive.WAITING, "Requests that wait for their answers."),
     live(8, "Routes", "UDINT", RouterLive.ROUTES, "That there are."),

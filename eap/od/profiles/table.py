@@ -1,4 +1,4 @@
-"""Records of which a profile's table consists, and short forms to write them.
+"""Rows of a profile's table, and forms and rules of its entries.
 
 The row of an entry names the source of its content: *config* (written in PreOp, kept), *fixed*
 (given at the start, read only), *live* (read from the running device under a key) or *derived*
@@ -42,7 +42,7 @@ class Rule(StrEnum):
 
 
 class Form(StrEnum):
-    """What an entry is to people, beside its data type."""
+    """Form in which people read and write an entry."""
 
     PLAIN = "plain"
     """As its type is written."""
@@ -57,7 +57,7 @@ class Form(StrEnum):
 
     @property
     def is_address(self) -> bool:
-        """Whether it is a block of octets that has a text of its own."""
+        """True if it is a block of octets that has a text of its own."""
         return self in _BLOCKS
 
     def text_of(self, octets: bytes) -> str:
