@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from contextlib import suppress
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
+import msgspec
 from msgspec.structs import replace
 
 from devicebus.errors import (
@@ -50,12 +51,13 @@ MAX_UNSOLICITED = 16
 """Messages taken in one go while nobody has asked for anything."""
 
 
-class Unsolicited(NamedTuple):
+class Unsolicited(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """A message that a slave sent unasked: an emergency, a notification, an Ethernet fragment."""
 
     station: int
     type: MailboxType
     data: bytes
+    """Without the mailbox header."""
 
 
 Report: TypeAlias = Callable[[Unsolicited], None]

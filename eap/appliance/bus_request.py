@@ -13,10 +13,10 @@ import msgspec
 from devicebus.errors import NoMailboxError
 from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
 from devicebus.master.access import DatagramReply, DatagramRequest
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_errors import ErrorRecord, to_error
 from eap.appliance.station_request import StationRequest
-from eap.codec.mailbox import MailboxType
 from eap.errors import EapError
 
 
@@ -209,13 +209,10 @@ class EngineStarted(msgspec.Struct, frozen=True, tag="hello"):
 
 
 class UnsolicitedMessage(msgspec.Struct, frozen=True, tag="heard"):
-    """Message that a slave sent unasked: an Ethernet frame, an emergency, a notification."""
+    """Message that a slave on a bus sent unasked."""
 
     bus: int
-    station: int
-    kind: MailboxType
-    data: bytes
-    """Without the mailbox header."""
+    message: Unsolicited
 
 
 class BusChange(msgspec.Struct, frozen=True, kw_only=True, tag="change"):

@@ -1,6 +1,7 @@
-"""The control protocol's words about buses; docs/control.md is their description.
+"""Methods of the control protocol for buses; docs/control.md is their description.
 
-Octets are hexadecimal digits, slaves are station addresses.
+The records of requests and replies are those of ``devicebus``; JSON has their octets as hexadecimal
+digits and times in milliseconds.  Slaves are station addresses.
 """
 
 from __future__ import annotations
@@ -8,41 +9,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
+import msgspec
 from msgspec import Meta
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import RESPONSE_TIMEOUT_NS, MailboxRequest
 from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.wire.datagram import Command
-from eap.appliance.control import ErrorCode, Parameters
+from eap.appliance.bus_request import BusReport
+from eap.appliance.control import ErrorCode, Method, Parameters
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
-
-BUS_METHODS = (
-    "bus_describe",
-    "bus_open",
-    "bus_ask",
-    "bus_close",
-    "bus_transfer",
-    "bus_bring",
-    "bus_fault",
-    "bus_forget",
-)
 
 MAX_CONVERSATIONS = 16
 """Open on one connection."""
 IDLE_S = 10.0
-"""A conversation in which nothing is asked for so long is ended: others may wait for it."""
+"""A conversation without a request for so long is ended: others may wait for it."""
 TURN_S = 30.0
-"""How long the turn at a mailbox is waited for."""
+"""Limit for the wait for a turn at a mailbox."""
 MARGIN_S = 10.0
 """Beyond the time-out of a mailbox message: those of other protocols may go first."""
 PATIENCE_S = 5.0
-"""How long a bus that is not up yet, or whose engine starts again, is waited for."""
+"""Limit for the wait for a bus that is not up yet, or whose engine starts again."""
 TRANSFER_S = 5.0
-"""What datagrams that are passed on may take."""
+"""Limit for datagrams."""
 BRING_S = 60.0
-"""What bringing slaves to a state may take."""
+"""Limit for bringing slaves to a state."""
 
 MS = 1_000_000
 _MAX_MS = 60_000
@@ -58,7 +50,7 @@ ReplyRow = tuple[int, str, int]
 
 
 class BusParameters(Parameters, frozen=True, kw_only=True):
-    """Base of those that name a bus."""
+    """Base of parameters that name a bus."""
 
     station: str
     port: str
@@ -108,13 +100,72 @@ class BusBringParameters(BusParameters, frozen=True, kw_only=True):
 
 
 class BusFaultParameters(BusParameters, frozen=True, kw_only=True):
-    """``bus_fault``: what a simulated segment is told."""
+    """``bus_fault``: a command for a simulated segment."""
 
     command: dict[str, Any]
 
 
 class BusForgetParameters(BusParameters, frozen=True, kw_only=True):
     """``bus_forget``: faults that are over are not shown any more."""
+
+
+class OpenConversation(msgspec.Struct, frozen=True):
+    """Number of a conversation that was opened."""
+
+    conversation: int
+
+
+class MailboxData(msgspec.Struct, frozen=True):
+    """Reply of a slave without its mailbox header, as hexadecimal digits."""
+
+    data: str
+
+
+class ClosedConversation(msgspec.Struct, frozen=True):
+    """Number of a conversation that is closed."""
+
+    closed: int
+
+
+class DatagramReplies(msgspec.Struct, frozen=True):
+    """Replies to datagrams, in their order."""
+
+    replies: list[ReplyRow]
+
+
+class ReachedState(msgspec.Struct, frozen=True):
+    """State in which the slaves are now."""
+
+    state: State
+
+
+class Done(msgspec.Struct, frozen=True):
+    """Answer without content."""
+
+    ok: bool = True
+
+
+BUS_DESCRIBE = Method("bus_describe", BusDescribeParameters, BusReport)
+BUS_OPEN = Method("bus_open", BusOpenParameters, OpenConversation)
+BUS_ASK = Method("bus_ask", BusAskParameters, MailboxData)
+BUS_CLOSE = Method("bus_close", BusCloseParameters, ClosedConversation)
+BUS_TRANSFER = Method("bus_transfer", BusTransferParameters, DatagramReplies)
+BUS_BRING = Method("bus_bring", BusBringParameters, ReachedState)
+BUS_FAULT = Method("bus_fault", BusFaultParameters, Done)
+BUS_FORGET = Method("bus_forget", BusForgetParameters, Done)
+BUS_METHODS = tuple(
+    method.name
+    for method in (
+        BUS_DESCRIBE,
+        BUS_OPEN,
+        BUS_ASK,
+        BUS_CLOSE,
+        BUS_TRANSFER,
+        BUS_BRING,
+        BUS_FAULT,
+        BUS_FORGET,
+    )
+)
 
 
 def protocol_of(kind: MailboxType) -> str:
@@ -127,19 +178,19 @@ def kind_of(protocol: str) -> MailboxType:
     return MailboxType[protocol.upper()]
 
 
-def ask_parameters(ask: MailboxRequest) -> dict[str, Any]:
+def request_parameters(request: MailboxRequest) -> dict[str, Any]:
     """Return a step of a conversation as parameters, without the conversation."""
     return {
-        "request": ask.request.hex(),
-        "listen": ask.listen,
-        "timeout_ms": _to_ms(ask.timeout_ns),
-        "delay_ms": _to_ms(ask.delay_ns),
-        "expects_reply": ask.expects_reply,
+        "request": request.request.hex(),
+        "listen": request.listen,
+        "timeout_ms": _to_ms(request.timeout_ns),
+        "delay_ms": _to_ms(request.delay_ns),
+        "expects_reply": request.expects_reply,
     }
 
 
-def to_ask(kind: MailboxType, wanted: BusAskParameters) -> MailboxRequest:
-    """Return the step that parameters tell of."""
+def to_request(kind: MailboxType, wanted: BusAskParameters) -> MailboxRequest:
+    """Return the step of a conversation that parameters describe."""
     return MailboxRequest(
         kind,
         to_octets(wanted.request),
@@ -150,13 +201,13 @@ def to_ask(kind: MailboxType, wanted: BusAskParameters) -> MailboxRequest:
     )
 
 
-def datagram_row(access: DatagramRequest) -> DatagramRow:
+def datagram_row(request: DatagramRequest) -> DatagramRow:
     """Return a datagram as a row."""
-    return access.command, access.adp, access.ado, access.data.hex(), access.tries
+    return request.command, request.adp, request.ado, request.data.hex(), request.tries
 
 
-def to_access(row: DatagramRow) -> DatagramRequest:
-    """Return the datagram of a row; raise ControlError if there is none like it."""
+def to_datagram(row: DatagramRow) -> DatagramRequest:
+    """Return the datagram of a row; raise ControlError if it has no such command."""
     command, adp, ado, octets, tries = row
     try:
         return DatagramRequest(Command(command), adp, ado, to_octets(octets), tries)
@@ -166,16 +217,16 @@ def to_access(row: DatagramRow) -> DatagramRequest:
 
 
 def reply_row(reply: DatagramReply) -> ReplyRow:
-    """Return what came back as a row."""
+    """Return a reply as a row."""
     return reply.wkc, reply.data.hex(), reply.tries
 
 
 def to_replies(rows: Sequence[ReplyRow]) -> list[DatagramReply]:
-    """Return what came back, from rows; raise BusError if they are none."""
+    """Return the replies of rows; raise BusError if they have other digits than hexadecimal."""
     try:
         return [DatagramReply(bytes.fromhex(octets), wkc, tries) for wkc, octets, tries in rows]
-    except (TypeError, ValueError):
-        raise BusError("what came back over the control socket is no reply") from None
+    except ValueError:
+        raise BusError("malformed reply on the control socket") from None
 
 
 def to_octets(text: str) -> bytes:

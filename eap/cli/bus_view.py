@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import UNSET
 
-from eap.appliance.bus_findings import FindingRow
+from eap.appliance.bus_status import FindingRow
 from eap.appliance.commands.bus_info import (
     BusScan,
     BusStates,

@@ -16,7 +16,8 @@ from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState, state_name
 from devicebus.wire.register import AlStatus
-from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose, no_mailbox
+from eap.appliance.bus_status import FrameCounts
+from eap.appliance.commands.bus_slave import Begin, Slave, choose, no_mailbox
 from eap.codec.mailbox import MailboxError
 from eap.codec.soeerror import SoeErrorCode
 from eap.errors import ConfigError, EapError

@@ -21,8 +21,8 @@ from devicebus.master.procedure import Procedure, Sleep
 from devicebus.wire import sii
 from devicebus.wire.alstatus import AlState, name_of, state_name
 from devicebus.wire.sii import SiiProtocol
-from eap.appliance.bus_findings import FindingRow, finding_row
-from eap.appliance.commands.bus_slave import FrameCounts, Slave, SlaveBus, choose
+from eap.appliance.bus_status import FindingRow, FrameCounts, finding_row
+from eap.appliance.commands.bus_slave import Slave, SlaveBus, choose
 
 _TRIES = 3
 _PAUSE_NS = 100_000_000

@@ -1,7 +1,7 @@
-"""The bus of a running station, as a command uses it: its master is asked over the control socket.
+"""Bus of a running station, as commands use it over the control socket.
 
-Conversations and procedures run here, their single steps there.  What a command has begun ends with
-its connection, however it ends.
+Conversations and procedures run here, their single steps at the running master.  Whatever a command
+has begun there ends with its connection.
 """
 
 from __future__ import annotations
@@ -24,18 +24,24 @@ from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
 from devicebus.master.topology import find_joints
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus, DlStatus, Register
-from eap.appliance import control_bus
-from eap.appliance.bus_findings import history_of, is_silent, report_findings
+from eap.appliance import control_bus as words
 from eap.appliance.bus_request import BusReport, SlaveReport, no_mailbox
-from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose
+from eap.appliance.bus_status import (
+    FrameCounts,
+    count_frames,
+    history_of,
+    is_silent,
+    report_findings,
+)
+from eap.appliance.commands.bus_slave import Begin, Slave, choose
 from eap.appliance.commands.client import Client, connect_station
-from eap.appliance.control_bus import ask_parameters, datagram_row, protocol_of, to_replies
+from eap.appliance.control import AnswerT, Method, ParametersT
 from eap.errors import ControlError
 
 T = TypeVar("T")
 
 LOOK_S = 0.1
-"""How often *meanwhile* is called while something runs."""
+"""Interval of calls of *meanwhile*."""
 
 _MARGIN_S = 10.0
 """For services on its way back from a restart, beyond what it waits for itself."""
@@ -47,7 +53,7 @@ class RunningBus:
     """One bus port of a running station; fits :class:`eap.appliance.commands.bus_slave.SlaveBus`.
 
     Args:
-        client: Connected to the appliance; nobody else asks it meanwhile.
+        client: Connected to the appliance, for this bus alone.
         station: Name of the station.
         port: Name of its bus port.
     """
@@ -102,7 +108,7 @@ class RunningBus:
 
     def forget(self) -> None:
         """Have the running master forget faults that are over."""
-        self._request(control_bus.PATIENCE_S, "bus_forget")
+        self._call(words.BUS_FORGET, words.PATIENCE_S)
 
     def find(self, name: str) -> Slave:
         """Return the slave with a station address or a name; raise BusError if that is not one."""
@@ -130,7 +136,7 @@ class RunningBus:
         if not report.to_slave:
             raise no_mailbox(report)
         conversation = begin(MailboxSizes(report.to_slave, report.to_master))
-        return self._lead(slave, conversation, meanwhile)
+        return self._drive(slave, conversation, meanwhile)
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
         """Bring slaves to a state, where the master keeps them then.
@@ -141,52 +147,42 @@ class RunningBus:
         """
         everyone = {slave.station for slave in slaves} == set(self._reports)
         for station in [0] if everyone else [slave.station for slave in slaves]:
-            self._request(control_bus.BRING_S, "bus_bring", slave=station, state=target.name)
+            self._call(words.BUS_BRING, words.BRING_S, slave=station, state=target.name)
 
     def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
         """Run a procedure to its end and return its result, or raise what went wrong."""
         del name
-        return drive(procedure, self._do)
+        return drive(procedure, self._step)
 
     def frame_counts(self) -> FrameCounts:
         """Return the frames of the master since the engine started."""
-        report = self._describe()
-        return FrameCounts(
-            sent=report.frames_sent,
-            received=report.frames_received,
-            late=report.frames_late,
-            lost=report.frames_lost,
-            retried=report.frames_retried,
-            timeout_us=report.timeout_ns // 1000,
-            round_trip_us=report.round_trip_ns // 1000,
-        )
+        return count_frames(self._describe())
 
     def _describe(self) -> BusReport:
-        found = self._request(control_bus.PATIENCE_S, "bus_describe", wait=True)
-        return msgspec.convert(found, BusReport)
+        return self._call(words.BUS_DESCRIBE, words.PATIENCE_S, wait=True)
 
-    def _do(self, step: Step) -> StepResult:
+    def _step(self, step: Step) -> StepResult:
         if isinstance(step, Sleep):
             select.select([], [], [], max(0, step.duration_ns) / _S)
             return StepResult((), monotonic_ns())
-        rows = [datagram_row(access) for access in step]
-        answer = self._request(control_bus.TRANSFER_S, "bus_transfer", datagrams=rows)
-        return StepResult(to_replies(answer["replies"]), monotonic_ns())
+        rows = [words.datagram_row(each) for each in step]
+        answer = self._call(words.BUS_TRANSFER, words.TRANSFER_S, datagrams=rows)
+        return StepResult(words.to_replies(answer.replies), monotonic_ns())
 
-    def _lead(
+    def _drive(
         self, slave: Slave, conversation: Conversation[T], meanwhile: Callable[[], None] | None
     ) -> T:
         look_s = 0.0
         number: int | None = None
 
-        def exchange(ask: MailboxRequest) -> MailboxMessage:
+        def exchange(request: MailboxRequest) -> MailboxMessage:
             nonlocal look_s, number
             if number is None:
-                number = self._open(slave, ask)
+                number = self._open(slave, request)
             elif meanwhile is not None and monotonic() >= look_s:
                 meanwhile()
                 look_s = monotonic() + LOOK_S
-            return MailboxMessage(ask.type, self._ask(number, ask), monotonic_ns())
+            return MailboxMessage(request.type, self._ask(number, request), monotonic_ns())
 
         try:
             return drive(conversation, exchange)
@@ -196,26 +192,25 @@ class RunningBus:
         finally:
             if number is not None:
                 with suppress(ControlError):
-                    self._client.request("bus_close", conversation=number)
+                    self._client.call(words.BUS_CLOSE, conversation=number)
 
-    def _open(self, slave: Slave, ask: MailboxRequest) -> int:
-        answer = self._request(
-            control_bus.TURN_S,
-            "bus_open",
-            slave=slave.station,
-            protocol=protocol_of(ask.type),
+    def _open(self, slave: Slave, request: MailboxRequest) -> int:
+        protocol = words.protocol_of(request.type)
+        opened = self._call(words.BUS_OPEN, words.TURN_S, slave=slave.station, protocol=protocol)
+        return opened.conversation
+
+    def _ask(self, number: int, request: MailboxRequest) -> bytes:
+        limit_s = (request.timeout_ns + request.delay_ns) / _S + words.MARGIN_S + _MARGIN_S
+        answer = self._client.call(
+            words.BUS_ASK,
+            within_s=limit_s,
+            conversation=number,
+            **words.request_parameters(request),
         )
-        return int(answer["conversation"])
+        return bytes.fromhex(answer.data)
 
-    def _ask(self, number: int, ask: MailboxRequest) -> bytes:
-        patience_s = (ask.timeout_ns + ask.delay_ns) / _S + control_bus.MARGIN_S + _MARGIN_S
-        answer = self._client.request_within(
-            patience_s, "bus_ask", conversation=number, **ask_parameters(ask)
-        )
-        return bytes.fromhex(answer["data"])
-
-    def _request(self, patience_s: float, method: str, **params: Any) -> Any:
-        return self._client.request_within(patience_s + _MARGIN_S, method, **self._where, **params)
+    def _call(self, method: Method[ParametersT, AnswerT], limit_s: float, **params: Any) -> AnswerT:
+        return self._client.call(method, within_s=limit_s + _MARGIN_S, **self._where, **params)
 
 
 @contextmanager

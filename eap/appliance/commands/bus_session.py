@@ -25,7 +25,8 @@ from devicebus.master.scan import FoundSlave, scan
 from devicebus.master.startup import set_up_cycle
 from devicebus.master.task import Task
 from devicebus.wire.alstatus import AlState
-from eap.appliance.commands.bus_slave import Begin, FrameCounts, Slave, choose
+from eap.appliance.bus_status import FrameCounts, count_frames
+from eap.appliance.commands.bus_slave import Begin, Slave, choose
 from eap.errors import EapError
 from eap.ids import InterfaceUri
 from eap.net.busport import BusPort, open_bus_port
@@ -125,16 +126,7 @@ class BusSession:
 
     def frame_counts(self) -> FrameCounts:
         """Return the counters of the frames of this session."""
-        stats = self._bus.link.stats()
-        return FrameCounts(
-            sent=stats.sent,
-            received=stats.received,
-            late=stats.late,
-            lost=stats.lost,
-            retried=stats.retried,
-            timeout_us=stats.timeout_ns // 1000,
-            round_trip_us=stats.round_trip_ns // 1000,
-        )
+        return count_frames(self._bus.link.stats())
 
     def known(self) -> Sequence[Slave]:
         """Return the slaves that a scan has found, which is made if there was none."""

@@ -18,6 +18,7 @@ from devicebus.master.findings import History
 from devicebus.master.procedure import Procedure
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus
+from eap.appliance.bus_status import FrameCounts
 
 T = TypeVar("T")
 Begin: TypeAlias = Callable[[MailboxSizes], Conversation[T]]
@@ -46,23 +47,6 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     """AL state where the master of a running station keeps it."""
     since_ns: int | None = None
     """How many nanoseconds ago *fault* began, if that is known."""
-
-
-class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Frames of a master, and what it knows of their round trip."""
-
-    sent: int
-    received: int
-    late: int
-    """Came back after their time-out."""
-    lost: int
-    """Never came back."""
-    retried: int
-    """Sent again."""
-    timeout_us: int
-    """How long the next one may be under way."""
-    round_trip_us: int
-    """Mean of the latest, 0 before the first."""
 
 
 class SlaveBus(Protocol):

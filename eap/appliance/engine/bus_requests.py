@@ -130,7 +130,7 @@ class BusRequestHandler:
 
     def forward(self, bus: int, message: Unsolicited) -> None:
         """Forward an unsolicited message of a slave on the bus numbered *bus*."""
-        self._send(UnsolicitedMessage(bus, message.station, message.type, message.data))
+        self._send(UnsolicitedMessage(bus, message))
 
     def publish(self) -> None:
         """Send what has changed on the buses."""

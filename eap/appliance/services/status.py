@@ -11,9 +11,9 @@ from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
 from typing import Any
 
 from eap.appliance.bus_request import BusReport
+from eap.appliance.bus_status import bus_document, bus_link
 from eap.appliance.handover import PortName
 from eap.appliance.runtime import ApplianceInfo, ProcessInfo
-from eap.appliance.services.bus.bus_status import bus_document, bus_link
 from eap.appliance.services.tasks import TaskSet
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri

@@ -17,12 +17,13 @@ from devicebus.mailbox.foe_store import MemoryFile, MemoryStore
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.mailbox.server import MailboxServer
 from devicebus.mailbox.voe_server import VoeServer
+from devicebus.master.mailboxes import Unsolicited
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Operation, OperationOutcome, Read, ReadWrite
 from eap.aoe.ads_request import take_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.spec import AccessRule, AccessService
-from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage
+from eap.appliance.bus_request import SlaveDescription
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.mailbox_queue import MailboxTurn
 from eap.appliance.services.gateway.door import GatewayDoor
@@ -139,7 +140,7 @@ class _Link:
     ) -> T:
         return await drive_async(conversation, _Talk(self._box).exchange)
 
-    def listen(self, heard: Callable[[UnsolicitedMessage], None]) -> None:
+    def listen(self, heard: Callable[[Unsolicited], None]) -> None:
         """It says nothing unasked."""
 
 

@@ -15,6 +15,7 @@ from devicebus.drive import drive_async
 from devicebus.errors import BusError, MailboxBusyError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.master.access import DatagramReply, DatagramRequest
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import (
@@ -62,12 +63,12 @@ class BusClient:
         self._number = number
         self._queues = MailboxQueues()
 
-    def listen(self, notify: Callable[[UnsolicitedMessage], None]) -> None:
+    def listen(self, notify: Callable[[Unsolicited], None]) -> None:
         """Call *notify* with each message that a slave sends unasked."""
 
         def take(message: UnsolicitedMessage) -> None:
             if message.bus == self._number:
-                notify(message)
+                notify(message.message)
 
         self._link.on_unsolicited.append(take)
 

@@ -1,23 +1,21 @@
-"""What the control protocol can be asked for on buses, with what belongs to one connection.
+"""Methods of the control protocol for buses, with the state of one connection.
 
-These methods wait for slaves and for turns, and with them only the connection that asked.  When it
-ends, what it waits for is cancelled, and its open conversations are ended at the slaves too.
+These methods wait for slaves and for turns, and with them only the connection that called.  When it
+ends, its requests are cancelled, and its open conversations are ended at the slaves too.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from inspect import isawaitable
 from typing import Any
-
-import msgspec
 
 from devicebus.sim.spec import FaultKind
 from devicebus.wire.alstatus import AlState
-from eap.appliance import control_bus
+from eap.appliance import control_bus as words
 from eap.appliance.bus_request import BusReport
-from eap.appliance.control import ErrorCode, of_station, parameters
-from eap.appliance.control_bus import BusParameters, kind_of, reply_row, to_access, to_ask
+from eap.appliance.control import ErrorCode, of_station
 from eap.appliance.handover import PortName
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.bus.mailbox_queue import MailboxTurn
@@ -61,8 +59,8 @@ class Buses:
                 raise answer
         return found
 
-    def find(self, wanted: BusParameters) -> BusClient:
-        """Return the bus that is meant; raise ControlError that names those there are."""
+    def find(self, wanted: words.BusParameters) -> BusClient:
+        """Return the bus that parameters name; raise ControlError with the names there are."""
         station = of_station(wanted.station, self._stations)
         buses = [port.name for port in station.ports if port.kind is PortKind.BUS]
         client = self._clients.get(PortName(station.name, wanted.port))
@@ -75,7 +73,7 @@ class Buses:
         raise _unknown(f"station {station.name} has no port {wanted.port!r}; {known}{hint}")
 
     def segment(self, port: PortName) -> SegmentLink:
-        """Return who takes commands for a bus; raise ControlError if it is not simulated."""
+        """Return the link for commands to a bus; raise ControlError if it is not simulated."""
         try:
             return self._segments[port]
         except KeyError:
@@ -87,7 +85,7 @@ class _Held:
     """A conversation that a connection has open, with its turn."""
 
     def __init__(
-        self, turn: MailboxTurn, kind: MailboxType, opened: control_bus.BusOpenParameters
+        self, turn: MailboxTurn, kind: MailboxType, opened: words.BusOpenParameters
     ) -> None:
         self.turn = turn
         self.kind = kind
@@ -96,22 +94,24 @@ class _Held:
 
 
 class BusConnection:
-    """What one client does on buses; :meth:`close` when it leaves."""
+    """Use of buses by one client; :meth:`close` when it leaves."""
 
     def __init__(self, buses: Buses) -> None:
         self._buses = buses
         self._held: dict[int, _Held] = {}
         self._last = 0
-        self._methods: dict[str, Callable[[dict[str, Any]], Awaitable[Any]]] = {
-            "bus_describe": self._describe,
-            "bus_open": self._open,
-            "bus_ask": self._ask,
-            "bus_close": self._close,
-            "bus_transfer": self._transfer,
-            "bus_bring": self._bring,
-            "bus_fault": self._fault,
-            "bus_forget": self._forget,
-        }
+        self._methods = dict(
+            (
+                words.BUS_DESCRIBE.served_by(self._describe),
+                words.BUS_OPEN.served_by(self._open),
+                words.BUS_ASK.served_by(self._ask),
+                words.BUS_CLOSE.served_by(self._close),
+                words.BUS_TRANSFER.served_by(self._transfer),
+                words.BUS_BRING.served_by(self._bring),
+                words.BUS_FAULT.served_by(self._fault),
+                words.BUS_FORGET.served_by(self._forget),
+            )
+        )
 
     async def call(self, method: str, params: dict[str, Any]) -> Any:
         """Return the result of one of BUS_METHODS.
@@ -121,9 +121,10 @@ class BusConnection:
             BusError: the bus or a slave did not do it.
             EngineGoneError: there is no engine.
         """
-        return await self._methods[method](params)
+        result = self._methods[method](params)
+        return await result if isawaitable(result) else result
 
-    def opened(self, number: int) -> control_bus.BusOpenParameters | None:
+    def opened(self, number: int) -> words.BusOpenParameters | None:
         """Return how a conversation was opened, None if it is not open."""
         held = self._held.get(number)
         return held.opened if held is not None else None
@@ -133,21 +134,18 @@ class BusConnection:
         for number in list(self._held):
             self._abandon(number)
 
-    async def _describe(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control_bus.BusDescribeParameters)
+    async def _describe(self, wanted: words.BusDescribeParameters) -> BusReport:
         client = self._buses.find(wanted)
-        report = await (client.wait_up() if wanted.wait else client.describe())
-        return dict(msgspec.to_builtins(report))
+        return await (client.wait_up() if wanted.wait else client.describe())
 
-    async def _open(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control_bus.BusOpenParameters)
+    async def _open(self, wanted: words.BusOpenParameters) -> words.OpenConversation:
         client = self._buses.find(wanted)
-        if len(self._held) >= control_bus.MAX_CONVERSATIONS:
-            reason = f"this connection has {control_bus.MAX_CONVERSATIONS} conversations open"
+        if len(self._held) >= words.MAX_CONVERSATIONS:
+            reason = f"this connection has {words.MAX_CONVERSATIONS} conversations open"
             raise ControlError(f"{reason}, which is the limit", code=ErrorCode.BUSY)
-        kind = kind_of(wanted.protocol)
+        kind = words.kind_of(wanted.protocol)
         try:
-            async with asyncio.timeout(control_bus.TURN_S):
+            async with asyncio.timeout(words.TURN_S):
                 turn = await client.open_turn(wanted.slave, kind, id(self))
         except TimeoutError:
             reason = f"slave {wanted.slave}: others talk {kind.name} with it all the while"
@@ -155,53 +153,44 @@ class BusConnection:
         self._last += 1
         self._held[self._last] = _Held(turn, kind, wanted)
         self._begin_idle(self._last)
-        return {"conversation": self._last}
+        return words.OpenConversation(self._last)
 
-    async def _ask(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control_bus.BusAskParameters)
+    async def _ask(self, wanted: words.BusAskParameters) -> words.MailboxData:
         held = self._of(wanted.conversation)
-        request = to_ask(held.kind, wanted)
+        request = words.to_request(held.kind, wanted)
         self._end_idle(held)
         try:
             message = await held.turn.exchange(request)
         finally:
             self._begin_idle(wanted.conversation)
-        return {"data": message.data.hex()}
+        return words.MailboxData(message.data.hex())
 
-    async def _close(self, params: dict[str, Any]) -> dict[str, Any]:
-        number = parameters(params, control_bus.BusCloseParameters).conversation
-        self._of(number)
-        self._drop(number).turn.close()
-        return {"closed": number}
+    def _close(self, wanted: words.BusCloseParameters) -> words.ClosedConversation:
+        self._of(wanted.conversation)
+        self._drop(wanted.conversation).turn.close()
+        return words.ClosedConversation(wanted.conversation)
 
-    async def _transfer(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control_bus.BusTransferParameters)
+    async def _transfer(self, wanted: words.BusTransferParameters) -> words.DatagramReplies:
         client = self._buses.find(wanted)
-        accesses = [to_access(row) for row in wanted.datagrams]
-        replies = await client.transfer(accesses)
-        return {"replies": [reply_row(reply) for reply in replies]}
+        replies = await client.transfer([words.to_datagram(row) for row in wanted.datagrams])
+        return words.DatagramReplies([words.reply_row(reply) for reply in replies])
 
-    async def _bring(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control_bus.BusBringParameters)
-        client = self._buses.find(wanted)
-        await client.bring(wanted.slave, AlState[wanted.state])
-        return {"state": wanted.state}
+    async def _bring(self, wanted: words.BusBringParameters) -> words.ReachedState:
+        await self._buses.find(wanted).bring(wanted.slave, AlState[wanted.state])
+        return words.ReachedState(wanted.state)
 
-    async def _fault(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control_bus.BusFaultParameters)
+    async def _fault(self, wanted: words.BusFaultParameters) -> words.Done:
         segment = self._buses.segment(self._buses.find(wanted).port)
         _check_kind(wanted.command)
         try:
             await segment.command(wanted.command)
         except ValueError as exc:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
-        return {"ok": True}
+        return words.Done()
 
-    async def _forget(self, params: dict[str, Any]) -> dict[str, Any]:
-        wanted = parameters(params, control_bus.BusForgetParameters)
-        client = self._buses.find(wanted)
-        await client.forget()
-        return {"ok": True}
+    async def _forget(self, wanted: words.BusForgetParameters) -> words.Done:
+        await self._buses.find(wanted).forget()
+        return words.Done()
 
     def _of(self, number: int) -> _Held:
         try:
@@ -209,12 +198,12 @@ class BusConnection:
         except KeyError:
             raise _unknown(
                 f"no conversation {number} is open on this connection; one in which nothing is"
-                f" asked for {control_bus.IDLE_S:.0f} s is ended"
+                f" asked for {words.IDLE_S:.0f} s is ended"
             ) from None
 
     def _begin_idle(self, number: int) -> None:
         loop = asyncio.get_running_loop()
-        self._held[number].idle = loop.call_later(control_bus.IDLE_S, self._abandon, number)
+        self._held[number].idle = loop.call_later(words.IDLE_S, self._abandon, number)
 
     def _end_idle(self, held: _Held) -> None:
         if held.idle is not None:

@@ -18,12 +18,13 @@ from typing import NamedTuple, TypeAlias
 from msgspec.structs import replace
 
 from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.wire.sii import SiiProtocol
 from eap.aoe.access import AccessList, host_of
 from eap.aoe.ads_operation import Operation
 from eap.aoe.spec import DoorKind
 from eap.aoe.way import Way
-from eap.appliance.bus_request import SlaveDescription, UnsolicitedMessage, no_mailbox
+from eap.appliance.bus_request import SlaveDescription, no_mailbox
 from eap.appliance.services.bus.bus_client import BusClient
 from eap.appliance.services.gateway.client_session import (
     ClientSession,
@@ -155,7 +156,7 @@ class MailboxGateway:
         self._tasks = TaskSet(f"gateway {settings.name}")
         self._count = 0
         self._listeners = EoeListeners()
-        bus.listen(self._take_unasked)
+        bus.listen(self._take_unsolicited)
 
     def start(self) -> None:
         """Take requests, again."""
@@ -411,9 +412,9 @@ class MailboxGateway:
                 )  # fmt: skip
                 session.close()
 
-    def _take_unasked(self, message: UnsolicitedMessage) -> None:
+    def _take_unsolicited(self, message: Unsolicited) -> None:
         """Send an Ethernet frame of a slave to the clients that talk EoE to it."""
-        if message.kind != MailboxType.EOE:
+        if message.type != MailboxType.EOE:
             return
         for listener in self._listeners.of(message.station, monotonic_ns()):
             self._encoder.send(listener.send, listener.address, MailboxType.EOE, message.data)

@@ -267,7 +267,7 @@ def test_what_comes_unasked_is_told_and_disturbs_no_request(line, box):
     line.elapse(2 * MS)
     box.look(line.now_ns)
     line.elapse(2 * MS)
-    assert line.heard == [(1001, MailboxType.VOE, b"news")]
+    assert line.heard == [Unsolicited(1001, MailboxType.VOE, b"news")]
     talker.unasked = [b"more"] * 3
     line.elapse(2 * MS)
     assert line.wait(start(line, box, vendor())) == VENDOR

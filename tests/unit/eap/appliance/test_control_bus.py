@@ -10,16 +10,17 @@ from devicebus.master.access import DatagramReply, DatagramRequest, fprd
 from devicebus.wire.datagram import Command
 from eap.appliance.control import parameters
 from eap.appliance.control_bus import (
+    BUS_TRANSFER,
     BusAskParameters,
-    ask_parameters,
     datagram_row,
     kind_of,
     protocol_of,
     reply_row,
-    to_access,
-    to_ask,
+    request_parameters,
+    to_datagram,
     to_octets,
     to_replies,
+    to_request,
 )
 from eap.codec.mailbox import MailboxType
 from eap.errors import ControlError
@@ -36,12 +37,12 @@ from eap.errors import ControlError
     ],
 )
 def test_step(ask):
-    wanted = parameters({"conversation": 1} | ask_parameters(ask), BusAskParameters)
-    assert to_ask(ask.type, wanted) == ask
+    wanted = parameters({"conversation": 1} | request_parameters(ask), BusAskParameters)
+    assert to_request(ask.type, wanted) == ask
 
 
 def test_times_are_rounded_up():
-    assert ask_parameters(MailboxRequest(MailboxType.COE, b"", timeout_ns=1))["timeout_ms"] == 1
+    assert request_parameters(MailboxRequest(MailboxType.COE, b"", timeout_ns=1))["timeout_ms"] == 1
 
 
 def test_protocols():
@@ -51,20 +52,21 @@ def test_protocols():
 
 def test_datagrams_and_replies():
     access = fprd(1001, 0x130, 6)
-    assert to_access(datagram_row(access)) == access
+    assert to_datagram(datagram_row(access)) == access
     row = (Command.FPWR, 1, 2, "ff", 0)
-    assert to_access(row) == DatagramRequest(Command.FPWR, 1, 2, b"\xff")
+    assert to_datagram(row) == DatagramRequest(Command.FPWR, 1, 2, b"\xff")
     replies = [DatagramReply(b"\1\2", 1, 2), DatagramReply(b"", 0)]
     assert to_replies([reply_row(each) for each in replies]) == replies
 
 
 def test_what_is_none():
     with pytest.raises(ControlError, match="99 is no command"):
-        to_access((99, 0, 0, "", 1))
+        to_datagram((99, 0, 0, "", 1))
     with pytest.raises(ControlError, match="'xy' is not pairs"):
         to_octets("xy")
-    for rows in ([(1, "xy", 1)], [1]):
-        with pytest.raises(BusError, match="no reply"):
-            to_replies(rows)
+    with pytest.raises(BusError, match="malformed reply"):
+        to_replies([(1, "xy", 1)])
+    with pytest.raises(ControlError, match="the answer to bus_transfer"):
+        BUS_TRANSFER.decode({"replies": [1]})
     with pytest.raises(ControlError, match="timeout_ms"):
         parameters({"conversation": 1, "request": "", "timeout_ms": 10**9}, BusAskParameters)

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from eap.appliance.bus_findings import FindingRow
+from eap.appliance.bus_status import FindingRow
 from eap.appliance.commands.bus_info import BusScan, BusStates, Diagnosis, EepromContent
 from eap.appliance.commands.bus_objects import (
     IdnElements,

@@ -4,8 +4,8 @@ import pytest
 
 from devicebus.master.findings import History
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_findings import history_of, report_findings
 from eap.appliance.bus_request import SlaveReport
+from eap.appliance.bus_status import history_of, report_findings
 from eap.appliance.engine.bus_report import report_bus
 from tests.support import enginebus
 from tests.support.cyclic import MS

@@ -186,7 +186,7 @@ def test_what_needs_no_reply_is_answered_when_it_is_sent(office):
 def test_what_a_slave_sent_unasked_is_told(office):
     office.handler.forward(0, Unsolicited(1001, MailboxType.EOE, b"frame"))
     message = msgspec.msgpack.decode(office.services.recv(100), type=EngineMessage)
-    assert message == UnsolicitedMessage(0, 1001, MailboxType.EOE, b"frame")
+    assert message == UnsolicitedMessage(0, Unsolicited(1001, MailboxType.EOE, b"frame"))
 
 
 def test_who_listens_gets_what_comes(office):

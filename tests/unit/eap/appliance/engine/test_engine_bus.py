@@ -7,7 +7,7 @@ import pytest
 
 from devicebus.master.master import Master
 from devicebus.wire.alstatus import AlState
-from eap.appliance.bus_findings import is_silent
+from eap.appliance.bus_status import is_silent
 from eap.appliance.engine.bus_report import report_bus
 from eap.appliance.engine.engine_bus import RETRY_NS, SILENT_RETRY_NS
 from eap.pd.spec import BusTarget

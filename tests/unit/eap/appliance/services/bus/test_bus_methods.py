@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
+import msgspec
 import pytest
 
 from devicebus.errors import BusError, MailboxTimeoutError
@@ -38,6 +39,13 @@ STATIONS = (
 )
 
 
+class Connection(BusConnection):
+    """A connection whose results are as JSON has them."""
+
+    async def call(self, method, params):
+        return msgspec.to_builtins(await super().call(method, params))
+
+
 class Scene:
     """The buses of an appliance, and the engine behind them."""
 
@@ -51,7 +59,7 @@ class Scene:
         self.buses = Buses(STATIONS, client, {PORT: self._segment_link})
 
     def connect(self):
-        return BusConnection(self.buses)
+        return Connection(self.buses)
 
     def close(self):
         for each in (self._link, self._segment_link, self.engine, self.segment):
@@ -255,7 +263,7 @@ def test_appliance_without_buses():
     async def scene():
         buses = Buses(STATIONS[1:], {}, {})
         assert await buses.reports(1) == {}
-        error = await refusal(BusConnection(buses), "bus_describe", station="right", port="bus0")
+        error = await refusal(Connection(buses), "bus_describe", station="right", port="bus0")
         assert "has no bus ports" in str(error)
 
     asyncio.run(scene())

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
+from devicebus.master.mailboxes import Unsolicited
 from eap.aoe.access import AccessList
 from eap.aoe.ads_operation import Read
 from eap.aoe.spec import AccessRule, AccessTarget
@@ -314,10 +315,10 @@ def test_ethernet_frames_of_a_slave_go_to_who_talks_to_it() -> None:
         task = desk.gateway.receive(frame, HERE, heard.append)
         assert task is not None
         await task
-        desk.engine.tell(UnsolicitedMessage(0, 1001, EOE, b"an Ethernet frame"))
-        desk.engine.tell(UnsolicitedMessage(0, 1001, COE, b"an emergency"))
-        desk.engine.tell(UnsolicitedMessage(0, 1002, EOE, b"of another slave"))
-        desk.engine.tell(UnsolicitedMessage(1, 1001, EOE, b"of another bus"))
+        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, EOE, b"an Ethernet frame")))
+        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, COE, b"an emergency")))
+        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1002, EOE, b"of another slave")))
+        desk.engine.tell(UnsolicitedMessage(1, Unsolicited(1001, EOE, b"of another bus")))
         await desk.ask(COE, 1001, VENDOR)
         (back,) = heard
         header, body = decode_frame(back)

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from eap.appliance.bus_request import BusReport, SlaveReport
-from eap.appliance.services.bus.bus_status import bus_document, bus_link
+from eap.appliance.bus_status import bus_document, bus_link
 
 
 def slave(state, station=1001, **more):
@@ -41,7 +41,7 @@ def test_document():
     bus = bus_document(report, 100.0)["bus"]
     assert (bus["is_up"], bus["fault"], bus["cycles"], bus["wkc_errors"]) == (True, "", 7, 1)
     assert (bus["lost"], bus["late"], bus["skipped"], bus["trip_us"]) == (2, 3, 4, 1)
-    assert bus["frames"] == {
+    assert msgspec.to_builtins(bus["frames"]) == {
         "sent": 90,
         "received": 80,
         "late": 5,
