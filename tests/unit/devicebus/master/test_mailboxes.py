@@ -16,6 +16,7 @@ from devicebus.errors import (
 )
 from devicebus.mailbox import coe_client, foe_client
 from devicebus.mailbox.conversation import MailboxRequest
+from devicebus.master.mailboxes import Unsolicited
 from devicebus.sim.spec import EntrySpec, FileSpec, MailboxSpec, ObjectSpec
 from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxHeader, MailboxType
