@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import msgspec
@@ -318,5 +318,10 @@ def test_an_image_whose_engine_died_while_it_was_replaced_is_found(
         fresh.take_name(path)  # and then the engine was killed
         fresh.close()
         with running(path, spec(VariableSpec("extra", "INT"))):
-            time.sleep(0.2)
-            assert station["extra"] == 0
+
+            def is_found() -> bool:
+                with suppress(ImageError):
+                    return station["extra"] == 0
+                return False
+
+            wait_until(is_found)

@@ -21,7 +21,7 @@ from eap.errors import ControlError, TornReadError
 from eap.net.connections import Activity, CloseReason, Limits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
-from tests.support.eventually import eventually
+from tests.support.eventually import eventually, settle
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -323,11 +323,12 @@ class Slow:
     def __init__(self) -> None:
         self.outcomes = []
         self.begun = asyncio.Event()
+        self.go_on = asyncio.Event()
 
     async def wait(self):
         self.begun.set()
         try:
-            await asyncio.sleep(0.2)
+            await self.go_on.wait()
         except asyncio.CancelledError:
             self.outcomes.append("cancelled")
             raise
@@ -349,7 +350,7 @@ def test_who_leaves_is_not_waited_for(files, rest):
             serving = asyncio.ensure_future(serve_client(server, theirs))
             ours.sendall(STATUS + rest)
             await slow.begun.wait()
-        await asyncio.wait_for(serving, 0.1)
+        await asyncio.wait_for(serving, 10)
         assert slow.outcomes == ["cancelled"]
 
     asyncio.run(talk())
@@ -363,7 +364,11 @@ def test_who_only_stops_sending_gets_answers(files):
         with ours:
             ours.sendall(STATUS)
             ours.shutdown(socket.SHUT_WR)
-            await asyncio.wait_for(serve_client(ControlServer(methods, NO_BUSES), theirs), 5)
+            serving = asyncio.ensure_future(serve_client(ControlServer(methods, NO_BUSES), theirs))
+            await slow.begun.wait()
+            await settle()
+            slow.go_on.set()
+            await asyncio.wait_for(serving, 10)
             assert ours.recv(100) == b'{"v":1,"id":1,"result":{}}\n'
         assert slow.outcomes == ["answered"]
 

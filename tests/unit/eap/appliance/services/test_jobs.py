@@ -94,7 +94,7 @@ def test_there_is_a_limit(monkeypatch):
     monkeypatch.setattr(module, "MAX_WAITING", 1)
 
     async def script(jobs):
-        begun = asyncio.ensure_future(jobs.do(lambda: asyncio.sleep(60)))
+        begun = asyncio.ensure_future(jobs.do(asyncio.Event().wait))
         await asyncio.sleep(0)
         waiting = asyncio.ensure_future(jobs.do(lambda: asyncio.sleep(0)))
         await asyncio.sleep(0)

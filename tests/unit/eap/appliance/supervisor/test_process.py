@@ -20,6 +20,7 @@ from eap.appliance.supervisor.sockets import SharedSockets
 from eap.config.load import Plant
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec
+from tests.support.eventually import wait_until
 
 DEMO = Path(__file__).parents[5] / "config" / "demo.yaml"
 
@@ -99,13 +100,15 @@ def test_a_segment_that_cannot_start_ends_all_with_its_exit_code(tmp_path, stati
 
 def end_when_all_run(folder: ApplianceFolder) -> None:
     """Ask this process to end as soon as engine and services run."""
-    deadline_s = time.monotonic() + 60
-    while time.monotonic() < deadline_s:
-        time.sleep(0.02)
+
+    def do_all_run() -> bool:
         processes = (folder.read_info().engine, folder.read_info().services)
-        if all(each.pid and not each.step for each in processes):
-            break
-    os.kill(os.getpid(), signal.SIGTERM)
+        return all(each.pid and not each.step for each in processes)
+
+    try:
+        wait_until(do_all_run, timeout_s=60)
+    finally:
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 @pytest.mark.net

@@ -14,7 +14,7 @@ from eap.appliance.services.device.sources import SourcePlayer, fit, play_source
 from eap.codec import datatypes
 from eap.errors import WriterConflictError
 from eap.pd.spec import CsvSource, HostSource, Measure, Writer
-from tests.support.eventually import eventually
+from tests.support.eventually import elapse, eventually, settle
 from tests.unit.eap.appliance.conftest import left
 
 
@@ -116,15 +116,16 @@ def test_other_sources_take_over_and_the_same_ones_go_on(images, tmp_path):
             task = group.create_task(player.serve())
             await wait_for(lambda value: value >= 10)
             player.change(playing("a", cycle_us=20_000))
-            await asyncio.sleep(0.05)
-            assert image.image.read("load") >= 10  # not from the start again
+            seen = []
+            await wait_for(lambda value: seen.append(value) or value >= 12)
+            assert min(seen) >= 10  # not from the start again
             player.change(playing("b"))
             await wait_for(lambda value: value == 7)
             player.change(msgspec.structs.replace(left(), sources=()))
-            await asyncio.sleep(0.02)
+            await settle()
             with image.image.writing(Writer.SERVICES):
                 image.image.write("load", 0)
-            await asyncio.sleep(0.05)
+            await elapse(1)
             assert image.image.read("load") == 0
             task.cancel()
 

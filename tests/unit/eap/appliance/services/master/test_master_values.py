@@ -36,7 +36,7 @@ from eap.codec.mailbox import MailboxType
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.master1100 import MasterLive
-from tests.support.eventually import elapse, eventually
+from tests.support.eventually import elapse, eventually, settle
 from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 
@@ -142,7 +142,7 @@ def test_view_requests_states_and_sets_loops() -> None:
             with pytest.raises(SdoAbortError, match=f"{value:#x} asks for no AL state"):
                 view.write_slave(1001, MasterLive.AL_CONTROL, value)
         view.write_slave(1004, MasterLive.LINK_CONTROL, 0x0C)
-        await asyncio.sleep(0.01)
+        await settle()
         await view.refresh(DIAGNOSIS)
         assert view.of_diagnosis(1004, MasterLive.LINK_CONTROL) == 0x0C
         view.write_slave(1004, MasterLive.FIXED_LINKS, 1)
