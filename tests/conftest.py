@@ -2,8 +2,9 @@
 
 Tests marked ``net`` open sockets and start processes, on fixed addresses; they come after all
 others.  Under xdist, where each file has one worker (``--dist loadfile``), every worker has a
-network namespace of its own where it may make one.  Tests marked ``quiet`` judge time: the other
-workers wait while one of them runs, as they do for each ``net`` test without namespaces.
+network namespace of its own where it may make one; without, only one file of ``net`` tests runs at
+a time.  Tests marked ``quiet`` judge time: the other workers wait while one of them is called, not
+while its fixtures are made.
 """
 
 from __future__ import annotations
@@ -52,6 +53,8 @@ _CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_SYS_ADMIN": 21}
 
 _CLONE_NEWNET = 0x40000000
 
+_TURN_S = 300.0
+"""Longest time for which a quiet test waits until the others have finished theirs."""
 _TURN = os.open(__file__, os.O_RDONLY)  # only ever locked, as is the next one
 _QUEUE = os.open(Path(__file__).parent / "support" / "eventually.py", os.O_RDONLY)
 
@@ -135,6 +138,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for marker, reason in missing.items():
             if reason is not None and item.get_closest_marker(marker) is not None:
                 item.add_marker(pytest.mark.skip(reason=reason))
+        if _is_quiet(item):
+            own = item.get_closest_marker("timeout")
+            limit_s = own.args[0] if own else float(item.config.getini("timeout"))
+            item.add_marker(pytest.mark.timeout(limit_s + _TURN_S), append=False)
     items.sort(key=_is_net)
 
 
@@ -149,29 +156,68 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(20_000, 20, 20)
 
 
+class _Turns:
+    """Locks between the workers of xdist: many tests at a time, or one that is alone."""
+
+    def __init__(self) -> None:
+        self._is_alone = False
+
+    def take(self, *, alone: bool) -> None:
+        """Wait until a test may run beside others, or *alone*; one that is alone remains so."""
+        if self._is_alone:
+            return
+        # A worker that waits to be alone holds the queue, so that no further test begins meanwhile.
+        fcntl.flock(_QUEUE, fcntl.LOCK_EX)
+        fcntl.flock(_TURN, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+        fcntl.flock(_QUEUE, fcntl.LOCK_UN)
+        self._is_alone = alone
+
+    def give_back(self) -> None:
+        """Let others run."""
+        fcntl.flock(_TURN, fcntl.LOCK_UN)
+        self._is_alone = False
+
+
+_TURNS = _Turns()
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Under xdist, let a test that judges time have the machine to itself.
+def pytest_runtest_protocol(
+    item: pytest.Item, nextitem: pytest.Item | None
+) -> Generator[None, object, object]:
+    """Under xdist, run beside other tests; without networks of their own, one file at a time.
 
     Outside pytest-timeout's wrapper, so that waiting for a turn costs no test its time.
     """
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return (yield)
-    # Who waits for the exclusive lock holds the queue, so that no further test begins meanwhile.
-    fcntl.flock(_QUEUE, fcntl.LOCK_EX)
-    fcntl.flock(_TURN, fcntl.LOCK_EX if _needs_machine(item) else fcntl.LOCK_SH)
-    fcntl.flock(_QUEUE, fcntl.LOCK_UN)
+    is_alone = _is_net(item) and not _HAS_OWN_NETWORK
+    _TURNS.take(alone=is_alone)
     try:
         return (yield)
     finally:
-        fcntl.flock(_TURN, fcntl.LOCK_UN)
+        # What the tests of a file share runs, on fixed addresses, until the last of them is over.
+        if not is_alone or nextitem is None or nextitem.path != item.path:
+            _TURNS.give_back()
 
 
-def _needs_machine(item: pytest.Item) -> bool:
-    """Tell whether nothing may run beside *item*: it judges time, or shares addresses."""
-    if item.get_closest_marker("quiet") is not None:
-        return True
-    return _is_net(item) and not _HAS_OWN_NETWORK
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Under xdist, let a test that judges time have the machine to itself."""
+    is_alone = _is_net(item) and not _HAS_OWN_NETWORK
+    if "PYTEST_XDIST_WORKER" not in os.environ or not _is_quiet(item) or is_alone:
+        return (yield)
+    _TURNS.give_back()
+    _TURNS.take(alone=True)
+    try:
+        return (yield)
+    finally:
+        _TURNS.give_back()
+        _TURNS.take(alone=False)
+
+
+def _is_quiet(item: pytest.Item) -> bool:
+    return item.get_closest_marker("quiet") is not None
 
 
 def _is_net(item: pytest.Item) -> bool:

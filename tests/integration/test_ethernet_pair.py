@@ -57,11 +57,14 @@ def pair(
 
 def quiet(appliance: Appliance, station: str) -> dict[str, Any]:
     """Return the subscription once no more frames come: its counters fit each other exactly."""
-    before = appliance.rx(station, "peer")
-    while (rx := appliance.rx(station, "peer"))["received"] != before["received"]:
-        before = rx
-        time.sleep(0.02)
-    return rx
+    seen: list[dict[str, Any]] = []
+
+    def is_calm() -> bool:
+        seen.append(appliance.rx(station, "peer"))
+        return len({rx["received"] for rx in seen[-20:]}) == 1 and len(seen) >= 20
+
+    wait_until(is_calm)
+    return seen[-1]
 
 
 @pytest.mark.quiet

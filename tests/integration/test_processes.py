@@ -322,7 +322,7 @@ def test_tcp_connections_go_where_their_first_frame_belongs(appliance: Appliance
     assert counted("right") == {"tcp_off": 1}
     with socket.create_connection(LEFT) as connection:
         connection.sendall(FOREIGN_PD[:1])
-        time.sleep(0.1)
+        time.sleep(0.1)  # so that the first octet comes alone
         connection.sendall(FOREIGN_PD[1:] + FOREIGN_PD)
         wait_until(lambda: counted()["wrong_publisher"] + counted()["unknown_id"] == 2)
         connection.sendall(MAILBOX)
