@@ -22,12 +22,12 @@ def main() -> int:
     options = parser.parse_args()
     try:
         with eap.attach(STATION) as station:
-            for _ in range(options.cycles):
+            for count in range(options.cycles):
                 values = station.read_all()
                 if values["left_running"]:
                     station["setpoint"] = (values["setpoint"] + 1) % 1000
                 cycle = station.wait_cycle()
-                if cycle % 50 == 0:
+                if count % 50 == 0:
                     print(f"cycle {cycle}: setpoint {values['setpoint']}")
     except EapError as exc:
         print(exc, file=sys.stderr)
