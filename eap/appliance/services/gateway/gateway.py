@@ -388,8 +388,11 @@ class MailboxGateway:
         return bus.slaves.get(station, Cause.NO_SLAVE) if bus.is_up else Cause.BUS_DOWN
 
     def _begin_local(self, key: SessionKey, slave: SlaveDescription) -> ClientSession:
-        access = LocalSlave(self._bus, slave, key.way, turn_s=self.settings.answer_s)
-        return self._begin(key, access, MailboxSizes(slave.to_slave, slave.to_master))
+        sizes = MailboxSizes(slave.to_slave, slave.to_master)
+        return self._begin(key, self._open_local(slave, key.way), sizes)
+
+    def _open_local(self, slave: SlaveDescription, way: Way) -> LocalSlave:
+        return LocalSlave(self._bus, slave, way, turn_s=self.settings.answer_s)
 
     def _begin(self, key: SessionKey, access: SlaveAccess, sizes: MailboxSizes) -> ClientSession:
         answer_s = self.settings.answer_s
@@ -422,10 +425,8 @@ class MailboxGateway:
     async def _serve_dialect(self, request: GatewayRequest, kind: MailboxType) -> None:
         address, start_ns = request.header.address, monotonic_ns()
         destination = self._addresses.resolve(address, ())
-        if isinstance(
-            destination, GroupAddress
-        ):  # the dialect knows none: no slave has the address
-            destination = SlaveAddress(address)
+        if isinstance(destination, GroupAddress):
+            destination = SlaveAddress(address)  # the dialect has no groups: no slave is there
         answer, cause = await self._dialect.answer(
             kind, request.body, request.way, self._target(destination),
             partial(self._dialect_target, kind, destination, request.way),
@@ -445,10 +446,7 @@ class MailboxGateway:
                 slave = await self._find(station)
                 if isinstance(slave, Cause):
                     return slave
-                turn_s = self.settings.answer_s
-                return find_refusal(kind, b"", slave) or LocalSlave(
-                    self._bus, slave, way, turn_s=turn_s
-                )
+                return find_refusal(kind, b"", slave) or self._open_local(slave, way)
         return Cause.NO_SLAVE
 
 

@@ -142,6 +142,31 @@ def test_a_step_out_of_order(opcode: FoeOpcode, number: int, code: FoeErrorCode)
     play(scene)
 
 
+def test_file_codec_reader_that_is_busy_gets_its_packet_again() -> None:
+    async def scene(bus: Bus, engine: FakeEngine) -> None:
+        desk = Files(bus)
+        await desk.write(CONTENT[: 3 * ROOM])
+        first = await desk.ask(READ, 0, b"a.bin")
+        assert await desk.once(BUSY, 0) == first
+        second = await desk.ask(ACK, 1)
+        assert second == (DATA, 2, CONTENT[ROOM : 2 * ROOM])
+        assert (await desk.ask(ACK, 1))[:2] == (ERROR, FoeErrorCode.PACKET_NUMBER)
+        assert not desk.codec.is_running
+
+    play(scene)
+
+
+def test_file_codec_ends_a_transfer_with_an_unknown_opcode() -> None:
+    async def scene(bus: Bus, engine: FakeEngine) -> None:
+        desk = Files(bus)
+        await desk.ask(READ, 0, b"a.bin")
+        (answer,) = await desk.codec.answer(bytes.fromhex("09 00 00000000"))
+        assert answer == encode_message(ERROR, FoeErrorCode.ILLEGAL)
+        assert not desk.codec.is_running
+
+    play(scene)
+
+
 def test_a_packet_longer_than_the_mailbox() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         desk = Files(bus)

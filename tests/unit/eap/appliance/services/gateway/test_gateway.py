@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Awaitable, Callable
 
 import pytest
+from msgspec.structs import replace
 
 from devicebus.master.mailboxes import Unsolicited
 from eap.aoe.access import AccessList
@@ -65,6 +66,7 @@ class Desk:
 
     Attributes:
         engine: That the slaves belong to.
+        bus: The client of that bus.
     """
 
     def __init__(self, bus: str, rules: tuple[AccessRule, ...], settings: Settings) -> None:
@@ -73,8 +75,9 @@ class Desk:
         self.engine = FakeEngine(FakeBus(LoopBus(bus)))
         self._link = EngineLink(self.engine.services)
         turns = itertools.cycle((False, True))  # has to be waited for, and has not
+        self.bus = BusClient(self._link, 0, PORT)
         self.gateway = MailboxGateway(
-            BusClient(self._link, 0, PORT),
+            self.bus,
             lambda: MasterSession(MASTER, settings.room, nothing, lambda index: next(turns)),
             lambda: AccessList(rules),
             settings,
@@ -265,6 +268,33 @@ def test_all_slaves_answer_for_themselves() -> None:
         }
         assert set(answers) == {1001, 1002, 1003}
         assert all(each.startswith("003043181001") for each in answers.values())
+
+    play(scene, bus="coe")
+
+
+def test_all_slaves_of_a_bus_that_is_down_are_answered_for() -> None:
+    async def scene(desk: Desk) -> None:
+        desk.engine.buses[0].is_up = False
+        desk.engine.say_hello()
+        ((header, body),) = await desk.ask(COE, 0xFFFF, VENDOR)
+        assert (header.address, body[-4:]) == (0xFFFF, bytes.fromhex("00000206"))
+        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
+
+    play(scene, bus="coe")
+
+
+def test_session_begins_anew_when_a_slave_has_another_mailbox() -> None:
+    upload = "0020 40 0180 00 00000000"
+
+    async def scene(desk: Desk) -> None:
+        assert (await desk.one(COE, 1003, upload)).startswith("00 30 41")
+        view = desk.bus.view
+        slaves = dict(view.latest.slaves)
+        slaves[1003] = replace(slaves[1003], to_slave=64, to_master=64)
+        view.latest = view.latest._replace(slaves=slaves)
+        answer = bytes.fromhex(await desk.one(COE, 1003, upload))
+        assert len(answer) == 64 - 6
+        assert len(desk.gateway.transfers()) == 1
 
     play(scene, bus="coe")
 
