@@ -35,7 +35,6 @@ from eap.appliance.services.gateway.client_session import (
     refusals,
 )
 from eap.appliance.services.gateway.dialect_handler import DialectHandler, DialectTarget
-from eap.appliance.services.gateway.eoe_listeners import EoeListeners
 from eap.appliance.services.gateway.file_codec import FileCodec
 from eap.appliance.services.gateway.guard import (
     MASTER_PORT,
@@ -46,7 +45,7 @@ from eap.appliance.services.gateway.guard import (
     result_of,
 )
 from eap.appliance.services.gateway.master_session import MasterSession
-from eap.appliance.services.gateway.message_codecs import codec_for
+from eap.appliance.services.gateway.message_codecs import EoeListeners, codec_for
 from eap.appliance.services.gateway.reply_encoder import GatewayRequest, ReplyEncoder, Send
 from eap.appliance.services.slaves.access import SlaveAccess
 from eap.appliance.services.slaves.local_slave import LocalSlave

@@ -1,15 +1,21 @@
 """SoE, VoE, AoE and EoE in front of a slave, for one client: nothing here lasts but fragments.
 
-A request in fragments is collected, and goes to the slave when it is whole.  EoE passes as it is.
+A request in fragments is collected, and goes to the slave when it is whole.  EoE passes as it is;
+the Ethernet frames of a slave name no client, so all that talk EoE to it get them, as the master
+that they stand for would.
 """
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable
 from time import monotonic_ns
+from typing import NamedTuple
 
 from devicebus.errors import SoeError
 from devicebus.mailbox.protocol import MailboxSizes
 from eap.aoe.fragment import Assembler, iter_fragments
+from eap.aoe.way import Way
 from eap.appliance.services.gateway.client_session import SessionCodec
 from eap.appliance.services.gateway.file_codec import FileCodec
 from eap.appliance.services.gateway.object_codec import ObjectCodec
@@ -23,6 +29,10 @@ from eap.gateway.refusal import GatewayError
 from eap.gateway.request_tracker import MemoryShare
 
 _INCOMPLETE = 0x08
+LISTENS_NS = 60_000_000_000
+"""For how long after its last message a client hears a slave."""
+MAX_LISTENERS = 8
+"""Of one slave."""
 MAX_WRITTEN = 0x10004
 """Octets of the longest list of SoE that is written in fragments."""
 _EOE_REQUESTS = frozenset(
@@ -187,6 +197,46 @@ class EthernetCodec(MessageCodec):
         except RemoteAccessError:
             raise GatewayError(Cause.NO_PROTOCOL) from None
         return [message.data] if expects_reply else []
+
+
+class EoeListener(NamedTuple):
+    """A client that talks EoE to a slave."""
+
+    address: int
+    """By which it calls the slave."""
+    send: Callable[[bytes], None]
+    until_ns: int
+
+
+class EoeListeners:
+    """The listeners of all slaves of a bus."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, OrderedDict[Way, EoeListener]] = {}
+
+    def note(
+        self, station: int, way: Way, address: int, send: Callable[[bytes], None], now_ns: int
+    ) -> None:
+        """Note that a client talks to a slave; the one that did so least lately makes room."""
+        of_slave = self._of.setdefault(station, OrderedDict())
+        of_slave[way] = EoeListener(address, send, now_ns + LISTENS_NS)
+        of_slave.move_to_end(way)
+        if len(of_slave) > MAX_LISTENERS:
+            of_slave.popitem(last=False)
+
+    def of(self, station: int, now_ns: int) -> list[EoeListener]:
+        """Return who hears a slave now."""
+        of_slave = self._of.get(station)
+        if of_slave is None:
+            return []
+        for way in [way for way, each in of_slave.items() if each.until_ns <= now_ns]:
+            del of_slave[way]
+        return [*of_slave.values()]
+
+    def forget(self, way: Way) -> None:
+        """Forget a client whose connection is closed."""
+        for of_slave in self._of.values():
+            of_slave.pop(way, None)
 
 
 _MESSAGES: dict[MailboxType, type[ElementCodec | VendorCodec | AdsCodec | EthernetCodec]] = {

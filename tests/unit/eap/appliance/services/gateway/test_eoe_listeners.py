@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eap.aoe.way import Way
-from eap.appliance.services.gateway.eoe_listeners import LISTENS_NS, MAX_LISTENERS, EoeListeners
+from eap.appliance.services.gateway.message_codecs import LISTENS_NS, MAX_LISTENERS, EoeListeners
 
 A, B = Way("udp:e", "10.0.0.1:1"), Way("udp:e", "10.0.0.2:1")
 

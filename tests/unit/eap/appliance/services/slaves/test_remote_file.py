@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 
 from eap.aoe.ads_operation import Read, ReadWrite
-from eap.appliance.services.slaves.remote_file import BLOCK, RemoteFile
+from eap.appliance.services.slaves.remote_slave import BLOCK, RemoteFile
 from eap.codec.ads import IndexGroup
 from tests.support import busads
 from tests.support.elsewhere import Bus
