@@ -24,8 +24,11 @@ from eap.appliance.services.routes.route_desk import RouteDesk
 from eap.appliance.services.routes.station_routes import StationRoutes
 from eap.appliance.services.routing.entrance import Entrance
 from eap.appliance.services.routing.link_watch import LinkWatch
-from eap.appliance.services.routing.mailbox_frames import FRAME_OVERHEAD
-from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake
+from eap.appliance.services.routing.mailbox_frames import (
+    FRAME_OVERHEAD,
+    ChannelCarrier,
+    MailboxIntake,
+)
 from eap.appliance.services.routing.mailbox_stream import LARGEST_FRAME, MailboxStreams
 from eap.appliance.services.routing.segment import Segment, SegmentCarrier
 from eap.appliance.services.routing.station_router import StationRouter

@@ -8,8 +8,7 @@ from typing import Any
 
 from eap.aoe.answer import AmsAnswer, response_to
 from eap.appliance.discards import Refusal
-from eap.appliance.services.ams.ams_connection import AmsConnection
-from eap.appliance.services.ams.ams_window import MAX_REQUESTS
+from eap.appliance.services.ams.ams_connection import MAX_REQUESTS, AmsConnection
 from eap.codec.ams import AmsHeader
 from eap.codec.amstcp import AmsTcpHeader, encode_with_prefix
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from eap.aoe.prober import PROBE_PORT
 from eap.appliance.services.routing.entrance import Entrance
-from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
+from eap.appliance.services.routing.mailbox_frames import ChannelCarrier
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
 from eap.errors import CodecError
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId

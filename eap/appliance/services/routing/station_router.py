@@ -17,30 +17,142 @@ Everything is called from the running loop; nothing that a peer sends raises.
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable
 from time import monotonic_ns
 
-from eap.aoe.access import AccessList
-from eap.aoe.action import Action, Forward, Reply, Trace
+from eap.aoe.access import AccessList, host_of
+from eap.aoe.action import Action, Forward, Outcome, Reply, Trace
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.judge import Limits
 from eap.aoe.judged import AuditEntry
 from eap.aoe.prober import Prober
-from eap.aoe.record import Record, Stats
+from eap.aoe.record import Record, Stats, reason_of
 from eap.aoe.report import ConnectionReport, Location, RouteReport
 from eap.aoe.restorer import Interruption
 from eap.aoe.router import Router
 from eap.aoe.routes import Route, RouteTable
 from eap.aoe.way import Door, Way
-from eap.appliance.services.routing.lanes import Lanes
+from eap.appliance.services.log_limits import caused_by
 from eap.appliance.services.routing.local_client import LOCAL_DOOR, LocalClient
-from eap.appliance.services.routing.service import Carrier, LocalRequest, Service
-from eap.appliance.services.routing.service_table import ServiceTable
-from eap.appliance.services.routing.timer import RouterTimer
-from eap.appliance.services.routing.trace_log import TraceLog
+from eap.appliance.services.routing.service import (
+    Carrier,
+    LocalRequest,
+    SerialQueues,
+    Service,
+    ServiceTable,
+)
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
+
+_SHORTEST_WAIT_S = 0.001
+_MOMENT_S = 0.02
+"""How late a time-out may be noticed."""
+
+
+class RouterTimer:
+    """Has something handled in time, from :meth:`start` to :meth:`stop`.
+
+    Args:
+        next_timeout: Returns when the next thing is due, in nanoseconds of the monotonic clock, or
+            None for never.
+        handle: Called then, or a bit earlier or later; it has the timer set again.
+    """
+
+    def __init__(self, next_timeout: Callable[[], int | None], handle: Callable[[], None]) -> None:
+        self._next_timeout = next_timeout
+        self._handle = handle
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._is_soon = False
+
+    def start(self) -> None:
+        """Begin, in the running loop."""
+        self._loop = asyncio.get_running_loop()
+        self.set()
+
+    def stop(self) -> None:
+        """Call nobody any more."""
+        self._loop = None
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def set(self) -> None:
+        """Call when the next thing is due."""
+        at_ns = self._next_timeout()
+        if at_ns is None or self._loop is None:
+            return
+        if self._timer is not None:
+            if self._is_soon or self._timer.when() <= at_ns / 1e9:
+                return
+            self._timer.cancel()
+        at_s = max(at_ns / 1e9, self._loop.time() + _SHORTEST_WAIT_S)
+        self._timer = self._loop.call_at(at_s, self._ring)
+
+    def set_soon(self) -> None:
+        """Call after a moment, as something may be due earlier than it was.
+
+        That is cheap; when exactly it is due is looked up then, and not for each packet.
+        """
+        if self._is_soon or self._loop is None:
+            return
+        self._is_soon = True
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_later(_MOMENT_S, self._ring)
+
+    def _ring(self) -> None:
+        self._timer = None
+        self._is_soon = False
+        self._handle()
+
+
+_LEVELS = {
+    Outcome.ANSWERED: logging.INFO,
+    Outcome.FAILED: logging.WARNING,
+    Outcome.DENIED: logging.WARNING,
+    Outcome.LOOP: logging.WARNING,
+    Outcome.LATE: logging.DEBUG,
+    Outcome.DROPPED: logging.DEBUG,
+    Outcome.INTERRUPTED: logging.WARNING,
+    Outcome.RESTORED: logging.INFO,
+}
+
+logger = logging.getLogger(__name__)
+
+
+class TraceLog:
+    """The lines of one *station*."""
+
+    def __init__(self, station: str) -> None:
+        self._station = station
+
+    def write(self, trace: Trace) -> None:
+        """Log what became of a packet."""
+        level = _LEVELS[trace.outcome]
+        if not logger.isEnabledFor(level):
+            return
+        host = "" if trace.came_by is None else host_of(trace.came_by)
+        door = "" if trace.came_by is None else trace.came_by.door
+        # Results inside an answer are in the text.
+        code = f" (0x{trace.error_code:x})" if trace.error_code else ""
+        extra = caused_by((self._station, *_cause(trace, host)), f"{self._station} {door} {host}")
+        logger.log(level, "%s: %s%s", self._station, trace.text, code, extra=extra)
+
+
+def _cause(trace: Trace, host: str) -> tuple[Hashable, ...]:
+    """Return what is equal for packets that met the same obstacle.
+
+    A hop that is down is one cause, whatever is asked by it, and by whom.  Elsewhere clients and
+    targets are told apart, and connections and AMS ports of clients are not.
+    """
+    reason = reason_of(trace)
+    if trace.outcome is Outcome.FAILED and trace.hop is not None:
+        return trace.outcome, trace.hop, trace.error_code, reason
+    header = trace.header
+    what = None if header is None else (header.target, header.target_port, header.command)
+    return trace.outcome, what, host, trace.error_code, reason
 
 
 class StationRouter:
@@ -92,7 +204,7 @@ class StationRouter:
         self._services = ServiceTable((net_id, *net_ids))
         for each in self._services.net_ids:
             self._router.add_device(each, self._services.ports(each))
-        self._lanes = Lanes(self._finish)
+        self._queues = SerialQueues(self._finish)
         self._client = LocalClient(self)
         self.add_door(LOCAL_DOOR, self._client)
         self._settling: dict[Way, tuple[int, asyncio.Event]] = {}
@@ -149,7 +261,7 @@ class StationRouter:
             await asyncio.Event().wait()
         finally:
             self._timer.stop()
-            await self._lanes.close()
+            await self._queues.close()
 
     def add_door(self, door: Door, carrier: Carrier) -> None:
         """Let packets come and go by *door*; raises ValueError if there is one of its name."""
@@ -226,7 +338,7 @@ class StationRouter:
     def connection_closed(self, door: str, connection: str) -> None:
         """Forget whom nobody can answer any more, and tell the services."""
         way = Way(door, connection)
-        self._lanes.forget(way)
+        self._queues.forget(way)
         self._services.client_gone(way)
         self._act(self._router.connection_closed(door, connection, monotonic_ns()))
 
@@ -313,14 +425,14 @@ class StationRouter:
 
     def _answer_now(self, header: AmsHeader, body: bytes, way: Way) -> tuple[AmsAnswer, int] | None:
         """Return what a service has at hand, unless its client waits there for something else."""
-        if self._lanes.has_work(way, header):
+        if self._queues.has_work(way, header):
             return None
         return self._services.answer_now(header, body)
 
     def _deliver(self, ticket: int, header: AmsHeader, body: bytes, way: Way) -> None:
         service = self._services.find(header)
         if service is not None:
-            self._lanes.put(ticket, service, LocalRequest(header, body, way))
+            self._queues.put(ticket, service, LocalRequest(header, body, way))
 
     def _finish(self, ticket: int, answer: AmsAnswer) -> None:
         self._act(self._router.receive_answer(ticket, answer, monotonic_ns()))

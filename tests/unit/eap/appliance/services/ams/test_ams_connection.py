@@ -16,7 +16,7 @@ import pytest
 
 from eap.aoe.answer import AmsAnswer, response_to
 from eap.appliance.discards import Refusal
-from eap.appliance.services.ams import ams_connection, ams_window
+from eap.appliance.services.ams import ams_connection
 from eap.appliance.services.ams.ams_connection import (
     AmsConnection,
     ClientAddresses,
@@ -176,7 +176,7 @@ def test_several_requests_are_under_way_and_answered_in_any_order() -> None:
 
 def test_who_sends_ahead_of_too_many_answers_is_not_read_from() -> None:
     async def script(reader, writer, taker):
-        count = ams_window.MAX_REQUESTS
+        count = ams_connection.MAX_REQUESTS
         for n in range(3 * count):
             writer.write(ask(b"x", n))
         await eventually(lambda: len(taker.waiting) == count)
@@ -338,7 +338,7 @@ def test_packets_that_wait_for_their_turn_are_not_slow() -> None:
     """The last one is not whole yet, which is our doing: we do not read."""
 
     async def script(reader, writer, taker):
-        count = ams_window.MAX_REQUESTS
+        count = ams_connection.MAX_REQUESTS
         writer.write(ask(b"x") * 3 * count)
         await eventually(lambda: len(taker.waiting) == count)
         await settle()

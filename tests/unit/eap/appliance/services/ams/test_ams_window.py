@@ -7,7 +7,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.appliance.services.ams.ams_window import (
+from eap.appliance.services.ams.ams_connection import (
     MAX_OCTETS,
     MAX_REQUESTS,
     AmsWindow,

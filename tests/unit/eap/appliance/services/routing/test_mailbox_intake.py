@@ -7,7 +7,7 @@ import pytest
 from eap.aoe.way import Door
 from eap.appliance.discards import Refusal
 from eap.appliance.services.gateway.door import GatewayDoor
-from eap.appliance.services.routing.mailbox_intake import ChannelCarrier, MailboxIntake
+from eap.appliance.services.routing.mailbox_frames import ChannelCarrier, MailboxIntake
 from tests.support import aoe
 from tests.support.routing import entrance, station
 

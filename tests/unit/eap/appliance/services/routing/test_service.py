@@ -9,7 +9,7 @@ import pytest
 from eap.appliance.services.ads.ads_service import AdsService
 from eap.appliance.services.ams.ams_door import AmsClients
 from eap.appliance.services.routing.local_client import LocalClient
-from eap.appliance.services.routing.mailbox_intake import ChannelCarrier
+from eap.appliance.services.routing.mailbox_frames import ChannelCarrier
 from eap.appliance.services.routing.mailbox_stream import MailboxStreams
 from eap.appliance.services.routing.service import Carrier, Service
 from tests.support.routing import KeepingCarrier, StubService

@@ -6,7 +6,7 @@ import pytest
 
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
-from eap.appliance.services.routing.service_table import ServiceTable
+from eap.appliance.services.routing.service import ServiceTable
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.ids import NetId
 from tests.support.routing import StubService, echo

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from time import monotonic_ns
 
-from eap.appliance.services.routing.timer import RouterTimer
+from eap.appliance.services.routing.station_router import RouterTimer
 from tests.support.eventually import elapse
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ import logging
 from eap.aoe.action import Outcome, Trace
 from eap.aoe.record import describe
 from eap.aoe.way import Way
-from eap.appliance.services.routing.trace_log import TraceLog
+from eap.appliance.services.routing.station_router import TraceLog
 from eap.codec.ams import AmsHeader
 from eap.ids import NetId
 

@@ -6,9 +6,8 @@ import asyncio
 
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.way import Way
-from eap.appliance.services.routing import lanes as lanes_module
-from eap.appliance.services.routing.lanes import Lanes
-from eap.appliance.services.routing.service import LocalRequest
+from eap.appliance.services.routing import service as service_module
+from eap.appliance.services.routing.service import LocalRequest, SerialQueues
 from eap.codec.ads import AdsError
 from eap.codec.ams import decode_packet
 from tests.support import aoe
@@ -41,51 +40,51 @@ async def settle() -> None:
 
 
 def play(script):
-    """Run ``script(lanes, slow)``; return the answers in their order."""
+    """Run ``script(queues, slow)``; return the answers in their order."""
     answers: list[tuple[int, AmsAnswer]] = []
 
     async def run():
-        lanes = Lanes(lambda ticket, answer: answers.append((ticket, answer)))
+        queues = SerialQueues(lambda ticket, answer: answers.append((ticket, answer)))
         try:
-            await script(lanes, Slow())
+            await script(queues, Slow())
         finally:
-            await lanes.close()
+            await queues.close()
 
     asyncio.run(run())
     return answers
 
 
 def test_what_is_at_hand_is_answered_at_once():
-    async def script(lanes, slow):
-        lanes.put(1, StubService(lambda each: AmsAnswer(each.body)), request(b"x"))
+    async def script(queues, slow):
+        queues.put(1, StubService(lambda each: AmsAnswer(each.body)), request(b"x"))
         assert asyncio.all_tasks() == {asyncio.current_task()}
 
     assert play(script) == [(1, AmsAnswer(b"x"))]
 
 
 def test_requests_of_a_client_to_a_port_keep_their_order_and_others_overtake():
-    async def script(lanes, slow):
+    async def script(queues, slow):
         quick = StubService(lambda each: AmsAnswer(each.body))
-        lanes.put(1, StubService(slow), request(b"1"))
-        lanes.put(2, StubService(slow), request(b"2"))
-        lanes.put(3, quick, request(b"3"))
-        lanes.put(4, quick, request(b"4", OTHER))
-        lanes.put(5, quick, request(b"5", port=1001))
+        queues.put(1, StubService(slow), request(b"1"))
+        queues.put(2, StubService(slow), request(b"2"))
+        queues.put(3, quick, request(b"3"))
+        queues.put(4, quick, request(b"4", OTHER))
+        queues.put(5, quick, request(b"5", port=1001))
         await settle()
         assert slow.begun == [b"1"]
         slow.gate.set()
         await settle()
-        lanes.put(6, quick, request(b"6"))
+        queues.put(6, quick, request(b"6"))
 
     assert [ticket for ticket, _ in play(script)] == [4, 5, 1, 2, 3, 6]
 
 
 def test_crowd_is_turned_away(monkeypatch):
-    monkeypatch.setattr(lanes_module, "MAX_WAITING", 2)
+    monkeypatch.setattr(service_module, "MAX_WAITING", 2)
 
-    async def script(lanes, slow):
+    async def script(queues, slow):
         for ticket in range(1, 5):
-            lanes.put(ticket, StubService(slow), request())
+            queues.put(ticket, StubService(slow), request())
         await settle()
         slow.gate.set()
         await settle()
@@ -95,14 +94,14 @@ def test_crowd_is_turned_away(monkeypatch):
 
 
 def test_octets_that_wait_are_limited_and_free_again(monkeypatch):
-    monkeypatch.setattr(lanes_module, "MAX_OCTETS", 100)
+    monkeypatch.setattr(service_module, "MAX_OCTETS", 100)
 
-    async def script(lanes, slow):
+    async def script(queues, slow):
         service = StubService(slow)
         for _ in range(3):
             for ticket in range(1, 4):
-                lanes.put(ticket, service, request(bytes(40)))
-            lanes.forget(ONE)
+                queues.put(ticket, service, request(bytes(40)))
+            queues.forget(ONE)
             slow.gate.set()
             await settle()
             slow.gate.clear()
@@ -115,10 +114,10 @@ def test_octets_that_wait_are_limited_and_free_again(monkeypatch):
 
 
 def test_what_waits_for_a_turn_is_forgotten_with_its_connection():
-    async def script(lanes, slow):
+    async def script(queues, slow):
         for ticket, way in ((1, ONE), (2, ONE), (3, OTHER), (4, OTHER)):
-            lanes.put(ticket, StubService(slow), request(str(ticket).encode(), way))
-        lanes.forget(ONE)
+            queues.put(ticket, StubService(slow), request(str(ticket).encode(), way))
+        queues.forget(ONE)
         slow.gate.set()
         await settle()
 
@@ -132,9 +131,9 @@ def test_service_that_fails_is_answered_for_and_the_next_request_served(caplog):
     async def fail_later(request):
         raise ZeroDivisionError
 
-    async def script(lanes, slow):
+    async def script(queues, slow):
         for ticket, reply in ((1, fail), (2, fail_later), (3, fail), (4, lambda _: AmsAnswer())):
-            lanes.put(ticket, StubService(reply), request())
+            queues.put(ticket, StubService(reply), request())
         await settle()
 
     answers = play(script)
@@ -149,8 +148,8 @@ def test_service_that_fails_is_answered_for_and_the_next_request_served(caplog):
 
 
 def test_what_is_under_way_at_the_end_is_given_up():
-    async def script(lanes, slow):
-        lanes.put(1, StubService(slow), request())
+    async def script(queues, slow):
+        queues.put(1, StubService(slow), request())
         await settle()
 
     assert play(script) == []

@@ -7,8 +7,8 @@ import socket
 
 import pytest
 
-from eap.appliance.services.routing import uplink
-from eap.appliance.services.routing.uplink import Uplinks
+from eap.appliance.services.routing import mailbox_stream
+from eap.appliance.services.routing.mailbox_stream import Uplinks
 from tests.support.eventually import eventually
 
 pytestmark = pytest.mark.net
@@ -16,9 +16,9 @@ pytestmark = pytest.mark.net
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(uplink, "FIRST_PAUSE_S", 0.01)
-    monkeypatch.setattr(uplink, "LONGEST_PAUSE_S", 0.02)
-    monkeypatch.setattr(uplink, "CONNECT_S", 0.5)
+    monkeypatch.setattr(mailbox_stream, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(mailbox_stream, "LONGEST_PAUSE_S", 0.02)
+    monkeypatch.setattr(mailbox_stream, "CONNECT_S", 0.5)
 
 
 class Hops:
@@ -160,7 +160,7 @@ def test_hop_without_a_route_is_tried_no_more():
 
 
 def test_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr(uplink, "_MAX_WAITING", 1000)
+    monkeypatch.setattr(mailbox_stream, "_MAX_WAITING", 1000)
 
     async def script(scene):
         assert scene.uplinks.send(scene.address, bytes(600)) is None
