@@ -1,7 +1,7 @@
-"""The mailbox of one slave: one request at a time, whoever asks, and nothing mixed up.
+"""The mailbox of one slave: one request at a time, from all requesters, and its counters.
 
-Conversations are queued (:mod:`lane`), written and read (:mod:`mailboxport`), and their replies
-told from late and unsolicited messages (:mod:`late`).
+Conversations are queued and their replies matched (:mod:`conversation_queue`), written and read
+(:mod:`mailboxport`).
 """
 
 from __future__ import annotations
@@ -25,10 +25,12 @@ from devicebus.errors import (
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.mailbox.counter import CounterWatch, next_counter
 from devicebus.mailbox.protocol import MailboxSizes
-from devicebus.master.lane import Job, Lanes
-from devicebus.master.late import is_unsolicited
+from devicebus.master.conversation_queue import (
+    ConversationQueue,
+    QueuedConversation,
+    is_unsolicited,
+)
 from devicebus.master.mailboxport import MailboxArea, MailboxPort, Posted
-from devicebus.master.mailstats import MailboxStats, Tally
 from devicebus.master.procedure import Procedure, Sleep
 from devicebus.master.runner import Runner
 from devicebus.master.task import Task
@@ -63,6 +65,90 @@ class Unsolicited(msgspec.Struct, frozen=True, array_like=True, gc=False):
 Report: TypeAlias = Callable[[Unsolicited], None]
 
 
+class MailboxStats(msgspec.Struct, frozen=True, kw_only=True):
+    """Counters since the slave is known; times in nanoseconds."""
+
+    sent: int
+    received: int
+    timeouts: int
+    errors: int
+    """Requests that ended in any other error."""
+    last_error: str
+    repeats: int
+    """Times that the slave was asked to repeat, because a reply was lost."""
+    duplicates: int
+    """Messages dropped because they repeat the one before."""
+    gaps: int
+    """Times that the slave's counter left numbers out."""
+    late: int
+    """Messages that answered nothing: their requests had timed out."""
+    unsolicited: int
+    malformed: int
+    latency_ns: int
+    """Of the last request, from writing it to its reply."""
+    mean_latency_ns: int
+    max_latency_ns: int
+
+
+class MailboxCounters:
+    """Counters of a mailbox, without those of the wire."""
+
+    __slots__ = (
+        "answered",
+        "errors",
+        "last_error",
+        "last_ns",
+        "late",
+        "malformed",
+        "max_ns",
+        "received",
+        "sent",
+        "timeouts",
+        "total_ns",
+        "unsolicited",
+    )  # fmt: skip
+
+    def __init__(self) -> None:
+        self.sent = self.received = self.timeouts = self.errors = 0
+        self.late = self.unsolicited = self.malformed = 0
+        self.answered = self.last_ns = self.max_ns = self.total_ns = 0
+        self.last_error = ""
+
+    def answer(self, latency_ns: int) -> None:
+        """Count a request that was answered."""
+        self.answered += 1
+        self.last_ns = latency_ns
+        self.total_ns += latency_ns
+        self.max_ns = max(self.max_ns, latency_ns)
+
+    def fail(self, error: EapError) -> None:
+        """Count a request that ended in an error."""
+        if isinstance(error, MailboxTimeoutError):
+            self.timeouts += 1
+        else:
+            self.errors += 1
+        self.last_error = str(error)
+
+    def stats(self, *, repeats: int, duplicates: int, gaps: int) -> MailboxStats:
+        """Return a snapshot, with the counters of the wire."""
+        return MailboxStats(
+            sent=self.sent,
+            received=self.received,
+            timeouts=self.timeouts,
+            errors=self.errors,
+            last_error=self.last_error,
+            repeats=repeats,
+            duplicates=duplicates,
+            gaps=gaps,
+            late=self.late,
+            unsolicited=self.unsolicited,
+            malformed=self.malformed,
+            latency_ns=self.last_ns,
+            mean_latency_ns=self.total_ns // self.answered if self.answered else 0,
+            max_latency_ns=self.max_ns,
+        )
+
+
 class Mailbox:
     """The mailbox of one slave that is in PREOP or above, or in BOOT.
 
@@ -79,13 +165,13 @@ class Mailbox:
         self._port = MailboxPort(station, area)
         self._runner = runner
         self._report = report
-        self._lanes = Lanes()
+        self._queue = ConversationQueue()
         self._watch = CounterWatch()
         self._counter = 0
         self._work: Task[None] | None = None
         self._is_busy = False
         self._is_open = True
-        self._tally = Tally()
+        self._counters = MailboxCounters()
 
     def converse(
         self,
@@ -106,14 +192,14 @@ class Mailbox:
             else:
                 task.finish(end.value)
             return task
-        job = Job(conversation, ask, f"slave {self.station}: {name}", requester)
+        job = QueuedConversation(conversation, ask, f"slave {self.station}: {name}", requester)
         refusal = self._refusal_of(ask, job.task.name)
         if refusal is not None:
             conversation.close()
             job.task.fail(refusal)
             return job.task
         job.ready_ns = now_ns + ask.delay_ns
-        self._lanes.add(job)
+        self._queue.add(job)
         self._begin(self._serve(), now_ns)
         return job.task
 
@@ -132,11 +218,11 @@ class Mailbox:
         self._is_open = False
         if self._work is not None:
             self._work.cancel()
-        self._lanes.fail_all("the slave's mailbox was closed, for it is set up anew")
+        self._queue.fail_all("the slave's mailbox was closed, for it is set up anew")
 
     def stats(self) -> MailboxStats:
         """Return a snapshot of the counters."""
-        return self._tally.stats(
+        return self._counters.stats(
             repeats=self._port.repeats, duplicates=self._watch.repeated, gaps=self._watch.gaps
         )
 
@@ -160,8 +246,8 @@ class Mailbox:
         """Serve conversations until none is left."""
         try:
             _, now_ns = yield Sleep(0)
-            while (ready_ns := self._lanes.next_ready()) is not None:
-                job = self._lanes.take(now_ns)
+            while (ready_ns := self._queue.next_ready()) is not None:
+                job = self._queue.take(now_ns)
                 if job is None:
                     _, now_ns = yield Sleep(min(ready_ns - now_ns, MAX_PAUSE_NS))
                 else:
@@ -178,7 +264,7 @@ class Mailbox:
                 yield from self._receive(None)
         yield from self._serve()
 
-    def _serve_one(self, job: Job) -> Procedure[int]:
+    def _serve_one(self, job: QueuedConversation) -> Procedure[int]:
         """Do what a conversation asks for next and resume it; return the time."""
         ask = job.ask
         _, start_ns = yield Sleep(0)
@@ -188,12 +274,12 @@ class Mailbox:
             message = yield from self._exchange(ask, start_ns + ask.timeout_ns)
         except EapError as exc:
             error = exc
-            self._tally.fail(exc)
+            self._counters.fail(exc)
             if isinstance(exc, MailboxTimeoutError) and not ask.listen:
-                self._lanes.judge(ask.type).expire(ask)
+                self._queue.matcher(ask.type).expire(ask)
         _, now_ns = yield Sleep(0)
         if error is None:
-            self._tally.answer(now_ns - start_ns)
+            self._counters.answer(now_ns - start_ns)
             answer = replace(message, at_ns=now_ns)
             _resume(job, lambda: job.conversation.send(answer), now_ns)
         else:
@@ -206,7 +292,7 @@ class Mailbox:
         if refusal is not None:
             raise refusal
         if ask.listen:
-            kept = self._lanes.judge(ask.type).take_kept(ask)
+            kept = self._queue.matcher(ask.type).take_kept(ask)
             if kept is not None:
                 return MailboxMessage(ask.type, kept)
         else:
@@ -214,7 +300,7 @@ class Mailbox:
             if early is not None:
                 return early
             if not ask.expects_reply:
-                self._lanes.judge(ask.type).took(ask.request)
+                self._queue.matcher(ask.type).took(ask.request)
                 return MailboxMessage(ask.type, b"")
         pause_ns = FIRST_PAUSE_NS
         is_full = True  # a quick slave has answered by now: look at once, and look only then
@@ -234,14 +320,14 @@ class Mailbox:
     def _send(self, ask: MailboxRequest, deadline_ns: int) -> Procedure[MailboxMessage | None]:
         """Write a request; return its reply if that came while it was written again."""
         self._counter = next_counter(self._counter)
-        address = self._lanes.judge(ask.type).next_address()
+        address = self._queue.matcher(ask.type).next_address()
         header = MailboxHeader(0, address, type=ask.type, counter=self._counter)
         message = encode_message(header, ask.request)
         maybe_there = False
         while True:
             posted = yield from self._post(message, deadline_ns)
             if posted.is_taken:
-                self._tally.sent += 1
+                self._counters.sent += 1
                 return None
             maybe_there = maybe_there or posted.is_ambiguous
             if (yield from self._is_full(deadline_ns)):
@@ -284,27 +370,27 @@ class Mailbox:
         octets = yield from self._port.fetch()
         if octets is None:
             return None
-        self._tally.received += 1
+        self._counters.received += 1
         try:
             header, body = decode_message(octets)
         except CodecError:
-            self._tally.malformed += 1
+            self._counters.malformed += 1
             return None
         data = bytes(body)
         if not self._watch.is_new(header.counter):
             return None
-        if ask is not None and self._lanes.judge(ask.type).answers(header, data, ask):
+        if ask is not None and self._queue.matcher(ask.type).answers(header, data, ask):
             if header.type == MailboxType.ERR:
                 raise self._refusal(data)
-            self._lanes.judge(ask.type).took(data)
+            self._queue.matcher(ask.type).took(data)
             return MailboxMessage(header.type, data, counter=header.counter)
-        if self._lanes.judge(header.type).keep(data):
+        if self._queue.matcher(header.type).keep(data):
             return None
         if is_unsolicited(header.type, data):
-            self._tally.unsolicited += 1
+            self._counters.unsolicited += 1
             self._report(Unsolicited(self.station, header.type, data))
         else:
-            self._tally.late += 1
+            self._counters.late += 1
         return None
 
     def _refusal(self, data: bytes) -> EapError:
@@ -319,7 +405,7 @@ class Mailbox:
         )
 
 
-def _resume(job: Job, action: Callable[[], MailboxRequest], now_ns: int) -> None:
+def _resume(job: QueuedConversation, action: Callable[[], MailboxRequest], now_ns: int) -> None:
     """Let a conversation go on, unless it was cancelled meanwhile."""
     if job.task.is_done:
         return

@@ -17,7 +17,7 @@ from devicebus.master.event import Event
 from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
 from devicebus.master.look import look_around
-from devicebus.master.mailstats import MailboxStats
+from devicebus.master.mailboxes import MailboxStats
 from devicebus.master.porterrors import PERIOD_NS as ERRORS_NS
 from devicebus.master.porterrors import PortErrorLog, look_at_errors
 from devicebus.master.procedure import Procedure

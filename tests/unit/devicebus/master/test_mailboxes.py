@@ -16,7 +16,7 @@ from devicebus.errors import (
 )
 from devicebus.mailbox import coe_client, foe_client
 from devicebus.mailbox.conversation import MailboxRequest
-from devicebus.master.mailboxes import Unsolicited
+from devicebus.master.mailboxes import MailboxCounters, Unsolicited
 from devicebus.sim.spec import EntrySpec, FileSpec, MailboxSpec, ObjectSpec
 from eap.codec.coe import CoeService, encode_message
 from eap.codec.mailbox import MailboxHeader, MailboxType
@@ -394,3 +394,17 @@ def test_hostile_answers_end_in_named_errors(line, box, octets, error, text):
         line.wait(start(line, box, vendor()))
     del server(line).receive_message
     assert line.wait(start(line, box, vendor())) == VENDOR
+
+
+def test_mailbox_counters_have_latencies_and_errors():
+    counters = MailboxCounters()
+    nothing = counters.stats(repeats=0, duplicates=0, gaps=0)
+    assert (nothing.mean_latency_ns, nothing.last_error) == (0, "")
+    for latency in (30, 10, 20):
+        counters.answer(latency)
+    counters.fail(MailboxTimeoutError("slow"))
+    counters.fail(BusError("odd"))
+    stats = counters.stats(repeats=1, duplicates=2, gaps=3)
+    assert (stats.latency_ns, stats.mean_latency_ns, stats.max_latency_ns) == (20, 20, 30)
+    assert (stats.timeouts, stats.errors, stats.last_error) == (1, 1, "odd")
+    assert (stats.repeats, stats.duplicates, stats.gaps) == (1, 2, 3)

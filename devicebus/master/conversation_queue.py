@@ -1,0 +1,237 @@
+"""Queue of the conversations with one slave, and the matching of its replies to their requests.
+
+Conversations of one protocol run one after the other, for a server knows only one transfer;
+requesters take turns.  Protocols take turns message by message, so that a long file transfer does
+not hold up an SDO.
+
+The counter of a reply says nothing about its request.  After a time-out requests therefore carry a
+tag in the address field, which slaves echo; with one that does not, the first reply that would
+have answered the request that timed out is taken for late.  A slave may send the next fragment of
+an answer before the master listens for it: it is kept.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Hashable, Iterator
+from typing import Any
+
+from devicebus.errors import MailboxClosedError
+from devicebus.mailbox.conversation import Conversation, MailboxRequest
+from devicebus.mailbox.match import answers, has_more, is_aoe_fragment
+from devicebus.master.task import Task
+from eap.codec.ams import AmsHeader, StateFlags
+from eap.codec.coe import CoeHeader, CoeService
+from eap.codec.eoe import EoeHeader, EoeType
+from eap.codec.mailbox import MailboxHeader, MailboxType
+from eap.codec.soe import SoeHeader, SoeOpcode
+from eap.errors import CodecError
+
+_COE_UNASKED = frozenset(
+    (CoeService.EMERGENCY, CoeService.TX_PDO, CoeService.TX_PDO_REMOTE_REQUEST)
+)
+_SOE_UNASKED = frozenset((SoeOpcode.NOTIFICATION, SoeOpcode.EMERGENCY))
+_TAG = 0x8000
+_TAGS = 0x3FFF
+MAX_KEPT = 64
+"""Fragments that are kept at most."""
+
+
+class ReplyMatcher:
+    """Tags of the requests of one protocol to one slave, and the matching of its messages."""
+
+    def __init__(self, kind: MailboxType) -> None:
+        self._kind = kind
+        self._kept: deque[bytes] = deque()
+        self._has_more = False
+        self._tag = 0
+        self._echoes = False
+        self._expired: list[MailboxRequest] = []
+        self._suspected = False
+
+    def next_address(self) -> int:
+        """Return the address field of the next request: 0 until something has timed out."""
+        self._suspected = self._has_more = False
+        self._kept.clear()
+        if self._tag:
+            self._tag = _TAG | (self._tag + 1 & _TAGS)
+        return self._tag
+
+    def expire(self, ask: MailboxRequest) -> None:
+        """Note that a request has timed out: its reply may still come."""
+        if not self._suspected:
+            self._expired.append(ask)
+        self._tag = self._tag or _TAG
+
+    def took(self, data: bytes) -> None:
+        """Note that a part was sent or received: what belongs to it may follow."""
+        self._has_more = has_more(self._kind, data)
+
+    def keep(self, data: bytes) -> bool:
+        """Keep a fragment that is not listened for yet; return whether the message is one."""
+        is_next = self._has_more and not is_unsolicited(self._kind, data)
+        if not is_next or len(self._kept) >= MAX_KEPT:
+            return False
+        self._kept.append(data)
+        self._has_more = has_more(self._kind, data)
+        return True
+
+    def take_kept(self, ask: MailboxRequest) -> bytes | None:
+        """Return the fragment that *ask* listens for, if it was kept."""
+        while self._kept:
+            data = self._kept.popleft()
+            if answers(ask.type, ask.request, data):
+                return data
+        return None
+
+    def answers(self, header: MailboxHeader, data: bytes, ask: MailboxRequest) -> bool:
+        """Return whether a message is the reply that *ask* waits for."""
+        if header.type == MailboxType.ERR or _fits(header, data, ask):
+            return not self._is_late(header, data)
+        self._forget(header, data)
+        return False
+
+    def _is_late(self, header: MailboxHeader, data: bytes) -> bool:
+        if not self._tag:
+            return False
+        if header.address == self._tag:
+            self._echoes = True
+            self._expired.clear()
+            return False
+        if self._echoes or header.address & _TAG:
+            return True
+        self._suspected = self._forget(header, data)
+        return self._suspected
+
+    def _forget(self, header: MailboxHeader, data: bytes) -> bool:
+        """Drop the request that timed out and has its reply now; return whether there is one."""
+        for ask in self._expired:
+            if header.type == MailboxType.ERR or _fits(header, data, ask):
+                self._expired.remove(ask)
+                return True
+        return False
+
+
+def _fits(header: MailboxHeader, data: bytes, ask: MailboxRequest) -> bool:
+    return header.type == ask.type and answers(ask.type, ask.request, data)
+
+
+def is_unsolicited(kind: MailboxType, data: bytes) -> bool:
+    """Return whether slaves send this kind of message unasked; any other that comes so is late."""
+    try:
+        match kind:
+            case MailboxType.COE:
+                return CoeHeader.decode(data).service in _COE_UNASKED
+            case MailboxType.SOE:
+                return SoeHeader.decode(data).opcode in _SOE_UNASKED
+            case MailboxType.EOE:
+                return EoeHeader.decode(data).type == EoeType.FRAGMENT
+            case MailboxType.AOE:
+                is_response = AmsHeader.decode(data).state_flags & StateFlags.RESPONSE
+                return not is_response and not is_aoe_fragment(data)
+    except CodecError:
+        return False
+    return kind is MailboxType.VOE
+
+
+class QueuedConversation:
+    """A conversation that was started.
+
+    Attributes:
+        ask: Its next request.
+        ready_ns: Earliest time for it.
+    """
+
+    __slots__ = ("ask", "conversation", "ready_ns", "requester", "task")
+
+    def __init__(
+        self, conversation: Conversation[Any], ask: MailboxRequest, name: str, requester: Hashable
+    ) -> None:
+        self.conversation = conversation
+        self.ask = ask
+        self.ready_ns = 0
+        self.requester = requester
+        self.task: Task[Any] = Task(name, conversation.close)
+
+
+class ProtocolQueue:
+    """The conversations of one protocol with one slave; *matcher* matches their replies."""
+
+    def __init__(self, kind: MailboxType) -> None:
+        self.matcher = ReplyMatcher(kind)
+        self.active: QueuedConversation | None = None
+        self._waiting: dict[Hashable, deque[QueuedConversation]] = {}
+
+    def add(self, job: QueuedConversation) -> None:
+        """Queue a conversation."""
+        self._waiting.setdefault(job.requester, deque()).append(job)
+        self.advance()
+
+    def advance(self) -> None:
+        """Begin the conversation of the next requester if the last one is over."""
+        if self.active is not None and not self.active.task.is_done:
+            return
+        self.active = None
+        while self._waiting and self.active is None:
+            requester = next(iter(self._waiting))
+            jobs = self._waiting.pop(requester)
+            job = jobs.popleft()
+            if jobs:
+                self._waiting[requester] = jobs
+            if not job.task.is_done:
+                self.active = job
+
+    def __iter__(self) -> Iterator[QueuedConversation]:
+        if self.active is not None:
+            yield self.active
+        for jobs in self._waiting.values():
+            yield from jobs
+
+
+class ConversationQueue:
+    """All conversations with one slave."""
+
+    def __init__(self) -> None:
+        self._queues: dict[MailboxType, ProtocolQueue] = {}
+
+    def add(self, job: QueuedConversation) -> None:
+        """Queue a conversation."""
+        self._queue(job.ask.type).add(job)
+
+    def matcher(self, kind: MailboxType) -> ReplyMatcher:
+        """Return the matcher for the replies of a protocol."""
+        return self._queue(kind).matcher
+
+    def _queue(self, kind: MailboxType) -> ProtocolQueue:
+        return self._queues.setdefault(kind, ProtocolQueue(kind))
+
+    def take(self, now_ns: int) -> QueuedConversation | None:
+        """Return the conversation that goes on now, if any may.
+
+        One that only listens goes first: no other would know its message.
+        """
+        ready = []
+        for queue in self._queues.values():
+            queue.advance()
+            if queue.active is not None and queue.active.ready_ns <= now_ns:
+                ready.append(queue.active)
+        if not ready:
+            return None
+        job = next((each for each in ready if each.ask.listen), ready[0])
+        self._queues[job.ask.type] = self._queues.pop(job.ask.type)
+        return job
+
+    def next_ready(self) -> int | None:
+        """Return when the next conversation may go on."""
+        times = [
+            queue.active.ready_ns for queue in self._queues.values() if queue.active is not None
+        ]
+        return min(times, default=None)
+
+    def fail_all(self, reason: str) -> None:
+        """End every conversation."""
+        for queue in self._queues.values():
+            for job in list(queue):
+                if not job.task.is_done:
+                    job.conversation.close()
+                    job.task.fail(MailboxClosedError(f"{job.task.name}: {reason}"))
