@@ -241,6 +241,8 @@ class NotificationSender:
     async def _run(self) -> None:
         while (due_ns := self._table.next_timeout()) is not None:
             await asyncio.sleep(max(LOOK_S, (due_ns - monotonic_ns()) / 1e9))
+            if self._table.next_timeout() is None:
+                return
             try:
                 await self._look()
             except EapError as exc:
