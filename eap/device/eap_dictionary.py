@@ -23,8 +23,7 @@ from eap.od.dictionary import ObjectDictionary, check_value, take_bits
 from eap.od.model import Access, Entry, OdObject, OdState
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, Status, Tx, Var
-from eap.od.profiles.maker import DEFAULT_TYPE
-from eap.od.profiles.table import CONFIG, ObjectRow
+from eap.od.profiles.table import CONFIG, DEFAULT_TYPE, ObjectRow
 from eap.pd.device import DeviceFault
 from eap.pd.rules import data_budget, frame_budget
 from eap.pd.spec import StationSpec

@@ -20,8 +20,14 @@ from eap.od.dictionary import ObjectDictionary
 from eap.od.model import WO, OdObject, ReadHook
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import Configured, FrameEntry, PortEntry, Rx, Tx, Var
-from eap.od.profiles.maker import DEFAULT_TYPE, make_entry, make_object
-from eap.od.profiles.table import OWN_TYPE, EntryRow, ObjectRow
+from eap.od.profiles.table import (
+    DEFAULT_TYPE,
+    OWN_TYPE,
+    EntryRow,
+    ObjectRow,
+    make_entry,
+    make_object,
+)
 from eap.pd.spec import PortSpec, StationSpec
 
 TRANSPORTS = ("udp", "ethernet", "tcp", "loop")

@@ -13,9 +13,8 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject, OdState
 from eap.od.profiles import master1100 as profile
-from eap.od.profiles.maker import live_source, make_object
 from eap.od.profiles.master1100 import MasterLive
-from eap.od.profiles.table import ObjectRow
+from eap.od.profiles.table import ObjectRow, live_source, make_object
 
 _DETECT = 0xF002
 

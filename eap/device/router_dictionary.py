@@ -19,9 +19,8 @@ from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject
 from eap.od.profiles import eap1000
 from eap.od.profiles import router9000 as profile
-from eap.od.profiles.maker import live_source, make_object
 from eap.od.profiles.router9000 import RouterLive
-from eap.od.profiles.table import ObjectRow
+from eap.od.profiles.table import ObjectRow, live_source, make_object
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 _IP_SCHEMES = ("udp", "tcp")

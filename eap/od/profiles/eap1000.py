@@ -4,8 +4,11 @@ The ranges, the meaning of the objects and the sub-indexes 3, 4 and 6 of process
 descriptions of the profile; the rest of the sub-index tables is ours, as no public document has
 them.  Clients find everything by name through SDO information.
 
-A field of the plant file is added here: its row says which key it has there, where the
-specification has it, and what it may hold; dictionaries, checks and docs/objects.md follow.
+To add a field of the plant file: its section (``eap.config.structs``) and its record
+(``eap.pd.spec``) get it, a row here names both, and docs/plant-file.md explains it; dictionaries,
+checks of entries, plans and docs/objects.md follow.  A TxFrame ends with the list of its PDs: a new
+entry takes the first sub-index of that list.  Stored objects are then those of another version
+(``eap.device.stored.VERSION``), and are made anew from the stored specification.
 """
 
 from __future__ import annotations
