@@ -20,6 +20,7 @@ from eap.gateway.request_tracker import RequestTracker, Ticket
 
 Send: TypeAlias = Callable[[bytes], None]
 """Sends a frame back to who sent a request, now or later."""
+_ADDRESSES = 1 << 16
 _MAX_ROWS = 4096
 """Slaves that do not exist have no rows of their own above this."""
 _LOGGED = frozenset(
@@ -169,7 +170,7 @@ class ReplyEncoder:
         self._tracker = tracker
         self._log = RefusalLog(name)
         self._is_silent = is_silent
-        self._counter = 0
+        self._counters = bytearray(_ADDRESSES)
 
     def answer(
         self,
@@ -215,9 +216,9 @@ class ReplyEncoder:
         self.answer(request, address, address, refusals(kind, request.body, reason), 0)
 
     def send(self, send: Send, address: int, kind: MailboxType, body: bytes) -> None:
-        """Send a message from *address*."""
-        self._counter = next_counter(self._counter)
-        send(encode_plain_frame(kind, address, self._counter, body))
+        """Send a message from *address*, counted as those of one slave are."""
+        counter = self._counters[address] = next_counter(self._counters[address])
+        send(encode_plain_frame(kind, address, counter, body))
 
     def _note_repeated(self, way: Way) -> None:
         counts = self._tracker.counts_of(way)

@@ -61,12 +61,17 @@ def play(
     station: Station,
     scene: Callable[[Ask, ClientSession], Awaitable[None]],
     idle_s: float = 5.0,
+    answer_s: float = 2.0,
 ) -> None:
     async def run() -> None:
         codec = codec_for(
-            kind, station.link(), MailboxSizes.of_data(100), memory_share(), wait_s=0.01
+            kind,
+            station.link(answer_s),
+            MailboxSizes.of_data(100),
+            memory_share(),
+            wait_s=answer_s / 3,
         )
-        session = ClientSession(kind, codec, answer_s=0.05, idle_s=idle_s)
+        session = ClientSession(kind, codec, answer_s=answer_s, idle_s=idle_s)
 
         async def ask(body: str, *, is_step: bool = False) -> list[str]:
             replies = await session.ask(bytes.fromhex(body), is_step=is_step)
@@ -164,7 +169,7 @@ def test_session_answers_in_time_for_a_station_that_does_not(kind: MailboxType, 
         assert reply.reason is Cause.TIMEOUT
         assert not session.is_running
 
-    play(kind, station, scene)
+    play(kind, station, scene, answer_s=0.05)
 
 
 def test_session_answers_in_time_for_requests_that_wait() -> None:
@@ -172,12 +177,12 @@ def test_session_answers_in_time_for_requests_that_wait() -> None:
     station.hangs = True
 
     async def scene(ask: Ask, session: ClientSession) -> None:
-        async with asyncio.timeout(0.4):  # not ten times as long as an answer may take
+        async with asyncio.timeout(4):  # not ten times as long as an answer may take
             asked = [session.ask(bytes.fromhex(UPLOAD), is_step=False) for _ in range(10)]
             answers = await asyncio.gather(*asked)
         assert {reply.reason for (reply,) in answers} == {Cause.TIMEOUT}
 
-    play(COE, station, scene)
+    play(COE, station, scene, answer_s=0.5)
 
 
 class Codec:
@@ -232,7 +237,7 @@ def test_session_request_that_is_cancelled_leaves_nothing_behind() -> None:
 
 @pytest.mark.parametrize(("is_long", "cause"), [(False, Cause.TIMEOUT), (True, None)])
 def test_session_last_step_of_a_download_may_take_longer(is_long: bool, cause: Cause) -> None:
-    session = ClientSession(COE, Codec(is_long=is_long), answer_s=0.04)
+    session = ClientSession(COE, Codec(is_long=is_long), answer_s=0.2)
     (reply,) = asyncio.run(session.ask(b"\0\x20\1", is_step=False))
     assert reply.reason is cause
 

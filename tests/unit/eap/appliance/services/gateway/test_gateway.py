@@ -113,11 +113,17 @@ class Desk:
         assert header.address == address
         return body.hex(" ")
 
+    async def begin_file(self, body: str, way: Way = HERE) -> str:
+        """Return the answer to a request of FoE, when it is another one than BUSY."""
+        async with asyncio.timeout(20):
+            while (answer := await self.one(FOE, 1001, body, way)).startswith("06"):
+                pass
+        return answer
+
     async def write_file(self, name: str, content: bytes, way: Way = HERE) -> None:
         """Write a file of the drive."""
         room = 1024 - 12
-        while (await self.one(FOE, 1001, "02 00 00000000" + name, way))[:2] == "06":
-            pass
+        await self.begin_file("02 00 00000000" + name, way)
         for number, at in enumerate(range(0, len(content) + 1, room), 1):
             packet = bytes((3, 0)) + number.to_bytes(4, "little") + content[at : at + room]
             while (answer := await self.one(FOE, 1001, packet, way))[:2] == "06":

@@ -106,9 +106,9 @@ def test_who_has_to_wait_too_long_is_told_that_the_slave_is_busy() -> None:
         answer = await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
         assert answer.startswith("06 00 00 00 64 00")
         await desk.ask(FOE, 1001, "05 00 00800000")
-        assert not (await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)).startswith("06")
+        assert (await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)).startswith("03")
 
-    play(scene, settings=Settings(NET_ID, answer_s=0.05))
+    play(scene, settings=Settings(NET_ID, answer_s=0.2))
 
 
 def test_a_step_that_comes_twice_gets_the_same_answer_and_goes_no_further() -> None:
@@ -136,9 +136,9 @@ def test_a_client_that_leaves_leaves_no_transfer_behind() -> None:
     async def scene(desk: Desk) -> None:
         await desk.one(FOE, 1001, "02 00 00000000" + FILE)
         desk.gateway.connection_closed(HERE)
-        assert not (await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)).startswith("06")
+        assert (await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)).startswith("03")
 
-    play(scene, settings=Settings(NET_ID, answer_s=0.05))
+    play(scene)
 
 
 def test_who_is_stopped_lets_go_of_everything() -> None:

@@ -37,13 +37,16 @@ def encoder(*, is_silent: bool = False) -> tuple[ReplyEncoder, RequestTracker]:
     return ReplyEncoder(tracker, "mill/bus0", is_silent=is_silent), tracker
 
 
-def test_reply_encoder_counts_its_messages(request_, sent):
+def test_reply_encoder_counts_the_messages_of_each_slave(request_, sent):
     gateway, _ = encoder()
     replies = [GatewayReply(COE, b"a"), GatewayReply(COE, b"b"), GatewayReply(COE, b"c")]
     gateway.answer(request_, 1001, 0x9000, replies, 1000)
     headers = [decode_frame(frame)[0] for frame in sent]
     assert [each.counter for each in headers] == [1, 2, 3]
     assert {each.address for each in headers} == {0x9000}
+    gateway.send(sent.append, 1001, COE, b"another slave")
+    gateway.send(sent.append, 0x9000, COE, b"d")
+    assert [decode_frame(frame)[0].counter for frame in sent[3:]] == [1, 4]
     (row,) = gateway.statistics.report()
     assert (row["address"], row["requests"], row["replies"]) == (1001, 1, 3)
 

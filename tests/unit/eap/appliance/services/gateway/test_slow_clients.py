@@ -25,8 +25,8 @@ from tests.unit.eap.appliance.services.gateway.test_gateway import (
 SENSOR, CALIBRATION, SIZE = 1003, "0180 00", 2048
 IDENTITY = "00 30 43 18 10 01 5a 0e 00 00"
 DATA = CoeHeader.SIZE + SdoHeader.SIZE
-PATIENCE = Settings(NET_ID, answer_s=0.1)
-"""A slave that another client holds is reported soon."""
+SETTINGS = Settings(NET_ID, answer_s=1.0)
+"""A slave that another client holds is reported, also on a busy machine."""
 
 
 async def read_identity(desk: Desk, count: int) -> list[str]:
@@ -60,7 +60,7 @@ def test_upload_fetched_slowly_leaves_the_slave_to_other_clients() -> None:
         assert await read_identity(desk, 7) == [IDENTITY] * 7
         assert content == bytes(SIZE)
 
-    play(scene, bus="coe", settings=PATIENCE)
+    play(scene, bus="coe", settings=SETTINGS)
 
 
 def test_download_brought_slowly_leaves_the_slave_to_other_clients() -> None:
@@ -79,7 +79,7 @@ def test_download_brought_slowly_leaves_the_slave_to_other_clients() -> None:
         found = bytes.fromhex(await desk.one(COE, SENSOR, f"0020 40 {CALIBRATION} 00000000"))
         assert found[DATA:] + await fetch_segments(desk, 0, SIZE) == data
 
-    play(scene, bus="coe", settings=PATIENCE)
+    play(scene, bus="coe", settings=SETTINGS)
 
 
 def test_file_read_slowly_leaves_the_slave_to_other_clients() -> None:
@@ -87,34 +87,32 @@ def test_file_read_slowly_leaves_the_slave_to_other_clients() -> None:
 
     async def scene(desk: Desk) -> None:
         await desk.write_file(FILE, content)
-        first = await desk.one(FOE, 1001, "01 00 00000000" + FILE)
+        first = await desk.begin_file("01 00 00000000" + FILE)
         for _ in range(3):
-            other = await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
+            other = await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)
             assert other == first
             assert await desk.ask(FOE, 1001, "05 00 00800000", ALSO_HERE) == []
         second = await desk.one(FOE, 1001, "04 00 01000000")
         assert bytes.fromhex(first)[6:] + bytes.fromhex(second)[6:] == content[: 2 * 1012]
 
-    play(scene, settings=PATIENCE)
+    play(scene, settings=SETTINGS)
 
 
 def test_file_left_in_the_middle_gives_way_to_another_client(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def scene(desk: Desk) -> None:
-        assert await desk.one(FOE, 1001, "02 00 00000000" + FILE) == "04 00 00 00 00 00"
+        assert await desk.begin_file("02 00 00000000" + FILE) == "04 00 00 00 00 00"
         begin = "01 00 00000000" + FILE
         assert (await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06")
         (held, waiting) = desk.gateway.transfers()
         assert (held.way, waiting.way) == (HERE, ALSO_HERE)
         monkeypatch.setattr(gateway, "STALL_S", 0.0)
-        while (answer := await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06"):
-            pass
-        assert answer.startswith("03 00 01 00 00 00")
+        assert (await desk.begin_file(begin, ALSO_HERE)).startswith("03 00 01 00 00 00")
         late = await desk.one(FOE, 1001, "03 00 01000000 61")
         assert bytes.fromhex(late)[6:] == b"no transfer is under way\0"
 
-    play(scene, settings=PATIENCE)
+    play(scene, settings=SETTINGS)
 
 
 def test_file_that_is_fetched_ahead_does_not_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,12 +121,12 @@ def test_file_that_is_fetched_ahead_does_not_give_way(monkeypatch: pytest.Monkey
 
     async def scene(desk: Desk) -> None:
         await desk.write_file(FILE, content)
-        await desk.one(FOE, 1001, "01 00 00000000" + FILE)
+        await desk.begin_file("01 00 00000000" + FILE)
         await desk.write_file(b"parameters.bin".hex(), content, ALSO_HERE)
         second = await desk.one(FOE, 1001, "04 00 01000000")
         assert bytes.fromhex(second)[6:] == content[1012 : 2 * 1012]
 
-    play(scene, settings=PATIENCE)
+    play(scene, settings=SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +148,7 @@ def test_client_that_leaves_keeps_nothing(
         assert not desk.gateway.transfers()
         assert desk.gateway.memory.held == desk.gateway.file_memory.held == 0
 
-    play(scene, bus=bus, settings=PATIENCE)
+    play(scene, bus=bus, settings=SETTINGS)
 
 
 def test_memory_budget_is_shared_by_the_ports_of_a_host() -> None:
