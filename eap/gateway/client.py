@@ -13,6 +13,7 @@ silence MailboxTimeoutError.
 from __future__ import annotations
 
 import io
+import select
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -52,7 +53,7 @@ T = TypeVar("T")
 
 __all__ = ["AsyncGatewayClient", "GatewayClient"]
 
-_S = 1_000_000_000
+_S, _MS = 1_000_000_000, 1_000_000
 _LARGEST = 4096
 
 
@@ -108,6 +109,8 @@ class GatewayClient(Closing):
         except TypeError:  # as sockets put it
             self._socket.close()
             raise EnvironmentalError(f"{self._place}: it is no name of a host") from None
+        self._readable = select.poll()
+        self._readable.register(self._socket, select.POLLIN)
 
     def close(self) -> None:
         """Let go of the socket."""
@@ -263,7 +266,6 @@ class GatewayClient(Closing):
     def _send_frames(self) -> None:
         try:
             for frame in self._conversations.frames_to_send(monotonic_ns()):
-                self._socket.settimeout(self._conversations.timeout_ns / _S)
                 self._socket.sendall(frame)
         except OSError as exc:
             raise self._failure(exc) from None
@@ -275,11 +277,13 @@ class GatewayClient(Closing):
                 frame, self._rest = cut_frame(self._rest)
                 if frame is not None:
                     return frame
-            self._socket.settimeout(max(0, deadline_ns - monotonic_ns()) / _S)
+            wait_ns = deadline_ns - monotonic_ns() if deadline_ns else 0
+            if not self._readable.poll(max(0, -(-wait_ns // _MS))):
+                return None
             try:
                 octets = self._socket.recv(_LARGEST)
-            except (TimeoutError, BlockingIOError):
-                return None
+            except TimeoutError:
+                return None  # a datagram whose checksum was wrong
             except OSError as exc:
                 raise self._failure(exc) from None
             if not self._is_stream:

@@ -128,7 +128,7 @@ class _Queue:
         request = self.pending
         if request is None or request.deadline_ns is None:
             return None
-        if request.sends or not request.ask.expects_reply:
+        if request.sends or not self.late or not request.ask.expects_reply:
             return request.deadline_ns
         held = [late.until_ns for late in self.late if self._fits(late, request.ask)]
         return max(request.deadline_ns, *held) if held else request.deadline_ns
@@ -168,6 +168,8 @@ class _Address:
 
     def is_free_for(self, request: PendingRequest) -> bool:
         """Say whether a request may be sent beside those that are in flight."""
+        if len(self.queues) == 1:
+            return True
         others = [other for _, other in self.pending() if other is not request]
         if request.is_single:
             return not any(other.is_in_flight for other in others)
@@ -241,6 +243,11 @@ class GatewayConversations:
             frame = encode_plain_frame(farewell.type, address.number, 0, farewell.request)
             self._frames.append(self._numbered(address.number, frame))
         self._advance(address, now_ns)
+        for queue in list(address.queues.values()):
+            if not queue.conversations and not queue.late:
+                del address.queues[queue.kind]
+        if not address.queues:
+            del self._addresses[address.number]
 
     def receive_frame(self, octets: Buffer, now_ns: int) -> None:
         """Take a frame; what answers nothing is dropped."""
@@ -317,24 +324,25 @@ class GatewayConversations:
 
     def _resend_last_single(self, address: _Address, now_ns: int) -> None:
         """Send the one request again, without delay, that a mailbox error has to belong to."""
+        if len(address.queues) == 1:
+            return
         left = [request for _, request in address.pending() if request.is_in_flight]
         if len(left) == 1 and left[0].is_single:
             left[0].deadline_ns = now_ns
 
     def _advance(self, address: _Address, now_ns: int) -> None:
         """Do whatever is due at an address, until nothing is."""
-        queues = list(address.queues.values())
-        while any([self._advance_queue(address, queue, now_ns) for queue in queues]):  # noqa: C419
-            pass
-        for queue in queues:
-            if not queue.conversations and not queue.late:
-                del address.queues[queue.kind]
-        if not address.queues:
-            del self._addresses[address.number]
+        is_changed = True
+        while is_changed:
+            is_changed = False
+            for queue in address.queues.values():
+                if self._advance_queue(address, queue, now_ns) and len(address.queues) > 1:
+                    is_changed = True
 
     def _advance_queue(self, address: _Address, queue: _Queue, now_ns: int) -> bool:
         """Do the next step for the pending request; return whether others may go on after it."""
-        queue.late = [late for late in queue.late if late.until_ns > now_ns]
+        if queue.late:
+            queue.late = [late for late in queue.late if late.until_ns > now_ns]
         request = queue.pending
         if request is None:
             return False

@@ -243,3 +243,46 @@ def test_conversation_that_never_had_its_turn_leaves_without_a_word(core) -> Non
 def test_message_too_long_for_a_frame_is_refused(core) -> None:
     with pytest.raises(CodecError):
         begin(core, MailboxRequest(MailboxType.VOE, bytes(2042)))
+
+
+def test_mailbox_error_beside_late_replies_counts_for_the_request(core) -> None:
+    place = GatewayConversation(1001)
+    core.request(place, UPLOAD, 0)
+    core.handle_timeout(TIMEOUT_NS)
+    core.receive_frame(REPLY, TIMEOUT_NS)
+    vendor = begin(core, VENDOR, TIMEOUT_NS)
+    core.receive_frame(REFUSED, TIMEOUT_NS)
+    with pytest.raises(MailboxRefusedError):
+        vendor.result()
+
+
+def test_second_mailbox_error_beside_two_requests_gives_no_more_tries(core) -> None:
+    requests = [begin(core, UPLOAD), begin(core, VENDOR)]
+    for _ in range(3):
+        core.receive_frame(REFUSED, 0)
+    assert [request.tries for request in requests] == [TRIES + 1] * 2
+
+
+def test_fragments_of_another_reply_that_came_early_are_left_out(core) -> None:
+    place = GatewayConversation(1001)
+    named = MailboxRequest(MailboxType.SOE, bytes.fromhex("01401000"))
+    core.request(place, named, 0)
+    for body in ("0a400100 01", "2a401000 02", "02401000 03"):
+        core.receive_frame(reply_of(MailboxType.SOE, bytes.fromhex(body)), 0)
+    cut = MailboxRequest(MailboxType.SOE, bytes.fromhex("0140"), listen=True)
+    listening = core.request(place, cut, 0)
+    assert listening.result().data[-1:] == b"\3"
+
+
+def test_late_replies_in_fragments_are_awaited_until_their_time_is_over(core) -> None:
+    place = GatewayConversation(1001)
+    named = MailboxRequest(MailboxType.SOE, bytes.fromhex("01401000"))
+    core.request(place, named, 0)
+    core.handle_timeout(TIMEOUT_NS)
+    core.receive_frame(reply_of(MailboxType.SOE, bytes.fromhex("02401000 03")), TIMEOUT_NS)
+    core.frames_to_send(0)
+    again = core.request(place, named, TIMEOUT_NS)
+    core.receive_frame(reply_of(MailboxType.SOE, bytes.fromhex("0a400100 01")), TIMEOUT_NS)
+    assert (core.frames_to_send(0), again.is_done) == ([], False)
+    core.receive_frame(reply_of(MailboxType.SOE, bytes.fromhex("02401000 02")), TIMEOUT_NS)
+    assert len(core.frames_to_send(0)) == 1
