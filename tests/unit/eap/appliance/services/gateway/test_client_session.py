@@ -203,7 +203,7 @@ class Codec:
     async def answer(self, body: bytes) -> list[bytes]:
         if self._error is not None:
             raise self._error
-        await elapse(0.1)
+        await elapse(0.4)
         return [b"done"]
 
     def is_step(self, body: bytes) -> bool:
