@@ -13,7 +13,7 @@ from eap.aoe.hop_report import HopReport
 from eap.appliance.control import Document, Method, Parameters
 
 PAGE = 1000
-"""Routes of an answer, unless it was asked for fewer."""
+"""Most routes of one answer."""
 MAX_XML = 1 << 20
 """Characters of a file with routes."""
 MAX_TEXT = 255
@@ -50,9 +50,9 @@ class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
         port: EAP port that they leave by; empty for the first that can.
         octets: How many octets of a NetID have to be those of *net_id*; 0 for a default route.
         virtual: NetID by which the station is known here; empty for its own.
-        unidirectional: Whether nothing may be asked from there.
+        unidirectional: Whether requests from there are refused.
         timeout_ms: How long an answer may take; 0 for as long as usual.
-        probed: Whether the next hop is asked from time to time whether it is alive.
+        probed: Whether the next hop is probed from time to time.
         replaces: Name or NetID of an added route that this one takes the place of; empty for none.
     """
 
@@ -129,7 +129,7 @@ class RoutesIntroduceParameters(Parameters, frozen=True, kw_only=True):
 
 
 class WayRow(Document, frozen=True, kw_only=True):
-    """One way of packets, and what was asked by it.
+    """One path of packets, and the figures of its requests.
 
     Attributes:
         transport: Of its packets.
@@ -157,18 +157,18 @@ class RouteRow(WayRow, frozen=True, kw_only=True):
 
     Attributes:
         name: As people call it.
-        net_id: As it is asked for here.
+        net_id: By which it is requested here.
         octets: How many of its octets have to match; 0 for a default route.
-        origin: Who says so: the plant file, its ports, somebody at run time, the station itself.
+        origin: Plant file, its ports, a change at run time, or the station itself.
         state: Whether a request would go on.
         why: What is wrong with one that is down.
         next_name: Name of the router at the next hop.
         rtt_us: Round trip to the next hop; None while it is not known.
         expires_s: In how many seconds it is forgotten; None for never.
         real: The NetID that the station itself has, where *net_id* is a virtual one; else empty.
-        unidirectional: Whether nothing may be asked from there.
+        unidirectional: Whether requests from there are refused.
         timeout_ms: How long an answer may take; 0 for as long as usual.
-        probed: Whether the next hop is asked from time to time.
+        probed: Whether the next hop is probed from time to time.
     """
 
     name: str
@@ -197,7 +197,7 @@ class ConnectionRow(WayRow, frozen=True, kw_only=True):
 
     Attributes:
         since_s: For how many seconds it has been used.
-        net_ids: That asked by it, the first few.
+        net_ids: Sources of its requests, the first few.
         took_us: How long the latest answer took; None before the first.
     """
 
@@ -273,7 +273,7 @@ class TestResult(Document, frozen=True, kw_only=True):
     """What came of a question to a target.
 
     Attributes:
-        target: NetID and AMS port that were asked.
+        target: NetID and AMS port of the request.
         name: Of the route that was taken; empty for none.
         ok: Whether there is a way there and back.
         rtt_us: How long that took; None without an answer.
@@ -299,7 +299,7 @@ class NeighbourRow(Document, frozen=True, kw_only=True):
     """A router of another host that answered.
 
     Attributes:
-        station: That asked.
+        station: Sender of the request.
         name: Of the router or its host.
         net_id: Of the router.
         address: IPv4 address that the answer came from.
@@ -318,7 +318,7 @@ class NeighbourRow(Document, frozen=True, kw_only=True):
 
 
 class IntroducedRow(Document, frozen=True, kw_only=True):
-    """What another router said when it was asked for a route.
+    """Answer of another router to a request to add a route.
 
     Attributes:
         ok: Whether it has it now.
@@ -361,7 +361,7 @@ class AddedRoute(Document, frozen=True, kw_only=True):
 
 
 class ViaParameters(Parameters, frozen=True, kw_only=True):
-    """Base: *via* is the station whose router asks; empty for the first one here."""
+    """Base: *via* is the station whose router sends the requests; empty for the first one here."""
 
     via: str = ""
 

@@ -52,7 +52,7 @@ _STANDARD = Path("-")
 def bus() -> None:
     """Look at a bus of slaves and talk to them.
 
-    The bus is a port of a running station (STATION/PORT), whose master is asked, or is behind an
+    The bus is a port of a running station (STATION/PORT), with its master, or is behind an
     interface (--interface URI), where the command is the master.  SLAVE is a station address (1001
     is the first slave) or the slave's name.  Slaves stay in their states, except that behind an
     interface one in INIT is brought to PREOP when its mailbox is needed.

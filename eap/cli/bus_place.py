@@ -35,7 +35,7 @@ class GatewayPlace(NamedTuple):
     port: int
     tcp: bool = False
     mailbox: int | None = None
-    """Octets of the slave's mailboxes, in place of what the master tells."""
+    """Octets of the slave's mailboxes, in place of the master's description."""
 
 
 Place: TypeAlias = BusPort | InterfaceUri | GatewayPlace

@@ -22,7 +22,7 @@ DEBUG_VARIABLE = "EAP_DEBUG"
 
 
 class ExitCode(IntEnum):
-    """What the shell is told."""
+    """Exit status."""
 
     DONE = 0
     FAILED = 1
@@ -32,7 +32,7 @@ class ExitCode(IntEnum):
 
 
 class LazyGroup(click.Group):
-    """Import a subcommand's module when it is asked for, not before.
+    """Group that imports a subcommand's module when it is used.
 
     Args:
         commands_at: ``module:attribute`` of each subcommand.

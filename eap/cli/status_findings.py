@@ -340,7 +340,7 @@ def _of_received(where: str, row: Row) -> Iterator[Finding]:
 
 
 def _of_sources(station: Row) -> Iterator[Finding]:
-    """Yield one finding for each address that sends with the publisher ID of somebody else."""
+    """Yield one finding for each address that sends with a foreign publisher ID."""
     wrong: dict[str, list[Row]] = {}
     for row in station["pd"]["rx"]:
         if source := row.get("wrong_source"):

@@ -77,7 +77,7 @@ def test_slave_that_is_cut_off(coe):
         assert len(found["slaves"]) == 2
         gone = eapctl("sdo", "read", "sensor", "0x1018:1", interface=COE)
         assert gone.returncode == 1
-        assert "there is no slave 'sensor'" in gone.stderr
+        assert "unknown slave 'sensor'" in gone.stderr
     finally:
         coe.fault(kind="cut", slave="sensor", end=True)
 

@@ -38,7 +38,7 @@ def trace(target: str, plant: str | None = None, via: str | None = None) -> Trac
     Args:
         target: ``STATION[/PORT[/SLAVE]]`` or ``NETID[:PORT]``.
         plant: Of the appliance that asks; None for the first that knows the target.
-        via: Station whose router asks; None for the first of the appliance.
+        via: Station whose router sends the requests; None for the first of the appliance.
 
     Raises:
         ControlError: there is no such target or station, or no appliance answers.
@@ -77,7 +77,7 @@ def first_that_knows(
         via: Station that has to run there; None for any.
 
     Raises:
-        ControlError: nothing runs, nobody knows the names, or *ask* failed in another way.
+        ControlError: nothing runs, the names are not known, or *ask* failed in another way.
     """
     unknown: ControlError | None = None
     with ExitStack() as stack:
@@ -96,7 +96,7 @@ def first_that_knows(
 
 
 class AmsRefusedError(ControlError):
-    """The device refuses, or nobody gets to it; *result* is that of ADS."""
+    """The device refuses, or cannot be reached; *result* is that of ADS."""
 
     def __init__(self, message: str, result: int) -> None:
         super().__init__(message, code=ErrorCode.REFUSED)
@@ -122,11 +122,11 @@ class AmsDevice:
         """Return the data of an answer.
 
         Args:
-            operation: What is asked for.
+            operation: The request.
             what: That, in words.
 
         Raises:
-            AmsRefusedError: the device refuses, or nobody gets to it.
+            AmsRefusedError: the device refuses, or cannot be reached.
         """
         outcome = self.ask(operation)
         if outcome.result:
@@ -157,7 +157,7 @@ def open_ams(target: str, plant: str | None) -> Iterator[AmsDevice]:
     """Reach *target* through the first appliance that knows it.
 
     Raises:
-        ControlError: nothing runs, or nobody knows the target.
+        ControlError: nothing runs, or the target is not known.
     """
     with first_that_knows(lambda each: AmsDevice(each, target).ask(ReadState()), plant) as found:
         client, _ = found
@@ -185,7 +185,7 @@ def request_state(
         pause: Lets seconds pass; None really does.
 
     Raises:
-        AmsRefusedError: the device cannot be asked.
+        AmsRefusedError: the device cannot be reached.
     """
     number = _NUMBERS[wanted]
     pause = pause or Event().wait

@@ -163,7 +163,7 @@ def write_entry(
     """Write an entry, or with *complete* a whole object given as hexadecimal digits.
 
     Raises:
-        ConfigError: *text* is no value of the entry's type, or nobody knows the type.
+        ConfigError: *text* is no value of the entry's type, or the type is not known.
         SdoAbortError: the slave refuses.
         BusError: there is no such slave, or it does not answer.
     """
@@ -294,7 +294,9 @@ def _octets_of(text: str, kind: DataType | None, name: str, *, complete: bool) -
             return kind.encode(kind.parse_text(text))
     except (EapError, ValueError) as exc:
         raise ConfigError(f"{name}: {exc}") from None
-    raise ConfigError(f"{name}: the slave does not tell its type: say it with --type, such as UINT")
+    raise ConfigError(
+        f"{name}: the slave does not describe its type: give it with --type, such as UINT"
+    )
 
 
 def read_idn(bus: SlaveBus, slave: str, idn: Idn, *, drive: int) -> IdnElements:

@@ -1,4 +1,4 @@
-"""What commands know of a slave, and what they can do on a bus, whoever its master is.
+"""Slaves and buses as commands use them, with any master.
 
 Two kinds fit :class:`SlaveBus`: ``BusSession`` in bus_session.py is a master of its own,
 ``RunningBus`` in bus_running.py asks that of a running station.
@@ -36,7 +36,7 @@ class Slave(msgspec.Struct, frozen=True, kw_only=True):
     alias: int
     status: AlStatus
     protocols: int | None
-    """As in its EEPROM; None where nobody tells."""
+    """As in its EEPROM; None where it is not known."""
     parent: int | None
     """Position of the slave that it is wired to; None for the master."""
     ports: tuple[int, ...]
@@ -83,7 +83,7 @@ class SlaveBus(Protocol):
         """Return all slaves in the order of the line, without asking those that are known."""
 
     def history(self) -> History | None:
-        """Return when faults were seen; None where nobody has looked before."""
+        """Return when faults were seen; None where there is no record."""
 
     def forget(self) -> None:
         """Forget faults that are over."""
@@ -103,9 +103,11 @@ def choose(slaves: Sequence[Slave], name: str) -> Slave:
         return fitting[0]
     if fitting:
         stations = ", ".join(str(slave.station) for slave in fitting)
-        raise BusError(f"{len(fitting)} slaves are called {name!r}: say which of {stations}")
+        raise BusError(
+            f"{len(fitting)} slaves are called {name!r}: use a station address ({stations})"
+        )
     known = ", ".join(f"{slave.station} ({slave.name})" for slave in slaves) or "none"
-    raise BusError(f"there is no slave {name!r}; there are {known}")
+    raise BusError(f"unknown slave {name!r}; known slaves: {known}")
 
 
 def no_mailbox(slave: Slave, state: str) -> BusError:

@@ -94,7 +94,7 @@ class Client(Closing):
     def events(self, **params: Any) -> Iterator[ValuesEvent]:
         """Subscribe with *params* and yield each event until the appliance goes.
 
-        Nothing else is asked on this connection meanwhile.
+        The connection takes no other requests meanwhile.
 
         Raises:
             ControlError: the appliance refused, went away, or cannot read the values now.
@@ -136,7 +136,7 @@ class Client(Closing):
 
 
 def _checked(reply: Reply) -> Reply:
-    """Return *reply*, or raise the error that it tells of."""
+    """Return *reply*, or raise the error in it."""
     error = reply.error
     if error is None:
         return reply
@@ -243,7 +243,7 @@ def _connect(connection: socket.socket, path: str) -> None:
     """Connect to a Unix socket; where too many wait to be accepted, wait for TIMEOUT_S.
 
     Raises:
-        OSError: nobody listens, or none was accepted in that time.
+        OSError: the socket has no listener, or did not accept in that time.
     """
     end_s = monotonic() + TIMEOUT_S
     while True:

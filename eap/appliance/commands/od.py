@@ -50,7 +50,7 @@ class EntryInfo(msgspec.Struct, frozen=True):
     subindex: int
     name: str
     kind: DataType | None
-    """None if it does not tell, or tells of a type that we do not know."""
+    """None if the device does not describe it, or the type is not known here."""
     access: str
     """``r``, ``w`` or ``rw``, empty if it does not tell."""
     unit: str = ""
@@ -65,7 +65,7 @@ class ObjectInfo(msgspec.Struct, frozen=True):
     """VAR, ARRAY, RECORD, or its number."""
     max_subindex: int
     label: str = ""
-    """Name of what it is about, if the device tells."""
+    """Name of the frame, PD or port that it describes, if the device has it."""
     entries: tuple[EntryInfo, ...] = ()
     """In the order of their subindexes; gaps are left out."""
 
@@ -185,7 +185,7 @@ class LoadedEntries(NamedTuple):
 def read_entry(
     device: OdDevice, index: int, subindex: int, kind: DataType | None = None
 ) -> OdValue:
-    """Return an entry; *kind* instead of the type that the device tells.
+    """Return an entry; *kind* instead of the type that the device describes.
 
     Raises:
         SdoAbortError, ControlError: the device refuses.
@@ -219,10 +219,10 @@ def read_object(device: OdDevice, index: int, first: int) -> OdWholeObject:
 def write_entry(
     device: OdDevice, index: int, subindex: int, text: str, kind: DataType | None = None
 ) -> OdValue:
-    """Write a value as typed, by the type that the device tells or by *kind*.
+    """Write a value as typed, by the type that the device describes or by *kind*.
 
     Raises:
-        ConfigError: *text* is no value of the type, or nobody knows the type.
+        ConfigError: *text* is no value of the type, or the type is not known.
         SdoAbortError, ControlError: the device refuses.
     """
     name = str(ObjectId(index, subindex))
@@ -230,8 +230,8 @@ def write_entry(
     kind = kind or entry.kind
     if kind is None:
         raise ConfigError(
-            f"{name}: nobody tells its type: say it with --type, such as UINT, or give the octets"
-            " with --hex"
+            f"{name}: the device does not describe its type: give it with --type, such as UINT, or"
+            " write octets with --hex"
         )
     try:
         octets = notation.parse(kind, text)

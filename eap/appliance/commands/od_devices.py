@@ -102,7 +102,7 @@ def open_device(target: Target) -> Iterator[OdDevice]:
     """Reach the object dictionary of *target*, for the length of a block.
 
     Raises:
-        ControlError: nobody runs the station or knows the way to it, or several run it and its
+        ControlError: no appliance runs the station or has a route to it, or several run it and its
             plant is left open.
         BusError: the bus has no such slave.
     """
@@ -157,7 +157,7 @@ def entry_info(subindex: int, found: EntryDescription) -> EntryInfo:
 
 
 def with_entries(device: OdDevice, found: ObjectInfo) -> ObjectInfo:
-    """Return an object with the entries that *device* tells of."""
+    """Return an object with the entries that *device* describes."""
     known = (device.entry(found.index, subindex) for subindex in range(found.max_subindex + 1))
     return replace(found, entries=tuple(each for each in known if each is not None))
 
@@ -165,7 +165,7 @@ def with_entries(device: OdDevice, found: ObjectInfo) -> ObjectInfo:
 def read_all(device: OdDevice, *refusals: type[Exception]) -> Iterator[Content]:
     """Yield all entries of all objects of *device*, as they come in.
 
-    *refusals* are the errors that are told beside an entry; others are raised.
+    *refusals* are the errors that stand beside an entry; others are raised.
     """
     for found in device.objects():
         for entry in device.describe(found.index).entries:
@@ -248,7 +248,7 @@ class AdsOd:
     """The objects of one device.
 
     Raises:
-        AmsRefusedError: (every method) the device refuses, or nobody gets to it.
+        AmsRefusedError: (every method) the device refuses, or cannot be reached.
     """
 
     def __init__(self, device: AmsDevice) -> None:

@@ -320,8 +320,8 @@ def apply_steps(
 ) -> Iterator[StepResult]:
     """Take *order* step by step, and yield what became of each; last the routers of *routed*.
 
-    A station that refused one is asked for nothing more.  What goes on with a change that was
-    broken off belongs to it, so that a rollback takes back both.
+    A station that refused a step gets no other.  Steps that go on with a change that was broken off
+    belong to it, so that a rollback takes back both.
     """
     running = [link.export(name) for name in link.stations]
     under_way = [each.cause for each in running if _is_under_way(each.spec)]
@@ -333,7 +333,7 @@ def apply_steps(
             refused.add(done.station)
     if keep_going or not refused:
         names = [name for name in routed if name not in refused]
-        yield from _tell_routers(
+        yield from _change_routers(
             [name for name in names if link.plan_routing(name).changes],
             partial(link.apply_routing, cause=cause),
         )
@@ -351,32 +351,32 @@ def roll_back(
     now = {name: each.spec for name, each in running.items()}
     goal = {name: without_alternates(now[name]) for name in stations}
     known = {name: running[name] for name in goal if running[name].previous is not None}
-    routers = {name: told for name in goal if (told := link.export_routing(name)) is not None}
-    routers = {name: told for name, told in routers.items() if told.previous is not None}
+    routers = {name: routing for name in goal if (routing := link.export_routing(name)) is not None}
+    routers = {name: each for name, each in routers.items() if each.previous is not None}
     causes = [each.cause for each in known.values()] + [each.cause for each in routers.values()]
     last = max(causes, default="")
     part = {name: each for name, each in known.items() if each.cause == last}
     left = {n: each for n, each in part.items() if not each.undone and each.previous != goal[n]}
-    routed = [name for name, told in routers.items() if told.cause == last]
-    told_left = [name for name in routed if not routers[name].undone]
-    if not (left or told_left or any(_is_under_way(each.spec) for each in part.values())):
-        left, told_left = part, routed
+    routed = [name for name, each in routers.items() if each.cause == last]
+    routed_left = [name for name in routed if not routers[name].undone]
+    if not (left or routed_left or any(_is_under_way(each.spec) for each in part.values())):
+        left, routed_left = part, routed
     goal |= {name: each.previous for name, each in left.items() if each.previous is not None}
     back = _walk(steps(now, {**now, **goal}), link.rollback, keep_going=keep_going)
-    return chain(back, _tell_routers(told_left, link.rollback_routing))
+    return chain(back, _change_routers(routed_left, link.rollback_routing))
 
 
 def _is_under_way(spec: StationSpec) -> bool:
     return any(pd.alternates for pd in spec.subscriptions)
 
 
-def _tell_routers(
-    stations: Iterable[str], tell: Callable[[str], RoutingDifference]
+def _change_routers(
+    stations: Iterable[str], change: Callable[[str], RoutingDifference]
 ) -> Iterator[StepResult]:
     for name in stations:
-        told = tell(name)
-        outcome = ApplyAnswer(not told.refused, [], [], told.refused)
-        yield StepResult(name, f"({', '.join(told.changes) or 'routes'})", outcome)
+        done = change(name)
+        outcome = ApplyAnswer(not done.refused, [], [], done.refused)
+        yield StepResult(name, f"({', '.join(done.changes) or 'routes'})", outcome)
 
 
 def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[StepResult]:

@@ -77,7 +77,7 @@ def _process_data(slave: BusSlaveSpec) -> list[list[tuple[int, int, int]]]:
 
 
 def _misfits(station: StationSpec) -> list[tuple[str, str]]:
-    """Return the EAP ports of *station* whose dictionary has no room for all of it, and why."""
+    """Return the EAP ports of *station* whose dictionary is too small, and why."""
     found = []
     for port in station.ports:
         if port.kind is PortKind.EAP:

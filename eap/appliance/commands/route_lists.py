@@ -107,7 +107,7 @@ def text_of_xml(octets: bytes) -> str:
     """Return what a file of XML holds, in the encoding that it begins with or declares.
 
     Raises:
-        ValueError: it is in another encoding, or in one that nobody knows.
+        ValueError: it is in another encoding, or in an unknown one.
     """
     for mark, encoding in _MARKS:
         if octets.startswith(mark):

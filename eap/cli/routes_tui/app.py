@@ -86,7 +86,7 @@ class RoutesApp(App[None]):
         self.call_after_refresh(self._show)
 
     def look(self) -> None:
-        """Ask the appliances, unless they are still being asked."""
+        """Request the routes, unless a request is under way."""
         if self._looks_since is None:
             self._looks_since = monotonic()
             self._look(self._match if self._view is View.ROUTES else "")
@@ -300,7 +300,7 @@ Left out columns: a wider terminal shows them."""
 _KEPT_ELSEWHERE = {
     "static": "Route {name} is in the plant file: change it there.",
     "derived": "Route {name} follows from the ports in the plant file: write another one there.",
-    "learned": "Route {name} is told of by the station itself.",
+    "learned": "Route {name} is announced by the station itself.",
 }
 
 

@@ -90,7 +90,7 @@ COLUMNS = {
 
 
 def lines(view: View, routers: Iterable[Router], match: str) -> list[Line]:
-    """Return the rows of *view*; of routes those that *match* have been asked for already."""
+    """Return the rows of *view*; routes are filtered by *match* already."""
     found = []
     for router in routers:
         if view is View.ROUTES:

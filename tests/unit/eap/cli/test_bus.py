@@ -95,7 +95,7 @@ def test_vendor_message(monkeypatch, command):
 def test_slave_that_is_not_there(line, command):
     code, _, err = command("state", "nobody", *WHERE)
     assert code == 1
-    assert "there is no slave 'nobody'" in err
+    assert "unknown slave 'nobody'" in err
 
 
 BOTH = [
@@ -165,7 +165,7 @@ def test_what_the_running_master_makes_of_it(bus_appliance, command, tmp_path):
         (("scan", "pres/bus0"), 1, "no station pres runs: running are works (press, saw), did you"),
         (("scan", "press/bus0", "--plant", "work"), 1, "no station press runs"),
         (("scan", "press/bus0/x"), 2, "'press/bus0/x' is no STATION/PORT"),
-        (("state", "press/bus0", "nobody"), 1, "there is no slave 'nobody'"),
+        (("state", "press/bus0", "nobody"), 1, "unknown slave 'nobody'"),
         (("voe", "press/bus0", "1001", "00", "--vendor", "1"), 1, "mailbox error"),
         (("sdo", "read", "press/bus0", "sensor", "0x8000:9"), 1, "subindex does not exist"),
     ],

@@ -46,7 +46,7 @@ def test_slaves_and_the_master(bus) -> None:
     assert row.mailbox is None, "the usual dictionary ends before them"
     assert bus.find("drive").station == bus.find("1001").station == 1001
     assert bus.find("master").station == bus.find("0").station == 0
-    with pytest.raises(BusError, match=r"no slave 'x'; there are 1001 \(drive\)"):
+    with pytest.raises(BusError, match=r"unknown slave 'x'; known slaves: 1001 \(drive\)"):
         bus.find("x")
     with pytest.raises(ConfigError, match="65535 is all slaves"):
         bus.find("65535")

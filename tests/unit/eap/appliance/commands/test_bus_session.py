@@ -45,7 +45,10 @@ def test_slave_by_address_and_by_name(line, name):
 
 
 def test_slave_that_is_not_there(line):
-    with line.session() as bus, pytest.raises(BusError, match=r"no slave 'x'.*1001 \(coupler\)"):
+    with (
+        line.session() as bus,
+        pytest.raises(BusError, match=r"unknown slave 'x'.*1001 \(coupler\)"),
+    ):
         bus.find("x")
 
 

@@ -35,14 +35,14 @@ def test_by_address_and_by_name(name):
 
 @pytest.mark.parametrize("name", ["x", "1004", "0xxx", "08", ""])
 def test_one_that_is_not_there(name):
-    with pytest.raises(BusError, match=r"no slave '.*'; there are 1001 \(coupler\), 1002"):
+    with pytest.raises(BusError, match=r"unknown slave '.*'; known slaves: 1001 \(coupler\), 1002"):
         choose(SLAVES, name)
-    with pytest.raises(BusError, match="there are none"):
+    with pytest.raises(BusError, match="known slaves: none"):
         choose([], name)
 
 
 def test_name_of_several():
-    with pytest.raises(BusError, match="2 slaves are called 'twin': say which of 1002, 1003"):
+    with pytest.raises(BusError, match=r"2 slaves are called 'twin': .* \(1002, 1003\)"):
         choose(SLAVES, "twin")
 
 

@@ -24,7 +24,7 @@ def test_entry_that_nobody_describes(device, monkeypatch):
     assert (row.name, row.type, row.value, row.data) == ("", None, 10000, "10270000")
     assert od.read_entry(device, 0x1008, 0).value == int.from_bytes(b"mixer #1", "little")
     assert od.read_entry(device, 0x8000, 3).value is None
-    with pytest.raises(ConfigError, match="say it with --type, such as UINT"):
+    with pytest.raises(ConfigError, match="give it with --type, such as UINT"):
         od.write_entry(device, 0xD000, 7, "1")
     od.write_entry(device, 0xD000, 7, "1", datatypes.parse("UDINT"))
     assert device.written == [(0xD000, 7, b"\1\0\0\0")]
