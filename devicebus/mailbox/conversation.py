@@ -22,8 +22,11 @@ from typing import TypeAlias, TypeVar
 import msgspec
 
 from devicebus.errors import MailboxProtocolError
+from eap.codec import foe
 from eap.codec.mailbox import MailboxType
+from eap.codec.sdo import encode_abort
 from eap.errors import CodecError
+from eap.od.abort import AbortCode
 
 T = TypeVar("T")
 
@@ -99,3 +102,26 @@ def reading(what: str) -> Iterator[None]:
         yield
     except CodecError as exc:
         raise MailboxProtocolError(f"{what}: {exc}") from None
+
+
+_ABORT_TIMEOUT_NS = 50_000_000
+"""Short: a slave that does not take messages shall not keep others waiting for this one."""
+ABORT_MESSAGES = {
+    MailboxType.COE: MailboxRequest(
+        MailboxType.COE,
+        encode_abort(0, 0, AbortCode.GENERAL),
+        timeout_ns=_ABORT_TIMEOUT_NS,
+        expects_reply=False,
+    ),
+    MailboxType.FOE: MailboxRequest(
+        MailboxType.FOE,
+        foe.encode_message(foe.FoeOpcode.ERROR, foe.FoeErrorCode.NOT_DEFINED),
+        timeout_ns=_ABORT_TIMEOUT_NS,
+        expects_reply=False,
+    ),
+}
+"""Requests that end a transfer whose client has left in the middle of it, by protocol.
+
+Other protocols have no transfers that stay open.  A slave without a transfer ignores them, so they
+may be sent whenever that is not known.
+"""

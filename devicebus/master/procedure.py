@@ -28,7 +28,7 @@ class Sleep(NamedTuple):
     duration_ns: int
 
 
-class StepResult(NamedTuple):
+class StepReplies(NamedTuple):
     """Value that a procedure is resumed with: one reply for each access, and the time."""
 
     replies: Sequence[DatagramReply]
@@ -36,7 +36,7 @@ class StepResult(NamedTuple):
 
 
 Step: TypeAlias = Sequence[DatagramRequest] | Sleep
-Procedure: TypeAlias = Generator[Step, StepResult, T]
+Procedure: TypeAlias = Generator[Step, StepReplies, T]
 
 
 def read(
@@ -89,7 +89,7 @@ def together(procedures: Sequence[Procedure[T]]) -> Procedure[list[T | EapError]
                 _, now_ns = yield Sleep(pause_ns)
             for child in running:
                 if not child.accesses and child.is_running and child.wake_ns <= now_ns:
-                    child.resume(StepResult((), now_ns))
+                    child.resume(StepReplies((), now_ns))
     finally:
         for child in children:
             child.procedure.close()
@@ -107,7 +107,7 @@ class _Child(Generic[T]):
         self.wake_ns = 0
         self._advance(lambda: next(procedure), now_ns)
 
-    def resume(self, answer: StepResult) -> None:
+    def resume(self, answer: StepReplies) -> None:
         self._advance(lambda: self.procedure.send(answer), answer.now_ns)
 
     def _advance(self, action: Callable[[], Step], now_ns: int) -> None:
@@ -134,6 +134,6 @@ def _ask_for(asking: Sequence[_Child[T]]) -> Procedure[int]:
     start = 0
     for child in asking:
         end = start + len(child.accesses)
-        child.resume(StepResult(replies[start:end], now_ns))
+        child.resume(StepReplies(replies[start:end], now_ns))
         start = end
     return now_ns

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from devicebus.errors import FrameLostError
 from devicebus.master.access import DatagramReply
 from devicebus.master.link import Exchange, Link
-from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
+from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.master.task import Task
 from eap.errors import EapError
 
@@ -43,7 +43,7 @@ class Runner:
         while self._sleeping and self._sleeping[0][0] <= now_ns:
             _, _, run = heapq.heappop(self._sleeping)
             if not run.task.is_done:
-                run.resume(StepResult((), now_ns))
+                run.resume(StepReplies((), now_ns))
 
     def take_step(self, run: _Run, step: Step, now_ns: int) -> None:
         """Queue the next step of a procedure."""
@@ -72,9 +72,9 @@ class _Run:
             error = outcome
             self.advance(lambda: self._procedure.throw(error), now_ns)
         else:
-            self.resume(StepResult(outcome, now_ns))
+            self.resume(StepReplies(outcome, now_ns))
 
-    def resume(self, answer: StepResult) -> None:
+    def resume(self, answer: StepReplies) -> None:
         """Resume the procedure with the result of its step."""
         self.advance(lambda: self._procedure.send(answer), answer.now_ns)
 
@@ -83,7 +83,7 @@ class _Run:
         try:
             step = action()
             while isinstance(step, Sleep) and step.duration_ns <= 0:
-                step = self._procedure.send(StepResult((), now_ns))
+                step = self._procedure.send(StepReplies((), now_ns))
         except StopIteration as end:
             self.task.finish(end.value)
         except EapError as error:

@@ -15,9 +15,8 @@ from __future__ import annotations
 from collections import deque
 
 from devicebus.errors import BusError, MailboxRefusedError, MailboxTimeoutError
-from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
+from devicebus.mailbox.conversation import ABORT_MESSAGES, MailboxMessage, MailboxRequest
 from devicebus.mailbox.counter import next_counter
-from devicebus.mailbox.farewell import FAREWELLS
 from devicebus.mailbox.match import answers, has_more
 from eap.codec.mailbox import (
     MailboxError,
@@ -238,8 +237,8 @@ class GatewayConversations:
                 until_ns = now_ns + self.timeout_ns
                 queue.late.append(_LateReplies(request, None, request.sends, until_ns))
             queue.conversations.remove(conversation)
-        if was_sent and not request.is_taken and request.ask.type in FAREWELLS:
-            farewell = FAREWELLS[request.ask.type]
+        if was_sent and not request.is_taken and request.ask.type in ABORT_MESSAGES:
+            farewell = ABORT_MESSAGES[request.ask.type]
             frame = encode_plain_frame(farewell.type, address.number, 0, farewell.request)
             self._frames.append(self._numbered(address.number, frame))
         self._advance(address, now_ns)

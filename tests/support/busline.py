@@ -13,7 +13,7 @@ from devicebus.master.esm import change_state
 from devicebus.master.link import Link
 from devicebus.master.mailboxes import Mailbox
 from devicebus.master.mailboxport import MailboxArea, configure
-from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
+from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.master.runner import Runner
 from devicebus.master.scan import scan
 from devicebus.master.task import Task
@@ -142,13 +142,13 @@ def drive(
 ):
     """Run a procedure against *respond* alone; sleeps take as long as they say."""
 
-    def exchange(step: Step) -> StepResult:
+    def exchange(step: Step) -> StepReplies:
         nonlocal now_ns
         if isinstance(step, Sleep):
             now_ns += step.duration_ns
-            return StepResult((), now_ns)
+            return StepReplies((), now_ns)
         now_ns += TRIP_NS
-        return StepResult([respond(access) for access in step], now_ns)
+        return StepReplies([respond(access) for access in step], now_ns)
 
     return devicebus.drive.drive(procedure, exchange)
 

@@ -20,7 +20,7 @@ from devicebus.mailbox.conversation import Conversation, MailboxMessage, Mailbox
 from devicebus.mailbox.protocol import MailboxSizes
 from devicebus.master.access import DatagramReply, fprd
 from devicebus.master.findings import History
-from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
+from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.master.topology import find_joints
 from devicebus.wire.alstatus import AlState
 from devicebus.wire.register import AlStatus, DlStatus, Register
@@ -161,13 +161,13 @@ class RunningBus:
     def _describe(self) -> BusReport:
         return self._call(words.BUS_DESCRIBE, words.PATIENCE_S, wait=True)
 
-    def _step(self, step: Step) -> StepResult:
+    def _step(self, step: Step) -> StepReplies:
         if isinstance(step, Sleep):
             select.select([], [], [], max(0, step.duration_ns) / _S)
-            return StepResult((), monotonic_ns())
+            return StepReplies((), monotonic_ns())
         rows = [words.datagram_row(each) for each in step]
         answer = self._call(words.BUS_TRANSFER, words.TRANSFER_S, datagrams=rows)
-        return StepResult(words.to_replies(answer.replies), monotonic_ns())
+        return StepReplies(words.to_replies(answer.replies), monotonic_ns())
 
     def _drive(
         self, slave: Slave, conversation: Conversation[T], meanwhile: Callable[[], None] | None

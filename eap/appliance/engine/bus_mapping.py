@@ -45,7 +45,7 @@ class BusMapping:
         slaves = (port.bus or BusPortSpec()).slaves
         self.bus_image: BusImage | None = None
         self._planner = BusPlanner(slaves, image.layout)
-        self._states = BusStates(port.name, slaves, image)
+        self._states = BusStateVariables(port.name, slaves, image)
         self._memory = memory_of(Writer.ENGINE)
         self._memory_of = memory_of
         self._plan: BusPlan | None = None
@@ -163,7 +163,7 @@ def _missing(
     )
 
 
-class BusStates:
+class BusStateVariables:
     """Variables ``PORT.state``, ``PORT.wkc_ok``, ``PORT.SLAVE.state``, where the image has them."""
 
     def __init__(self, port: str, slaves: Sequence[BusSlaveSpec], image: Image) -> None:

@@ -79,7 +79,7 @@ class _Numbered(msgspec.Struct):
     id: int
 
 
-class _Pending(NamedTuple):
+class _PendingRequest(NamedTuple):
     """A request that is under way."""
 
     task: Task[Any]
@@ -112,7 +112,7 @@ class BusRequestHandler:
         ]
         self._serve_station = serve_station
         self._decoder = msgspec.msgpack.Decoder(EngineRequest)
-        self._pending: dict[int, _Pending] = {}
+        self._pending: dict[int, _PendingRequest] = {}
         self._places: Counter[_Place] = Counter()
         sock.setblocking(False)
 
@@ -259,7 +259,7 @@ class BusRequestHandler:
     ) -> None:
         """Reply when *task* is done, and keep it until then."""
         place = request.bus, station
-        self._pending[request.id] = _Pending(task, place)
+        self._pending[request.id] = _PendingRequest(task, place)
         self._places[place] += 1
 
         def done(task: Task[T]) -> None:

@@ -11,7 +11,7 @@ from devicebus.master import eeprom
 from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.layout import SlaveShape, lay_out
 from devicebus.master.pdo import channels_from_sii
-from devicebus.master.procedure import Sleep, Step, StepResult
+from devicebus.master.procedure import Sleep, Step, StepReplies
 from devicebus.wire import sii
 from devicebus.wire.register import Register
 from devicebus.wire.sii import CategoryHeader, SiiCategory
@@ -62,7 +62,7 @@ def _read(image: bytes) -> bytes:
     """Read *image* as a master does, from a controller that gives four octets at a time."""
     word = 0
 
-    def exchange(step: Step) -> StepResult:
+    def exchange(step: Step) -> StepReplies:
         nonlocal word
         replies = []
         if not isinstance(step, Sleep):
@@ -70,7 +70,7 @@ def _read(image: bytes) -> bytes:
                 if access.ado == Register.EEPROM_CONTROL and len(access.data) == 6:
                     word = int.from_bytes(access.data[2:6], "little")
                 replies.append(_reply(access, image, word))
-        return StepResult(replies, 0)
+        return StepReplies(replies, 0)
 
     return drive(eeprom.read_image(1001), exchange)
 

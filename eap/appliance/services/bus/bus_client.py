@@ -16,7 +16,7 @@ from devicebus.errors import BusError, MailboxBusyError
 from devicebus.mailbox.conversation import Conversation, MailboxMessage, MailboxRequest
 from devicebus.master.access import DatagramReply, DatagramRequest
 from devicebus.master.mailboxes import Unsolicited
-from devicebus.master.procedure import Procedure, Sleep, Step, StepResult
+from devicebus.master.procedure import Procedure, Sleep, Step, StepReplies
 from devicebus.wire.alstatus import AlState
 from eap.appliance.bus_request import (
     BringSlaves,
@@ -174,11 +174,11 @@ class BusClient:
         """Run a procedure to its end; return its result or raise what went wrong."""
         await self._be_up()
 
-        async def exchange(step: Step) -> StepResult:
+        async def exchange(step: Step) -> StepReplies:
             if isinstance(step, Sleep):
                 await asyncio.sleep(step.duration_ns / _S)
-                return StepResult((), monotonic_ns())
-            return StepResult(await self.transfer(step), monotonic_ns())
+                return StepReplies((), monotonic_ns())
+            return StepReplies(await self.transfer(step), monotonic_ns())
 
         return await drive_async(procedure, exchange)
 

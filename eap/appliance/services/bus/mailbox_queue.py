@@ -7,8 +7,7 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 
-from devicebus.mailbox.conversation import MailboxMessage, MailboxRequest
-from devicebus.mailbox.farewell import FAREWELLS
+from devicebus.mailbox.conversation import ABORT_MESSAGES, MailboxMessage, MailboxRequest
 from eap.appliance.bus_request import ExchangeMailbox
 from eap.appliance.control_bus import MARGIN_S
 from eap.appliance.services.engine_link import EngineLink
@@ -94,7 +93,7 @@ class MailboxTurn:
 
     def abandon(self) -> None:
         """Close it in the middle, and have the slave end the transfer that was begun."""
-        farewell = FAREWELLS.get(self._kind)
+        farewell = ABORT_MESSAGES.get(self._kind)
         if self._is_open and not self._is_unused and farewell is not None:
             with suppress(EngineGoneError):
                 self._link.send(lambda number: self._step(number, farewell))

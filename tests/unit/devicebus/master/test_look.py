@@ -6,7 +6,7 @@ from devicebus.master.access import DatagramReply
 from devicebus.master.look import look_around
 from devicebus.master.mailboxes import Unsolicited
 from devicebus.master.master import Master
-from devicebus.master.procedure import StepResult
+from devicebus.master.procedure import StepReplies
 from devicebus.wire.alstatus import AlState
 from eap.codec.mailbox import MailboxType
 from tests.support.busline import MS, Line, segment, slave
@@ -60,7 +60,7 @@ def test_all_that_is_said_is_heard(line):
 def test_a_look_at_seventeen_takes_two_frames(line):
     looking = look_around(line.core._bus)
     assert len(next(looking)) == 15
-    assert len(looking.send(StepResult([DatagramReply(b"\0", 1)] * 15, 0))) == 2
+    assert len(looking.send(StepReplies([DatagramReply(b"\0", 1)] * 15, 0))) == 2
 
 
 def test_a_look_that_is_lost_is_made_again(line):

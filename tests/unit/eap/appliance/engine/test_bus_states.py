@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from devicebus.wire.alstatus import AlState
-from eap.appliance.engine.bus_mapping import BusStates
+from eap.appliance.engine.bus_mapping import BusStateVariables
 from eap.pd.spec import BusSlaveSpec, VariableSpec, Writer
 from tests.support.cyclic import image_of, station
 
@@ -39,7 +39,7 @@ def read(image):
 
 
 def test_the_lowest_state_is_that_of_the_bus(image):
-    states = BusStates("bus0", SLAVES, image)
+    states = BusStateVariables("bus0", SLAVES, image)
     master = Master(Unit(AlState.OP), Unit(AlState.SAFEOP))
     master.cycle = Cycle()
     states.show(master)
@@ -54,17 +54,17 @@ def test_the_lowest_state_is_that_of_the_bus(image):
 def test_what_another_engine_left_does_not_stay(image):
     for name in NAMES:
         image.write(name, 8)
-    BusStates("bus0", SLAVES, image).show(Master())
+    BusStateVariables("bus0", SLAVES, image).show(Master())
     assert read(image) == [0, 0, 0, False]
 
 
 def test_slaves_that_nobody_described_count(image):
-    BusStates("bus0", SLAVES[:1], image).show(Master(Unit(AlState.OP), Unit(AlState.INIT)))
+    BusStateVariables("bus0", SLAVES[:1], image).show(Master(Unit(AlState.OP), Unit(AlState.INIT)))
     assert read(image)[:3] == [1, 8, 0]
 
 
 def test_a_station_without_such_variables_is_left_alone():
     bare = image_of(station())
     before = bytes(bare.memory)
-    BusStates("bus0", SLAVES, bare).show(Master(Unit(AlState.OP), Unit(AlState.OP)))
+    BusStateVariables("bus0", SLAVES, bare).show(Master(Unit(AlState.OP), Unit(AlState.OP)))
     assert bytes(bare.memory) == before

@@ -1,23 +1,23 @@
-"""What ends a transfer for somebody who has left."""
+"""Abort messages for transfers whose client has left."""
 
 from __future__ import annotations
 
 import pytest
 
 from devicebus.mailbox import coe_client
-from devicebus.mailbox.farewell import FAREWELLS
+from devicebus.mailbox.conversation import ABORT_MESSAGES
 from tests.support.loopbus import LoopBus
 
 
-@pytest.mark.parametrize("kind", FAREWELLS)
-def test_slave_without_a_transfer_ignores_it(kind):
+@pytest.mark.parametrize("kind", ABORT_MESSAGES)
+def test_abort_message_is_ignored_by_a_slave_without_a_transfer(kind):
     def leave(sizes):
         del sizes
-        message = yield FAREWELLS[kind]
+        message = yield ABORT_MESSAGES[kind]
         return message.data
 
     with LoopBus("drive").session() as bus:
         drive = bus.find("drive")
-        assert bus.converse(drive, leave, "farewell") == b""
+        assert bus.converse(drive, leave, "abort") == b""
         vendor = bus.converse(drive, lambda _: coe_client.upload(0x1018, 1), "vendor")
     assert vendor == b"\x5a\x0e\0\0"
