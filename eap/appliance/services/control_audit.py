@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from eap.aoe.ads_operation import Operation, Read, ReadWrite
 from eap.appliance.control import Request
-from eap.appliance.control_bus import BusOpenParameters, kind_of
+from eap.appliance.control_bus import BusOpenParameters, MailboxData, kind_of
 from eap.appliance.control_device import ApplyAnswer, StateAnswer
 from eap.appliance.services.accepting import process_of
 from eap.appliance.services.audit import operation_words
@@ -78,10 +78,10 @@ def refusal_in(result: Any, talk: BusOpenParameters | None = None) -> str:
         result: Of a request.
         talk: How the conversation was opened that it is an answer of, if it is one.
     """
-    if talk is not None:
+    if talk is not None and isinstance(result, MailboxData):
         from eap.appliance.services.gateway.guard import error_in  # plants without buses have none
 
-        kind, answer = kind_of(talk.protocol), bytes.fromhex(result["data"])
+        kind, answer = kind_of(talk.protocol), bytes.fromhex(result.data)
         code = error_in(kind, answer)
         if code and kind is MailboxType.COE:
             head = SdoHeader.decode(answer, CoeHeader.SIZE)

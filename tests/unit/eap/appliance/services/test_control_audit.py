@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from eap.appliance.control import Request
-from eap.appliance.control_bus import BusOpenParameters
+from eap.appliance.control_bus import BusOpenParameters, MailboxData
 from eap.appliance.control_device import ApplyAnswer, StateAnswer, StateError
 from eap.appliance.services.control_audit import change_of, peer_of, refusal_in
 
@@ -119,6 +119,6 @@ def test_refusals_that_are_results(result: Any, text: str) -> None:
     ],
 )
 def test_what_a_slave_refuses(protocol: str, data: str, is_error: bool) -> None:
-    text = refusal_in({"data": data}, opened(protocol))
+    text = refusal_in(MailboxData(data), opened(protocol))
     assert bool(text) == is_error
     assert protocol != "coe" or not is_error or "read-only entry (0x06010002)" in text
