@@ -124,7 +124,7 @@ def test_publisher_sends_expected_slaves_of_a_master_that_was_replaced(rig, rece
 def test_publisher_forgets_no_change_whatever_happens_on_the_bus(tmp_path, seed):
     """Faults and requests at random; after each message services has what a report shows."""
     pick = random.Random(seed)
-    rig, receiver = BusRig(tmp_path).start(), Receiver()
+    rig, receiver = BusRig(tmp_path, cycle_us=4000).start(), Receiver()
     publisher = BusPublisher(0, rig.bus, receiver.take)
     names, count = ["coupler", "io", "level"], 0
     for _ in range(60):
