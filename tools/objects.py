@@ -13,7 +13,7 @@ from pathlib import Path
 from eap.codec import datatypes
 from eap.od.model import Access, Entry, ObjectCode
 from eap.od.profiles import eap1000, router9000
-from eap.od.profiles.table import CONFIG, OWN_TYPE, EntryRow, ObjectRow, to_text
+from eap.od.profiles.table import CONFIG, OWN_TYPE, ProfileEntry, ProfileObject, to_text
 
 _COLUMNS = (
     "Sub", "Name", "Type", "Bits", "Access", "Content", "Default", "Limits", "Unit", "Description",
@@ -64,7 +64,7 @@ def render() -> str:
     return "".join([_HEAD, *_profile(eap1000.ALL), _ROUTER, *_profile(router9000.ALL)])
 
 
-def _profile(rows: Sequence[ObjectRow]) -> Iterator[str]:
+def _profile(rows: Sequence[ProfileObject]) -> Iterator[str]:
     yield "\n## Overview\n\n"
     yield from _overview(rows)
     for row in rows:
@@ -72,28 +72,28 @@ def _profile(rows: Sequence[ObjectRow]) -> Iterator[str]:
         yield from _object(row)
 
 
-def _overview(rows: Sequence[ObjectRow]) -> Iterator[str]:
+def _overview(rows: Sequence[ProfileObject]) -> Iterator[str]:
     yield "| Index | Object | Kind | Description |\n|---|---|---|---|\n"
     for row in rows:
         kind = f"{row.code.name}{', dynamic' if row.dynamic else ''}"
         yield f"| {_range(row)} | {_title(row)} | {kind} | {_cell(row.description)} |\n"
 
 
-def _object(row: ObjectRow) -> Iterator[str]:
+def _object(row: ProfileObject) -> Iterator[str]:
     yield f"## {_range(row)} {_title(row)}\n\n{row.code.name}"
     yield ", dynamic" if row.dynamic else ""
     yield f". {row.description}\n\n"
     columns = (*_COLUMNS, "Plant file") if row.section else _COLUMNS
     yield f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}\n"
     if row.code is not ObjectCode.VAR:
-        count = EntryRow(0, "Highest sub-index", "USINT", row.count_access, _count_text(row),
+        count = ProfileEntry(0, "Highest sub-index", "USINT", row.count_access, _count_text(row),
                          row.fixed_count)  # fmt: skip
         yield _entry(count, row.section)
     for entry in row.entries:
         yield _entry(entry, row.section)
 
 
-def _count_text(row: ObjectRow) -> str:
+def _count_text(row: ProfileObject) -> str:
     texts = []
     if row.list_row:
         texts.append(f"At most {row.last_subindex}.")
@@ -104,7 +104,7 @@ def _count_text(row: ObjectRow) -> str:
     return " ".join(texts)
 
 
-def _entry(row: EntryRow, section: str = "") -> str:
+def _entry(row: ProfileEntry, section: str = "") -> str:
     kind = None if row.kind == OWN_TYPE else datatypes.parse(row.kind)
     cells = (
         f"{row.subindex:02X} to {row.last:02X}" if row.last else f"{row.subindex:02X}",
@@ -122,7 +122,7 @@ def _entry(row: EntryRow, section: str = "") -> str:
     return f"| {' | '.join(_cell(cell) for cell in cells)} |\n"
 
 
-def _access(row: EntryRow) -> str:
+def _access(row: ProfileEntry) -> str:
     states = (
         (Access.READ_PREOP, Access.WRITE_PREOP),
         (Access.READ_SAFEOP, Access.WRITE_SAFEOP),
@@ -144,7 +144,7 @@ def _access(row: EntryRow) -> str:
     return " ".join([*rights, *marks])
 
 
-def _content(row: EntryRow) -> str:
+def _content(row: ProfileEntry) -> str:
     if row.live:
         return "live"
     if row.derived:
@@ -154,7 +154,7 @@ def _content(row: EntryRow) -> str:
     return "command" if row.access & Access.WRITE_ANY else "fixed"
 
 
-def _default(row: EntryRow) -> str:
+def _default(row: ProfileEntry) -> str:
     if row.live or row.derived or row.kind == OWN_TYPE:
         return ""
     entry = Entry(row.name, row.kind, row.access, row.default)
@@ -162,18 +162,18 @@ def _default(row: EntryRow) -> str:
     return text or "empty"
 
 
-def _limits(row: EntryRow) -> str:
+def _limits(row: ProfileEntry) -> str:
     if row.minimum is None and row.maximum is None:
         return ""
     return f"{row.minimum or 0} to {row.maximum}"
 
 
-def _range(row: ObjectRow) -> str:
+def _range(row: ProfileObject) -> str:
     first = f"0x{row.first:04X}"
     return first if row.first == row.last else f"{first} to 0x{row.last:04X}"
 
 
-def _title(row: ObjectRow) -> str:
+def _title(row: ProfileObject) -> str:
     return row.name.format(n="n")
 
 

@@ -20,7 +20,7 @@ from devicebus.wire import sii
 from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus
 from eap.config.convert import convert_to
 from eap.config.document import read
-from eap.config.finding import Finding, FindingReport, one_of
+from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.errors import ConfigError
 from eap.near import near
 from eap.od.dictionary import ObjectDictionary
@@ -46,7 +46,7 @@ class BusResult(msgspec.Struct, frozen=True):
     """Either a bus and no findings, or no bus and all findings in the order of the file."""
 
     bus: Bus | None
-    findings: tuple[Finding, ...]
+    findings: tuple[PlantFinding, ...]
 
 
 def load(path: Path) -> BusResult:
@@ -82,7 +82,7 @@ def load_or_raise(path: Path) -> Bus:
     return result.bus
 
 
-def describe(path: Path) -> ExpectedBus | tuple[Finding, ...]:
+def describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
     """Return what a plant is to know of the bus file at *path*, or all that is wrong with it.
 
     That is what a master finds on such a bus.  What the file leaves open may be anything on a real

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from eap.config.bus import ExpectedBus
-from eap.config.finding import Finding
-from eap.config.load import LoadResult, load
+from eap.config.finding import PlantFinding
+from eap.config.load import PlantResult, load
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 from eap.pd.spec import PortKind, StationSpec
 
 
-def load_plant(path: Path) -> LoadResult:
+def load_plant(path: Path) -> PlantResult:
     """Read, check and complete the plant file at *path* and the bus files that it names."""
     return load(path, _describe)
 
@@ -44,7 +44,7 @@ def require_own_buses(stations: Sequence[StationSpec]) -> None:
             (buses if is_bus else others)[uri.host] = label
 
 
-def _describe(path: Path) -> ExpectedBus | tuple[Finding, ...]:
+def _describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:
     from eap.appliance.busfile import describe  # simulated devices, when a plant has a bus
 
     return describe(path)

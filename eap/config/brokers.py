@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from eap.aoe.mqtt_topics import check_network
 from eap.aoe.spec import DoorKind, MqttSpec, TlsSpec
-from eap.config.finding import Finding, FindingReport
+from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
 from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import parse_host
@@ -212,7 +212,7 @@ def check_learning(index: Index, report: FindingReport) -> None:
                 report.add(f"{station.at}.learn[{position}]", f"learn: {exc}", _SOURCES)
 
 
-def warn_of_open_brokers(index: Index, report: FindingReport) -> tuple[Finding, ...]:
+def warn_of_open_brokers(index: Index, report: FindingReport) -> tuple[PlantFinding, ...]:
     """Return a warning for each broker that teaches routes without knowing its clients.
 
     A station that names the network in ``learn`` wants that.
@@ -227,7 +227,7 @@ def warn_of_open_brokers(index: Index, report: FindingReport) -> tuple[Finding, 
                 )
                 expected = f"learn: [mqtt:{route.network}] if that is meant, else learn: false"
                 line = report.line_of(f"{route.at}.mqtt")
-                found.append(Finding(report.file, line, route.at, message, expected))
+                found.append(PlantFinding(report.file, line, route.at, message, expected))
     return tuple(found)
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 
-from eap.config.finding import Finding, FindingReport
+from eap.config.finding import FindingReport, PlantFinding
 from eap.config.structs import PlantFile, PortSection, StationSection
 from eap.ids import InterfaceUri, ObjectId
 from eap.pd.spec import BusEntrySpec, BusSlaveSpec, PortKind
@@ -59,7 +59,7 @@ class ExpectedBus(msgspec.Struct, frozen=True):
     slaves: tuple[DescribedSlave, ...] = ()
 
 
-DescribeBus: TypeAlias = Callable[[Path], ExpectedBus | tuple[Finding, ...]]
+DescribeBus: TypeAlias = Callable[[Path], ExpectedBus | tuple[PlantFinding, ...]]
 """Reads a bus file; returns its findings if it has any, and never raises for what it holds."""
 
 

@@ -11,7 +11,7 @@ from eap.aoe.routes import Route as AmsRoute
 from eap.aoe.spec import DEFAULT_TARGET, RouteSpec, RoutingSpec
 from eap.aoe.way import Way
 from eap.config.brokers import check_brokers
-from eap.config.finding import Finding, FindingReport, one_of
+from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
 from eap.config.routes import MQTT, MisfitError, next_hop, reach, target_of, without_prefix
 from eap.config.structs import RouteSection, StationSection
@@ -153,7 +153,7 @@ def _check_owners(
 
 def follow_routes(
     index: Index, routing: Mapping[str, RoutingSpec], report: FindingReport
-) -> tuple[Finding, ...]:
+) -> tuple[PlantFinding, ...]:
     """Return a warning for each written route that runs in a circle or gets nowhere.
 
     Args:
@@ -168,7 +168,7 @@ def follow_routes(
             if message := _follow(plant, station, route.to):
                 expected = "routes that end at who is meant"
                 line = report.line_of(route.at)
-                found.append(Finding(report.file, line, route.at, message, expected))
+                found.append(PlantFinding(report.file, line, route.at, message, expected))
     return tuple(found)
 
 

@@ -17,7 +17,7 @@ _VARYING = re.compile(r"'[^']*'|\S*\d\S*|, did you mean [^?]*\?")
 """Parts of a message that differ from one use of an anchor to the next."""
 
 
-class Finding(msgspec.Struct, frozen=True):
+class PlantFinding(msgspec.Struct, frozen=True):
     """One thing to correct."""
 
     file: str
@@ -49,10 +49,10 @@ class FindingReport:
         self.broken: set[str] = set()
         self.stations: set[str] = set()
         self._nodes: dict[str, Node] = {}
-        self._findings: dict[tuple[int, str, str], Finding] = {}
-        self._first_use: dict[tuple[int, str, str], Finding] = {}
-        self._further_uses: dict[Finding, set[str]] = {}
-        self._adopted: list[Finding] = []
+        self._findings: dict[tuple[int, str, str], PlantFinding] = {}
+        self._first_use: dict[tuple[int, str, str], PlantFinding] = {}
+        self._further_uses: dict[PlantFinding, set[str]] = {}
+        self._adopted: list[PlantFinding] = []
 
     def enter(self, path: str, line: int, node: Node) -> None:
         """Remember that *path* leads to *node*, in *line*."""
@@ -62,7 +62,7 @@ class FindingReport:
     def add(self, path: str, message: str, expected: str, *, line: int | None = None) -> None:
         """Report *message* at *path*; without *line* the one of the path or of what holds it."""
         where = self.line_of(path) if line is None else line
-        finding = Finding(self.file, where, path, message, expected)
+        finding = PlantFinding(self.file, where, path, message, expected)
         first = self._first_use.setdefault(self._cause(path, message), finding)
         if first.path != path:
             self._further_uses.setdefault(first, set()).add(path)
@@ -74,7 +74,7 @@ class FindingReport:
         for breach in breaches:
             self.add(f"{at}.{breach.key}", breach.message, breach.expected)
 
-    def adopt(self, findings: Iterable[Finding]) -> None:
+    def adopt(self, findings: Iterable[PlantFinding]) -> None:
         """Take over what is wrong with another file."""
         self._adopted += findings
 
@@ -101,12 +101,12 @@ class FindingReport:
         shape = _VARYING.sub("", " ".join(words))
         return id(self._nodes[known]), path.removeprefix(known), shape
 
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[PlantFinding, ...]:
         """Return all findings in the order of the file, then those of other files."""
         own = sorted(map(self._with_uses, self._findings.values()), key=lambda each: each.line)
         return (*own, *self._adopted)
 
-    def _with_uses(self, finding: Finding) -> Finding:
+    def _with_uses(self, finding: PlantFinding) -> PlantFinding:
         further = len(self._further_uses.get(finding, ()))
         if not further:
             return finding

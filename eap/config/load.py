@@ -19,7 +19,7 @@ from eap.config.check_variables import check_variables
 from eap.config.convert import convert, read_net_id
 from eap.config.derive import derive, derive_directory, derive_routing
 from eap.config.document import read
-from eap.config.finding import Finding, FindingReport
+from eap.config.finding import FindingReport, PlantFinding
 from eap.config.gateways import check_gateways
 from eap.config.index import Index
 from eap.config.links import check_links
@@ -41,18 +41,18 @@ class Plant(msgspec.Struct, frozen=True):
     """Whether changes that cannot be recorded are refused."""
 
 
-class LoadResult(msgspec.Struct, frozen=True):
+class PlantResult(msgspec.Struct, frozen=True):
     """Either a plant and no findings, or no plant and all findings in the order of the file."""
 
     plant: Plant | None
-    findings: tuple[Finding, ...]
+    findings: tuple[PlantFinding, ...]
     lines: Mapping[str, int] = {}
     """Of a plant: the line of each path of its file."""
-    warnings: tuple[Finding, ...] = ()
+    warnings: tuple[PlantFinding, ...] = ()
     """Of a plant: what is worth a look."""
 
 
-def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
+def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     """Read, check and complete the plant file at *path*; never raises for what the file holds.
 
     *describe_bus* reads the bus files that it names; their findings follow its own.
@@ -61,7 +61,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     root = read(path, report)
     plant_file = None if root is None else convert(root, report)
     if plant_file is None:
-        return LoadResult(None, report.findings())
+        return PlantResult(None, report.findings())
     report.stations |= {station.name for station in plant_file.stations}
     index = Index(plant_file, describe_buses(plant_file, path.parent, describe_bus, report))
     check_ports(index, report)
@@ -75,7 +75,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
     check_learning(index, report)
     check_access(index, report, path.parent)
     if findings := report.findings():
-        return LoadResult(None, findings)
+        return PlantResult(None, findings)
     plant = Plant(
         plant_file.plant,
         derive(index, path.parent),
@@ -84,7 +84,7 @@ def load(path: Path, describe_bus: DescribeBus) -> LoadResult:
         audit_required=plant_file.access.audit is AuditDuty.REQUIRED,
     )
     warnings = (*follow_routes(index, plant.routing, report), *warn_of_open_brokers(index, report))
-    return LoadResult(plant, (), report.lines, warnings)
+    return PlantResult(plant, (), report.lines, warnings)
 
 
 PORT = "eap0"
@@ -93,7 +93,7 @@ INTERFACE_PATH = f"{_PORT}.interface"
 NET_ID_PATHS = f"{_PORT}.net_id", f"{_ROUTER}.net_id"
 
 
-def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
+def blank(name: str, interface: str, net_id: str, cycle_us: int) -> PlantResult:
     """Return a plant called *name* that has one station of that name.
 
     A plant file's rules hold, and findings have paths as above.  *net_id* is that of the
@@ -115,11 +115,11 @@ def blank(name: str, interface: str, net_id: str, cycle_us: int) -> LoadResult:
     index = Index(PlantFile(plant="blank", stations=(station,)))
     check_ports(index, report)
     if findings := report.findings():
-        return LoadResult(None, findings)
+        return PlantResult(None, findings)
     plant = Plant(
         name, derive(index, Path()), derive_routing(index, Path()), derive_directory(index)
     )
-    return LoadResult(plant, ())
+    return PlantResult(plant, ())
 
 
 def _router(net_id: NetId) -> NetId:

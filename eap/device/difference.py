@@ -16,8 +16,8 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_rules import MappingEntry
 from eap.device.stored import Configuration, configuration
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import FrameEntry, Rx, Tx, Var
-from eap.od.profiles.table import Form, ObjectRow, to_text
+from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var
+from eap.od.profiles.table import Form, ProfileObject, to_text
 
 _NONE = b"\0"
 _REFERENCES = {
@@ -93,15 +93,15 @@ class _Comparison:
                 for subindex in sorted(after)[1:]:
                     yield self._change(row.first, subindex)
 
-    def _members(self, row: ObjectRow, kept: Configuration) -> list[int]:
+    def _members(self, row: ProfileObject, kept: Configuration) -> list[int]:
         return [index for index in sorted(kept) if row.first <= index <= row.last]
 
-    def _removed(self, row: ObjectRow) -> Iterator[EntryChange]:
+    def _removed(self, row: ProfileObject) -> Iterator[EntryChange]:
         for index in self._members(row, self._old):
             if index not in self._new:
                 yield self._change(index, 0, _NONE)
 
-    def _both(self, row: ObjectRow) -> list[int]:
+    def _both(self, row: ProfileObject) -> list[int]:
         return [index for index in self._members(row, self._old) if index in self._new]
 
     def _cut_lists(self) -> Iterator[EntryChange]:
@@ -115,7 +115,7 @@ class _Comparison:
     def _is_rewritten(self, index: int) -> bool:
         """Tell whether the list of a frame is more than continued."""
         before, after = self._old[index], self._new[index]
-        return any(after.get(sub) != before[sub] for sub in before if sub >= FrameEntry.TXPD)
+        return any(after.get(sub) != before[sub] for sub in before if sub >= FrameSub.TXPD)
 
     def _mappings_to_write(self) -> list[int]:
         """Return the mappings that change, or map variables whose type does or that go."""
@@ -153,7 +153,7 @@ class _Comparison:
                     if any(before) and (before != after or (goes and subindex != Tx.PDO_INDEX)):
                         yield self._change(index, subindex, bytes(2), interim=goes or any(after))
 
-    def _written(self, row: ObjectRow) -> Iterator[EntryChange]:
+    def _written(self, row: ProfileObject) -> Iterator[EntryChange]:
         for index in self._members(row, self._new):
             after = self._new[index]
             before = self._before(row, index)
@@ -161,7 +161,7 @@ class _Comparison:
             for subindex in changed or ([] if index in self._old else [min(after, key=bool)]):
                 yield self._change(index, subindex)
 
-    def _before(self, row: ObjectRow, index: int) -> dict[int, bytes]:
+    def _before(self, row: ProfileObject, index: int) -> dict[int, bytes]:
         """Return what the object at *index* holds when its turn to be written comes."""
         after = self._new[index]
         if index in self._old:
@@ -173,7 +173,7 @@ class _Comparison:
             entry = self._new_dictionary[index].entries[Var.DEFAULT]
             before |= {Var.DEFAULT_GIVEN: _NONE, Var.DEFAULT: entry.default}
         if row is profile.TX_FRAME and index in self._old and self._is_rewritten(index):
-            before = {sub: octets for sub, octets in before.items() if sub < FrameEntry.TXPD}
+            before = {sub: octets for sub, octets in before.items() if sub < FrameSub.TXPD}
         if row is profile.RX_PD and before[Rx.PUBLISHER] != after[Rx.PUBLISHER]:
             before[Rx.SOURCE] = b""  # as writing the publisher does
         for subindex in _REFERENCES.get(row.first, ()):

@@ -22,8 +22,8 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary, check_value, take_bits
 from eap.od.model import Access, Entry, OdObject, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, Status, Tx, Var
-from eap.od.profiles.table import CONFIG, DEFAULT_TYPE, ObjectRow
+from eap.od.profiles.eap1000 import AddressMode, FrameSub, Rx, Status, Tx, Var
+from eap.od.profiles.table import CONFIG, DEFAULT_TYPE, ProfileObject
 from eap.pd.device import DeviceFault
 from eap.pd.rules import data_budget, frame_budget
 from eap.pd.spec import StationSpec
@@ -139,7 +139,7 @@ class EapDictionary(EapObjects):
         return True
 
     def _write_whole(
-        self, row: ObjectRow, index: int, first: int, data: bytes, state: OdState
+        self, row: ProfileObject, index: int, first: int, data: bytes, state: OdState
     ) -> None:
         self._whole(index, first)  # refuses what has no complete access
         item = self[index]
@@ -161,7 +161,7 @@ class EapDictionary(EapObjects):
         if has_count and row.mapping:
             self._write_count(row, item, bytes((count,)), state)
 
-    def _make_room(self, row: ObjectRow, item: OdObject, count: int, state: OdState) -> None:
+    def _make_room(self, row: ProfileObject, item: OdObject, count: int, state: OdState) -> None:
         """Empty what can be emptied and make place for *count* entries; 0 may delete it all."""
         if row.mapping:
             self._write_count(row, item, b"\0", state)
@@ -170,7 +170,7 @@ class EapDictionary(EapObjects):
             self._write_count(row, item, bytes((count,)), state)
 
     def _write(
-        self, row: ObjectRow, index: int, subindex: int, data: bytes, state: OdState
+        self, row: ProfileObject, index: int, subindex: int, data: bytes, state: OdState
     ) -> None:
         item = self[index]
         if subindex == 0 and is_counted(item):
@@ -197,7 +197,7 @@ class EapDictionary(EapObjects):
             self.put(index, Rx.SOURCE, b"")  # it was the address of the publisher before
         self.put(index, subindex, data)
 
-    def _write_count(self, row: ObjectRow, item: OdObject, data: bytes, state: OdState) -> None:
+    def _write_count(self, row: ProfileObject, item: OdObject, data: bytes, state: OdState) -> None:
         """Write sub-index 0: the length of a list or a mapping, or 0 to delete or empty."""
         index = item.index
         ObjectDictionary.check_download(self, index, 0, len(data), state)
@@ -220,7 +220,7 @@ class EapDictionary(EapObjects):
         self.resize(index, count)
 
     def _check_mapping_entry(
-        self, row: ObjectRow, item: OdObject, subindex: int, data: bytes
+        self, row: ProfileObject, item: OdObject, subindex: int, data: bytes
     ) -> None:
         if item.max_subindex:
             raise SdoAbortError(AbortCode.SUBINDEX_0_NOT_ZERO, item.index, subindex)
@@ -235,7 +235,7 @@ class EapDictionary(EapObjects):
             detail = f"{ObjectId(*user)} refers to it"
             raise SdoAbortError(code, index, subindex, detail)
 
-    def _settle(self, row: ObjectRow, index: int, written: list[int], state: OdState) -> None:
+    def _settle(self, row: ProfileObject, index: int, written: list[int], state: OdState) -> None:
         """Check what written entries mean for frames, and tell those who want to know."""
         if index not in self:
             return
@@ -255,14 +255,10 @@ class EapDictionary(EapObjects):
             except DeviceFault as exc:
                 raise SdoAbortError(AbortCode.PARAMETER, index, written[0], str(exc)) from None
 
-    def _frames_to_check(self, row: ObjectRow, index: int, subindex: int) -> list[int]:
+    def _frames_to_check(self, row: ProfileObject, index: int, subindex: int) -> list[int]:
         """Return the frames whose length or budget the entry has a part in."""
         if row is profile.TX_FRAME:
-            return (
-                [index]
-                if subindex >= FrameEntry.TXPD or subindex == FrameEntry.ADDRESS_MODE
-                else []
-            )
+            return [index] if subindex >= FrameSub.TXPD or subindex == FrameSub.ADDRESS_MODE else []
         if row is profile.TX_PD and subindex == Tx.PDO_INDEX:
             wanted = {index}
         elif row in {profile.TX_PDO, profile.MORE_TX_PDO} and subindex == 0:
@@ -278,7 +274,7 @@ class EapDictionary(EapObjects):
 
     def _check_budget(self, frame: int, index: int, subindex: int) -> None:
         length = self.frame_length(frame)
-        mode = AddressMode(self[frame].entries[FrameEntry.ADDRESS_MODE].value)
+        mode = AddressMode(self[frame].entries[FrameSub.ADDRESS_MODE].value)
         budget = frame_budget(self.uri.scheme, mode.kind)
         if length > budget:
             detail = f"{self.name_of(frame)} would have {length} octets, at most {budget} go there"
@@ -290,7 +286,7 @@ def is_counted(item: OdObject) -> bool:
     return item.entries[0].access == CONFIG
 
 
-def _right(row: ObjectRow) -> Access:
+def _right(row: ProfileObject) -> Access:
     is_sent = row in {profile.TX_PDO, profile.MORE_TX_PDO}
     return Access.TX_MAPPABLE if is_sent else Access.RX_MAPPABLE
 

@@ -21,8 +21,8 @@ from eap.device.eap_rules import encode_mapping
 from eap.device.pdlayout import bus_variables
 from eap.ids import Destination, DestinationKind, MacAddr, NetId
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, RxFlag, Tx, Var
-from eap.od.profiles.table import ObjectRow
+from eap.od.profiles.eap1000 import AddressMode, FrameSub, Rx, RxFlag, Tx, Var
+from eap.od.profiles.table import ProfileObject
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import (
     REQUESTER,
@@ -105,13 +105,13 @@ class _Filling:
         for frame in self._frames:
             self._fill_frame(frames[frame.name], frame, tx)
 
-    def _assign(self, rows: tuple[ObjectRow, ...], names: list[str]) -> dict[str, int]:
+    def _assign(self, rows: tuple[ProfileObject, ...], names: list[str]) -> dict[str, int]:
         """Return an index of *rows* for each name: that of *like*, or another."""
         like = self._like
         before = {like.name_of(i): i for i in like.members(*rows)} if like is not None else {}
         return self._choose(rows, names, before)
 
-    def _mappings(self, rows: tuple[ObjectRow, ...], pds: Mapping[str, int]) -> dict[str, int]:
+    def _mappings(self, rows: tuple[ProfileObject, ...], pds: Mapping[str, int]) -> dict[str, int]:
         """Return the index of each PD's mapping: that of *like*, or its own number."""
         before: dict[str, int] = {}
         if self._like is not None:
@@ -124,7 +124,7 @@ class _Filling:
         return self._choose(rows, list(pds), before)
 
     def _choose(
-        self, rows: tuple[ObjectRow, ...], names: list[str], before: Mapping[str, int]
+        self, rows: tuple[ProfileObject, ...], names: list[str], before: Mapping[str, int]
     ) -> dict[str, int]:
         chosen = {name: before[name] for name in names if name in before}
         taken = set(chosen.values())
@@ -144,7 +144,7 @@ class _Filling:
         self._set_fields(profile.PORT, self._dictionary.port)
         self._set_list(profile.GROUPS, 1, self._dictionary.port.join)
 
-    def _fill_variable(self, row: ObjectRow, index: int, variable: VariableSpec) -> None:
+    def _fill_variable(self, row: ProfileObject, index: int, variable: VariableSpec) -> None:
         kind = self._types[variable.name]
         self._dictionary.make(row, index)
         self._set_fields(index, variable)
@@ -177,8 +177,8 @@ class _Filling:
     def _fill_frame(self, index: int, frame: TxFrameSpec, tx: Mapping[str, int]) -> None:
         self._dictionary.make(profile.TX_FRAME, index)
         self._set_fields(index, frame)
-        self._set(index, {FrameEntry.ENABLED: True, **_address(frame)})
-        self._set_list(index, FrameEntry.TXPD, [tx[pd.name] for pd in frame.pds])
+        self._set(index, {FrameSub.ENABLED: True, **_address(frame)})
+        self._set_list(index, FrameSub.TXPD, [tx[pd.name] for pd in frame.pds])
 
     def _set_fields(
         self, index: int, record: Struct, references: Mapping[str, int] | None = None
@@ -225,15 +225,15 @@ def _value(record: Any, path: str) -> Any:
 def _address(frame: TxFrameSpec) -> dict[int, Any]:
     """Return the entries of a TxFrame that say where it goes."""
     if frame.destination == REQUESTER:
-        return {FrameEntry.ADDRESS_MODE: AddressMode.REQUESTER}
+        return {FrameSub.ADDRESS_MODE: AddressMode.REQUESTER}
     destination = Destination.parse(frame.destination)
-    values: dict[int, Any] = {FrameEntry.ADDRESS_MODE: AddressMode[destination.kind.name]}
+    values: dict[int, Any] = {FrameSub.ADDRESS_MODE: AddressMode[destination.kind.name]}
     if destination.kind is DestinationKind.MAC:
-        values[FrameEntry.DESTINATION_MAC] = MacAddr.parse(destination.host)
+        values[FrameSub.DESTINATION_MAC] = MacAddr.parse(destination.host)
     elif destination.kind is DestinationKind.NET_ID:
-        values[FrameEntry.DESTINATION_NETID] = NetId.parse(destination.host)
-        values[FrameEntry.DESTINATION_MAC] = MacAddr.parse(frame.mac) if frame.mac else bytes(6)
+        values[FrameSub.DESTINATION_NETID] = NetId.parse(destination.host)
+        values[FrameSub.DESTINATION_MAC] = MacAddr.parse(frame.mac) if frame.mac else bytes(6)
     else:
-        values[FrameEntry.DESTINATION_IP] = IPv4Address(destination.host).packed
-        values[FrameEntry.PORT_NUMBER] = destination.port
+        values[FrameSub.DESTINATION_IP] = IPv4Address(destination.host).packed
+        values[FrameSub.PORT_NUMBER] = destination.port
     return values

@@ -19,12 +19,12 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import WO, OdObject, ReadHook
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Configured, FrameEntry, PortEntry, Rx, Tx, Var
+from eap.od.profiles.eap1000 import Configured, FrameSub, PortSub, Rx, Tx, Var
 from eap.od.profiles.table import (
     DEFAULT_TYPE,
     OWN_TYPE,
-    EntryRow,
-    ObjectRow,
+    ProfileEntry,
+    ProfileObject,
     make_entry,
     make_object,
 )
@@ -35,8 +35,8 @@ TRANSPORTS = ("udp", "ethernet", "tcp", "loop")
 NAME_AT = {
     0x6: (0x6000, Var.NAME),
     0x7: (0x7000, Var.NAME),
-    0x8: (0x8000, FrameEntry.NAME),
-    0xA: (0x8000, FrameEntry.NAME),
+    0x8: (0x8000, FrameSub.NAME),
+    0xA: (0x8000, FrameSub.NAME),
     0xB: (0xD000, Tx.NAME),
     0xC: (0xE000, Rx.NAME),
     0xD: (0xD000, Tx.NAME),
@@ -46,7 +46,7 @@ NAME_AT = {
 _STEMS = {0x6: "tx-variable", 0x7: "rx-variable", 0x8: "frame", 0xD: "txpd", 0xE: "rxpd"}
 """Names of new objects, without their number."""
 _CHANGEABLE = {
-    profile.TX_FRAME.first: FrameEntry.CHANGEABLE,
+    profile.TX_FRAME.first: FrameSub.CHANGEABLE,
     profile.TX_PD.first: Tx.CHANGEABLE,
     profile.RX_PD.first: Rx.CHANGEABLE,
 }
@@ -138,10 +138,10 @@ class EapObjects(ObjectDictionary):
         fixed = {
             (0x1000, 0): identity.module_profile << 16 | (self.port.profile or profile.PROFILE),
             **identity.entries(),
-            (profile.PORT, PortEntry.NAME): self.port.name,
-            (profile.PORT, PortEntry.TRANSPORT): TRANSPORTS.index(uri.scheme),
-            (profile.PORT, PortEntry.INTERFACE): self.port.interface,
-            (profile.PORT, PortEntry.PORT_NUMBER): uri.port,
+            (profile.PORT, PortSub.NAME): self.port.name,
+            (profile.PORT, PortSub.TRANSPORT): TRANSPORTS.index(uri.scheme),
+            (profile.PORT, PortSub.INTERFACE): self.port.interface,
+            (profile.PORT, PortSub.PORT_NUMBER): uri.port,
             (profile.NET_ID, 1): self._net_id,
         }
         for (index, subindex), value in fixed.items():
@@ -164,11 +164,11 @@ class EapObjects(ObjectDictionary):
             if row.companion:
                 self.remove(index - row.first + row.companion)
 
-    def members(self, *rows: ObjectRow) -> list[int]:
+    def members(self, *rows: ProfileObject) -> list[int]:
         """Return the indexes of the objects that *rows* describe, in order."""
         return [index for row in rows for index in sorted(self._members[row.first])]
 
-    def make(self, row: ObjectRow, index: int) -> OdObject:
+    def make(self, row: ProfileObject, index: int) -> OdObject:
         """Add an object of a dynamic range, and the one that shows what becomes of it."""
         item = self.make_object(row, index)
         self.add(item)
@@ -183,12 +183,14 @@ class EapObjects(ObjectDictionary):
         return item
 
     def make_object(
-        self, row: ObjectRow, index: int, kind: DataType = DEFAULT_TYPE, last: int = 0
+        self, row: ProfileObject, index: int, kind: DataType = DEFAULT_TYPE, last: int = 0
     ) -> OdObject:
         """Return an object with its defaults, not added yet; arguments as for ``make_object``."""
         return make_object(row, index, partial(self._source, index), kind=kind, last=last)
 
-    def _source(self, index: int, row: EntryRow, subindex: int, kind: DataType) -> ReadHook | None:
+    def _source(
+        self, index: int, row: ProfileEntry, subindex: int, kind: DataType
+    ) -> ReadHook | None:
         if row.live:
             return partial(self._live, index, row.live, kind.size)
         return partial(self._derived, index, subindex) if row.derived else None
@@ -221,7 +223,7 @@ class EapObjects(ObjectDictionary):
                     more = WO if any(octets) else each.access
                     item.entries[each.subindex].access = each.access | more
 
-    def _retype(self, item: OdObject, row: ObjectRow, kind: DataType) -> None:
+    def _retype(self, item: OdObject, row: ProfileObject, kind: DataType) -> None:
         """Give a variable another type; its default is forgotten."""
         if item.entries[Var.DEFAULT].kind == kind:
             return
@@ -251,10 +253,10 @@ class EapObjects(ObjectDictionary):
     def listed_pds(self, index: int) -> Iterator[tuple[int, int]]:
         """Yield sub-index and TxPD of the list of the frame at *index*, without its blanks."""
         for subindex, entry in self[index].entries.items():
-            if subindex >= FrameEntry.TXPD and (pd := int.from_bytes(entry.octets, "little")):
+            if subindex >= FrameSub.TXPD and (pd := int.from_bytes(entry.octets, "little")):
                 yield subindex, pd
 
-    def next_free(self, rows: tuple[ObjectRow, ...]) -> int:
+    def next_free(self, rows: tuple[ProfileObject, ...]) -> int:
         """Return the first index of *rows* that is free, 0 if none is."""
         for row in rows:
             taken = self._members[row.first]
@@ -285,7 +287,7 @@ class EapObjects(ObjectDictionary):
                     if subindex and MappingEntry.decode(entry.value).target == index:
                         yield item.index, subindex
 
-    def _poll_of(self, index: int, row: ObjectRow, subindex: int) -> tuple[int, int] | None:
+    def _poll_of(self, index: int, row: ProfileObject, subindex: int) -> tuple[int, int] | None:
         for item in self._members[row.first].values():
             if item.entries[subindex].value == index:
                 return item.index, subindex
@@ -305,7 +307,7 @@ class EapObjects(ObjectDictionary):
         entry = self[index].entries[subindex]
         return entry.kind.encode(self._compute(profile.row_of(index), index, subindex))
 
-    def _compute(self, row: ObjectRow, index: int, subindex: int) -> int:
+    def _compute(self, row: ProfileObject, index: int, subindex: int) -> int:
         if row is profile.TX_FRAME:
             return self.frame_length(index)
         if row in {profile.TX_PD, profile.RX_PD}:

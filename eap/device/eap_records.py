@@ -29,8 +29,8 @@ from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import (
     AddressMode,
     Configured,
-    FrameEntry,
-    PortEntry,
+    FrameSub,
+    PortSub,
     Rx,
     RxFlag,
     Tx,
@@ -195,9 +195,9 @@ class PortReader:
             if each.schemes and value(each.subindex) and self._scheme not in each.schemes:
                 detail = f"only on {' and '.join(each.schemes)}, this is {self._scheme}"
                 raise self.fault(FaultCode.PORT, detail, profile.PORT, each.subindex)
-        if value(PortEntry.VLAN_PRIORITY) and not value(PortEntry.VLAN_ID):
+        if value(PortSub.VLAN_PRIORITY) and not value(PortSub.VLAN_ID):
             detail = "a priority needs a VLAN"
-            raise self.fault(FaultCode.PORT, detail, profile.PORT, PortEntry.VLAN_PRIORITY)
+            raise self.fault(FaultCode.PORT, detail, profile.PORT, PortSub.VLAN_PRIORITY)
         fields = {**msgspec.to_builtins(self._dictionary.port), **self._fields(profile.PORT)}
         return msgspec.convert({**fields, "join": list(self._groups())}, PortSpec)
 
@@ -232,7 +232,7 @@ class PortReader:
                     detail = f"TxPD 0x{pd:04X}"
                     raise self.fault(FaultCode.MISSING_OBJECT, detail, index, subindex)
                 seen[pd] = index
-            if self._values(index)(FrameEntry.ENABLED):
+            if self._values(index)(FrameSub.ENABLED):
                 yield self._frame(index, [pd for _, pd in listed])
         for pd in self._dictionary.members(profile.TX_PD):
             if pd not in seen and self._values(pd)(Tx.ENABLED):
@@ -243,19 +243,19 @@ class PortReader:
         enabled = [pd for pd in listed if self._values(pd)(Tx.ENABLED)]
         pds = tuple(self._tx(pd) for pd in enabled)
         if not pds:
-            raise self.fault(FaultCode.EMPTY_FRAME, value(FrameEntry.NAME), index, FrameEntry.TXPD)
-        mode = AddressMode(value(FrameEntry.ADDRESS_MODE))
+            raise self.fault(FaultCode.EMPTY_FRAME, value(FrameSub.NAME), index, FrameSub.TXPD)
+        mode = AddressMode(value(FrameSub.ADDRESS_MODE))
         length = self._dictionary.frame_length(index)
         budget = frame_budget(self._scheme, mode.kind)
         if length > budget:
             detail = f"{length} octets, at most {budget} go there"
-            raise self.fault(FaultCode.FRAME_TOO_LONG, detail, index, FrameEntry.FRAME_LENGTH)
+            raise self.fault(FaultCode.FRAME_TOO_LONG, detail, index, FrameSub.FRAME_LENGTH)
         record = TxFrameSpec(
             **self._fields(index),
             port=self.name,
             destination=self._destination(index, mode),
             pds=pds,
-            mac=_known_mac(value(FrameEntry.DESTINATION_MAC)) if mode is AddressMode.NET_ID else "",
+            mac=_known_mac(value(FrameSub.DESTINATION_MAC)) if mode is AddressMode.NET_ID else "",
         )
         frame = FoundRecord(self.name, index, record)
         self.sent += [
@@ -269,24 +269,24 @@ class PortReader:
             return REQUESTER
         if kind not in DESTINATIONS[self._scheme]:
             detail = f"{mode.name} is no way to address from {self._scheme}"
-            raise self.fault(FaultCode.NO_DESTINATION, detail, index, FrameEntry.ADDRESS_MODE)
+            raise self.fault(FaultCode.NO_DESTINATION, detail, index, FrameSub.ADDRESS_MODE)
         number = 0
         if kind is DestinationKind.MAC:
             subindex, host = (
-                FrameEntry.DESTINATION_MAC,
-                str(MacAddr(value(FrameEntry.DESTINATION_MAC))),
+                FrameSub.DESTINATION_MAC,
+                str(MacAddr(value(FrameSub.DESTINATION_MAC))),
             )
         elif kind is DestinationKind.NET_ID:
             subindex, host = (
-                FrameEntry.DESTINATION_NETID,
-                str(NetId(value(FrameEntry.DESTINATION_NETID))),
+                FrameSub.DESTINATION_NETID,
+                str(NetId(value(FrameSub.DESTINATION_NETID))),
             )
         else:
             subindex, host = (
-                FrameEntry.DESTINATION_IP,
-                str(IPv4Address(value(FrameEntry.DESTINATION_IP))),
+                FrameSub.DESTINATION_IP,
+                str(IPv4Address(value(FrameSub.DESTINATION_IP))),
             )
-            number = value(FrameEntry.PORT_NUMBER)
+            number = value(FrameSub.PORT_NUMBER)
         destination = Destination(kind, host, number)
         is_tcp_group = kind is DestinationKind.TCP and destination.is_group
         if not any(value(subindex)) or is_tcp_group:
@@ -386,7 +386,7 @@ def check_station(
     Raises:
         DeviceFault: for the first object that is wrong.
     """
-    _check_unique(frames, FrameEntry.NAME, "frame")
+    _check_unique(frames, FrameSub.NAME, "frame")
     _check_unique(pds, Tx.NAME, "sent PD")
     _check_unique(subscriptions, Rx.NAME, "received PD")
     uris = {port.name: InterfaceUri.parse(port.interface) for port in spec.ports}

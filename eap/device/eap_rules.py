@@ -22,7 +22,7 @@ from eap.od.dictionary import ObjectDictionary
 from eap.od.model import Access, Entry, OdObject
 from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import MAX_ENTRIES, WHOLE, RxFlag
-from eap.od.profiles.table import ObjectRow, Rule
+from eap.od.profiles.table import ProfileObject, Rule
 from eap.pd.address import address_text, source_octets
 from eap.pd.rules import MADE_SUFFIXES, NAME, is_group, is_name
 
@@ -31,7 +31,7 @@ REQUESTED = frozenset({2, 4, 8})
 _BOOL = 0x01
 
 
-def checked(row: ObjectRow, subindex: int, entry: Entry, data: bytes) -> bytes:
+def checked(row: ProfileObject, subindex: int, entry: Entry, data: bytes) -> bytes:
     """Return *data* as *entry* at *subindex* of one of *row*'s objects stores it."""
     if entry.is_text:
         data = _text(data)

@@ -14,7 +14,7 @@ from eap.od.dictionary import ObjectDictionary
 from eap.od.model import OdObject, OdState
 from eap.od.profiles import master1100 as profile
 from eap.od.profiles.master1100 import MasterLive
-from eap.od.profiles.table import ObjectRow, live_source, make_object
+from eap.od.profiles.table import ProfileObject, live_source, make_object
 
 _DETECT = 0xF002
 
@@ -124,12 +124,12 @@ class MasterDictionary(ObjectDictionary):
             found.update(range(row.first, row.first + lists))
         return found
 
-    def _stations(self, row: ObjectRow) -> Sequence[int]:
+    def _stations(self, row: ProfileObject) -> Sequence[int]:
         is_found = row in {profile.DETECTED, profile.DETECTED_LIST}
         stations = self._values.detected() if is_found else self._values.configured()
         return stations[: profile.MAX_SLAVES]
 
-    def _make(self, row: ObjectRow, index: int) -> OdObject:
+    def _make(self, row: ProfileObject, index: int) -> OdObject:
         stations, number = self._stations(row), index - row.first
         if row in profile.LISTS:
             return self._make_list(row, index, stations)
@@ -149,7 +149,7 @@ class MasterDictionary(ObjectDictionary):
         source = live_source(lambda key: read(station, MasterLive(key)))
         return make_object(row, index, source, write=write, extent=extent)
 
-    def _make_list(self, row: ObjectRow, index: int, stations: Sequence[int]) -> OdObject:
+    def _make_list(self, row: ProfileObject, index: int, stations: Sequence[int]) -> OdObject:
         start = (index - row.first) * profile.PER_LIST
         part = stations[start : start + profile.PER_LIST]
         if start and not part:

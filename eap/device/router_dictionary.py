@@ -20,7 +20,7 @@ from eap.od.model import OdObject
 from eap.od.profiles import eap1000
 from eap.od.profiles import router9000 as profile
 from eap.od.profiles.router9000 import RouterLive
-from eap.od.profiles.table import ObjectRow, live_source, make_object
+from eap.od.profiles.table import ProfileObject, live_source, make_object
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 
 _IP_SCHEMES = ("udp", "tcp")
@@ -133,7 +133,7 @@ _PROFILES = {PortKind.EAP: eap1000.MODULE_PROFILE, PortKind.BUS: profile.MASTER_
 
 
 def _make(
-    row: ObjectRow, index: int, read: Callable[[RouterLive], Any], *, last: int = 0
+    row: ProfileObject, index: int, read: Callable[[RouterLive], Any], *, last: int = 0
 ) -> OdObject:
     return make_object(row, index, live_source(lambda key: read(RouterLive(key))), last=last)
 

@@ -18,7 +18,7 @@ from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import check_value
 from eap.od.model import Entry, ObjectCode
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.table import CONFIG, ObjectRow
+from eap.od.profiles.table import CONFIG, ProfileObject
 
 VERSION = 1
 
@@ -132,7 +132,7 @@ def _put_all(dictionary: EapDictionary, kept: Mapping[int, Mapping[int, bytes]])
 
 
 def _put(
-    dictionary: EapDictionary, row: ObjectRow, index: int, subindex: int, octets: bytes
+    dictionary: EapDictionary, row: ProfileObject, index: int, subindex: int, octets: bytes
 ) -> None:
     entry = dictionary.entry(index, subindex)
     if not _is_kept(entry):

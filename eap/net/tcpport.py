@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from eap.ids import Destination, DestinationKind
 from eap.net.connections import CloseReason, ConnectionTable, Limits
 from eap.net.tcp import CONNECTION, TcpReceiver, TcpSender
-from eap.pd.link import Channel, OutFrame, Taker
+from eap.pd.link import FrameChannel, OutFrame, Taker
 
 LIMITS = Limits(total=32, reserved=8, per_host=16)
 """Incoming connections of a port: each costs a system call a cycle, whether it says anything."""
@@ -31,7 +31,7 @@ class TcpPort:
     minimum_size = 0
 
     def __init__(
-        self, address: str, datagrams: Channel | None = None, answers: Sequence[Taker] = ()
+        self, address: str, datagrams: FrameChannel | None = None, answers: Sequence[Taker] = ()
     ) -> None:
         self._answers = list(answers)
         self.errors: dict[str, int] = {}

@@ -7,7 +7,7 @@ from heapq import heapify, heapreplace
 from types import MappingProxyType
 
 from eap.pd.device import DeviceState
-from eap.pd.link import Channel, CyclicBus
+from eap.pd.link import CyclicBus, FrameChannel
 from eap.pd.station import Station
 from eap.pd.words import StationWord
 
@@ -20,11 +20,11 @@ class Engine:
 
     def __init__(self, stations: Sequence[Station]) -> None:
         self._stations = list(stations)
-        self._arrivals: list[Channel] = []
+        self._arrivals: list[FrameChannel] = []
         self._buses: list[CyclicBus] = []
         self._due: list[tuple[int, int]] = []
 
-    def drain_on_arrival(self, channels: Iterable[Channel]) -> None:
+    def drain_on_arrival(self, channels: Iterable[FrameChannel]) -> None:
         """Take what these channels receive as soon as :meth:`receive` is called."""
         self._arrivals.extend(channels)
 

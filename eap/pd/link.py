@@ -55,7 +55,7 @@ class OutFrame:
         self.oversized = False
 
 
-class Channel(Protocol):
+class FrameChannel(Protocol):
     """One way in and out: a UDP socket, an Ethernet interface, a TCP connection, a loopback."""
 
     def drain(self, now_ns: int) -> int:
@@ -122,7 +122,7 @@ class StateChannel:
         words: Of the station's image, which hold its state.
     """
 
-    def __init__(self, channel: Channel, words: memoryview) -> None:
+    def __init__(self, channel: FrameChannel, words: memoryview) -> None:
         self._channel = channel
         self._words = words
         self._toggle = 0

@@ -10,7 +10,7 @@ from eap.pd.address import from_word, net_id_of, to_word
 from eap.pd.frame_status import enter_refused, enter_sent, enter_skipped, enter_suppressed
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FrameSlot, TxSlot
-from eap.pd.link import Channel, OutFrame
+from eap.pd.link import FrameChannel, OutFrame
 from eap.pd.poll import Requests
 from eap.pd.spec import TriggerSpec, TxFrameSpec
 from eap.pd.trigger import EVENT_BIT, SUPPRESS_BIT, Schedule, Trigger, plan_schedule
@@ -54,7 +54,7 @@ class Publisher:
         image: Image,
         inputs: Inputs,
         publisher: NetId,
-        channel: Channel,
+        channel: FrameChannel,
         frames: Iterable[FrameRow],
     ) -> None:
         self._image = image
@@ -267,7 +267,7 @@ class _AnswerFrame:
         self._kept: dict[tuple[str, tuple[TxPd, ...]], Selection] = {}
 
     def select(
-        self, sender: str, pds: tuple[TxPd, ...], publisher: NetId, channel: Channel
+        self, sender: str, pds: tuple[TxPd, ...], publisher: NetId, channel: FrameChannel
     ) -> Selection:
         """Return the buffer for *pds* to *sender*."""
         kept = self._kept
@@ -299,7 +299,7 @@ class Answerer:
         image: Image,
         inputs: Inputs,
         publisher: NetId,
-        channel: Channel,
+        channel: FrameChannel,
         frames: Iterable[FrameRow],
         requests: Requests,
     ) -> None:

@@ -21,7 +21,7 @@ from eap.pd.address import NetIdLearner, forget
 from eap.pd.device import DeviceState, EapDevice
 from eap.pd.generator import Generators
 from eap.pd.image import Image, Inputs
-from eap.pd.link import Channel, CyclicBus, StateChannel, Taker
+from eap.pd.link import CyclicBus, FrameChannel, StateChannel, Taker
 from eap.pd.links import Links
 from eap.pd.poll import questions_of, requests_at
 from eap.pd.publisher import Answerer, FrameRow, Publisher
@@ -80,11 +80,11 @@ class Station:
         """True if anything follows from what was received."""
         self._has_own_variables = self._computes
         self.buses: list[CyclicBus] = []
-        self._publishers: list[tuple[Publisher | Answerer, Channel]] = []
-        self._sending: list[tuple[Publisher | Answerer, Channel]] = []
+        self._publishers: list[tuple[Publisher | Answerer, FrameChannel]] = []
+        self._sending: list[tuple[Publisher | Answerer, FrameChannel]] = []
         """The publishers, in states that send."""
-        self._ports: dict[str, tuple[Channel, Publisher | None]] = {}
-        self._channels: list[Channel] = []
+        self._ports: dict[str, tuple[FrameChannel, Publisher | None]] = {}
+        self._channels: list[FrameChannel] = []
         self._drains: list[Callable[[int], object]] = []
         self._rarely: list[Callable[[int], int]] = []
         self._rarely_every = max(1, _UNREAD_FOR_US // spec.cycle_us)
@@ -113,7 +113,7 @@ class Station:
         own = [(pd, slot) for pd, slot in rows if pd.port == port]
         return Subscriber(self.image, own, self.cycle_ns, self._requests[port], self._questions)
 
-    def connect(self, port: str, channel: Channel) -> None:
+    def connect(self, port: str, channel: FrameChannel) -> None:
         """Send the frames of *port* through *channel*, and drain it.
 
         That is done in each cycle, or now and then if nothing is subscribed to there.
@@ -149,7 +149,7 @@ class Station:
             learner.sought = () if publisher is None else publisher.sought
             learner.learn = forget if publisher is None else publisher.learn
 
-    def drain_also(self, channel: Channel) -> None:
+    def drain_also(self, channel: FrameChannel) -> None:
         """Drain another channel that feeds this station, such as a multicast group."""
         if channel not in self._channels:
             self._channels.append(channel)
@@ -233,12 +233,12 @@ class Station:
             for requests in self._requests.values():
                 requests.take()
 
-    def channel(self, port: str) -> Channel:
+    def channel(self, port: str) -> FrameChannel:
         """Return what *port* is connected to."""
         return self._ports[port][0]
 
     def prepare_handover(
-        self, before: Station, channels: Mapping[str, Channel] = MappingProxyType({})
+        self, before: Station, channels: Mapping[str, FrameChannel] = MappingProxyType({})
     ) -> None:
         """Be connected as *before* is, or to *channels*, and know the frames that it receives.
 

@@ -17,7 +17,7 @@ from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdFrameHeader, PdHeader
 from eap.ids import NetId
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FrameSlot, TxSlot
-from eap.pd.link import Channel, OutFrame
+from eap.pd.link import FrameChannel, OutFrame
 from eap.pd.spec import Writer
 from eap.pd.trigger import Schedule, Trigger
 
@@ -156,7 +156,7 @@ class TxFrame:
         publisher: NetId,
         pds: tuple[TxPd, ...],
         gate: tuple[int, int],
-        channel: Channel,
+        channel: FrameChannel,
         destination: str,
     ) -> None:
         self.slot = slot
@@ -216,7 +216,7 @@ class TxFrame:
 
 
 def build_frame(
-    publisher: NetId, pds: tuple[TxPd, ...], channel: Channel, destination: str
+    publisher: NetId, pds: tuple[TxPd, ...], channel: FrameChannel, destination: str
 ) -> OutFrame:
     """Return a frame with all headers and no data yet."""
     header = channel.link_header(destination)

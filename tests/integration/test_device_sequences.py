@@ -24,7 +24,7 @@ from eap.appliance.store import effective, settle
 from eap.device.eap_records import read_back
 from eap.errors import EngineGoneError, EngineRefusedError
 from eap.od.abort import SdoAbortError
-from eap.od.profiles.eap1000 import FrameEntry, Rx, Tx, Var
+from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var
 from eap.pd.device import DeviceState
 from eap.pd.spec import (
     CounterSource,
@@ -87,13 +87,13 @@ DOWNLOADS = [
     (0x1600, 0, b"\0"),
     (0x1600, 1, LONG.pack(0x7000_0120)),
     (0x1600, 0, b"\1"),
-    (0x8000, FrameEntry.DESTINATION_IP, b"\x7f\x09\x02\x09"),
-    (0x8000, FrameEntry.ENABLED, b"\0"),
-    (0x8000, FrameEntry.ENABLED, b"\1"),
-    (0x8000, FrameEntry.TXPD, WORD.pack(0)),
-    (0x8000, FrameEntry.TXPD, WORD.pack(0xD000)),
-    (0x8000, FrameEntry.TXPD + 1, WORD.pack(0xD001)),
-    (0x8000, 0, OCTET.pack(FrameEntry.TXPD)),
+    (0x8000, FrameSub.DESTINATION_IP, b"\x7f\x09\x02\x09"),
+    (0x8000, FrameSub.ENABLED, b"\0"),
+    (0x8000, FrameSub.ENABLED, b"\1"),
+    (0x8000, FrameSub.TXPD, WORD.pack(0)),
+    (0x8000, FrameSub.TXPD, WORD.pack(0xD000)),
+    (0x8000, FrameSub.TXPD + 1, WORD.pack(0xD001)),
+    (0x8000, 0, OCTET.pack(FrameSub.TXPD)),
     (0xD000, Tx.PD_ID, WORD.pack(8)),
     (0xD000, Tx.PD_ID, WORD.pack(10)),
     (0xD000, Tx.CYCLE_TIME, LONG.pack(20_000)),

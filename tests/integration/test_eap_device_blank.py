@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, RxFlag, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, FrameSub, Rx, RxFlag, Tx, Var
 from tests.integration.test_eap_device import (
     BLANK,
     LEFT,
@@ -51,10 +51,10 @@ def configure_blank(put: Downloads) -> None:
     put(0xD000, Tx.PD_ID, 9)
     put(0xD000, Tx.ENABLED, b"\1")
     put(0xD000, Tx.CYCLE_TIME, 10_000, 4)
-    put(0x8000, FrameEntry.ADDRESS_MODE, int(AddressMode.IP), 1)
-    put(0x8000, FrameEntry.DESTINATION_IP, socket.inet_aton(RIGHT))
-    put(0x8000, FrameEntry.TXPD, 0xD000)
-    put(0x8000, FrameEntry.ENABLED, b"\1")
+    put(0x8000, FrameSub.ADDRESS_MODE, int(AddressMode.IP), 1)
+    put(0x8000, FrameSub.DESTINATION_IP, socket.inet_aton(RIGHT))
+    put(0x8000, FrameSub.TXPD, 0xD000)
+    put(0x8000, FrameSub.ENABLED, b"\1")
     for number, (name, kind) in enumerate((("ticks", "UDINT"), ("setpoint", "UINT"))):
         put(0x7000 + number, Var.TYPE_NAME, kind)
         put(0x7000 + number, Var.NAME, name)

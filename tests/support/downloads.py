@@ -8,7 +8,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.stored import adopt
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, RxFlag, Tx, Var, row_of
+from eap.od.profiles.eap1000 import AddressMode, FrameSub, Rx, RxFlag, Tx, Var, row_of
 
 PREOP, SAFEOP, OP = OdState.PREOP, OdState.SAFEOP, OdState.OP
 
@@ -78,13 +78,11 @@ def rx_pd(dictionary: EapDictionary, index: int, pdo: int, pd_id: int) -> int:
 def frame(dictionary: EapDictionary, index: int, *pds: int, to: bytes = b"\x0a\0\0\2") -> int:
     """Make an enabled frame to an IPv4 address, or to a MAC address of six octets."""
     is_mac = len(to) == 6
-    write(dictionary, index, FrameEntry.ADDRESS_MODE, AddressMode.MAC if is_mac else AddressMode.IP)
-    write(
-        dictionary, index, FrameEntry.DESTINATION_MAC if is_mac else FrameEntry.DESTINATION_IP, to
-    )
-    for subindex, pd in enumerate(pds, FrameEntry.TXPD):
+    write(dictionary, index, FrameSub.ADDRESS_MODE, AddressMode.MAC if is_mac else AddressMode.IP)
+    write(dictionary, index, FrameSub.DESTINATION_MAC if is_mac else FrameSub.DESTINATION_IP, to)
+    for subindex, pd in enumerate(pds, FrameSub.TXPD):
         write(dictionary, index, subindex, pd)
-    write(dictionary, index, FrameEntry.ENABLED, 1)
+    write(dictionary, index, FrameSub.ENABLED, 1)
     return index
 
 

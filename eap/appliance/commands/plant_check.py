@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from eap.appliance.plantfile import load_plant
-from eap.config.finding import Finding
+from eap.config.finding import PlantFinding
 from eap.config.load import Plant
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_fill import fill
@@ -24,8 +24,8 @@ class CheckReport(msgspec.Struct, frozen=True):
     """``eapctl check``: all errors of a plant file, and its warnings if it has none."""
 
     ok: bool
-    findings: tuple[Finding, ...]
-    warnings: tuple[Finding, ...]
+    findings: tuple[PlantFinding, ...]
+    warnings: tuple[PlantFinding, ...]
 
 
 def check_plant(path: Path) -> tuple[CheckReport, Plant | None]:
@@ -39,7 +39,7 @@ def check_plant(path: Path) -> tuple[CheckReport, Plant | None]:
         for message, expected in (*_small_dictionaries(station), *_alike_slaves(station)):
             line = result.lines.get(place, 0)
             warnings.append(
-                Finding(str(path), line, place, f"station {station.name}, {message}", expected)
+                PlantFinding(str(path), line, place, f"station {station.name}, {message}", expected)
             )
     return CheckReport(True, (), (*warnings, *result.warnings)), result.plant
 

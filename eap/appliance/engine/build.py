@@ -31,7 +31,7 @@ from eap.net.udp import UdpChannel
 from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
-from eap.pd.link import Channel, Taker
+from eap.pd.link import FrameChannel, Taker
 from eap.pd.spec import PortKind, PortSpec, Wake
 from eap.pd.station import Station
 from eap.pd.words import StationWord
@@ -42,7 +42,7 @@ _REFUSALS: Mapping[str, Refusal] = {
 }
 
 
-class SocketChannel(Channel, Protocol):
+class SocketChannel(FrameChannel, Protocol):
     """A channel over a descriptor."""
 
     def fileno(self) -> int:
@@ -172,7 +172,7 @@ class EnginePlant:
                 self._station(owner).drain_also(channel)
         self._wake_on_arrival(shared.owners, channel)
 
-    def _connect(self, name: PortName, datagrams: Channel | None) -> None:
+    def _connect(self, name: PortName, datagrams: FrameChannel | None) -> None:
         """Connect a port to its datagrams, to TCP, or to both."""
         spec = self._handover.port(name)
         station = self._station(name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eap.ids import Destination, DestinationKind, InterfaceUri
 from eap.net.tcpport import TcpPort
-from eap.pd.link import Channel
+from eap.pd.link import FrameChannel
 from eap.pd.spec import REQUESTER, PortSpec, StationSpec
 from eap.pd.station import Station
 
@@ -20,7 +20,7 @@ def has_tcp(spec: StationSpec, port: PortSpec) -> bool:
     return port.tcp or port.interface.startswith("tcp:") or bool(sends_to(spec, port.name))
 
 
-def open_tcp_port(spec: PortSpec, datagrams: Channel | None) -> TcpPort:
+def open_tcp_port(spec: PortSpec, datagrams: FrameChannel | None) -> TcpPort:
     """Return the channel of a port with TCP, beside its *datagrams* if it has any."""
     return TcpPort(InterfaceUri.parse(spec.interface).host, datagrams)
 

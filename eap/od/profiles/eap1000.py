@@ -19,9 +19,9 @@ from eap.ids import DestinationKind
 from eap.od.model import RO, RW, Access, ObjectCode
 from eap.od.profiles.table import (
     OWN_TYPE,
-    EntryRow,
     Form,
-    ObjectRow,
+    ProfileEntry,
+    ProfileObject,
     Rule,
     config,
     derived,
@@ -115,7 +115,7 @@ class Var(IntEnum):
     WRITER = 10
 
 
-class FrameEntry(IntEnum):
+class FrameSub(IntEnum):
     """0x8000: a TxFrame."""
 
     ENABLED = 1
@@ -205,7 +205,7 @@ class Configured(IntEnum):
     PHASE = 9
 
 
-class PortEntry(IntEnum):
+class PortSub(IntEnum):
     """0xF810: the port itself."""
 
     NAME = 1
@@ -288,10 +288,10 @@ _VARIABLE = (
     config(Var.DEFAULT, "Default", OWN_TYPE, "Value at the start, and as a substitute.",
            key="default", rule=Rule.DEFAULT),
 )  # fmt: skip
-_VALUE = EntryRow(
+_VALUE = ProfileEntry(
     1, "Value", OWN_TYPE, RO, "As it lies in the process image.", live=EapLive.VALUE.value
 )
-TX_VARIABLE = ObjectRow(
+TX_VARIABLE = ProfileObject(
     0x6000, 0x6FFF, "Tx variable {n}", _RECORD,
     (
         _VALUE._replace(access=RO | Access.TX_MAPPABLE),
@@ -304,7 +304,7 @@ TX_VARIABLE = ObjectRow(
     "port or a bus of the station has by the same name is that one, and described alike.",
     dynamic=True, section="variables",
 )  # fmt: skip
-RX_VARIABLE = ObjectRow(
+RX_VARIABLE = ProfileObject(
     0x7000, 0x7FFF, "Rx variable {n}", _RECORD,
     (_VALUE._replace(access=RO | Access.TX_MAPPABLE | Access.RX_MAPPABLE), *_VARIABLE),
     "A variable that is received; it may be sent on.", dynamic=True,
@@ -316,11 +316,11 @@ _MAPPED = (
            "is padding, bit length 255 the whole of a longer variable.", last=MAX_ENTRIES,
            form=Form.MAPPING, key="variables"),
 )  # fmt: skip
-RX_PDO = ObjectRow(
+RX_PDO = ProfileObject(
     0x1600, 0x17FF, "RxPDO mapping {n}", _ARRAY, _MAPPED,
     "Variables of a received PD in their order.", dynamic=True, mapping=True, section="subscribe",
 )  # fmt: skip
-TX_PDO = ObjectRow(
+TX_PDO = ProfileObject(
     0x1A00, 0x1BFF, "TxPDO mapping {n}", _ARRAY, _MAPPED,
     "Variables of a sent PD in their order.", dynamic=True, mapping=True, section="publish",
 )  # fmt: skip
@@ -333,51 +333,51 @@ MORE_TX_PDO = TX_PDO._replace(
     description="As 0x1A00, for ports that send more than 512 different PDOs.",
 )  # fmt: skip
 
-TX_FRAME = ObjectRow(
+TX_FRAME = ProfileObject(
     0x8000, 0x8FFF, "TxFrame {n}", _RECORD,
     (
-        config(FrameEntry.ENABLED, "Enabled", "BOOL",
+        config(FrameSub.ENABLED, "Enabled", "BOOL",
                "A frame that is not is left alone altogether."),
-        config(FrameEntry.ADDRESS_MODE, "Address mode", "USINT",
+        config(FrameSub.ADDRESS_MODE, "Address mode", "USINT",
                "0 MAC, 1 NetID, 2 IP by UDP, 3 IP by TCP, 4 the requester of its PDs.",
                maximum=4, changeable=True, key="to"),
-        config(FrameEntry.DESTINATION_MAC, "Destination MAC", "BLOCK(6)",
+        config(FrameSub.DESTINATION_MAC, "Destination MAC", "BLOCK(6)",
                "Address mode 0; in mode 1 that of the NetID, and all zero or a group if it is to "
                "be learned.", default=bytes.fromhex("010105040000"), form=Form.MAC,
                changeable=True, key="to"),
-        config(FrameEntry.DESTINATION_NETID, "Destination NetID", "BLOCK(6)", "Address mode 1.",
+        config(FrameSub.DESTINATION_NETID, "Destination NetID", "BLOCK(6)", "Address mode 1.",
                form=Form.NET_ID, changeable=True, key="to"),
-        config(FrameEntry.DESTINATION_IP, "Destination IP", "BLOCK(4)",
+        config(FrameSub.DESTINATION_IP, "Destination IP", "BLOCK(4)",
                "Address modes 2 and 3, first octet first.", form=Form.IP, changeable=True,
                key="to"),
-        config(FrameEntry.PORT_NUMBER, "Port number", "UINT", "UDP or TCP; 0 is 34980.",
+        config(FrameSub.PORT_NUMBER, "Port number", "UINT", "UDP or TCP; 0 is 34980.",
                changeable=True, key="to"),
-        setting(FrameEntry.MONITORING_INTERVAL, "Monitoring interval", "UDINT",
+        setting(FrameSub.MONITORING_INTERVAL, "Monitoring interval", "UDINT",
                 "How often to look whether the subscriber is there; 0 never.", unit="ms",
                 key="monitor_interval_ms"),
-        live(FrameEntry.FRAME_STATE, "Frame state", "UINT", EapLive.FRAME_STATE,
+        live(FrameSub.FRAME_STATE, "Frame state", "UINT", EapLive.FRAME_STATE,
              "Bit 0 not sent, bit 1 too long, bit 2 subscriber missing."),
-        setting(FrameEntry.NAME, "Name", NAME, "Unique among the station's frames.", key="name",
+        setting(FrameSub.NAME, "Name", NAME, "Unique among the station's frames.", key="name",
                 rule=Rule.NAME),
-        setting(FrameEntry.DIVIDER, "Divider", "UINT",
+        setting(FrameSub.DIVIDER, "Divider", "UINT",
                 "Leaves only in cycles whose number, divided by this, leaves the modulo; 0 off.",
                 key="divider"),
-        setting(FrameEntry.MODULO, "Modulo", "UINT", "Less than the divider.", key="modulo"),
-        setting(FrameEntry.MONITOR_IP, "Monitor IP", "BLOCK(4)",
+        setting(FrameSub.MODULO, "Modulo", "UINT", "Less than the divider.", key="modulo"),
+        setting(FrameSub.MONITOR_IP, "Monitor IP", "BLOCK(4)",
                 "Host to probe for on Ethernet; all zero none.", form=Form.IP, key="monitor_ip"),
-        setting(FrameEntry.CHANGEABLE, "Changeable", "BOOL",
+        setting(FrameSub.CHANGEABLE, "Changeable", "BOOL",
                 "Whether the destination may be written in SafeOp and Op.", key="changeable"),
-        live(FrameEntry.FRAME_CONTROL, "Frame control", "UINT", EapLive.FRAME_CTRL,
+        live(FrameSub.FRAME_CONTROL, "Frame control", "UINT", EapLive.FRAME_CTRL,
              "Bit 0 suppresses the frame."),
-        derived(FrameEntry.FRAME_LENGTH, "Frame length", "UINT", Derived.FRAME_LENGTH,
+        derived(FrameSub.FRAME_LENGTH, "Frame length", "UINT", Derived.FRAME_LENGTH,
                 "Octets with all its PDs."),
-        config(FrameEntry.TXPD, "TxPD {n}", "UINT", "Index of a PD that it carries; 0 none.",
+        config(FrameSub.TXPD, "TxPD {n}", "UINT", "Index of a PD that it carries; 0 none.",
                last=MAX_ENTRIES, form=Form.INDEX, refers=(0xD000,)),
     ),
     "One frame to send: where it goes and what is in it.", dynamic=True, companion=0xA000,
     section="frames",
 )  # fmt: skip
-FRAME_DIAGNOSIS = ObjectRow(
+FRAME_DIAGNOSIS = ProfileObject(
     0xA000, 0xAFFF, "TxFrame diagnosis {n}", _RECORD,
     (
         live(1, "Sent whole", "ULINT", EapLive.FRAME_WHOLE, "With all PDs by the same schedule."),
@@ -387,7 +387,7 @@ FRAME_DIAGNOSIS = ObjectRow(
     ),
     "What became of the TxFrame of the same number.",
 )  # fmt: skip
-TX_PD = ObjectRow(
+TX_PD = ProfileObject(
     0xD000, 0xDFFF, "TxPD {n}", _RECORD,
     (
         config(Tx.PDO_INDEX, "PDO index", "UINT",
@@ -434,7 +434,7 @@ TX_PD = ObjectRow(
     ),
     "One PD to send: which PDO, and when.", dynamic=True, companion=0xB000, section="publish",
 )  # fmt: skip
-TX_DIAGNOSIS = ObjectRow(
+TX_DIAGNOSIS = ProfileObject(
     0xB000, 0xBFFF, "TxPD diagnosis {n}", _RECORD,
     (
         live(1, "Last reason", "USINT", EapLive.TX_LAST_REASON,
@@ -449,7 +449,7 @@ TX_DIAGNOSIS = ObjectRow(
     ),
     "Why the TxPD of the same number was sent.",
 )  # fmt: skip
-RX_PD = ObjectRow(
+RX_PD = ProfileObject(
     0xE000, 0xEFFF, "RxPD {n}", _RECORD,
     (
         config(Rx.PDO_INDEX, "PDO index", "UINT",
@@ -497,7 +497,7 @@ RX_PD = ObjectRow(
     "One PD to receive: its sender, and its PDO.", dynamic=True, companion=0xC000,
     section="subscribe",
 )  # fmt: skip
-RX_DIAGNOSIS = ObjectRow(
+RX_DIAGNOSIS = ProfileObject(
     0xC000, 0xCFFF, "RxPD diagnosis {n}", _RECORD,
     (
         live(1, "Received", "ULINT", EapLive.RX_RECEIVED, "PDs taken."),
@@ -524,7 +524,7 @@ COUNTED = ((TX_FRAME,), (TX_PD,), (RX_PD,), (TX_PDO, MORE_TX_PDO), (RX_PDO, MORE
 """The ranges behind sub-indexes 1 to 7 of 0xF800 and 0xF801."""
 
 
-def identity(module_profile: int) -> tuple[ObjectRow, ...]:
+def identity(module_profile: int) -> tuple[ProfileObject, ...]:
     """Return the objects that name a device of *module_profile*."""
     return (
         single(0x1000, "Device type", "Profile in the low word, module profile in the high one.",
@@ -576,7 +576,8 @@ DEVICE = (
            live(13, "No sender", "ULINT", EapLive.STATION_DISCARDED_NO_SENDER,
                  "Requests without an address to answer.")),
     single(0xF200, "EAP control", "What the device is asked to do.",
-           EntryRow(1, "Requested state", "UINT", RW, "2 PreOp, 4 SafeOp, 8 Op; the status says "
+           ProfileEntry(1, "Requested state", "UINT", RW,
+                        "2 PreOp, 4 SafeOp, 8 Op; the status says "
                     "what came of it.", rule=Rule.STATE)),
     single(0xF800, "Configured objects", "How many there are; counted by the device.",
            *(derived(sub, name, "UINT", Derived.COUNT, "How many exist.")
@@ -592,27 +593,27 @@ DEVICE = (
                      form=Form.INDEX)
              for sub, name in enumerate(_KINDS, 1))),
     single(0xF810, "EAP port", "How the port reaches others.",
-           fixed(PortEntry.NAME, "Name", NAME, "In the plant file.", key="name"),
-           fixed(PortEntry.TRANSPORT, "Transport", "USINT",
+           fixed(PortSub.NAME, "Name", NAME, "In the plant file.", key="name"),
+           fixed(PortSub.TRANSPORT, "Transport", "USINT",
                  "0 UDP, 1 Ethernet, 2 TCP, 3 loop within the process.", key="interface"),
-           fixed(PortEntry.INTERFACE, "Interface", TEXT,
+           fixed(PortSub.INTERFACE, "Interface", TEXT,
                  "Such as udp://10.0.0.1 or ethernet://eth0.",
                  key="interface"),
-           fixed(PortEntry.PORT_NUMBER, "Port number", "UINT",
+           fixed(PortSub.PORT_NUMBER, "Port number", "UINT",
                  "UDP or TCP; 0 is 34980, or there is none.", key="interface"),
-           setting(PortEntry.VLAN_ID, "VLAN ID", "UINT", "Ethernet: tag of its frames; 0 untagged.",
+           setting(PortSub.VLAN_ID, "VLAN ID", "UINT", "Ethernet: tag of its frames; 0 untagged.",
                    maximum=4094, key="vlan.id", field="vlan_id", schemes=("ethernet",)),
-           setting(PortEntry.VLAN_PRIORITY, "VLAN priority", "USINT", "Of the tag.", maximum=7,
+           setting(PortSub.VLAN_PRIORITY, "VLAN priority", "USINT", "Of the tag.", maximum=7,
                    key="vlan.priority", field="vlan_priority", schemes=("ethernet",)),
-           setting(PortEntry.TCP, "TCP", "BOOL",
+           setting(PortSub.TCP, "TCP", "BOOL",
                    "Whether process data is taken from TCP connections too.", key="tcp",
                    schemes=("tcp", "udp")),
-           setting(PortEntry.BROADCAST, "Broadcast", "BOOL",
+           setting(PortSub.BROADCAST, "Broadcast", "BOOL",
                    "UDP: whether broadcasts are listened to.", key="broadcast", schemes=("udp",)),
-           setting(PortEntry.WAKE, "Wake", "USINT",
+           setting(PortSub.WAKE, "Wake", "USINT",
                    "Frames are taken 0 in each cycle, 1 as they arrive.", maximum=1, key="wake",
                    words=Waking),
-           setting(PortEntry.EAP_SM, "EAP SM", "BOOL",
+           setting(PortSub.EAP_SM, "EAP SM", "BOOL",
                    "Whether the frames it sends carry the device's state.", key="eap_sm"),
            section="ports"),
     single(0xF811, "Multicast groups", "Groups to listen to besides the EAP default.",
@@ -643,7 +644,7 @@ _BY_PAGE = {
 }
 
 
-def find(index: int) -> ObjectRow | None:
+def find(index: int) -> ProfileObject | None:
     """Return what the profile has at *index*, None if nothing."""
     for row in _BY_PAGE[index >> 8]:
         if row.first <= index <= row.last:
@@ -651,7 +652,7 @@ def find(index: int) -> ObjectRow | None:
     return None
 
 
-def row_of(index: int) -> ObjectRow:
+def row_of(index: int) -> ProfileObject:
     """Return what the profile has at *index*, of an object that exists."""
     row = find(index)
     if row is None:

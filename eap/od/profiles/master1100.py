@@ -11,7 +11,7 @@ from enum import StrEnum, auto
 
 from eap.od.model import RW, ObjectCode
 from eap.od.profiles.eap1000 import identity
-from eap.od.profiles.table import EntryRow, ObjectRow, fixed, live, single
+from eap.od.profiles.table import ProfileEntry, ProfileObject, fixed, live, single
 
 MODULE_PROFILE = 1100
 MAX_SLAVES = 4080
@@ -71,11 +71,11 @@ class MasterLive(StrEnum):
     RESET = auto()
 
 
-def _writable(row: EntryRow) -> EntryRow:
+def _writable(row: ProfileEntry) -> ProfileEntry:
     return row._replace(access=RW)
 
 
-CONFIGURED = ObjectRow(
+CONFIGURED = ProfileObject(
     0x8000, 0x8FEF, "Configuration data slave {n}", _RECORD,
     (
         live(1, "Fixed station address", "UINT", MasterLive.ADDRESS, "ESC register 0x0010."),
@@ -108,7 +108,7 @@ CONFIGURED = ObjectRow(
     ),
     "A slave of the configuration, in the order of the bus.",
 )  # fmt: skip
-DETECTED = ObjectRow(
+DETECTED = ProfileObject(
     0x9000, 0x9FEF, "Information data slave {n}", _RECORD,
     (
         live(1, "Fixed station address", "UINT", MasterLive.ADDRESS, "ESC register 0x0010."),
@@ -120,7 +120,7 @@ DETECTED = ObjectRow(
     ),
     "A slave that the last scan has found, in the order of the bus.",
 )  # fmt: skip
-DIAGNOSIS = ObjectRow(
+DIAGNOSIS = ProfileObject(
     0xA000, 0xAFEF, "Diagnosis data slave {n}", _RECORD,
     (
         live(1, "AL status", "UINT", MasterLive.AL_STATUS, "ESC register 0x0130."),
@@ -196,7 +196,7 @@ FIXED = (
            _writable(live(16, "Reset diag info", "BOOL", MasterLive.RESET, "A rising edge sets the "
                           "counters of 0xAnnn and 0xF120 to 0."))),
 )  # fmt: skip
-CONFIGURED_LIST = ObjectRow(
+CONFIGURED_LIST = ProfileObject(
     0xF020, 0xF02F, "Configured address list {n}", _ARRAY,
     (fixed(1, "Subindex {n:03}", "UINT", "Station address.", last=PER_LIST),),
     "Station addresses of the configuration, 255 in each object.",

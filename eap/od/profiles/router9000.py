@@ -11,7 +11,7 @@ from enum import StrEnum, auto
 
 from eap.od.model import ObjectCode
 from eap.od.profiles.eap1000 import MAX_ENTRIES, NAME, TEXT, identity
-from eap.od.profiles.table import Form, ObjectRow, fixed, live, single
+from eap.od.profiles.table import Form, ProfileObject, fixed, live, single
 
 MODULE_PROFILE = 9000
 ROUTER = "router"
@@ -51,7 +51,7 @@ class RouterLive(StrEnum):
     ROUTE_LAST_ERROR = auto()
 
 
-DEVICE = ObjectRow(
+DEVICE = ProfileObject(
     0x8000, 0x8FFF, "AoE device {n}", _RECORD,
     (
         fixed(1, "NetID", "BLOCK(6)", "Of the port.", form=Form.NET_ID),
@@ -69,7 +69,7 @@ DEVICE = ObjectRow(
     ),
     "A port of the station, in the order of the plant file.",
 )  # fmt: skip
-ROUTE = ObjectRow(
+ROUTE = ProfileObject(
     0x9000, 0x93FF, "Route {n}", _RECORD,
     (
         live(1, "NetID", "BLOCK(6)", RouterLive.ROUTE_NET_ID,

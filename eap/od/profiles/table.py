@@ -123,7 +123,7 @@ OWN_TYPE = ""
 """Type of an entry that holds a value of the variable that its object describes."""
 
 
-class EntryRow(NamedTuple):
+class ProfileEntry(NamedTuple):
     """One sub-index, or a list of equal ones from *subindex* to *last*."""
 
     subindex: int
@@ -182,7 +182,7 @@ class EntryRow(NamedTuple):
         return self.name.format(n=subindex - self.subindex) if self.last else self.name
 
 
-class ObjectRow(NamedTuple):
+class ProfileObject(NamedTuple):
     """Objects of one kind: one object, or as many as were made from *first* to *last*.
 
     *name* holds ``{n}`` where the number of the object within its range goes.
@@ -192,7 +192,7 @@ class ObjectRow(NamedTuple):
     last: int
     name: str
     code: ObjectCode
-    entries: tuple[EntryRow, ...]
+    entries: tuple[ProfileEntry, ...]
     description: str
     dynamic: bool = False
     """Whether a download to a free index makes an object and 0 in sub-index 0 deletes it."""
@@ -204,7 +204,7 @@ class ObjectRow(NamedTuple):
     """Section of the plant file that an object stands for."""
 
     @property
-    def list_row(self) -> EntryRow | None:
+    def list_row(self) -> ProfileEntry | None:
         """The row of the list at the object's end, None if there is none."""
         row = self.entries[-1]
         return row if row.last else None
@@ -227,7 +227,7 @@ class ObjectRow(NamedTuple):
         row = self.entries[-1]
         return row.last or row.subindex
 
-    def row(self, subindex: int) -> EntryRow | None:
+    def row(self, subindex: int) -> ProfileEntry | None:
         """Return the row of a sub-index, None if no object of this kind has it."""
         for row in self.entries:
             if row.subindex == subindex or row.subindex <= subindex <= row.last:
@@ -244,15 +244,15 @@ class ObjectRow(NamedTuple):
 
 
 def single(
-    index: int, name: str, description: str, *entries: EntryRow, section: str = ""
-) -> ObjectRow:
+    index: int, name: str, description: str, *entries: ProfileEntry, section: str = ""
+) -> ProfileObject:
     """Write the row of one object; an entry without a description has that of the object."""
     first = entries[0]
     code = ObjectCode.ARRAY if first.last else ObjectCode.RECORD
     described = tuple(
         each._replace(description=each.description or description) for each in entries
     )
-    return ObjectRow(
+    return ProfileObject(
         index, index, name, code if first.subindex else ObjectCode.VAR, described, description,
         section=section,
     )  # fmt: skip
@@ -260,38 +260,40 @@ def single(
 
 def config(
     subindex: int, name: str, kind: str, description: str, *, key: str = "", **more: Any
-) -> EntryRow:
-    """Write a row of configuration; *more* as :class:`EntryRow` has it."""
-    return EntryRow(int(subindex), name, kind, CONFIG, description, key=key, **more)
+) -> ProfileEntry:
+    """Write a row of configuration; *more* as :class:`ProfileEntry` has it."""
+    return ProfileEntry(int(subindex), name, kind, CONFIG, description, key=key, **more)
 
 
 def setting(
     subindex: int, name: str, kind: str, description: str, *, key: str, field: str = "", **more: Any
-) -> EntryRow:
+) -> ProfileEntry:
     """Write a row of configuration that the specification has as one field, *key* by default."""
     return config(subindex, name, kind, description, key=key, field=field or key, **more)
 
 
-def fixed(subindex: int, name: str, kind: str, description: str, **more: Any) -> EntryRow:
+def fixed(subindex: int, name: str, kind: str, description: str, **more: Any) -> ProfileEntry:
     """Write a row that is given at the start."""
-    return EntryRow(int(subindex), name, kind, RO, description, **more)
+    return ProfileEntry(int(subindex), name, kind, RO, description, **more)
 
 
-def live(subindex: int, name: str, kind: str, key: Enum, description: str, **more: Any) -> EntryRow:
+def live(
+    subindex: int, name: str, kind: str, key: Enum, description: str, **more: Any
+) -> ProfileEntry:
     """Write a row that shows what *key* stands for while the device runs."""
-    return EntryRow(int(subindex), name, kind, RO, description, live=key.value, **more)
+    return ProfileEntry(int(subindex), name, kind, RO, description, live=key.value, **more)
 
 
 def derived(
     subindex: int, name: str, kind: str, key: Enum, description: str, **more: Any
-) -> EntryRow:
+) -> ProfileEntry:
     """Write a row that is computed from other entries."""
-    return EntryRow(int(subindex), name, kind, RO, description, derived=key.value, **more)
+    return ProfileEntry(int(subindex), name, kind, RO, description, derived=key.value, **more)
 
 
 DEFAULT_TYPE = datatypes.parse("UINT")
 
-Source: TypeAlias = Callable[[EntryRow, int, DataType], ReadHook | None]
+Source: TypeAlias = Callable[[ProfileEntry, int, DataType], ReadHook | None]
 """Source of entries that store nothing: called with row, sub-index and type of each entry."""
 LiveRead: TypeAlias = Callable[[str], Any]
 """Returns the value of a live key: a number, octets or a text, as the type of its entry says."""
@@ -300,7 +302,7 @@ LiveWrite: TypeAlias = Callable[[str, bytes], None]
 
 
 def make_object(
-    row: ObjectRow,
+    row: ProfileObject,
     index: int,
     source: Source,
     *,
@@ -335,7 +337,7 @@ def make_object(
 
 
 def make_entry(
-    row: EntryRow,
+    row: ProfileEntry,
     subindex: int,
     source: Source,
     *,
@@ -355,7 +357,7 @@ def make_entry(
 def live_source(read: LiveRead) -> Source:
     """Return a source whose live entries show what *read* returns for their keys."""
 
-    def source(row: EntryRow, _subindex: int, kind: DataType) -> ReadHook | None:
+    def source(row: ProfileEntry, _subindex: int, kind: DataType) -> ReadHook | None:
         return (lambda: live_octets(kind, read(row.live))) if row.live else None
 
     return source

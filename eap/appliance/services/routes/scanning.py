@@ -17,7 +17,7 @@ from eap.aoe.directory import AmsAddress, Directory
 from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryPort, DirectoryStation
 from eap.appliance.control_routes import PortEntry, SlaveEntry, StationEntry
-from eap.appliance.services.routes.tracing import Station, ask_one, find_fault
+from eap.appliance.services.routes.tracing import TracedStation, ask_one, find_fault
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, IO_PORT
 from eap.ids import STATION_OCTETS, NetId
@@ -64,7 +64,7 @@ def stations_of(directory: Directory, routes: Iterable[Route]) -> list[Known]:
     return [*found.values()]
 
 
-async def scan(station: Station, known: Sequence[Known]) -> list[StationEntry]:
+async def scan(station: TracedStation, known: Sequence[Known]) -> list[StationEntry]:
     """Ask all stations; return an entry for each, in their order.
 
     Args:
@@ -85,7 +85,7 @@ async def scan(station: Station, known: Sequence[Known]) -> list[StationEntry]:
 class _Look:
     """A look at one station."""
 
-    def __init__(self, asker: Station, known: Known) -> None:
+    def __init__(self, asker: TracedStation, known: Known) -> None:
         self._asker = asker
         self._known = known
         ports = known.planned.ports if known.planned else ()

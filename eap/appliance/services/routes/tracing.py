@@ -54,7 +54,7 @@ _NO_ANSWER = frozenset((AdsError.TARGET_MACHINE, AdsError.HOST_UNREACHABLE, AdsE
 """What is not said by the router that was asked."""
 
 
-class Station(Protocol):
+class TracedStation(Protocol):
     """A router, as tracing and scanning need it."""
 
     @property
@@ -109,7 +109,7 @@ class Traced(NamedTuple):
 
 
 async def ask_one(
-    station: Station,
+    station: TracedStation,
     target: NetId,
     port: int,
     operation: Operation,
@@ -122,7 +122,7 @@ async def ask_one(
 
 
 async def answer_question(
-    station: Station, question: HopQuestion, way: Way, source: NetId
+    station: TracedStation, question: HopQuestion, way: Way, source: NetId
 ) -> HopReport:
     """Return what a router says of an address, or what the routers behind it do.
 
@@ -152,7 +152,7 @@ async def answer_question(
 
 
 async def trace(
-    station: Station, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
+    station: TracedStation, target: NetId, port: int, *, clock: Callable[[], int] = monotonic_ns
 ) -> Traced:
     """Follow the way from *station* to *target*, and ask that for its state."""
     hops, why = await _follow(station, target, port, clock)
@@ -173,7 +173,7 @@ async def trace(
     return Traced(tuple(hops), answer, took_ns, why)
 
 
-async def find_fault(station: Station, target: NetId, port: int) -> str:
+async def find_fault(station: TracedStation, target: NetId, port: int) -> str:
     """Return at which router the way to *target* ends, and why; empty if it ends at none.
 
     For a request that was not answered: the router that refused it may not know which one of those
@@ -184,7 +184,7 @@ async def find_fault(station: Station, target: NetId, port: int) -> str:
 
 
 async def _follow(
-    station: Station, target: NetId, port: int, clock: Callable[[], int]
+    station: TracedStation, target: NetId, port: int, clock: Callable[[], int]
 ) -> tuple[list[Hop], str]:
     """Return the routers on the way, and why it goes no further than the last one."""
     hops: list[Hop] = []

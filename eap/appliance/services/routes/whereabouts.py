@@ -12,7 +12,7 @@ from eap.aoe.ads_request import encode_outcome, parse_request
 from eap.aoe.answer import AmsAnswer
 from eap.aoe.hop_report import HopQuestion, encode_report
 from eap.aoe.way import Way
-from eap.appliance.services.routes.tracing import Station, answer_question
+from eap.appliance.services.routes.tracing import TracedStation, answer_question
 from eap.appliance.services.routing.service import LocalRequest, Service
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import AmsCommand
@@ -27,7 +27,7 @@ class Whereabouts:
         rest: Answers everything else.
     """
 
-    def __init__(self, station: Station, rest: Service) -> None:
+    def __init__(self, station: TracedStation, rest: Service) -> None:
         self._station = station
         self._rest = rest
 

@@ -24,7 +24,7 @@ from eap.codec.mailbox import (
 )
 from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
-from eap.pd.link import Channel, FrameOrigin, OutFrame
+from eap.pd.link import FrameChannel, FrameOrigin, OutFrame
 
 FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE
 _MAX_PEERS = 1024
@@ -149,7 +149,7 @@ class MailboxIntake:
 class ChannelCarrier:
     """Sends packets in frames to addresses that *channel* reaches."""
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: FrameChannel) -> None:
         self._channel = channel
         self._counters = MailboxCounters()
 

@@ -19,7 +19,7 @@ from eap.appliance.services.routing.mailbox_frames import ChannelCarrier
 from eap.codec.ams import DEVICE_PORT, AmsCommand, AmsHeader, StateFlags
 from eap.errors import CodecError
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
-from eap.pd.link import Channel
+from eap.pd.link import FrameChannel
 
 ASK_NS = 1_000_000_000
 """Between two questions for a NetID that nobody answered."""
@@ -87,7 +87,7 @@ class SegmentCarrier:
         net_id: Of the station's router, in whose name is asked.
     """
 
-    def __init__(self, segment: Segment, channel: Channel, net_id: NetId) -> None:
+    def __init__(self, segment: Segment, channel: FrameChannel, net_id: NetId) -> None:
         self._segment = segment
         self._carrier = ChannelCarrier(channel)
         self._net_id = net_id

@@ -5,7 +5,7 @@ import pytest
 from eap.config.bus import DescribedEntry, DescribedSlave, ExpectedBus, describe_buses
 from eap.config.convert import convert
 from eap.config.document import read
-from eap.config.finding import Finding, FindingReport
+from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
 from eap.config.load import load
 
@@ -59,7 +59,7 @@ BUS = ExpectedBus(
 def describe(path):
     """Stand for the reader of bus files, which belongs to the appliance."""
     if "broken" in path.name:
-        return (Finding(str(path), 3, "slaves[0]", "kind is 'x'", "one of a, b"),)
+        return (PlantFinding(str(path), 3, "slaves[0]", "kind is 'x'", "one of a, b"),)
     return BUS
 
 

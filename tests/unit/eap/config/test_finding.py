@@ -1,16 +1,16 @@
 from __future__ import annotations
 
 from eap.config.document import Node
-from eap.config.finding import Finding, FindingReport, one_of
+from eap.config.finding import FindingReport, PlantFinding, one_of
 
 
 def test_a_finding_reads_as_file_line_what_and_what_was_expected():
-    finding = Finding("p.yaml", 7, "stations[0].publish[1].id", "id is 'x'", "a whole number")
+    finding = PlantFinding("p.yaml", 7, "stations[0].publish[1].id", "id is 'x'", "a whole number")
     assert str(finding) == "p.yaml:7: id is 'x'; expected a whole number"
 
 
 def test_a_finding_of_the_whole_file_has_no_line():
-    assert str(Finding("p.yaml", 0, "", "is a directory", "a file")).startswith("p.yaml: is")
+    assert str(PlantFinding("p.yaml", 0, "", "is a directory", "a file")).startswith("p.yaml: is")
 
 
 def test_a_path_without_a_line_of_its_own_has_that_of_what_holds_it():
@@ -36,7 +36,7 @@ def test_one_of_nothing_says_so():
 
 def test_findings_of_other_files_come_last():
     report = FindingReport("p.yaml")
-    report.adopt([Finding("bus.yaml", 1, "", "wrong", "right")])
+    report.adopt([PlantFinding("bus.yaml", 1, "", "wrong", "right")])
     report.add("a", "first", "x", line=2)
     assert [str(f) for f in report.findings()] == [
         "p.yaml:2: first; expected x",

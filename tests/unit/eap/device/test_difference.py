@@ -5,7 +5,7 @@ from hypothesis import given
 from eap.device.difference import compare
 from eap.device.stored import configuration
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import RX_PD, TX_PD, FrameEntry, Rx, Tx, Var
+from eap.od.profiles.eap1000 import RX_PD, TX_PD, FrameSub, Rx, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import copy, mapping, receiver, sender, tx_pd, variable, write
 from tests.support.examples import examples
@@ -60,7 +60,7 @@ def test_a_changed_entry_is_told_by_names_and_values(udp):
     sender(udp)
     new = copy(udp)
     write(new, 0xD000, Tx.CYCLE_TIME, 20_000)
-    write(new, 0x8000, FrameEntry.DESTINATION_IP, b"\x0a\0\0\3")
+    write(new, 0x8000, FrameSub.DESTINATION_IP, b"\x0a\0\0\3")
     write(new, 0xF800, 8, 5000)
     assert _told(udp, new) == [
         ("changed", "Configured objects: Device cycle time", "10000", "5000", False),
@@ -97,17 +97,17 @@ def test_what_is_no_longer_there_is_removed_from_the_outside_in(udp):
 def test_a_pd_more_in_a_frame_goes_to_the_end_of_its_list(udp):
     sender(udp)
     new = copy(udp)
-    write(new, 0x8000, FrameEntry.TXPD + 1, tx_pd(new, 0xD001, 0x1A00, 2))
+    write(new, 0x8000, FrameSub.TXPD + 1, tx_pd(new, 0xD001, 0x1A00, 2))
     changes = [change for change in compare(udp, new) if change.index == 0x8000]
     assert [(c.kind, c.subindex, c.new) for c in changes] == [("added", 17, "0xD001")]
 
 
 def test_pds_that_change_their_places_leave_the_frame_first(udp):
     sender(udp)
-    write(udp, 0x8000, FrameEntry.TXPD + 1, tx_pd(udp, 0xD001, 0x1A00, 2))
+    write(udp, 0x8000, FrameSub.TXPD + 1, tx_pd(udp, 0xD001, 0x1A00, 2))
     new = copy(udp)
-    write(new, 0x8000, FrameEntry.TXPD, 0xD001)
-    write(new, 0x8000, FrameEntry.TXPD + 1, 0xD000)
+    write(new, 0x8000, FrameSub.TXPD, 0xD001)
+    write(new, 0x8000, FrameSub.TXPD + 1, 0xD000)
     assert [(c.subindex, c.new, c.interim) for c in compare(udp, new)] == [
         (0, "15", True),
         (16, "0xD001", False),

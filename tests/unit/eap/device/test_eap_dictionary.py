@@ -9,7 +9,7 @@ from eap.device.stored import configuration
 from eap.od import info
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Rx, Tx, Var
+from eap.od.profiles.eap1000 import AddressMode, FrameSub, Rx, Tx, Var
 from eap.pd.device import DeviceFault, FaultCode
 from tests.support.downloads import (
     OP,
@@ -60,9 +60,9 @@ def test_zero_empties_a_mapping_which_stays(udp):
 
 
 def test_a_list_grows_by_writing_behind_its_end_and_shrinks_by_its_count(udp):
-    write(udp, 0x8000, FrameEntry.TXPD + 2, 0xD002)
+    write(udp, 0x8000, FrameSub.TXPD + 2, 0xD002)
     assert udp[0x8000].max_subindex == 18
-    assert udp.upload(0x8000, FrameEntry.TXPD, PREOP) == b"\0\0"
+    assert udp.upload(0x8000, FrameSub.TXPD, PREOP) == b"\0\0"
     write(udp, 0x8000, 0, 16)
     assert max(udp[0x8000].entries) == 16
 
@@ -92,7 +92,7 @@ def test_a_list_grows_by_writing_behind_its_end_and_shrinks_by_its_count(udp):
         (AbortCode.TOO_LONG, (0xD000, Tx.PD_ID, b"\0\0\0")),
         (AbortCode.TOO_SHORT, (0xD000, Tx.PD_ID, b"\0")),
         (AbortCode.TOO_LONG, (0x6000, Var.UNIT, "u" * 256)),
-        (AbortCode.TOO_HIGH, (0x8000, FrameEntry.ADDRESS_MODE, 5)),
+        (AbortCode.TOO_HIGH, (0x8000, FrameSub.ADDRESS_MODE, 5)),
         (AbortCode.TOO_HIGH, (0xF800, 8, 60_000_001)),
         (AbortCode.TOO_LOW, (0xF800, 8, 99)),
         (AbortCode.VALUE, (0x6000, Var.NAME, "two words")),
@@ -101,7 +101,7 @@ def test_a_list_grows_by_writing_behind_its_end_and_shrinks_by_its_count(udp):
         (AbortCode.VALUE, (0x6000, Var.NAME, "state.VarCtrl")),
         (AbortCode.VALUE, (0x6001, Var.TYPE_NAME, "WORT")),
         (AbortCode.VALUE, (0xD000, Tx.PDO_INDEX, 0x1600)),
-        (AbortCode.VALUE, (0x8000, FrameEntry.TXPD, 0xE000)),
+        (AbortCode.VALUE, (0x8000, FrameSub.TXPD, 0xE000)),
         (AbortCode.VALUE, (0x8000, 0, 14)),
         (AbortCode.VALUE, (0xE000, Rx.FLAGS, 0x82)),
         (AbortCode.VALUE, (0xF200, 1, 1)),
@@ -127,7 +127,7 @@ def test_referred_objects_stay(udp):
     receiver(udp)
     write(udp, 0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)
     assert "0xD000:0A refers" in _refused(udp, AbortCode.PARAMETER, 0xE000, 0, 0)
-    write(udp, 0x8000, FrameEntry.TXPD, 0)
+    write(udp, 0x8000, FrameSub.TXPD, 0)
     write(udp, 0xE000, Rx.POLL_REQUEST_TXPD, 0xD000)
     assert "0xE000:07 refers" in _refused(udp, AbortCode.PARAMETER, 0xD000, 0, 0)
 
@@ -142,7 +142,7 @@ def test_configuration_is_written_in_preop_only(udp, state):
         (0x1A00, 0, 0),
         (0x1A00, 1, 0x6000_0110),
         (0xD000, Tx.CYCLE_TIME, 1000),
-        (0x8000, FrameEntry.TXPD + 1, 0xD000),
+        (0x8000, FrameSub.TXPD + 1, 0xD000),
         (0xF800, 8, 1000),
         (0xF811, 1, "239.1.1.1"),
     ):
@@ -156,12 +156,12 @@ def test_what_an_object_says_to_be_changeable_is_written_in_op(udp):
     sender(udp)
     told: list[tuple[int, int]] = []
     udp.on_change = lambda index, subindex: told.append((index, subindex))
-    write(udp, 0x8000, FrameEntry.CHANGEABLE, 1)
-    write(udp, 0x8000, FrameEntry.DESTINATION_IP, b"\x0a\0\0\3", OP)
-    assert told == [(0x8000, FrameEntry.DESTINATION_IP)]
-    _refused(udp, AbortCode.DEVICE_STATE, 0x8000, FrameEntry.DIVIDER, 2, state=OP)
-    write(udp, 0x8000, FrameEntry.CHANGEABLE, 0)
-    _refused(udp, AbortCode.DEVICE_STATE, 0x8000, FrameEntry.PORT_NUMBER, 2, state=OP)
+    write(udp, 0x8000, FrameSub.CHANGEABLE, 1)
+    write(udp, 0x8000, FrameSub.DESTINATION_IP, b"\x0a\0\0\3", OP)
+    assert told == [(0x8000, FrameSub.DESTINATION_IP)]
+    _refused(udp, AbortCode.DEVICE_STATE, 0x8000, FrameSub.DIVIDER, 2, state=OP)
+    write(udp, 0x8000, FrameSub.CHANGEABLE, 0)
+    _refused(udp, AbortCode.DEVICE_STATE, 0x8000, FrameSub.PORT_NUMBER, 2, state=OP)
 
 
 def test_a_change_in_op_that_cannot_run_is_taken_back(udp):
@@ -179,10 +179,10 @@ def test_a_change_in_op_that_cannot_run_is_taken_back(udp):
 
 def test_nobody_has_to_want_to_know(udp):
     sender(udp)
-    write(udp, 0x8000, FrameEntry.CHANGEABLE, 1)
-    write(udp, 0x8000, FrameEntry.PORT_NUMBER, 7, OP)
+    write(udp, 0x8000, FrameSub.CHANGEABLE, 1)
+    write(udp, 0x8000, FrameSub.PORT_NUMBER, 7, OP)
     write(udp, 0xF200, 1, 8)
-    assert udp.upload(0x8000, FrameEntry.PORT_NUMBER, OP) == b"\7\0"
+    assert udp.upload(0x8000, FrameSub.PORT_NUMBER, OP) == b"\7\0"
 
 
 class TestInformation:
@@ -270,7 +270,7 @@ def two_large_pds(dictionary: EapDictionary) -> None:
 def test_a_pd_for_which_a_frame_has_no_room_is_refused_in_its_list(udp):
     two_large_pds(udp)
     frame(udp, 0x8000, 0xD000)
-    reason = _refused(udp, AbortCode.PDO_LENGTH, 0x8000, FrameEntry.TXPD + 1, 0xD001)
+    reason = _refused(udp, AbortCode.PDO_LENGTH, 0x8000, FrameSub.TXPD + 1, 0xD001)
     assert "frame0 would have 1630 octets, at most 1472 go there" in reason
 
 
@@ -286,10 +286,10 @@ def test_a_pd_that_grows_beyond_its_frame_is_refused_where_it_grows(udp):
 
 def test_a_long_frame_stays_with_the_way_that_takes_it(udp):
     two_large_pds(udp)
-    write(udp, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.TCP)
+    write(udp, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.TCP)
     for number in range(2):
-        write(udp, 0x8000, FrameEntry.TXPD + number, 0xD000 + number)
-    _refused(udp, AbortCode.PDO_LENGTH, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.IP)
+        write(udp, 0x8000, FrameSub.TXPD + number, 0xD000 + number)
+    _refused(udp, AbortCode.PDO_LENGTH, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.IP)
 
 
 def test_a_new_type_forgets_the_default(udp):

@@ -8,7 +8,7 @@ import pytest
 
 from eap.device.stored import configuration
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.profiles.eap1000 import AddressMode, FrameEntry, Var
+from eap.od.profiles.eap1000 import AddressMode, FrameSub, Var
 from tests.support.downloads import (
     OP,
     PREOP,
@@ -77,9 +77,9 @@ class TestCompleteAccess:
 
     def test_a_whole_frame_that_is_too_long_is_refused(self, udp):
         two_large_pds(udp)
-        write(udp, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.TCP)
+        write(udp, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.TCP)
         for number in range(2):
-            write(udp, 0x8000, FrameEntry.TXPD + number, 0xD000 + number)
+            write(udp, 0x8000, FrameSub.TXPD + number, 0xD000 + number)
         data = bytearray(udp.upload_complete(0x8000, 0, PREOP))
         data[3] = AddressMode.IP  # behind sub-index 0 and Enabled
         with pytest.raises(SdoAbortError) as caught:
@@ -115,10 +115,10 @@ class TestBeforeTheDataIsThere:
 
     def test_what_an_object_says_to_be_changeable_is_let_by_in_op(self, udp):
         sender(udp)
-        write(udp, 0x8000, FrameEntry.CHANGEABLE, 1)
-        udp.check_download(0x8000, FrameEntry.DESTINATION_MAC, 6, OP)
+        write(udp, 0x8000, FrameSub.CHANGEABLE, 1)
+        udp.check_download(0x8000, FrameSub.DESTINATION_MAC, 6, OP)
         with pytest.raises(SdoAbortError) as caught:
-            udp.check_download(0x8000, FrameEntry.NAME, 6, OP)
+            udp.check_download(0x8000, FrameSub.NAME, 6, OP)
         assert caught.value.code == AbortCode.DEVICE_STATE
 
     def test_the_default_of_a_variable_is_as_long_as_its_type(self, udp):

@@ -15,7 +15,7 @@ from eap.od import model
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, ObjectCode, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import MORE_TX_PDO, EapLive, FrameEntry, Tx, Var
+from eap.od.profiles.eap1000 import MORE_TX_PDO, EapLive, FrameSub, Tx, Var
 from eap.pd.spec import PortKind, PortSpec, VariableSpec
 from tests.support.downloads import PREOP, frame, mapping, receiver, sender, tx_pd, variable, write
 from tests.support.stations import BLANK
@@ -63,7 +63,7 @@ def test_members_are_listed_in_order_of_their_indexes(udp):
 
 def test_a_longest_list_has_names_for_all_entries(udp):
     item = udp.make_object(profile.TX_FRAME, 0x8000, last=254)
-    assert item.entries[FrameEntry.TXPD].name == "TxPD 0"
+    assert item.entries[FrameSub.TXPD].name == "TxPD 0"
     assert item.entries[254].name == "TxPD 238"
     assert item.max_subindex == 254
 
@@ -84,11 +84,11 @@ def test_a_type_makes_value_and_default_as_large(udp):
 
 def test_rights_follow_the_entry_that_grants_them(udp):
     item = udp.make(profile.TX_FRAME, 0x8000)
-    udp.put(0x8000, FrameEntry.CHANGEABLE, b"\1")
-    assert item.entries[FrameEntry.DESTINATION_IP].access & Access.WRITE_OP
-    assert not item.entries[FrameEntry.DIVIDER].access & Access.WRITE_OP
-    udp.put(0x8000, FrameEntry.CHANGEABLE, b"\0")
-    assert not item.entries[FrameEntry.DESTINATION_IP].access & Access.WRITE_OP
+    udp.put(0x8000, FrameSub.CHANGEABLE, b"\1")
+    assert item.entries[FrameSub.DESTINATION_IP].access & Access.WRITE_OP
+    assert not item.entries[FrameSub.DIVIDER].access & Access.WRITE_OP
+    udp.put(0x8000, FrameSub.CHANGEABLE, b"\0")
+    assert not item.entries[FrameSub.DESTINATION_IP].access & Access.WRITE_OP
 
 
 def _read(dictionary: EapDictionary, index: int, subindex: int) -> int:
@@ -156,7 +156,7 @@ def test_lengths_counts_and_free_indexes_are_computed(udp):
     receiver(udp)
     write(udp, 0x3000, 1, 0x6000_0110)
     assert _read(udp, 0xD000, Tx.PDO_LENGTH) == 2
-    assert _read(udp, 0x8000, FrameEntry.FRAME_LENGTH) == 14 + 8 + 2
+    assert _read(udp, 0x8000, FrameSub.FRAME_LENGTH) == 14 + 8 + 2
     assert [_read(udp, 0xF800, sub) for sub in range(1, 8)] == [1, 1, 1, 2, 1, 1, 1]
     assert [_read(udp, 0xF801, sub) for sub in (1, 2, 4)] == [0x8001, 0xD001, 0x1A01]
     write(udp, 0xD000, Tx.PDO_INDEX, 0x1A07)
@@ -184,7 +184,7 @@ def test_users_of_an_object_are_found(udp):
     sender(udp)
     frame(udp, 0x8001, 0xD005)
     assert udp.user_of(0x6000) == (0x1A00, 1)
-    assert udp.user_of(0xD000) == (0x8000, FrameEntry.TXPD)
+    assert udp.user_of(0xD000) == (0x8000, FrameSub.TXPD)
     assert udp.user_of(0x8000) is None
     assert udp.user_of(0x1A00) is None
 

@@ -12,8 +12,8 @@ from eap.od.abort import SdoAbortError
 from eap.od.profiles.eap1000 import (
     AddressMode,
     Configured,
-    FrameEntry,
-    PortEntry,
+    FrameSub,
+    PortSub,
     Rx,
     RxFlag,
     Tx,
@@ -98,7 +98,7 @@ def _change(dictionary: EapDictionary, *writes: tuple[int, int, object]) -> EapD
             (FaultCode.MISSING_OBJECT, 0xE000, Rx.POLL_REQUEST_TXPD),
         ),
         ([(0xE000, Rx.PDO_INDEX, 0)], (FaultCode.NO_PDO, 0xE000, Rx.PDO_INDEX)),
-        ([(0xF810, PortEntry.VLAN_ID, 5)], (FaultCode.PORT, 0xF810, PortEntry.VLAN_ID)),
+        ([(0xF810, PortSub.VLAN_ID, 5)], (FaultCode.PORT, 0xF810, PortSub.VLAN_ID)),
         ([(0xF811, 1, "01:00:5e:00:00:01")], (FaultCode.PORT, 0xF811, 1)),
     ],
 )
@@ -122,8 +122,8 @@ def test_each_fault_names_its_object(udp, writes, fault):
 )
 def test_a_port_addresses_as_its_interface_can(interface, mode, is_way):
     dictionary = _on(interface)
-    write(dictionary, 0x8000, FrameEntry.ADDRESS_MODE, mode)
-    write(dictionary, 0x8000, FrameEntry.DESTINATION_NETID, bytes(range(1, 7)))
+    write(dictionary, 0x8000, FrameSub.ADDRESS_MODE, mode)
+    write(dictionary, 0x8000, FrameSub.DESTINATION_NETID, bytes(range(1, 7)))
     if is_way:
         (read,) = (found.record for found in PortReader(dictionary).frames())
         assert (
@@ -138,19 +138,19 @@ def test_a_port_addresses_as_its_interface_can(interface, mode, is_way):
         )
         assert (read.mac, read.monitor_interval_ms, read.monitor_ip) == ("", 0, "")
     else:
-        assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, FrameEntry.ADDRESS_MODE)
+        assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, FrameSub.ADDRESS_MODE)
 
 
 @pytest.mark.parametrize(
     ("interface", "subindex", "is_taken"),
     [
-        ("udp://10.0.0.1", PortEntry.TCP, True),
-        ("ethernet://eth0", PortEntry.TCP, False),
-        ("udp://10.0.0.1", PortEntry.BROADCAST, True),
-        ("tcp://10.0.0.1", PortEntry.BROADCAST, False),
-        ("ethernet://eth0", PortEntry.VLAN_ID, True),
-        ("loop://line", PortEntry.VLAN_ID, False),
-        ("ethernet://eth0", PortEntry.VLAN_PRIORITY, False),
+        ("udp://10.0.0.1", PortSub.TCP, True),
+        ("ethernet://eth0", PortSub.TCP, False),
+        ("udp://10.0.0.1", PortSub.BROADCAST, True),
+        ("tcp://10.0.0.1", PortSub.BROADCAST, False),
+        ("ethernet://eth0", PortSub.VLAN_ID, True),
+        ("loop://line", PortSub.VLAN_ID, False),
+        ("ethernet://eth0", PortSub.VLAN_PRIORITY, False),
     ],
 )
 def test_a_port_has_what_its_interface_can(interface, subindex, is_taken):
@@ -176,13 +176,13 @@ def test_a_frame_that_is_too_long_is_a_fault_of_the_frame(udp):
     udp.grow(0x8000, 17)
     udp[0x8000].entries[17].value = 0xD001
     udp[0x8000].entries[0].value = 17
-    assert _fault(udp) == (FaultCode.FRAME_TOO_LONG, 0x8000, FrameEntry.FRAME_LENGTH)
+    assert _fault(udp) == (FaultCode.FRAME_TOO_LONG, 0x8000, FrameSub.FRAME_LENGTH)
 
 
 def test_what_is_not_enabled_is_left_out(udp):
     receiver(sender(udp))
     write(udp, 0xD001, Tx.NAME, "later")
-    write(udp, 0x8001, FrameEntry.NAME, "later")
+    write(udp, 0x8001, FrameSub.NAME, "later")
     write(udp, 0xE000, Rx.FLAGS, 0)
     reader = PortReader(udp)
     assert [found.at for found in reader.frames()] == [0x8000]
@@ -236,24 +236,24 @@ def test_times_of_on_change_switch_it_on(udp):
 
 def test_a_net_id_may_come_with_its_mac_address():
     dictionary = _on("ethernet://eth0")
-    write(dictionary, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.NET_ID)
-    assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, FrameEntry.DESTINATION_NETID)
-    write(dictionary, 0x8000, FrameEntry.DESTINATION_NETID, b"\5\5\5\5\2\1")
+    write(dictionary, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.NET_ID)
+    assert _fault(dictionary) == (FaultCode.NO_DESTINATION, 0x8000, FrameSub.DESTINATION_NETID)
+    write(dictionary, 0x8000, FrameSub.DESTINATION_NETID, b"\5\5\5\5\2\1")
     for octets, mac in (
         (b"\x02\0\0\0\0\x09", "02:00:00:00:00:09"),
         (bytes(6), ""),
         (b"\x01\0\0\0\0\x09", ""),
     ):
-        write(dictionary, 0x8000, FrameEntry.DESTINATION_MAC, octets)
+        write(dictionary, 0x8000, FrameSub.DESTINATION_MAC, octets)
         (read,) = (found.record for found in PortReader(dictionary).frames())
         assert (read.destination, read.mac) == ("5.5.5.5.2.1", mac)
 
 
 def test_subscribers_are_monitored_as_the_object_says():
     dictionary = _on("ethernet://eth0")
-    write(dictionary, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.MAC)
-    write(dictionary, 0x8000, FrameEntry.MONITORING_INTERVAL, 2500)
-    write(dictionary, 0x8000, FrameEntry.MONITOR_IP, b"\x0a\0\0\x09")
+    write(dictionary, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.MAC)
+    write(dictionary, 0x8000, FrameSub.MONITORING_INTERVAL, 2500)
+    write(dictionary, 0x8000, FrameSub.MONITOR_IP, b"\x0a\0\0\x09")
     (read,) = (found.record for found in PortReader(dictionary).frames())
     assert (read.monitor_interval_ms, read.monitor_ip) == (2500, "10.0.0.9")
 
@@ -384,11 +384,11 @@ def ports():
 @pytest.mark.parametrize(
     ("writes", "fault"),
     [
-        ([(0x8001, FrameEntry.NAME, "frame0")], (FaultCode.NAME_TWICE, 0x8001, FrameEntry.NAME)),
+        ([(0x8001, FrameSub.NAME, "frame0")], (FaultCode.NAME_TWICE, 0x8001, FrameSub.NAME)),
         ([(0xD001, Tx.NAME, "txpd0")], (FaultCode.NAME_TWICE, 0xD001, Tx.NAME)),
         ([(0xE001, Rx.NAME, "rxpd0")], (FaultCode.NAME_TWICE, 0xE001, Rx.NAME)),
         ([(0xD001, Tx.PD_ID, 1)], (FaultCode.PD_ID_TWICE, 0xD001, Tx.PD_ID)),
-        ([(0x8000, FrameEntry.MODULO, 1)], (FaultCode.MODULO, 0x8000, FrameEntry.MODULO)),
+        ([(0x8000, FrameSub.MODULO, 1)], (FaultCode.MODULO, 0x8000, FrameSub.MODULO)),
         ([(0xD000, Tx.MODULO, 1)], (FaultCode.MODULO, 0xD000, Tx.MODULO)),
         ([(0xD000, Tx.CYCLE_TIME, 1500)], (FaultCode.CYCLE_TIME, 0xD000, Tx.CYCLE_TIME)),
         (
@@ -404,39 +404,39 @@ def ports():
             (FaultCode.TIME_OUT, 0xD000, Tx.ON_CHANGE_TIMEOUT),
         ),
         (
-            [(0x8000, FrameEntry.DIVIDER, 4), (0xD000, Tx.DIVIDER, 6)],
+            [(0x8000, FrameSub.DIVIDER, 4), (0xD000, Tx.DIVIDER, 6)],
             (FaultCode.GATE, 0xD000, Tx.DIVIDER),
         ),
         (
-            [(0x8000, FrameEntry.DIVIDER, 4), (0xD000, Tx.CYCLE_TIME, 20000)],
+            [(0x8000, FrameSub.DIVIDER, 4), (0xD000, Tx.CYCLE_TIME, 20000)],
             (FaultCode.GATE, 0xD000, Tx.CYCLE_TIME),
         ),
         (
             [
-                (0x8000, FrameEntry.DIVIDER, 2),
-                (0x8000, FrameEntry.MODULO, 1),
+                (0x8000, FrameSub.DIVIDER, 2),
+                (0x8000, FrameSub.MODULO, 1),
                 (0xD000, Tx.DIVIDER, 4),
             ],
             (FaultCode.GATE, 0xD000, Tx.DIVIDER),
         ),
         (
-            [(0x8000, FrameEntry.MONITOR_IP, b"\x0a\0\0\2")],
-            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITOR_IP),
+            [(0x8000, FrameSub.MONITOR_IP, b"\x0a\0\0\2")],
+            (FaultCode.MONITORING, 0x8000, FrameSub.MONITOR_IP),
         ),
         (
-            [(0x8000, FrameEntry.MONITORING_INTERVAL, 99)],
-            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITORING_INTERVAL),
+            [(0x8000, FrameSub.MONITORING_INTERVAL, 99)],
+            (FaultCode.MONITORING, 0x8000, FrameSub.MONITORING_INTERVAL),
         ),
         (
-            [(0x8000, FrameEntry.MONITORING_INTERVAL, 100), (0x8000, FrameEntry.ADDRESS_MODE, 3)],
-            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITORING_INTERVAL),
+            [(0x8000, FrameSub.MONITORING_INTERVAL, 100), (0x8000, FrameSub.ADDRESS_MODE, 3)],
+            (FaultCode.MONITORING, 0x8000, FrameSub.MONITORING_INTERVAL),
         ),
         (
             [
-                (0x8000, FrameEntry.MONITORING_INTERVAL, 100),
-                (0x8000, FrameEntry.DESTINATION_IP, b"\xef\1\1\1"),
+                (0x8000, FrameSub.MONITORING_INTERVAL, 100),
+                (0x8000, FrameSub.DESTINATION_IP, b"\xef\1\1\1"),
             ],
-            (FaultCode.MONITORING, 0x8000, FrameEntry.MONITORING_INTERVAL),
+            (FaultCode.MONITORING, 0x8000, FrameSub.MONITORING_INTERVAL),
         ),
         ([(0xE001, Rx.PD_ID, 1)], (FaultCode.RECEIVED_TWICE, 0xE001, Rx.PD_ID)),
         ([(0xE001, Rx.PDO_INDEX, 0x1600)], (FaultCode.RECEIVED_TWICE, 0xE001, Rx.PDO_INDEX)),
@@ -446,23 +446,23 @@ def ports():
         ),
         (
             [(0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)],
-            (FaultCode.POLL, 0x8000, FrameEntry.ADDRESS_MODE),
+            (FaultCode.POLL, 0x8000, FrameSub.ADDRESS_MODE),
         ),
         (
-            [(0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER)],
-            (FaultCode.POLL, 0x8000, FrameEntry.ADDRESS_MODE),
+            [(0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER)],
+            (FaultCode.POLL, 0x8000, FrameSub.ADDRESS_MODE),
         ),
         (
             [
-                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
-                (0x8000, FrameEntry.DIVIDER, 2),
+                (0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameSub.DIVIDER, 2),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
             ],
-            (FaultCode.TRIGGERS, 0x8000, FrameEntry.DIVIDER),
+            (FaultCode.TRIGGERS, 0x8000, FrameSub.DIVIDER),
         ),
         (
             [
-                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xD000, Tx.EVENT, 1),
             ],
@@ -470,7 +470,7 @@ def ports():
         ),
         (
             [
-                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xE000, Rx.FLAGS, 0),
             ],
@@ -478,7 +478,7 @@ def ports():
         ),
         (
             [
-                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xE000, Rx.POLL_REQUEST_TXPD, 0xD001),
             ],
@@ -486,7 +486,7 @@ def ports():
         ),
         (
             [
-                (0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER),
+                (0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER),
                 (0xD000, Tx.POLL_REQUEST_RXPD, 0xE000),
                 (0xE001, Rx.POLL_REQUEST_TXPD, 0xD000),
             ],
@@ -514,14 +514,14 @@ def test_names_are_given_once_in_the_station(ports):
     with pytest.raises(DeviceFault, match="frame frame0 is 0x8000 of eap0 already") as caught:
         read_back(BLANK, ports)
     assert caught.value.port == "eap1"
-    write(other, 0x8000, FrameEntry.NAME, "other")
+    write(other, 0x8000, FrameSub.NAME, "other")
     write(other, 0xD000, Tx.NAME, "other")
     assert len(read_back(BLANK, ports).frames) == 3  # IDs are unique per publisher
 
 
 def test_polls_that_fit_are_taken(ports):
     udp = ports["eap0"]
-    write(udp, 0x8000, FrameEntry.ADDRESS_MODE, AddressMode.REQUESTER)
+    write(udp, 0x8000, FrameSub.ADDRESS_MODE, AddressMode.REQUESTER)
     write(udp, 0xD000, Tx.POLL_REQUEST_RXPD, 0xE000)
     write(udp, 0xE001, Rx.POLL_REQUEST_TXPD, 0xD001)
     spec = read_back(BLANK, ports)

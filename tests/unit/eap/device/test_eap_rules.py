@@ -20,7 +20,7 @@ from eap.device.eap_rules import (
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import FrameEntry, Rx, Tx, Var
+from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var
 from tests.support.downloads import variable, write
 from tests.support.stations import BLANK, TYPES
 
@@ -46,7 +46,7 @@ CONTROL = profile.row_of(0xF200)
         (profile.TX_PD, Tx.PDO_INDEX, b"\x00\x30", b"\x00\x30"),
         (profile.TX_PD, Tx.PDO_INDEX, b"\0\0", b"\0\0"),
         (profile.RX_PD, Rx.FLAGS, b"\x85", b"\x85"),
-        (profile.TX_FRAME, FrameEntry.TXPD + 3, b"\x05\xd0", b"\x05\xd0"),
+        (profile.TX_FRAME, FrameSub.TXPD + 3, b"\x05\xd0", b"\x05\xd0"),
         (GROUPS, 9, b"01-00-5E-00-00-01", b"01:00:5e:00:00:01"),
         (GROUPS, 1, b"239.1.2.3", b"239.1.2.3"),
         (GROUPS, 1, b"", b""),
@@ -67,7 +67,7 @@ def test_values_are_kept_in_their_usual_form(udp, row, subindex, data, kept):
         (profile.TX_VARIABLE, Var.UNIT, b"\xff", "UTF-8"),
         (profile.TX_PD, Tx.PDO_INDEX, b"\x00\x16", "0x1A00 to 0x1BFF or 0x3000 to 0x3DFF"),
         (profile.RX_PD, Rx.POLL_REQUEST_TXPD, b"\x00\xe0", "0xD000 to 0xDFFF"),
-        (profile.TX_FRAME, FrameEntry.TXPD, b"\x01\0", "0xD000 to 0xDFFF"),
+        (profile.TX_FRAME, FrameSub.TXPD, b"\x01\0", "0xD000 to 0xDFFF"),
         (profile.RX_PD, Rx.FLAGS, b"\x08", "of the flags 0x85 only"),
         (GROUPS, 1, b"10.0.0.1", "no multicast address"),
         (GROUPS, 1, b"02:00:00:00:00:01", "no multicast address"),

@@ -13,7 +13,7 @@ from eap.device.eap_state import EapStateMachine
 from eap.device.stored import configuration, dump, load
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import FrameEntry, Rx, Tx, Var
+from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
 from eap.pd.spec import StationSpec
 from tests.support.downloads import PREOP, receiver, sender, write
@@ -197,7 +197,7 @@ def _downloads(draw: st.DrawFn) -> tuple[int, int, object]:
             st.tuples(st.just(0xE000), st.just(Rx.FLAGS), st.sampled_from([0x80, 0x85, 0])),
             st.tuples(st.just(0xE000), st.sampled_from(list(Rx)), st.integers(0, 20)),
             st.tuples(st.just(0x8000), st.integers(16, 18), _NUMBERS.map(0xD000.__add__)),
-            st.tuples(st.just(0x8000), st.sampled_from(list(FrameEntry)), st.integers(0, 5)),
+            st.tuples(st.just(0x8000), st.sampled_from(list(FrameSub)), st.integers(0, 5)),
             st.tuples(
                 st.sampled_from([0x6000, 0x7000, 0x8000, 0xD000, 0xE000]), st.just(0), st.just(0)
             ),

@@ -15,7 +15,7 @@ from eap.device.stored import (
 )
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
-from eap.od.profiles.eap1000 import FrameEntry, Tx, Var
+from eap.od.profiles.eap1000 import FrameSub, Tx, Var
 from eap.pd.spec import StationSpec
 from tests.support.downloads import OP, copy, receiver, sender, variable, write
 from tests.support.examples import examples
@@ -79,12 +79,12 @@ def test_adopting_touches_only_what_differs(udp):
 
 def test_rights_that_the_configuration_grants_are_restored(udp):
     sender(udp)
-    write(udp, 0x8000, FrameEntry.CHANGEABLE, 1)
+    write(udp, 0x8000, FrameSub.CHANGEABLE, 1)
     other = copy(udp)
-    write(other, 0x8000, FrameEntry.DESTINATION_IP, b"\1\2\3\4", OP)
+    write(other, 0x8000, FrameSub.DESTINATION_IP, b"\1\2\3\4", OP)
     restore(other, configuration(sender(EapDictionary(BLANK, "eap0"))))
     with pytest.raises(SdoAbortError) as caught:
-        write(other, 0x8000, FrameEntry.DESTINATION_IP, b"\1\2\3\4", OP)
+        write(other, 0x8000, FrameSub.DESTINATION_IP, b"\1\2\3\4", OP)
     assert caught.value.code == AbortCode.DEVICE_STATE
 
 

@@ -88,12 +88,12 @@ def test_device_type_is_profile_and_module_profile():
     ("index", "names"),
     [
         (0x6000, profile.Var),
-        (0x8000, profile.FrameEntry),
+        (0x8000, profile.FrameSub),
         (0xD000, profile.Tx),
         (0xE000, profile.Rx),
         (0xF100, profile.Status),
         (0xF800, profile.Configured),
-        (0xF810, profile.PortEntry),
+        (0xF810, profile.PortSub),
     ],
 )
 def test_each_name_is_that_of_its_entry_and_none_is_missing(index, names):

@@ -10,9 +10,9 @@ from eap.od.profiles.eap1000 import Derived, EapLive
 from eap.od.profiles.master1100 import CONFIGURED_LIST, DIAGNOSIS, MasterLive
 from eap.od.profiles.table import (
     CONFIG,
-    EntryRow,
     Form,
-    ObjectRow,
+    ProfileEntry,
+    ProfileObject,
     config,
     derived,
     fixed,
@@ -24,7 +24,7 @@ from eap.od.profiles.table import (
     to_text,
 )
 
-PLAIN = ObjectRow(
+PLAIN = ProfileObject(
     0xD000, 0xD00F, "TxPD {n}", ObjectCode.RECORD,
     (config(1, "One", "UINT", "1."), fixed(2, "Two", "UINT", "2.")), "PDs.",
 )  # fmt: skip
@@ -56,7 +56,7 @@ def test_rows_say_where_their_content_comes_from():
         fixed(1, "a", "UINT", "d"),
         live(1, "a", "UINT", EapLive.VALUE, "d", unit="ms"),
         derived(1, "a", "UINT", Derived.COUNT, "d"),
-        EntryRow(1, "a", "UINT", RW, "d"),
+        ProfileEntry(1, "a", "UINT", RW, "d"),
     )
     assert [row.access for row in rows] == [CONFIG, RO, RO, RO, RW]
     assert (rows[0].default, rows[2].live, rows[2].unit, rows[3].derived) == (

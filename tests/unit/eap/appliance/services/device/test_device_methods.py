@@ -17,7 +17,7 @@ from eap.device.eap_objects import DeviceIdentity
 from eap.device.router_dictionary import RouterDictionary
 from eap.errors import ControlError, EngineRefusedError
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.od.profiles.eap1000 import FrameEntry, Tx
+from eap.od.profiles.eap1000 import FrameSub, Tx
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from tests.support.routervalues import Values
 from tests.support.stationengine import make_device
@@ -111,9 +111,9 @@ def test_describe_what_a_download_would_make(call):
 
     assert entries(0x1A77, 3) == {0: "USINT", 1: "UDINT", 2: "UDINT", 3: "UDINT"}
     assert entries(0xD077)[Tx.PD_ID] == "UINT"
-    assert max(entries(0x8000)) == FrameEntry.TXPD
+    assert max(entries(0x8000)) == FrameSub.TXPD
     assert entries(0x8000, 20)[20] == "UINT"
-    assert max(entries(0x8000, 5)) == FrameEntry.TXPD
+    assert max(entries(0x8000, 5)) == FrameSub.TXPD
     assert 0x9999 not in [row["index"] for row in call("od_list", target="left")["objects"]]
     assert 0x1A77 not in [row["index"] for row in call("od_list", target="left")["objects"]]
     with pytest.raises(SdoAbortError):
