@@ -71,7 +71,7 @@ class Failure(msgspec.Struct, frozen=True, omit_defaults=True):
     """Its number, as ``bus_errors`` packs it; with code ``abort`` the abort code."""
 
 
-class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
+class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
     """One line from the server: a result, an error, or one event of a subscription."""
 
     v: int
@@ -204,7 +204,7 @@ ServedMethod: TypeAlias = tuple[str, Callable[[dict[str, Any]], Any]]
 """Name, and function of the undecoded parameters."""
 
 _REQUEST = msgspec.json.Decoder(Request)
-_REPLY = msgspec.json.Decoder(Reply)
+_REPLY = msgspec.json.Decoder(ControlReply)
 
 
 class Method(Generic[ParametersT, AnswerT]):
@@ -289,7 +289,7 @@ def request_id(line: bytes) -> int | None:
     return number if isinstance(number, int) else None
 
 
-def decode_reply(line: bytes) -> Reply:
+def decode_reply(line: bytes) -> ControlReply:
     """Read one line of a server; raise ControlError if it is none."""
     try:
         return _REPLY.decode(line)

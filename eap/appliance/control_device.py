@@ -122,7 +122,7 @@ class RoutingApplyParameters(RoutingPlanParameters, frozen=True, kw_only=True):
     cause: Annotated[str, Meta(max_length=64)] = ""
 
 
-class ObjectRow(Document, frozen=True, kw_only=True):
+class ListedObject(Document, frozen=True, kw_only=True):
     """Object without its entries; *label* is the name of the frame, PD or port described by it."""
 
     index: int
@@ -132,7 +132,7 @@ class ObjectRow(Document, frozen=True, kw_only=True):
     max_subindex: int
 
 
-class EntryRow(Document, frozen=True, kw_only=True):
+class DescribedEntry(Document, frozen=True, kw_only=True):
     """Entry without its value."""
 
     subindex: int
@@ -147,19 +147,19 @@ class EntryRow(Document, frozen=True, kw_only=True):
     maximum: int | float | None
 
 
-class EntryContent(EntryRow, frozen=True, kw_only=True):
+class EntryContent(DescribedEntry, frozen=True, kw_only=True):
     """Entry with its octets, None if they cannot be read."""
 
     data: str | None
 
 
-class DescribedObject(ObjectRow, frozen=True, kw_only=True):
+class DescribedObject(ListedObject, frozen=True, kw_only=True):
     """Answer to ``od_describe``."""
 
-    entries: list[EntryRow]
+    entries: list[DescribedEntry]
 
 
-class DumpedObject(ObjectRow, frozen=True, kw_only=True):
+class DumpedObject(ListedObject, frozen=True, kw_only=True):
     """Object of an answer to ``od_dump``."""
 
     entries: list[EntryContent]
@@ -168,7 +168,7 @@ class DumpedObject(ObjectRow, frozen=True, kw_only=True):
 class ObjectPage(Document, frozen=True):
     """Answer to ``od_list``; *next* is the index at which it goes on, None at the end."""
 
-    objects: list[ObjectRow]
+    objects: list[ListedObject]
     next: int | None
 
 
@@ -307,9 +307,9 @@ ROUTING_APPLY = Method("routing_apply", RoutingApplyParameters, RoutingDifferenc
 ROUTING_ROLLBACK = Method("routing_rollback", StationParameters, RoutingDifference)
 
 
-def object_row(item: OdObject, label: str) -> ObjectRow:
+def object_row(item: OdObject, label: str) -> ListedObject:
     """Return an object without its entries."""
-    return ObjectRow(
+    return ListedObject(
         index=item.index,
         name=item.name,
         label=label,
@@ -326,7 +326,7 @@ def described_object(item: OdObject, label: str) -> DescribedObject:
         label=label,
         code=item.code.name,
         max_subindex=item.max_subindex,
-        entries=[EntryRow(**_entry_fields(*each)) for each in item.entries.items()],
+        entries=[DescribedEntry(**_entry_fields(*each)) for each in item.entries.items()],
     )
 
 

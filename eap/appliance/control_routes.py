@@ -396,7 +396,7 @@ class SlaveEntry(Document, frozen=True):
     state: str | None
 
 
-class PortEntry(Document, frozen=True):
+class ScannedPort(Document, frozen=True):
     """Port of a station, with the slaves of a bus; *error* says why they are not known."""
 
     name: str
@@ -412,7 +412,7 @@ class StationEntry(Document, frozen=True):
 
     name: str
     net_id: str
-    ports: list[PortEntry]
+    ports: list[ScannedPort]
     error: str
 
 

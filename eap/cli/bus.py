@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.bus_place import BusCommand, BusPort, Place, bus_options, open_session
+from eap.cli.bus_place import BusCommand, Place, StationBus, bus_options, open_session
 from eap.cli.group import LazyGroup
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.cli.params import (
     CommandT,
     examples,
@@ -62,7 +62,7 @@ def bus() -> None:
 @click.command(cls=BusCommand)
 @bus_options
 @json_option("Print one object.")
-def scan(bus: Place, output: Output) -> None:
+def scan(bus: Place, output: Renderer) -> None:
     """Show all slaves: identity, state, alias, mailbox protocols."""
     from eap.appliance.commands.bus_info import scan_slaves
     from eap.cli.bus_view import scan_tables
@@ -76,7 +76,7 @@ def scan(bus: Place, output: Output) -> None:
 @bus_options
 @click.argument("words", nargs=-1, metavar="[SLAVE] [INIT|PREOP|SAFEOP|OP|BOOT]")
 @json_option("Print one object.")
-def state(words: tuple[str, ...], bus: Place, output: Output) -> None:
+def state(words: tuple[str, ...], bus: Place, output: Renderer) -> None:
     """Show states, or bring slaves to a state.
 
     One slave, or all of them.  The master of a running station keeps them there.  Behind an
@@ -92,7 +92,7 @@ def state(words: tuple[str, ...], bus: Place, output: Output) -> None:
     with open_session(bus) as session:
         found = slave_states(session, rest[0] if rest else None, target)
     note = ""
-    if target is not None and isinstance(bus, BusPort):
+    if target is not None and isinstance(bus, StationBus):
         note = f"\nThe master of {bus} keeps {'it' if rest else 'them'} there."
     output.show(found, lambda states: state_view(states, note))
 
@@ -103,7 +103,7 @@ def state(words: tuple[str, ...], bus: Place, output: Output) -> None:
 @click.option("--full", is_flag=True, help="Show slaves without errors too, however many.")
 @click.option("--reset", is_flag=True, help="Clear error counters and findings that are over.")
 @json_option("Print one object.")
-def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Output) -> None:
+def diag(slave: str | None, bus: Place, full: bool, reset: bool, output: Renderer) -> None:
     """Show present and past faults of a bus.
 
     One line for each cause, below a table of states and error counters of ports.  A running station
@@ -135,7 +135,7 @@ def sii() -> None:
 @slave_argument
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @json_option("Print one object, with all octets in hexadecimal digits.")
-def sii_dump(slave: str, file: Path | None, bus: Place, output: Output) -> None:
+def sii_dump(slave: str, file: Path | None, bus: Place, output: Renderer) -> None:
     """Read the EEPROM; with FILE, store its octets there."""
     from eap.appliance.commands.bus_info import read_eeprom
     from eap.appliance.durable import whole_file
@@ -154,7 +154,7 @@ def sii_dump(slave: str, file: Path | None, bus: Place, output: Output) -> None:
 @slave_argument
 @click.argument("file", type=click.Path(exists=True, path_type=Path, dir_okay=False))
 @json_option("Print one object.")
-def sii_write(slave: str, file: Path, bus: Place, output: Output) -> None:
+def sii_write(slave: str, file: Path, bus: Place, output: Renderer) -> None:
     """Write FILE into the EEPROM, read it back and compare.
 
     The master of a running station reads it when it brings its bus up anew.
@@ -163,7 +163,7 @@ def sii_write(slave: str, file: Path, bus: Place, output: Output) -> None:
 
     def lines(done: WrittenEeprom) -> Iterator[str]:
         yield f"slave {done.address}: {done.octets} octets written and compared"
-        if isinstance(bus, BusPort):
+        if isinstance(bus, StationBus):
             yield f"\nThe master of {bus} uses the old content until its plant starts again."
 
     with open_session(bus) as session:
@@ -184,7 +184,9 @@ def sii_write(slave: str, file: Path, bus: Place, output: Output) -> None:
     help="Type of the message, defined by the vendor.",
 )
 @json_option("Print one object.")
-def voe(slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, output: Output) -> None:
+def voe(
+    slave: str, data: bytes, vendor: int, vendor_type: int, bus: Place, output: Renderer
+) -> None:
     """Send a message of a vendor's own protocol (VoE) and print the answer."""
     from eap.appliance.commands.bus_foe import exchange
 
@@ -224,7 +226,7 @@ def sdo_read(
     kind: DataType | None,
     complete: bool,
     bus: Place,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Read an entry.
 
@@ -252,7 +254,7 @@ def sdo_write(
     kind: DataType | None,
     complete: bool,
     bus: Place,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Write an entry.
 
@@ -270,7 +272,7 @@ def sdo_write(
 @bus_options
 @slave_argument
 @json_option("Print one object a line.")
-def sdo_list(slave: str, bus: Place, output: Output) -> None:
+def sdo_list(slave: str, bus: Place, output: Renderer) -> None:
     """List the objects that the slave describes."""
     from eap.appliance.commands import bus_objects
     from eap.cli.bus_view import object_table
@@ -283,7 +285,7 @@ def sdo_list(slave: str, bus: Place, output: Output) -> None:
 @bus_options
 @slave_argument
 @json_option("Print one object a line.")
-def sdo_dump(slave: str, bus: Place, output: Output) -> None:
+def sdo_dump(slave: str, bus: Place, output: Renderer) -> None:
     """Read every entry of every object that the slave describes."""
     from eap.appliance.commands.bus_objects import dump_entries
     from eap.cli.bus_view import dump_table
@@ -326,7 +328,7 @@ def idn() -> None:
 @click.argument("number", type=parse_idn, metavar="IDN")
 @_drive_option
 @json_option("Print one object.")
-def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Output) -> None:
+def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Renderer) -> None:
     """Read an IDN with all elements that it has."""
     from eap.appliance.commands.bus_objects import read_idn
     from eap.cli.bus_view import idn_lines
@@ -343,7 +345,9 @@ def idn_read(slave: str, number: Idn, drive: int, bus: Place, output: Output) ->
 @click.argument("value")
 @_drive_option
 @json_option("Print one object: what was written.")
-def idn_write(slave: str, number: Idn, value: str, drive: int, bus: Place, output: Output) -> None:
+def idn_write(
+    slave: str, number: Idn, value: str, drive: int, bus: Place, output: Renderer
+) -> None:
     """Write the value of an IDN.
 
     The numbers of a list have commas between them.
@@ -360,7 +364,7 @@ def idn_write(slave: str, number: Idn, value: str, drive: int, bus: Place, outpu
 @slave_argument
 @_drive_option
 @json_option("Print one object a line.")
-def idn_list(slave: str, drive: int, bus: Place, output: Output) -> None:
+def idn_list(slave: str, drive: int, bus: Place, output: Renderer) -> None:
     """List all IDNs of a drive."""
     from eap.appliance.commands import bus_objects
     from eap.cli.bus_view import idn_table
@@ -397,7 +401,7 @@ def foe_get(
     file: Path | None,
     password: int,
     bus: Place,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Read the file NAME of a slave into FILE.
 
@@ -432,7 +436,7 @@ def foe_put(
     name: str | None,
     password: int,
     bus: Place,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Write FILE to a slave, as NAME if that is given.
 

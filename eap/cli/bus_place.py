@@ -17,7 +17,7 @@ _PLACE, _INTERFACE, _PLANT = "place", "interface", "plant"
 _FORMS = "STATION/PORT", "--interface URI"
 
 
-class BusPort(NamedTuple):
+class StationBus(NamedTuple):
     """A bus port of a running station, of a certain plant if several run that station."""
 
     station: str
@@ -38,7 +38,7 @@ class GatewayPlace(NamedTuple):
     """Octets of the slave's mailboxes, in place of the master's description."""
 
 
-Place: TypeAlias = BusPort | InterfaceUri | GatewayPlace
+Place: TypeAlias = StationBus | InterfaceUri | GatewayPlace
 
 
 class BusCommand(click.Command):
@@ -121,10 +121,10 @@ def place_parameters() -> frozenset[str]:
     return frozenset((_PLACE, _INTERFACE, _PLANT))
 
 
-def parse_port(text: str) -> BusPort | None:
+def parse_port(text: str) -> StationBus | None:
     """Read STATION/PORT; return None if it is something else."""
     station, slash, port = text.partition("/")
-    return BusPort(station, port) if slash and station and port and "/" not in port else None
+    return StationBus(station, port) if slash and station and port and "/" not in port else None
 
 
 def parse_uri(text: str) -> InterfaceUri:
@@ -142,7 +142,7 @@ def parse_uri(text: str) -> InterfaceUri:
 
 def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
     """Open the bus; imported here, so that ``--help`` need not wait for a master."""
-    if isinstance(bus, BusPort):
+    if isinstance(bus, StationBus):
         from eap.appliance.commands.bus_running import open_running
 
         return open_running(*bus)
@@ -155,7 +155,7 @@ def open_session(bus: Place) -> AbstractContextManager[SlaveBus]:
     return bus_session.open_bus(bus)
 
 
-def _to_port(ctx: click.Context, param: click.Parameter, text: str | None) -> BusPort | None:
+def _to_port(ctx: click.Context, param: click.Parameter, text: str | None) -> StationBus | None:
     del param
     port = parse_port(text or "")
     if port is None and not ctx.resilient_parsing:

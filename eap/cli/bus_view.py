@@ -10,12 +10,12 @@ from msgspec import UNSET
 from eap.appliance.bus_status import FindingRow
 from eap.appliance.commands.bus_info import (
     BusScan,
-    BusStates,
     CounterReset,
     DiagnosedSlave,
     Diagnosis,
     EepromContent,
-    SlaveState,
+    SlaveStateRow,
+    SlaveStates,
     fault_lines,
 )
 from eap.appliance.commands.bus_objects import (
@@ -65,7 +65,7 @@ def scan_tables(found: BusScan) -> Iterator[TextTable | str]:
         yield from faults
 
 
-def state_view(found: BusStates, note: str) -> Iterator[TextTable | str]:
+def state_view(found: SlaveStates, note: str) -> Iterator[TextTable | str]:
     """Yield the table of the slaves' states, and *note* unless it is empty."""
     table = TextTable("Slave", "Name", "State", Column("Reason", wraps=True))
     for row in found.slaves:
@@ -268,7 +268,7 @@ def _state(name: str | None) -> Styled:
     return Styled(name, style="red" if name.endswith("ERROR") else "")
 
 
-def _reason(row: SlaveState) -> str:
+def _reason(row: SlaveStateRow) -> str:
     return f"{row.reason} (0x{row.code:04X})" if row.code else row.reason
 
 

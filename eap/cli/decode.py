@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.cli.params import json_option
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _SEPARATORS = str.maketrans("", "", ":-, \t\r\n")
 @click.argument("source", metavar="HEX|FILE", nargs=-1, required=True)
 @json_option("Print one object a frame, on one line.")
 @click.pass_context
-def decode(ctx: click.Context, source: tuple[str, ...], output: Output) -> None:
+def decode(ctx: click.Context, source: tuple[str, ...], output: Renderer) -> None:
     """Decode one frame given as HEX, or all frames of a pcap or pcapng FILE.
 
     HEX starts at the EtherCAT header or at the Ethernet header; spaces are allowed.  A file whose

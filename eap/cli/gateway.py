@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.cli.params import examples, json_option, plant_option
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def gateway() -> None:
 @_TARGET
 @plant_option
 @_JSON
-def start(target: str, plant: str | None, output: Output) -> None:
+def start(target: str, plant: str | None, output: Renderer) -> None:
     """Start a gateway that was stopped."""
     output.show_rows(_call("start", target, plant), _state_lines)
 
@@ -48,7 +48,7 @@ def start(target: str, plant: str | None, output: Output) -> None:
 @_TARGET
 @plant_option
 @_JSON
-def stop(target: str, plant: str | None, output: Output) -> None:
+def stop(target: str, plant: str | None, output: Renderer) -> None:
     """Stop a gateway until it is started again; the bus goes on."""
     output.show_rows(_call("stop", target, plant), _state_lines)
 
@@ -57,7 +57,7 @@ def stop(target: str, plant: str | None, output: Output) -> None:
 @click.argument("target", metavar="[STATION[/PORT]]", default="")
 @plant_option
 @_JSON
-def status(target: str, plant: str | None, output: Output) -> None:
+def status(target: str, plant: str | None, output: Renderer) -> None:
     """Show sockets, clients and requests of a gateway.
 
     Without STATION, of all gateways that run.

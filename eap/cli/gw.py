@@ -17,7 +17,7 @@ from eap.cli.bus_place import (
     place_parameters,
 )
 from eap.cli.group import LazyGroup
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.cli.params import examples, json_option
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def gw(ctx: click.Context, place: GatewayPlace, tcp: bool, mailbox: int | None) 
 @bus_options
 @click.argument("slave", default="0", metavar="[SLAVE]")
 @json_option("Print one object a line.")
-def od(slave: str, bus: Place, output: Output) -> None:
+def od(slave: str, bus: Place, output: Renderer) -> None:
     """Show every object with its entries and values; of the master if SLAVE is left out."""
     from eap.appliance.commands.bus_objects import dump_entries
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.cli.params import examples, json_option, plant_option
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _VIA = click.option(
 @_VIA
 @plant_option
 @json_option("Print one object: stations, with their ports and slaves.")
-def scan(via: str | None, plant: str | None, output: Output) -> None:
+def scan(via: str | None, plant: str | None, output: Renderer) -> None:
     """List the stations of the plant, local and remote, with their ports and slaves.
 
     Each line ends with the Python line that connects pyads to it; 'eapctl od', 'state' and 'trace'
@@ -65,7 +65,11 @@ def scan(via: str | None, plant: str | None, output: Output) -> None:
 @json_option("Print one object for each target; docs/trace.md explains its fields.")
 @click.pass_context
 def trace(
-    ctx: click.Context, targets: tuple[str, ...], via: str | None, plant: str | None, output: Output
+    ctx: click.Context,
+    targets: tuple[str, ...],
+    via: str | None,
+    plant: str | None,
+    output: Renderer,
 ) -> None:
     """Query each router on the path to TARGET for its next hop, then TARGET itself.
 

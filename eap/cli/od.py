@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.cli.params import json_option, parse_entry, parse_octets, parse_type, plant_option
 from eap.errors import ControlError
 
@@ -67,7 +67,7 @@ def od() -> None:
 @od.command("list")
 @target_argument
 @json_option("Print one object a line.")
-def list_objects(target: Target, output: Output) -> None:
+def list_objects(target: Target, output: Renderer) -> None:
     """List all objects with their names."""
     from eap.appliance.commands.od import object_rows
     from eap.appliance.commands.od_devices import open_device
@@ -95,7 +95,7 @@ def _object_table(rows: Iterable[OdObjectRow]) -> Iterator[TextTable]:
 )
 @json_option("Print one object.")
 def read(
-    entry: ObjectId, kind: DataType | None, complete: bool, target: Target, output: Output
+    entry: ObjectId, kind: DataType | None, complete: bool, target: Target, output: Renderer
 ) -> None:
     """Read an entry, or a whole object."""
     from eap.appliance.commands.od import read_entry, read_object
@@ -138,7 +138,7 @@ def write(
     complete: bool,
     file: Path | None,
     target: Target,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Write an entry, a whole object, or all that a file holds.
 
@@ -164,7 +164,7 @@ def write(
             output.show(write_entry(device, *place, value or "", kind), value_line)
 
 
-def _load(target: Target, file: Path, output: Output) -> None:
+def _load(target: Target, file: Path, output: Renderer) -> None:
     """Write the entries of *file* to *target*."""
     from eap.appliance.commands import od as ops
     from eap.appliance.commands.od_devices import open_device
@@ -173,13 +173,13 @@ def _load(target: Target, file: Path, output: Output) -> None:
     entries = read_file(file)
     with open_device(target) as device:
         done = ops.load(device, entries)
-    output.show(ops.LoadResult(str(target), *done), load_line)
+    output.show(ops.OdLoadResult(str(target), *done), load_line)
 
 
 @od.command()
 @target_argument
 @json_option("Print one entry a line, as an object.")
-def dump(target: Target, output: Output) -> None:
+def dump(target: Target, output: Renderer) -> None:
     """Write all entries of all objects to stdout, for people and for 'od write --from'."""
     from eap.appliance.commands.od import dump_rows
     from eap.appliance.commands.od_devices import open_device
@@ -215,7 +215,7 @@ def _entry_to_write(
 )
 @json_option("Print one object: state, and error or null.")
 @click.pass_context
-def state(ctx: click.Context, wanted: str | None, target: Target, output: Output) -> None:
+def state(ctx: click.Context, wanted: str | None, target: Target, output: Renderer) -> None:
     """Show the state of TARGET, or bring it to another one.
 
     TARGET is STATION or STATION/PORT: PREOP takes configuration, SAFEOP sends, OP sends and

@@ -19,8 +19,8 @@ import msgspec
 
 from eap.appliance.commands.od import (
     Download,
-    LoadResult,
     OdDumpEntry,
+    OdLoadResult,
     OdOctets,
     OdValue,
     OdWholeObject,
@@ -71,7 +71,7 @@ def object_name(name: str, label: str) -> str:
     return f"{name} ({label})" if label else name
 
 
-def load_line(done: LoadResult) -> str:
+def load_line(done: OdLoadResult) -> str:
     """Return the result of ``od write --from``."""
     rest = f", {done.unchanged} were there already" if done.unchanged else ""
     word = "entry" if done.written == 1 else "entries"

@@ -1,6 +1,6 @@
 """The renderer of ``eapctl``: a command's typed result as JSON, or as its text view.
 
-Each command hands its result to :class:`Output`: ``--json`` prints the encoded record, else
+Each command hands its result to :class:`Renderer`: ``--json`` prints the encoded record, else
 the lines and tables of the command's view.  Results go to stdout, everything else to stderr.  A
 reader of stdout may stop early (``| head``): that ends the command quietly and counts as done.
 """
@@ -30,7 +30,7 @@ _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 """ECMA-48: cursor to the first column of the first line, erase to the end of line, of screen."""
 
 
-class Output:
+class Renderer:
     """Renderer of one command line.
 
     Attributes:

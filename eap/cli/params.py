@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import click
 
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.ids import ObjectId
 
 if TYPE_CHECKING:
@@ -45,9 +45,9 @@ def json_option(text: str) -> Callable[[CommandT], CommandT]:
     return click.option("--json", "output", is_flag=True, callback=_to_output, help=text)
 
 
-def _to_output(ctx: click.Context, param: click.Parameter, is_json: bool) -> Output:
+def _to_output(ctx: click.Context, param: click.Parameter, is_json: bool) -> Renderer:
     del ctx, param
-    return Output(is_json=is_json)
+    return Renderer(is_json=is_json)
 
 
 def plant_option(command: CommandT) -> CommandT:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from eap.cli.output import Output
+from eap.cli.output import Renderer
 from eap.cli.params import (
     json_option,
     parse_assignment,
@@ -34,7 +34,7 @@ def pd() -> None:
 @plant_option
 @station_option
 @json_option("One object a line: a PD, or the variables of a station that no PD carries.")
-def list_pds(plant: str | None, station: str | None, output: Output) -> None:
+def list_pds(plant: str | None, station: str | None, output: Renderer) -> None:
     """List every PD with what identifies it, and every variable with its type and writer."""
     from eap.appliance.commands.client import connect
     from eap.appliance.control import PD_LIST, VARIABLES
@@ -65,7 +65,7 @@ def list_pds(plant: str | None, station: str | None, output: Output) -> None:
 @plant_option
 @json_option("One object a line.")
 def watch(
-    names: tuple[str, ...], count: int | None, period_ms: int, plant: str | None, output: Output
+    names: tuple[str, ...], count: int | None, period_ms: int, plant: str | None, output: Renderer
 ) -> None:
     """Print a line for each change of a variable, until Ctrl-C.
 
@@ -93,7 +93,7 @@ def watch(
 @click.argument("words", nargs=-1, required=True, metavar="STATION VAR VALUE")
 @plant_option
 @json_option("Print one object: what was written.")
-def set_value(words: tuple[str, ...], plant: str | None, output: Output) -> None:
+def set_value(words: tuple[str, ...], plant: str | None, output: Renderer) -> None:
     """Set a variable that the plant file gives to the application.
 
     VALUE as the variable's type has it: 12, 0xC, -1.5e3, true, text, 1,2,3 for an array,

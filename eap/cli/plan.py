@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Output, write_text
+from eap.cli.output import Renderer, write_text
 from eap.cli.params import PLANT_FILE, CommandT, json_option
 from eap.errors import ControlError
 from eap.ids import ObjectId
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         ChangeReport,
         PlanReport,
         PlantLink,
-        StepResult,
+        StepOutcome,
     )
     from eap.appliance.control_device import ObjectChange
     from eap.pd.spec import StationSpec
@@ -68,7 +68,7 @@ def running_plant(
 @plant_arguments
 @json_option("Print one object: ok, stations with changes, the steps of 'apply', absent stations.")
 @click.pass_context
-def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Output) -> None:
+def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Renderer) -> None:
     """Show the differences, object by object, between PLANT and its stations that run here.
 
     Nothing is changed.  Exits with 1 when a station cannot become what the file says while it runs.
@@ -92,7 +92,7 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Out
 @_RESULT
 @click.pass_context
 def apply(
-    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Output
+    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Renderer
 ) -> None:
     """Apply PLANT to its stations that run here, without a restart.
 
@@ -120,7 +120,7 @@ def apply(
 @_RESULT
 @click.pass_context
 def rollback(
-    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Output
+    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Renderer
 ) -> None:
     """Take back the last change of the stations of PLANT that run here.
 
@@ -136,15 +136,15 @@ def rollback(
 
 def _run_steps(
     ctx: click.Context,
-    steps: Iterable[StepResult],
+    steps: Iterable[StepOutcome],
     link: PlantLink,
     refusing: Mapping[str, list[str]],
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Take all steps, print the text of each when it is done, and then the whole result."""
     from eap.appliance.commands.plant_change import ChangeReport
 
-    taken: list[StepResult] = []
+    taken: list[StepOutcome] = []
     error: ControlError | None = None
     try:
         for step in steps:
@@ -221,7 +221,7 @@ def _change_lines(changes: Sequence[ObjectChange]) -> Iterator[str]:
         yield change_text(change, f"{change.port}: {change.name}" if several else change.name)
 
 
-def _step_lines(step: StepResult) -> Iterator[str]:
+def _step_lines(step: StepOutcome) -> Iterator[str]:
     """Yield the result of one step."""
     outcome = step.outcome
     yield f"{step.station} {step.why}: {'ok' if outcome.ok else 'refused'}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Output, write_text
+from eap.cli.output import Renderer, write_text
 from eap.cli.params import PLANT_FILE, json_option, parse_cycle
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ SHAPES = ("ring", "star")
 @click.argument("plant", type=PLANT_FILE)
 @json_option("Print one object: ok, all findings, and warnings.")
 @click.pass_context
-def check(ctx: click.Context, plant: Path, output: Output) -> None:
+def check(ctx: click.Context, plant: Path, output: Renderer) -> None:
     """Check the plant file PLANT, and report all errors at once.
 
     Exits with 2 when there is an error.  What works, but not with all commands, is a warning.
@@ -98,7 +98,7 @@ def new(
     address: str,
     cycle_us: int,
     force: bool,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Write the plant file FILE, or stdout for -, with N stations in a ring or a star.
 

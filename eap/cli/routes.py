@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode, LazyGroup
-from eap.cli.output import Output, write_text
+from eap.cli.output import Renderer, write_text
 from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
 from eap.errors import EnvironmentalError
 
@@ -55,7 +55,7 @@ def routes(ctx: click.Context, plant: str | None) -> None:
             raise click.UsageError("--plant goes behind the command")
         return
     if not is_terminal():
-        ctx.invoke(list_all, plant=plant, station=None, match="", output=Output(is_json=False))
+        ctx.invoke(list_all, plant=plant, station=None, match="", output=Renderer(is_json=False))
         return
     _run_view(plant)
 
@@ -88,7 +88,7 @@ def _run_view(plant: str | None) -> None:
 )
 @plant_option
 @json_option("Print one object: stations, each with routes, connections, requests, warnings.")
-def list_all(station: str | None, match: str, plant: str | None, output: Output) -> None:
+def list_all(station: str | None, match: str, plant: str | None, output: Renderer) -> None:
     """List the routes and connections of STATION, or of all running stations."""
     from eap.appliance.commands.route_lists import RouterList, list_routes
     from eap.cli.routes_view import routes_view
@@ -145,7 +145,7 @@ def add(
     timeout_ms: int | None,
     no_probe: bool,
     plant: str | None,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Add a route to the router of STATION: to NAME with NETID, by way of VIA.
 
@@ -180,7 +180,7 @@ def add(
 @plant_option
 @json_option("Print one object: the route.")
 def remove(
-    station: str, route: str, transport: str, address: str, plant: str | None, output: Output
+    station: str, route: str, transport: str, address: str, plant: str | None, output: Renderer
 ) -> None:
     """Remove ROUTE, a name or NetID, from the router of STATION.
 
@@ -218,7 +218,7 @@ def test(
     targets: tuple[str, ...],
     timeout_ms: int,
     plant: str | None,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Read the state of each TARGET through the router of STATION, and measure the time.
 
@@ -277,7 +277,7 @@ def import_routes(
     file: Path,
     dry_run: bool,
     plant: str | None,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Add the routes of FILE (StaticRoutes.xml of TwinCAT) to the router of STATION.
 
@@ -376,7 +376,7 @@ def introduce(
     password_file: Path | None,
     wait_ms: int,
     plant: str | None,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Request the router at ADDRESS, such as that of a PLC, to add a route to STATION.
 
@@ -436,7 +436,7 @@ def _password(user: str, file: Path | None) -> str:
 @plant_option
 @json_option("Print one object a router and line.")
 def scan(
-    station: str | None, address: str, wait_ms: int, plant: str | None, output: Output
+    station: str | None, address: str, wait_ms: int, plant: str | None, output: Renderer
 ) -> None:
     """Discover the AMS routers of other hosts by UDP 48899.
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from eap.cli.bus_place import BusPort, parse_port
+from eap.cli.bus_place import StationBus, parse_port
 from eap.cli.group import LazyGroup
-from eap.cli.output import Output, write_json
+from eap.cli.output import Renderer, write_json
 from eap.cli.params import CommandT, examples, json_option, plant_option
 from eap.ids import InterfaceUri
 
@@ -114,7 +114,7 @@ def _place_argument(command: CommandT) -> CommandT:
     return click.argument("bus", callback=_to_port, metavar="STATION/PORT")(command)
 
 
-def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> BusPort:
+def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> StationBus:
     port = parse_port(text)
     if port is None:
         raise click.BadParameter(f"{text!r} is no STATION/PORT, such as press/bus0", ctx, param)
@@ -134,7 +134,7 @@ def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> BusPort:
 @plant_option
 @json_option("Print one object: what was sent.")
 def fault(
-    bus: BusPort, words: tuple[str, ...], end: bool, plant: str | None, output: Output
+    bus: StationBus, words: tuple[str, ...], end: bool, plant: str | None, output: Renderer
 ) -> None:
     """Inject a fault into a simulated bus of a running station.
 
@@ -164,13 +164,13 @@ def fault(
 @plant_option
 @json_option("Print one object: what was sent.")
 def set_value(
-    bus: BusPort,
+    bus: StationBus,
     slave: str,
     entry: str,
     value: str | None,
     release: bool,
     plant: str | None,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Force an entry of a simulated slave to a value, until --release.
 
@@ -189,7 +189,7 @@ def set_value(
     output.show(command, lambda _: f"{bus}: {slave} {entry} {done}")
 
 
-def _send(bus: BusPort, command: dict[str, Any], plant: str | None) -> None:
+def _send(bus: StationBus, command: dict[str, Any], plant: str | None) -> None:
     from eap.appliance.commands.client import connect_station
 
     with connect_station(bus.station, plant) as client:

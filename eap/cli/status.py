@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from eap.cli.output import Output, repaint, write_json
+from eap.cli.output import Renderer, repaint, write_json
 from eap.cli.params import json_option, plant_option, station_option
 from eap.errors import ControlError
 
@@ -57,7 +57,7 @@ def status(
     interval_s: float,
     plant: str | None,
     station: str | None,
-    output: Output,
+    output: Renderer,
 ) -> None:
     """Show the state of the running appliances: errors first, then a line for each station.
 

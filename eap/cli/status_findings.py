@@ -67,7 +67,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class StatusFinding:
     """One fault or remark.
 
     Attributes:
@@ -94,7 +94,7 @@ class Finding:
         return "; ".join(filter(None, parts))
 
     @classmethod
-    def from_plain(cls, row: Row) -> Finding:
+    def from_plain(cls, row: Row) -> StatusFinding:
         """Return the finding of a *row* of a document."""
         return cls(**{**row, "severity": Severity(row["severity"])})
 
@@ -103,7 +103,7 @@ class Finding:
         return asdict(self)
 
 
-def findings(document: Row, now_s: float) -> list[Finding]:
+def findings(document: Row, now_s: float) -> list[StatusFinding]:
     """Return all findings of a status *document*, errors first, then warnings."""
     found = [
         replace(each, plant=appliance["plant"])
@@ -131,22 +131,22 @@ def is_special(frame: Row) -> bool:
     return bool(frame["monitor_interval_ms"]) or frame["destination"].count(".") == _NET_ID_DOTS
 
 
-def _error(where: str, what: str, advice: str = "", since: float | None = None) -> Finding:
-    return Finding(Severity.ERROR, where, what, advice, since)
+def _error(where: str, what: str, advice: str = "", since: float | None = None) -> StatusFinding:
+    return StatusFinding(Severity.ERROR, where, what, advice, since)
 
 
-def _warning(where: str, what: str, advice: str = "", since: float | None = None) -> Finding:
-    return Finding(Severity.WARNING, where, what, advice, since)
+def _warning(where: str, what: str, advice: str = "", since: float | None = None) -> StatusFinding:
+    return StatusFinding(Severity.WARNING, where, what, advice, since)
 
 
-def _info(where: str, what: str) -> Finding:
-    return Finding(Severity.INFO, where, what)
+def _info(where: str, what: str) -> StatusFinding:
+    return StatusFinding(Severity.INFO, where, what)
 
 
-def _of_appliance(appliance: Row) -> Iterator[Finding]:
+def _of_appliance(appliance: Row) -> Iterator[StatusFinding]:
     plant = appliance["plant"]
     for row in appliance.get("findings", ()):
-        yield Finding.from_plain(row)
+        yield StatusFinding.from_plain(row)
     processes = dict(appliance["processes"])
     segments = processes.pop("segments", {})
     processes |= {f"segment {name}": process for name, process in segments.items()}
@@ -174,7 +174,7 @@ def _of_appliance(appliance: Row) -> Iterator[Finding]:
         yield _info(f"{plant} engine", f"requests to buses: {counts}")
 
 
-def _of_audit(where: str, audit: Row) -> Iterator[Finding]:
+def _of_audit(where: str, audit: Row) -> Iterator[StatusFinding]:
     lost, error = count(audit["lines"], "line"), audit["error"]
     if error:
         effect = "changes are refused" if audit["required"] else "changes are not recorded"
@@ -184,13 +184,13 @@ def _of_audit(where: str, audit: Row) -> Iterator[Finding]:
         yield _warning(where, f"{lost} lost; written again", since=audit["since"])
 
 
-def _of_descriptors(where: str, descriptors: Row | None) -> Iterator[Finding]:
+def _of_descriptors(where: str, descriptors: Row | None) -> Iterator[StatusFinding]:
     if descriptors is not None and descriptors["used"] > _MOST_DESCRIPTORS * descriptors["limit"]:
         what = f"{descriptors['used']} of {descriptors['limit']} file descriptors are in use"
         yield _warning(where, what, "raise the hard limit (ulimit -Hn, or LimitNOFILE= of systemd)")
 
 
-def _of_listener(plant: str, listener: Row) -> Iterator[Finding]:
+def _of_listener(plant: str, listener: Row) -> Iterator[StatusFinding]:
     counts = {name: listener[key] for key, name in LISTENER_COUNTS.items() if listener[key]}
     if not counts:
         return
@@ -205,7 +205,7 @@ def _of_listener(plant: str, listener: Row) -> Iterator[Finding]:
         yield _info(where, f"connections: {what}")
 
 
-def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[Finding]:
+def _of_engine(plant: str, stations: Sequence[Row], now_s: float) -> Iterator[StatusFinding]:
     """Yield one finding for all stations that the engine runs no more."""
     if hung := [station for station in stations if _is_hung(station)]:
         names = ", ".join(station["name"] for station in hung)
@@ -221,7 +221,7 @@ def _is_hung(station: Row) -> bool:
     return silent_us > max(_HUNG_AFTER_US, _HUNG_AFTER_CYCLES * cycle_us)
 
 
-def _of_station(station: Row) -> Iterator[Finding]:
+def _of_station(station: Row) -> Iterator[StatusFinding]:
     yield from _of_cycles(station)
     for port in station["ports"]:
         where = f"{station['name']}/{port['name']}"
@@ -245,7 +245,7 @@ def _of_station(station: Row) -> Iterator[Finding]:
     yield from _of_sources(station)
 
 
-def _of_cycles(station: Row) -> Iterator[Finding]:
+def _of_cycles(station: Row) -> Iterator[StatusFinding]:
     name, state = station["name"], station["state"]
     if effect := STATES.get(state):
         advice = f"'eapctl state {name} OP' ends that"
@@ -268,7 +268,7 @@ _BUS_COUNTERS = (
 )
 
 
-def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
+def _of_bus(where: str, bus: Row) -> Iterator[StatusFinding]:
     advice = f"'eapctl bus diag {where}' says more"
     if bus["fault"]:
         lines = "; ".join(line.strip() for line in bus["fault"].splitlines())
@@ -282,7 +282,7 @@ def _of_bus(where: str, bus: Row) -> Iterator[Finding]:
             yield _info(where, f"{count(number, noun)} {text}")
 
 
-def _of_sent(where: str, row: Row) -> Iterator[Finding]:
+def _of_sent(where: str, row: Row) -> Iterator[StatusFinding]:
     frame_state = row.get("frame_state", 0)
     if frame_state & _TOO_LARGE:
         advice = "fewer or smaller PDs in its frame"
@@ -299,7 +299,7 @@ def _of_sent(where: str, row: Row) -> Iterator[Finding]:
         yield _info(where, f"sent {', '.join(counts)}")
 
 
-def _of_silent(station: Row) -> Iterator[Finding]:
+def _of_silent(station: Row) -> Iterator[StatusFinding]:
     """Yield the subscriptions that receive nothing; many with the same fault as one finding."""
     stale = [row for row in station["pd"]["rx"] if row["state"] == "stale"]
     advice = "check its sender and the way to it"
@@ -313,7 +313,7 @@ def _of_silent(station: Row) -> Iterator[Finding]:
 
 def _grouped(
     station: Row, rows: Sequence[Row], what: str, advice: str, finding: Any = _error
-) -> Iterator[Finding]:
+) -> Iterator[StatusFinding]:
     name = station["name"]
     if len(rows) <= _LISTED:
         for row in rows:
@@ -325,7 +325,7 @@ def _grouped(
     yield finding(where, what, advice, min(times, default=None))
 
 
-def _of_received(where: str, row: Row) -> Iterator[Finding]:
+def _of_received(where: str, row: Row) -> Iterator[StatusFinding]:
     if wrong := {_OTHER_VERSION: "version", _OTHER_LENGTH: "length"}.get(row.get("var_state", 0)):
         advice = "compare the plant files of both stations"
         yield _error(where, f"dropped: another {wrong} than expected", advice)
@@ -339,7 +339,7 @@ def _of_received(where: str, row: Row) -> Iterator[Finding]:
         yield _info(where, "; ".join(remarks))
 
 
-def _of_sources(station: Row) -> Iterator[Finding]:
+def _of_sources(station: Row) -> Iterator[StatusFinding]:
     """Yield one finding for each address that sends with a foreign publisher ID."""
     wrong: dict[str, list[Row]] = {}
     for row in station["pd"]["rx"]:

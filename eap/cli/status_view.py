@@ -17,8 +17,8 @@ from eap.cli.status_findings import (
     LISTENER_COUNTS,
     REASONS,
     STATES,
-    Finding,
     Severity,
+    StatusFinding,
     is_special,
 )
 from eap.cli.table import Column, ItemLine, Styled, TextTable, count, duration, quality, times
@@ -49,7 +49,7 @@ class StatusScreen:
     def __init__(
         self, document: Row, now_s: float, earlier: Row | None = None, seconds: float = 0.0
     ) -> None:
-        findings = [Finding.from_plain(row) for row in document["findings"]]
+        findings = [StatusFinding.from_plain(row) for row in document["findings"]]
         self._document = document
         self._findings = [each for each in findings if each.severity is not Severity.INFO]
         self._remarks = len(findings) - len(self._findings)
@@ -168,7 +168,7 @@ def _verdict(document: Row, plant: str) -> Styled:
     return text.append(scope, "not bold")
 
 
-def finding_grid(found: Iterable[Finding], now_s: float) -> RenderableType:
+def finding_grid(found: Iterable[StatusFinding], now_s: float) -> RenderableType:
     """Return a line for each finding, or more where it is long."""
     from rich.table import Table
 
@@ -254,7 +254,7 @@ def full_view(document: Row, now_s: float) -> Iterator[RenderableType]:
     """Yield everything in a status *document* of *now_s*, as tables."""
     stations = document["stations"]
     yield from verdicts(document)
-    found = [Finding.from_plain(row) for row in document["findings"]]
+    found = [StatusFinding.from_plain(row) for row in document["findings"]]
     if faults := [each for each in found if each.severity is not Severity.INFO]:
         yield finding_grid(faults, now_s)
     for appliance in document["appliances"]:

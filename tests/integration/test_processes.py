@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from eap.appliance.commands.client import Client, connect
+from eap.appliance.commands.client import ControlClient, connect
 from eap.appliance.runtime import VARIABLE
 from eap.codec.ethercat import EAP_PORT, EtherCatHeader
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
@@ -347,7 +347,7 @@ def test_a_client_of_a_dead_appliance_is_told(appliance: Appliance) -> None:
         ask_for(client, seconds=10)
 
 
-def ask_for(client: Client, *, seconds: float) -> None:
+def ask_for(client: ControlClient, *, seconds: float) -> None:
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         client.request("hello")

@@ -9,7 +9,7 @@ import pytest
 
 from eap.appliance.commands.route_lists import list_routes
 from eap.cli.routes_tui.app import RoutesApp
-from eap.cli.routes_tui.link import Link
+from eap.cli.routes_tui.link import RouteLink
 from tests.support.appliance import wait_until
 from tests.support.pages import ROOT, Shell, commands, shell
 from tests.support.screens import Screen, play
@@ -47,7 +47,7 @@ def screen_after(keys: tuple[str, ...]) -> str:
     async def script(screen: Screen) -> None:
         shown.append(await screen.press(*keys))
 
-    play(RoutesApp(Link(None), period_s=1000.0), script)
+    play(RoutesApp(RouteLink(None), period_s=1000.0), script)
     return "\n".join(line.rstrip() for line in shown[0].splitlines()) + "\n"
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import eap
 from eap.appliance.attach import AttachedStation
-from eap.appliance.commands.client import Client, connect_station
+from eap.appliance.commands.client import ControlClient, connect_station
 from eap.appliance.runtime import VARIABLE
 from eap.net.ticker import Ticker
 from tools.bench import buses, machine
@@ -91,7 +91,7 @@ class _Bench:
     def __init__(self, plant: Path, stack: ExitStack) -> None:
         environment = stack.enter_context(running(plant, None))
         with _environment(environment[VARIABLE]):
-            self._client: Client = stack.enter_context(connect_station(STATION, None))
+            self._client: ControlClient = stack.enter_context(connect_station(STATION, None))
             self._station: AttachedStation = stack.enter_context(eap.attach(STATION))
         self._ticker = Ticker()
         stack.callback(self._ticker.close)

@@ -12,7 +12,7 @@ from devicebus.wire.alstatus import state_name
 from eap.aoe.ads_operation import Operation, OperationOutcome, ReadState, WriteControl
 from eap.aoe.ads_query import decode_outcome, encode_query
 from eap.aoe.ads_state import BOOT, INIT, OP, PREOP, SAFEOP, states_of
-from eap.appliance.commands.client import Client, connect
+from eap.appliance.commands.client import ControlClient, connect
 from eap.appliance.control import ErrorCode
 from eap.appliance.control_device import StateAnswer, StateError
 from eap.appliance.control_routes import AMS_ASK, SCAN, TRACE, PlantScan, TracedPath
@@ -44,7 +44,7 @@ def trace(target: str, plant: str | None = None, via: str | None = None) -> Trac
         ControlError: there is no such target or station, or no appliance answers.
     """
 
-    def ask(client: Client) -> TracedPath:
+    def ask(client: ControlClient) -> TracedPath:
         return client.call(TRACE, within_s=TRACE_S, via=via or "", target=target)
 
     with first_that_knows(ask, plant, via) as (_, answer):
@@ -67,8 +67,8 @@ def scan(plant: str | None = None, via: str | None = None) -> list[PlantScan]:
 
 @contextmanager
 def first_that_knows(
-    ask: Callable[[Client], T], plant: str | None, via: str | None = None
-) -> Iterator[tuple[Client, T]]:
+    ask: Callable[[ControlClient], T], plant: str | None, via: str | None = None
+) -> Iterator[tuple[ControlClient, T]]:
     """Ask one appliance after the other; give the first that knows the names, and its answer.
 
     Args:
@@ -106,7 +106,7 @@ class AmsRefusedError(ControlError):
 class AmsDevice:
     """One device; *target* is ``STATION[/PORT[/SLAVE]]`` or ``NETID[:PORT]``."""
 
-    def __init__(self, client: Client, target: str) -> None:
+    def __init__(self, client: ControlClient, target: str) -> None:
         self.target = target
         self._client = client
 

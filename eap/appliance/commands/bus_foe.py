@@ -85,7 +85,7 @@ def get_file(
         def begin(sizes: MailboxSizes) -> Conversation[int]:
             return foe_client.read(name, sink, sizes, password=password, progress=progress)
 
-        transfer = _Transfer(bus, slave, begin, f"FoE read of {name!r}", progress)
+        transfer = _FileCopy(bus, slave, begin, f"FoE read of {name!r}", progress)
         restarts = transfer.run(rewind if target is not None and file.seekable() else None, report)
     report(progress.done, progress.done, restarts.count)
     seconds = time.monotonic() - start
@@ -124,7 +124,7 @@ def put_file(
         def begin(sizes: MailboxSizes) -> Conversation[int]:
             return foe_client.write(name, take, sizes, password=password, progress=progress)
 
-        transfer = _Transfer(bus, slave, begin, f"FoE write of {name!r}", progress)
+        transfer = _FileCopy(bus, slave, begin, f"FoE write of {name!r}", progress)
         with _telling_how_far(progress, "written"):
             restarts = transfer.run(rewind if is_regular else None, report)
     report(progress.done, progress.done, restarts.count)
@@ -132,7 +132,7 @@ def put_file(
     return transfer.summary(name, source, seconds, digest.hexdigest(), restarts)
 
 
-class _Transfer:
+class _FileCopy:
     """A file on its way to a slave or from it."""
 
     def __init__(

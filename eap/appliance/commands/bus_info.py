@@ -55,7 +55,7 @@ class BusScan(msgspec.Struct, frozen=True):
     slaves: list[ScannedSlave]
 
 
-class SlaveState(msgspec.Struct, frozen=True):
+class SlaveStateRow(msgspec.Struct, frozen=True):
     """AL state of one slave; None if it does not answer."""
 
     address: int
@@ -65,10 +65,10 @@ class SlaveState(msgspec.Struct, frozen=True):
     reason: str
 
 
-class BusStates(msgspec.Struct, frozen=True):
+class SlaveStates(msgspec.Struct, frozen=True):
     """``eapctl bus state``."""
 
-    slaves: list[SlaveState]
+    slaves: list[SlaveStateRow]
 
 
 class ErrorOrigin(msgspec.Struct, frozen=True):
@@ -152,7 +152,7 @@ def fault_lines(slaves: Iterable[ScannedSlave]) -> list[str]:
     return [describe_trouble(names, fault) for fault, names in faults.items()]
 
 
-def slave_states(bus: SlaveBus, slave: str | None, target: str | None) -> BusStates:
+def slave_states(bus: SlaveBus, slave: str | None, target: str | None) -> SlaveStates:
     """Return the states of one slave or of all, after bringing them to *target* if it is given.
 
     The state of one that does not answer is None.
@@ -163,7 +163,7 @@ def slave_states(bus: SlaveBus, slave: str | None, target: str | None) -> BusSta
     units: Sequence[Slave] = [bus.find(slave)] if slave is not None else bus.scan()
     if target is not None:
         bus.bring(units, AlState[target])
-    return BusStates([_state(bus, unit) for unit in units])
+    return SlaveStates([_state(bus, unit) for unit in units])
 
 
 def diagnosis(bus: SlaveBus, slave: str | None, now_s: float) -> Diagnosis:
@@ -302,11 +302,11 @@ def _scanned(slave: Slave) -> ScannedSlave:
     )
 
 
-def _state(bus: SlaveBus, slave: Slave) -> SlaveState:
+def _state(bus: SlaveBus, slave: Slave) -> SlaveStateRow:
     try:
         status = bus.run(read_status(slave.station), f"slave {slave.station}: its state")
     except WorkingCounterError:
-        return SlaveState(slave.station, slave.name, None, 0, "it does not answer")
+        return SlaveStateRow(slave.station, slave.name, None, 0, "it does not answer")
     reason = name_of(status.code) if status.code else ""
     state = state_name(status.state | status.error << 4)
-    return SlaveState(slave.station, slave.name, state, status.code, reason)
+    return SlaveStateRow(slave.station, slave.name, state, status.code, reason)

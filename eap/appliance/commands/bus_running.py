@@ -34,7 +34,7 @@ from eap.appliance.bus_status import (
     report_findings,
 )
 from eap.appliance.commands.bus_slave import Begin, Slave, choose
-from eap.appliance.commands.client import Client, connect_station
+from eap.appliance.commands.client import ControlClient, connect_station
 from eap.appliance.control import AnswerT, Method, ParametersT
 from eap.errors import ControlError
 
@@ -58,7 +58,7 @@ class RunningBus:
         port: Name of its bus port.
     """
 
-    def __init__(self, client: Client, station: str, port: str) -> None:
+    def __init__(self, client: ControlClient, station: str, port: str) -> None:
         self._client = client
         self._where = {"station": station, "port": port}
         self._report = BusReport(is_up=False)

@@ -17,10 +17,10 @@ from eap.appliance.control import (
     MAX_LINE,
     SUBSCRIBE,
     AnswerT,
+    ControlReply,
     ErrorCode,
     Method,
     ParametersT,
-    Reply,
     ValuesEvent,
     decode_reply,
     encode_request,
@@ -36,7 +36,7 @@ _CONNECT_PAUSE_S = 0.02
 _EVENT = partial(msgspec.convert, type=ValuesEvent)
 
 
-class Client(Closing):
+class ControlClient(Closing):
     """One connection to one running appliance."""
 
     def __init__(
@@ -116,7 +116,7 @@ class Client(Closing):
         self._reader.close()
         self._socket.close()
 
-    def _next_reply(self) -> Reply:
+    def _next_reply(self) -> ControlReply:
         try:
             line = self._reader.readline(MAX_LINE)
         except OSError as exc:
@@ -135,7 +135,7 @@ class Client(Closing):
         )
 
 
-def _checked(reply: Reply) -> Reply:
+def _checked(reply: ControlReply) -> ControlReply:
     """Return *reply*, or raise the error in it."""
     error = reply.error
     if error is None:
@@ -145,7 +145,7 @@ def _checked(reply: Reply) -> Reply:
     raise ControlError(error.message, code=error.code)
 
 
-def connect(plant: str | None = None, station: str | None = None) -> list[Client]:
+def connect(plant: str | None = None, station: str | None = None) -> list[ControlClient]:
     """Connect to all running appliances, or to those that run *plant* or *station*.
 
     Raises:
@@ -161,13 +161,13 @@ def connect(plant: str | None = None, station: str | None = None) -> list[Client
     return clients
 
 
-def connect_those(wanted: Callable[[ApplianceInfo], bool]) -> list[Client]:
+def connect_those(wanted: Callable[[ApplianceInfo], bool]) -> list[ControlClient]:
     """Connect to the running appliances that are *wanted*; there may be none.
 
     Raises:
         ControlError: one of them cannot be reached.
     """
-    clients: list[Client] = []
+    clients: list[ControlClient] = []
     try:
         for folder, info in find_running():
             if wanted(info):
@@ -179,7 +179,7 @@ def connect_those(wanted: Callable[[ApplianceInfo], bool]) -> list[Client]:
     return clients
 
 
-def connect_station(station: str, plant: str | None) -> Client:
+def connect_station(station: str, plant: str | None) -> ControlClient:
     """Connect to the one running appliance that has *station*.
 
     Raises:
@@ -224,7 +224,7 @@ def merge_status(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> Client:
+def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> ControlClient:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.settimeout(TIMEOUT_S)
     try:
@@ -236,7 +236,7 @@ def _connect_one(folder: ApplianceFolder, info: ApplianceInfo) -> Client:
             f" {folder.control_socket}: {exc.strerror}",
             code=ErrorCode.UNAVAILABLE,
         ) from None
-    return Client(connection, info, folder)
+    return ControlClient(connection, info, folder)
 
 
 def _connect(connection: socket.socket, path: str) -> None:

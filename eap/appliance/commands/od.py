@@ -167,7 +167,7 @@ class OdDumpEntry(msgspec.Struct, frozen=True, kw_only=True):
     error: str | UnsetType = UNSET
 
 
-class LoadResult(msgspec.Struct, frozen=True):
+class OdLoadResult(msgspec.Struct, frozen=True):
     """``eapctl od write --from``: numbers of entries, as in LoadedEntries."""
 
     target: str

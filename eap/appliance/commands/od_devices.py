@@ -22,7 +22,7 @@ from eap.aoe.ads_operation import Read, Write
 from eap.appliance.commands.ams import AmsDevice, AmsRefusedError, open_ams
 from eap.appliance.commands.bus_objects import kind_of
 from eap.appliance.commands.bus_slave import SlaveBus
-from eap.appliance.commands.client import Client, connect_station
+from eap.appliance.commands.client import ControlClient, connect_station
 from eap.appliance.commands.od import Content, EntryInfo, ObjectInfo, OdDevice
 from eap.appliance.control import ErrorCode
 from eap.appliance.control_device import (
@@ -31,9 +31,9 @@ from eap.appliance.control_device import (
     OD_LIST,
     OD_READ,
     OD_WRITE,
+    DescribedEntry,
     DescribedObject,
-    EntryRow,
-    ObjectRow,
+    ListedObject,
 )
 from eap.appliance.runtime import find_running
 from eap.codec import datatypes
@@ -123,7 +123,7 @@ def open_device(target: Target) -> Iterator[OdDevice]:
             yield device
 
 
-def is_bus(client: Client, target: Target) -> bool:
+def is_bus(client: ControlClient, target: Target) -> bool:
     """Say whether *target* is a bus port of a station that runs here: its master."""
     if not target.port or target.slave:
         return False
@@ -321,13 +321,13 @@ class StationOd:
         SdoAbortError: (``entry``) there is no such entry, and none can be made.
     """
 
-    def __init__(self, client: Client, target: str) -> None:
+    def __init__(self, client: ControlClient, target: str) -> None:
         self._client = client
         self._target = target
 
     def objects(self) -> list[ObjectInfo]:
         """Return all objects without their entries."""
-        rows: list[ObjectRow] = []
+        rows: list[ListedObject] = []
         first: int | None = 0
         while first is not None:
             page = self._client.call(OD_LIST, target=self._target, first=first)
@@ -383,7 +383,7 @@ class StationOd:
             first = page.next
 
 
-def _station_object(row: ObjectRow) -> ObjectInfo:
+def _station_object(row: ListedObject) -> ObjectInfo:
     return ObjectInfo(row.index, row.name, row.code, row.max_subindex, row.label)
 
 
@@ -391,7 +391,7 @@ def _described(row: DescribedObject) -> ObjectInfo:
     return replace(_station_object(row), entries=tuple(map(_station_entry, row.entries)))
 
 
-def _station_entry(row: EntryRow) -> EntryInfo:
+def _station_entry(row: DescribedEntry) -> EntryInfo:
     try:
         kind = datatypes.parse(row.type)
     except ValueError:

@@ -21,7 +21,7 @@ import msgspec
 
 from eap.aoe.spec import RoutingSpec
 from eap.appliance import control_device as protocol
-from eap.appliance.commands.client import Client, connect_those
+from eap.appliance.commands.client import ControlClient, connect_those
 from eap.appliance.control import AnswerT, ErrorCode, Method, ParametersT
 from eap.appliance.control_device import (
     ApplyAnswer,
@@ -66,7 +66,7 @@ class StationPlan(msgspec.Struct, frozen=True):
         return bool(self.changes or self.notes or self.refused)
 
 
-class StepResult(msgspec.Struct, frozen=True):
+class StepOutcome(msgspec.Struct, frozen=True):
     """Result of one step."""
 
     station: str
@@ -124,7 +124,7 @@ class ChangeReport(msgspec.Struct, frozen=True):
     @classmethod
     def of(
         cls,
-        taken: Iterable[StepResult],
+        taken: Iterable[StepOutcome],
         refusing: Mapping[str, list[str]],
         error: ControlError | None,
     ) -> Self:
@@ -163,7 +163,7 @@ class PlantLink:
 
     def __init__(
         self,
-        clients: Mapping[str, Client],
+        clients: Mapping[str, ControlClient],
         file: Path,
         absent: tuple[str, ...] = (),
         routing: Mapping[str, RoutingSpec] = MappingProxyType({}),
@@ -317,7 +317,7 @@ def apply_steps(
     *,
     keep_going: bool = False,
     routed: Iterable[str] = (),
-) -> Iterator[StepResult]:
+) -> Iterator[StepOutcome]:
     """Take *order* step by step, and yield what became of each; last the routers of *routed*.
 
     A station that refused a step gets no other.  Steps that go on with a change that was broken off
@@ -341,7 +341,7 @@ def apply_steps(
 
 def roll_back(
     link: PlantLink, stations: Iterable[str], *, keep_going: bool = False
-) -> Iterator[StepResult]:
+) -> Iterator[StepOutcome]:
     """Take the last change of *stations* back, and yield what became of each step.
 
     Those that it did not change are left alone.  If it was taken back everywhere, and nothing is
@@ -372,20 +372,20 @@ def _is_under_way(spec: StationSpec) -> bool:
 
 def _change_routers(
     stations: Iterable[str], change: Callable[[str], RoutingDifference]
-) -> Iterator[StepResult]:
+) -> Iterator[StepOutcome]:
     for name in stations:
         done = change(name)
         outcome = ApplyAnswer(not done.refused, [], [], done.refused)
-        yield StepResult(name, f"({', '.join(done.changes) or 'routes'})", outcome)
+        yield StepOutcome(name, f"({', '.join(done.changes) or 'routes'})", outcome)
 
 
-def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[StepResult]:
+def _walk(order: Iterable[Step], do: Do, *, keep_going: bool) -> Iterator[StepOutcome]:
     refused: set[str] = set()
     for step in order:
         if step.station in refused:
             continue
         outcome = do(step.spec)
-        yield StepResult(step.station, step.why, outcome)
+        yield StepOutcome(step.station, step.why, outcome)
         if not outcome.ok:
             refused.add(step.station)
             if not keep_going:

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 
 import msgspec
 
-from eap.appliance.commands.client import Client, connect
+from eap.appliance.commands.client import ControlClient, connect
 from eap.appliance.control import Document
 from eap.appliance.control_routes import ROUTES_LIST, RouterRow, TestResult
 
@@ -86,7 +86,7 @@ def list_routes(
 
 
 def _ask(
-    client: Client, station: str, match: str, requests: int, most: int | None
+    client: ControlClient, station: str, match: str, requests: int, most: int | None
 ) -> list[RouterRow]:
     """Return the routes of one appliance, page by page."""
     whole = []

@@ -16,7 +16,7 @@ from eap.appliance.control_routes import RouteRow
 from eap.cli import routes_view
 from eap.cli.routes_tui.forms import Message, Question, RouteForm, values_of
 from eap.cli.routes_tui.grid import STYLES, Grid
-from eap.cli.routes_tui.link import Link, Picture, Router
+from eap.cli.routes_tui.link import Picture, PlantRouter, RouteLink
 from eap.cli.routes_tui.table import View, detail, lines
 from eap.errors import EapError
 
@@ -54,7 +54,7 @@ class RoutesApp(App[None]):
         Binding("q,ctrl+c", "quit", "Quit", key_display="q"),
     ]
 
-    def __init__(self, link: Link, *, period_s: float = PERIOD_S) -> None:
+    def __init__(self, link: RouteLink, *, period_s: float = PERIOD_S) -> None:
         super().__init__()
         self._link = link
         self._period_s = period_s
@@ -107,7 +107,7 @@ class RoutesApp(App[None]):
         self._picture = picture
         self._show()
 
-    def _routers(self) -> list[Router]:
+    def _routers(self) -> list[PlantRouter]:
         routers = self._picture.routers
         names = {each.routes.station for each in routers}
         if self._station in names:
@@ -125,7 +125,7 @@ class RoutesApp(App[None]):
         )
         self._show_detail()
 
-    def _show_head(self, routers: list[Router]) -> None:
+    def _show_head(self, routers: list[PlantRouter]) -> None:
         stations = [each.routes for each in routers]
         plants = ", ".join(dict.fromkeys(each.plant for each in self._picture.routers))
         where = self._station if self._station != _ALL else f"{len(stations)} stations"
@@ -244,7 +244,7 @@ class RoutesApp(App[None]):
         self.action_test()
 
     @work(thread=True)
-    def _remove(self, router: Router, row: RouteRow) -> None:
+    def _remove(self, router: PlantRouter, row: RouteRow) -> None:
         try:
             self._link.remove(router, row.net_id, row.transport, row.address)
         except EapError as exc:
@@ -252,7 +252,7 @@ class RoutesApp(App[None]):
         self.call_from_thread(self.look)
 
     @work(thread=True)
-    def _test(self, router: Router, row: RouteRow) -> None:
+    def _test(self, router: PlantRouter, row: RouteRow) -> None:
         try:
             result = self._link.test(router, row.net_id)
         except EapError as exc:
@@ -265,7 +265,7 @@ class RoutesApp(App[None]):
         self.call_from_thread(self._tell, title, text)
         self.call_from_thread(self.look)
 
-    def _ask_for(self, router: Router, title: str, values: dict[str, Any]) -> None:
+    def _ask_for(self, router: PlantRouter, title: str, values: dict[str, Any]) -> None:
         def ended(warnings: list[str] | None) -> None:
             self.look()
             if warnings:
@@ -274,7 +274,7 @@ class RoutesApp(App[None]):
         form = RouteForm(title, values, lambda params: self._link.add(router, params))
         self.push_screen(form, ended)
 
-    def _router(self) -> Router | None:
+    def _router(self) -> PlantRouter | None:
         line = self.query_one(Grid).chosen
         if line is not None:
             return line.router
@@ -306,4 +306,4 @@ _KEPT_ELSEWHERE = {
 
 def run_view(plant: str | None) -> None:
     """Show the live view until it is left."""
-    RoutesApp(Link(plant)).run()
+    RoutesApp(RouteLink(plant)).run()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.text import Text
 from textual.widgets import DataTable
 
-from eap.cli.routes_tui.table import Column, Line, View, cut, fit
+from eap.cli.routes_tui.table import GridColumn, Line, View, cut, fit
 
 STYLES = {
     "up": "green",
@@ -26,7 +26,7 @@ class Grid(DataTable[Text]):
     def __init__(self, name: str) -> None:
         super().__init__(id=name, cursor_type="row", cell_padding=0)
         self._lines: Sequence[Line] = ()
-        self._fitted: list[tuple[int, Column, int]] = []
+        self._fitted: list[tuple[int, GridColumn, int]] = []
 
     @property
     def chosen(self) -> Line | None:

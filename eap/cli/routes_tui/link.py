@@ -23,7 +23,7 @@ _TEST_MS = 5000
 _TEST_S = 10.0
 
 
-class Router(NamedTuple):
+class PlantRouter(NamedTuple):
     """The router of one station, and the plant of its appliance."""
 
     plant: str
@@ -33,11 +33,11 @@ class Router(NamedTuple):
 class Picture(NamedTuple):
     """Content of the view; *problem* says why there is nothing new."""
 
-    routers: list[Router]
+    routers: list[PlantRouter]
     problem: str = ""
 
 
-class Link:
+class RouteLink:
     """The running appliances, or the one that runs *plant*."""
 
     def __init__(self, plant: str | None) -> None:
@@ -49,21 +49,23 @@ class Link:
             found = list_routes(self._plant, None, match, requests=_REQUESTS, most=MOST)
         except EapError as exc:
             return Picture([], str(exc))
-        return Picture([Router(each.plant, row) for each in found for row in each.stations])
+        return Picture([PlantRouter(each.plant, row) for each in found for row in each.stations])
 
-    def add(self, router: Router, params: dict[str, Any]) -> list[str]:
+    def add(self, router: PlantRouter, params: dict[str, Any]) -> list[str]:
         """Add a route, and return the warnings; raise EapError if refused."""
         return self._call(router, ROUTES_ADD, **params).warnings
 
-    def remove(self, router: Router, route: str, transport: str, address: str) -> None:
+    def remove(self, router: PlantRouter, route: str, transport: str, address: str) -> None:
         """Remove a route; raise EapError if refused."""
         self._call(router, ROUTES_REMOVE, route=route, transport=transport, address=address)
 
-    def test(self, router: Router, target: str) -> TestResult:
+    def test(self, router: PlantRouter, target: str) -> TestResult:
         """Test the way to *target*, which may take some seconds; raise EapError if refused."""
         return self._call(router, ROUTES_TEST, target=target, timeout_ms=_TEST_MS)
 
-    def _call(self, router: Router, method: Method[ParametersT, AnswerT], **params: Any) -> AnswerT:
+    def _call(
+        self, router: PlantRouter, method: Method[ParametersT, AnswerT], **params: Any
+    ) -> AnswerT:
         station = router.routes.station
         with connect_station(station, router.plant) as client:
             return client.call(method, within_s=_TEST_S, station=station, **params)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from eap.appliance.control_routes import ConnectionRow, RouteRow
 from eap.cli import routes_view
-from eap.cli.routes_tui.link import Router
+from eap.cli.routes_tui.link import PlantRouter
 
 _GAP = 1
 _EXTRA = 6
@@ -28,7 +28,7 @@ class View(StrEnum):
     WARNINGS = "warnings"
 
 
-class Column(NamedTuple):
+class GridColumn(NamedTuple):
     """A column.
 
     Attributes:
@@ -50,7 +50,7 @@ class Line(NamedTuple):
     """A row of a table."""
 
     key: str
-    router: Router
+    router: PlantRouter
     row: RouteRow | ConnectionRow | None
     """None for a warning."""
     cells: tuple[str, ...]
@@ -58,38 +58,38 @@ class Line(NamedTuple):
     """``up``, ``down``, ``unknown``, or empty: how it is coloured."""
 
 
-_STATION = Column("Station", 7, 14)
+_STATION = GridColumn("Station", 7, 14)
 COLUMNS = {
     View.ROUTES: (
         _STATION,
-        Column("Route", 8, 20),
-        Column("NetID", 11, 23, rank=1),
-        Column("Transport", 9, 16, rank=3),
-        Column("State", 5, 7),
-        Column("Trip", 7, 8, is_number=True, rank=2),
-        Column("Asked", 5, 5, is_number=True, rank=4),
-        Column("Octets", 6, 6, is_number=True, rank=5),
-        Column("Errors", 6, 6, is_number=True),
-        Column("Address", 12, 21, rank=6),
-        Column("Origin", 7, 7, rank=7),
-        Column("Last error", 20, 0, rank=8),
+        GridColumn("Route", 8, 20),
+        GridColumn("NetID", 11, 23, rank=1),
+        GridColumn("Transport", 9, 16, rank=3),
+        GridColumn("State", 5, 7),
+        GridColumn("Trip", 7, 8, is_number=True, rank=2),
+        GridColumn("Asked", 5, 5, is_number=True, rank=4),
+        GridColumn("Octets", 6, 6, is_number=True, rank=5),
+        GridColumn("Errors", 6, 6, is_number=True),
+        GridColumn("Address", 12, 21, rank=6),
+        GridColumn("Origin", 7, 7, rank=7),
+        GridColumn("Last error", 20, 0, rank=8),
     ),
     View.CONNECTIONS: (
         _STATION,
-        Column("Connection", 16, 26),
-        Column("Transport", 9, 16, rank=3),
-        Column("NetIDs", 12, 23, rank=1),
-        Column("For", 6, 8, is_number=True, rank=2),
-        Column("Asked", 5, 5, is_number=True),
-        Column("Octets", 6, 6, is_number=True, rank=4),
-        Column("Errors", 6, 6, is_number=True),
-        Column("Last error", 20, 0, rank=5),
+        GridColumn("Connection", 16, 26),
+        GridColumn("Transport", 9, 16, rank=3),
+        GridColumn("NetIDs", 12, 23, rank=1),
+        GridColumn("For", 6, 8, is_number=True, rank=2),
+        GridColumn("Asked", 5, 5, is_number=True),
+        GridColumn("Octets", 6, 6, is_number=True, rank=4),
+        GridColumn("Errors", 6, 6, is_number=True),
+        GridColumn("Last error", 20, 0, rank=5),
     ),
-    View.WARNINGS: (_STATION, Column("Warning", 30, 0)),
+    View.WARNINGS: (_STATION, GridColumn("Warning", 30, 0)),
 }
 
 
-def lines(view: View, routers: Iterable[Router], match: str) -> list[Line]:
+def lines(view: View, routers: Iterable[PlantRouter], match: str) -> list[Line]:
     """Return the rows of *view*; routes are filtered by *match* already."""
     found = []
     for router in routers:
@@ -110,7 +110,7 @@ def lines(view: View, routers: Iterable[Router], match: str) -> list[Line]:
 
 def fit(
     view: View, found: Sequence[Line], width: int, *, has_station: bool
-) -> list[tuple[int, Column, int]]:
+) -> list[tuple[int, GridColumn, int]]:
     """Return number, column and width of what *width* characters have room for.
 
     Columns are as wide as they need to be.  Where that is too wide, extra columns are left out, and
@@ -141,7 +141,7 @@ def fit(
     return [(number, column, sizes[number]) for number, column in chosen.items()]
 
 
-def _sizes(chosen: Mapping[int, Column], found: Sequence[Line]) -> dict[int, int]:
+def _sizes(chosen: Mapping[int, GridColumn], found: Sequence[Line]) -> dict[int, int]:
     """Return the width that each column needs, between its bounds."""
     sizes = {}
     for number, column in chosen.items():
@@ -162,7 +162,7 @@ def cut(text: str, size: int, *, is_number: bool) -> str:
     return text.rjust(size) if is_number else text
 
 
-def _route_line(router: Router, row: RouteRow) -> Line:
+def _route_line(router: PlantRouter, row: RouteRow) -> Line:
     station = router.routes.station
     key = f"{router.plant}/{station}/{row.net_id}/{row.transport}/{row.address}"
     cells = (
@@ -175,7 +175,7 @@ def _route_line(router: Router, row: RouteRow) -> Line:
     return Line(key, router, row, cells, row.state)
 
 
-def _connection_line(router: Router, row: ConnectionRow) -> Line:
+def _connection_line(router: PlantRouter, row: ConnectionRow) -> Line:
     station = router.routes.station
     key = f"{router.plant}/{station}/{row.transport}/{row.address}"
     cells = (

@@ -16,7 +16,7 @@ from eap.aoe.ads_operation import OperationOutcome, Read, ReadDeviceInfo
 from eap.aoe.directory import AmsAddress, Directory
 from eap.aoe.routes import Route
 from eap.aoe.spec import DirectoryPort, DirectoryStation
-from eap.appliance.control_routes import PortEntry, SlaveEntry, StationEntry
+from eap.appliance.control_routes import ScannedPort, SlaveEntry, StationEntry
 from eap.appliance.services.routes.tracing import TracedStation, ask_one, find_fault
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import DEVICE_PORT, IO_PORT
@@ -107,7 +107,7 @@ class _Look:
         ports.sort(key=lambda port: port.kind != "eap")
         return StationEntry(name, net_id, ports, "")
 
-    async def _port(self, place: int, number: int) -> PortEntry:
+    async def _port(self, place: int, number: int) -> ScannedPort:
         """Return a port; *place* is where it stands in the list."""
         octets = await self._read_io(number, "net_id")
         type_number = int.from_bytes(await self._read_io(number, "type"), "little")
@@ -123,7 +123,7 @@ class _Look:
                 slaves = await self._slaves(net_id, planned)
             except _FailedError as exc:
                 slaves, error = _planned_slaves(planned), str(exc)
-        return PortEntry(name, kind, str(net_id), interface, slaves, error)
+        return ScannedPort(name, kind, str(net_id), interface, slaves, error)
 
     async def _interface(self, place: int) -> str:
         """Return what a port is attached to, as the dictionary of the router says."""
@@ -172,9 +172,9 @@ class _Look:
         return await ask_one(self._asker, *address, operation, PATIENCE_S)
 
 
-def _planned_port(port: DirectoryPort) -> PortEntry:
+def _planned_port(port: DirectoryPort) -> ScannedPort:
     kind = "bus" if port.is_bus else "eap"
-    return PortEntry(port.name, kind, str(port.net_id), port.interface, _planned_slaves(port), "")
+    return ScannedPort(port.name, kind, str(port.net_id), port.interface, _planned_slaves(port), "")
 
 
 def _planned_slaves(port: DirectoryPort | None) -> list[SlaveEntry]:

@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eap.appliance import control
-from eap.appliance.control import ErrorCode, Failure, Reply, Request, of_station, unless_unavailable
+from eap.appliance.control import (
+    ControlReply,
+    ErrorCode,
+    Failure,
+    Request,
+    of_station,
+    unless_unavailable,
+)
 from eap.errors import ControlError, EnvironmentalError
 
 
@@ -55,11 +62,11 @@ def test_the_id_of_a_refused_line_is_found():
 
 
 def test_answers_cross():
-    assert control.decode_reply(control.encode_result(1, {"a": 1})) == Reply(1, 1, {"a": 1})
+    assert control.decode_reply(control.encode_result(1, {"a": 1})) == ControlReply(1, 1, {"a": 1})
     refused = control.encode_error(2, ControlError("no", code=ErrorCode.REFUSED))
-    assert control.decode_reply(refused) == Reply(1, 2, error=Failure("refused", "no"))
+    assert control.decode_reply(refused) == ControlReply(1, 2, error=Failure("refused", "no"))
     event = control.encode_event(3, {"cycle": 5})
-    assert control.decode_reply(event) == Reply(1, subscription=3, event={"cycle": 5})
+    assert control.decode_reply(event) == ControlReply(1, subscription=3, event={"cycle": 5})
 
 
 def test_an_answer_too_long_becomes_an_error():

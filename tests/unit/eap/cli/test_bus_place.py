@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from eap.cli.bus_place import (
     BusCommand,
-    BusPort,
+    StationBus,
     bus_options,
     open_session,
     parse_port,
@@ -33,7 +33,7 @@ def invoke(*words):
 
 
 def test_ports():
-    assert parse_port("press/bus0") == BusPort("press", "bus0")
+    assert parse_port("press/bus0") == StationBus("press", "bus0")
     for text in ("press", "/bus0", "press/", "a/b/c", ""):
         assert parse_port(text) is None
 
@@ -49,12 +49,12 @@ def test_interfaces():
 @pytest.mark.parametrize(
     ("words", "shown"),
     [
-        (("press/bus0", "1001"), "BusPort press/bus0 1001 None False"),
-        (("--json", "press/bus0", "--type", "a/b", "1001"), "BusPort press/bus0 1001 a/b True"),
+        (("press/bus0", "1001"), "StationBus press/bus0 1001 None False"),
+        (("--json", "press/bus0", "--type", "a/b", "1001"), "StationBus press/bus0 1001 a/b True"),
         (("1001", "--interface", UDP), f"InterfaceUri {UDP} 1001 None False"),
         ((f"--interface={UDP}", "1001"), f"InterfaceUri {UDP} 1001 None False"),
         (("--type", "a/b", "--interface", UDP, "1001"), f"InterfaceUri {UDP} 1001 a/b False"),
-        (("press/bus0", "--", "--interface"), "BusPort press/bus0 --interface None False"),
+        (("press/bus0", "--", "--interface"), "StationBus press/bus0 --interface None False"),
     ],
 )
 def test_both_forms(words, shown):
@@ -104,5 +104,5 @@ def test_open_session():
 
 @pytest.mark.net
 def test_open_session_of_a_station(bus_appliance):
-    with open_session(BusPort("press", "bus0")) as session:
+    with open_session(StationBus("press", "bus0")) as session:
         assert [slave.name for slave in session.scan()] == ["coupler", "buttons", "sensor"]

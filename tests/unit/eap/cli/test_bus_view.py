@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from eap.appliance.bus_status import FindingRow
-from eap.appliance.commands.bus_info import BusScan, BusStates, Diagnosis, EepromContent
+from eap.appliance.commands.bus_info import BusScan, Diagnosis, EepromContent, SlaveStates
 from eap.appliance.commands.bus_objects import (
     IdnElements,
     NamedIdn,
@@ -65,7 +65,7 @@ def test_slave_whose_eeprom_is_unreadable():
 def test_state_with_its_reason():
     row = {"address": 1001, "name": "a", "state": "INIT+ERROR", "code": 0x51, "reason": "bad"}
     gone = row | {"state": None, "code": 0, "reason": "it does not answer"}
-    text = shown(*state_view(record(BusStates, slaves=[row, gone]), ""))
+    text = shown(*state_view(record(SlaveStates, slaves=[row, gone]), ""))
     assert "bad (0x0051)" in text
     assert "no answer" in text
     assert "it does not answer (" not in text

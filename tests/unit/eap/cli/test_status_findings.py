@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from eap.cli.status_findings import Finding, Severity, findings
+from eap.cli.status_findings import Severity, StatusFinding, findings
 from tests.support.statusdocument import NOW_S, bus_port, document, frame, rx, tx
 
 
@@ -85,7 +85,9 @@ def test_second_sender_of_many_pds_is_one_finding() -> None:
 
 
 def test_finding_names_its_beginning_behind_the_fault() -> None:
-    fault = Finding(Severity.ERROR, "a/bus0", "b does not answer; c is the last", "d", NOW_S - 2)
+    fault = StatusFinding(
+        Severity.ERROR, "a/bus0", "b does not answer; c is the last", "d", NOW_S - 2
+    )
     since = f"since {clock(NOW_S - 2)} (2.0 s)"
     assert fault.text(NOW_S) == f"a/bus0: b does not answer, {since}; c is the last; d"
 
@@ -152,10 +154,14 @@ def test_audit_that_is_written_again_is_a_warning_when_lines_are_lost() -> None:
 
 def test_findings_of_the_services_are_taken_over() -> None:
     status = document()
-    alarm = Finding(Severity.ERROR, "line audit", "changes not recorded: disk full", "free space")
+    alarm = StatusFinding(
+        Severity.ERROR, "line audit", "changes not recorded: disk full", "free space"
+    )
     status["appliances"][0]["findings"] = [alarm.to_plain()]
     (only,) = findings(status, NOW_S)
-    assert only == Finding(**{**alarm.to_plain(), "severity": Severity.ERROR, "plant": "line"})
+    assert only == StatusFinding(
+        **{**alarm.to_plain(), "severity": Severity.ERROR, "plant": "line"}
+    )
 
 
 @pytest.mark.parametrize(("cycle_us", "hangs"), [(10_000, True), (1_000_000, False)])
@@ -179,7 +185,7 @@ def test_stale_pd_is_an_error_since_the_last_good_one() -> None:
 
 
 def test_time_of_another_day_has_its_date() -> None:
-    text = Finding(Severity.ERROR, "a", "b", since=NOW_S - 3 * 86400).text(NOW_S)
+    text = StatusFinding(Severity.ERROR, "a", "b", since=NOW_S - 3 * 86400).text(NOW_S)
     day = datetime.fromtimestamp(NOW_S - 3 * 86400).astimezone().strftime("%Y-%m-%d")
     assert text.startswith(f"a: b, since {day} ")
     assert text.endswith("(72 h)")

@@ -10,7 +10,7 @@ import threading
 import pytest
 
 from devicebus.errors import AlStatusError
-from eap.appliance.commands.client import Client, connect, merge_status
+from eap.appliance.commands.client import ControlClient, connect, merge_status
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo, ProcessInfo
 from eap.errors import ControlError
 
@@ -26,7 +26,7 @@ class Script:
 
     def __init__(self, *answers: list[dict]) -> None:
         ours, theirs = socket.socketpair()
-        self.client = Client(ours, info())
+        self.client = ControlClient(ours, info())
         self.requests: list[dict] = []
         self._thread = threading.Thread(target=self._play, args=(theirs, answers))
         self._thread.start()

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from eap.appliance.bus_request import BusReport, EngineReply, EngineRequest
-from eap.appliance.commands.client import Client
+from eap.appliance.commands.client import ControlClient
 from eap.appliance.handover import Handover
 from eap.appliance.runtime import ApplianceFolder, ApplianceInfo
 from eap.appliance.services import process
@@ -72,10 +72,10 @@ class Services:
         self.sockets.close()
         os.close(self.ready)
 
-    def connect(self) -> Client:
+    def connect(self) -> ControlClient:
         connection = socket.socket(socket.AF_UNIX)
         connection.connect(str(self.folder.control_socket))
-        return Client(connection, self.info)
+        return ControlClient(connection, self.info)
 
 
 @pytest.mark.usefixtures("files")

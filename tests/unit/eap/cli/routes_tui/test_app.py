@@ -10,7 +10,7 @@ import pytest
 
 from eap.cli.routes_tui import app
 from eap.cli.routes_tui.app import RoutesApp
-from eap.cli.routes_tui.link import Link
+from eap.cli.routes_tui.link import RouteLink
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
 from tests.support.screens import Screen, play
@@ -32,7 +32,7 @@ def stub(fake, runtime):
 
 
 def run(script, size=SIZE):
-    play(RoutesApp(Link(None), period_s=NEVER_S), script, size)
+    play(RoutesApp(RouteLink(None), period_s=NEVER_S), script, size)
 
 
 async def look(screen: Screen) -> str:
@@ -300,7 +300,7 @@ def test_appliance_that_hangs_is_told(stub, fake, monkeypatch):
 
 
 def test_it_looks_by_itself(stub):
-    app = RoutesApp(Link("line"), period_s=0.1)
+    app = RoutesApp(RouteLink("line"), period_s=0.1)
 
     async def script(screen):
         while len(stub.requests) < 4:

@@ -6,14 +6,14 @@ import msgspec
 
 from eap.cli.routes_tui.app import RoutesApp
 from eap.cli.routes_tui.forms import Message, Question, RouteForm, values_of
-from eap.cli.routes_tui.link import Link
+from eap.cli.routes_tui.link import RouteLink
 from eap.errors import ControlError
 from tests.support.fakeroutes import ISLAND, PRESS
 from tests.support.screens import play
 
 
 def run(script):
-    play(RoutesApp(Link(None), period_s=1000.0), script)
+    play(RoutesApp(RouteLink(None), period_s=1000.0), script)
 
 
 def test_form_for_a_change_begins_with_the_route() -> None:

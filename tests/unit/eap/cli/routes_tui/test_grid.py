@@ -5,7 +5,7 @@ import asyncio
 from textual.app import App, ComposeResult
 
 from eap.cli.routes_tui.grid import Grid
-from eap.cli.routes_tui.link import Router
+from eap.cli.routes_tui.link import PlantRouter
 from eap.cli.routes_tui.table import View, lines
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
 
@@ -19,7 +19,7 @@ def test_lines_change_in_place_and_the_cursor_follows_its_line() -> None:
     fake = FakeRoutes()
 
     def found():
-        return lines(View.ROUTES, [Router("line", fake.stations["island-01"])], "")
+        return lines(View.ROUTES, [PlantRouter("line", fake.stations["island-01"])], "")
 
     async def script() -> None:
         app = Holder()

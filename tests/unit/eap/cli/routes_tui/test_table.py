@@ -3,11 +3,11 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from eap.cli.routes_tui.link import Router
+from eap.cli.routes_tui.link import PlantRouter
 from eap.cli.routes_tui.table import View, cut, detail, fit, lines
 from tests.support.fakeroutes import ISLAND, FakeRoutes
 
-ROUTER = Router("line", FakeRoutes().stations["island-01"])
+ROUTER = PlantRouter("line", FakeRoutes().stations["island-01"])
 
 
 def widths(view: View, width: int, *, has_station: bool = True) -> dict[str, int]:
