@@ -62,7 +62,7 @@ logger = logging.getLogger(__name__)
 
 
 class StateRequests:
-    """Requests for AL states, which nobody waits for; the last one for a slave counts.
+    """Requests for AL states that are answered at once; the last one for a slave counts.
 
     Args:
         bus: With these slaves.

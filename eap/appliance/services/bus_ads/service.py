@@ -75,7 +75,7 @@ class BusService:
         self._slaves = SlaveAds(bus, net_id, states)
 
     async def answer(self, request: LocalRequest) -> AmsAnswer:
-        """Do what a request asks for."""
+        """Do the operations of a request; return its answer."""
         header = request.header
         client = Client(request.came_by, header.source, header.source_port)
         end_s = asyncio.get_running_loop().time() + ANSWER_S

@@ -185,7 +185,7 @@ class SlaveFiles:
                 loop.call_at(left_at_s, self._give_up_left, handle, item.idle_since_s)
 
     def _give_up_left(self, handle: int, since_s: float) -> None:
-        """Give a file up if nothing has been asked for it since then."""
+        """Give a file up if there was no request for it since then."""
         item = self._open.get(handle)
         if item is not None and item.idle_since_s == since_s:
             logger.info("%s given up: %s left it open and opens another one", item.name, item.owner)
@@ -224,7 +224,7 @@ class SlaveFiles:
 
     def _expire(self, handle: int) -> None:
         item = self._open[handle]
-        logger.info("%s closed: %s has asked for nothing for %g s", item.name, item.owner, IDLE_S)
+        logger.info("%s closed: no request of %s for %g s", item.name, item.owner, IDLE_S)
         self._drop(handle)
 
     def _drop(self, handle: int) -> None:

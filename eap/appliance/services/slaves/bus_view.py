@@ -1,8 +1,8 @@
 """Cached description of one bus, kept current by the events of the engine.
 
 The engine sends a change before the answer to any request that it has done after it, so that a
-client that has requested a state and got its answer finds that state here.  Changes that nobody
-has requested come within the engine's pause between two looks, 20 ms.
+client that has requested a state and got its answer finds that state here.  Other changes
+come within the engine's pause between two looks at its sockets, 20 ms.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ class BusView:
     async def current(self) -> BusDescription:
         """Return the description, as a rule without waiting; raise EngineGoneError.
 
-        The engine is asked only if it has sent nothing for a second, or nothing about this bus.
+        A request goes to the engine only if it has sent nothing for a second, or nothing about
+        this bus: a dead engine says nothing, and must not leave an old state here for long.
         """
         if self.is_current:
             return self.latest

@@ -55,7 +55,7 @@ class FileStream(ABC):
         is_write: As given.
         sizes: Of the slave's mailboxes, known when the file is open.
         progress: Octets that the slave has, or has given.
-        has_turn: Whether the slave has been asked for it; before, other files are moved.
+        has_turn: Whether it is its turn at the slave; before, other files are moved.
         is_open: Whether the slave has opened it.
         is_whole: Whether nothing more will be written to it.
         is_complete: Whether all of it was moved.
@@ -114,7 +114,7 @@ class FileStream(ABC):
 
     @abstractmethod
     async def move(self) -> None:
-        """Move the whole file; raise EapError.  Cancelling it tells the slave too."""
+        """Move the whole file; raise EapError.  Cancelling it ends it at the slave too."""
 
     def notify(self, *, has_turn: bool = False, is_open: bool = False) -> None:
         """Let everything that waits for a change look again."""

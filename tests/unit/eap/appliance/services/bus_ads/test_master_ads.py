@@ -127,7 +127,7 @@ def test_notification_sends_each_state_of_a_slave_until_it_is_deleted():
         await settle()
         looks = len(engine.of(Ping))
         await elapse(1)
-        assert len(engine.of(Ping)) == looks  # nobody looks when nobody wants to know
+        assert len(engine.of(Ping)) == looks
 
     play(scene)
 

@@ -50,7 +50,7 @@ def sum_of(group: int, *items: Read | Write) -> ReadWrite:
     return ReadWrite(group, len(items), 1000, heads + data)
 
 
-def test_slave_by_its_address():
+def test_service_answers_for_a_slave_at_its_address():
     async def scene(client, engine):
         assert await client.good(DRIVE, VENDOR) == VENDOR_ID
         assert await client.good(DRIVE, ReadState()) == AdsStates(AdsState.CONFIG, 2).encode()
@@ -76,7 +76,7 @@ def test_request_to_a_slave_costs_one_engine_round_trip():
     play(scene, look_s=5.0)
 
 
-def test_master_by_port_0xffff():
+def test_service_answers_for_the_master_at_port_0xffff():
     async def scene(client, engine):
         info = AdsDeviceInfo.decode(await client.good(MASTER, ReadDeviceInfo()))
         assert info.name == device_name("left/bus0")
@@ -87,7 +87,7 @@ def test_master_by_port_0xffff():
     play(scene, "coe")
 
 
-def test_dictionary_of_the_master():
+def test_master_shows_its_dictionary():
     async def scene(client, engine):
         assert (
             await client.read(MASTER, IndexGroup.SDO, 0x1008 << 16) == b"EtherCAT master left/bus0"
@@ -107,7 +107,7 @@ def test_dictionary_of_the_master():
     play(scene, "coe")
 
 
-def test_dictionary_of_the_master_is_live():
+def test_master_dictionary_shows_states_and_scans_as_they_are():
     async def scene(client, engine):
         await client.good(MASTER, Write(IndexGroup.SDO, 0xA000_0002, b"\1\0"))
 
@@ -127,7 +127,7 @@ def test_dictionary_of_the_master_is_live():
     play(scene)
 
 
-def test_only_what_somebody_is_told_of_is_looked_at_again(monkeypatch):
+def test_notifications_refresh_only_objects_that_they_show(monkeypatch):
     looked_at = []
     refresh = MasterDictionaryProvider.refresh
 
@@ -154,7 +154,7 @@ def test_only_what_somebody_is_told_of_is_looked_at_again(monkeypatch):
     play(scene, "coe")
 
 
-def test_states_are_requested():
+def test_states_are_requested_of_master_and_slaves():
     async def scene(client, engine):
         await client.good(MASTER, WriteControl(AdsState.INIT, 0, b""))
         await until_state(client, 1)
@@ -175,7 +175,7 @@ async def until_state(client, state):
     await until(is_there)
 
 
-def test_raw_command():
+def test_raw_command_counts_the_slaves():
     async def scene(client, engine):
         answer = await client.ask(MASTER, IndexGroup.RAW_COMMAND, 0, COMMAND, len(COMMAND))
         assert answer[2:4] == b"\3\0"  # what AdsLib takes for the number of slaves
@@ -186,7 +186,7 @@ def test_raw_command():
     play(scene, "coe")
 
 
-def test_who_is_not_there():
+def test_port_without_a_slave_is_refused_with_the_known_ones():
     async def scene(client, engine):
         answer = await client.answer(1009, AmsCommand.READ_STATE, b"")
         assert answer[:2] == (b"", AdsError.TARGET_PORT)
@@ -197,7 +197,7 @@ def test_who_is_not_there():
     play(scene)
 
 
-def test_bus_that_is_down():
+def test_bus_that_is_down_is_host_unreachable():
     async def scene(client, engine):
         engine.buses[0].is_up = False
         answer = await client.answer(DRIVE, AmsCommand.READ, AdsRange(*VENDOR).encode())
@@ -210,7 +210,7 @@ def test_bus_that_is_down():
     play(scene)
 
 
-def test_engine_that_is_gone():
+def test_engine_that_is_gone_is_host_unreachable():
     async def scene(client, engine):
         engine.holds = True
         answer = await client.answer(MASTER, AmsCommand.READ_STATE, b"")
@@ -220,7 +220,7 @@ def test_engine_that_is_gone():
     play(scene)
 
 
-def test_sum_commands_item_by_item():
+def test_sum_command_has_a_result_for_each_item():
     async def scene(client, engine):
         items = VENDOR, Read(IndexGroup.SDO, 0x5555_0000, 4), Read(0x9999, 0, 2)
         found = await client.good(DRIVE, sum_of(IndexGroup.SUM_READ, *items))
@@ -238,7 +238,7 @@ def test_sum_commands_item_by_item():
     play(scene)
 
 
-def test_what_takes_too_long_is_answered_in_time(monkeypatch):
+def test_operation_that_takes_too_long_is_answered_in_time(monkeypatch):
     monkeypatch.setattr(service, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
@@ -252,7 +252,7 @@ def test_what_takes_too_long_is_answered_in_time(monkeypatch):
     play(scene)
 
 
-def test_slaves_do_not_wait_for_each_other():
+def test_slave_that_is_busy_does_not_hold_up_others():
     async def scene(client, engine):
         talk = await client.bus.open_turn(1001, MailboxType.COE, "somebody else")
         waiting = asyncio.ensure_future(client.do(1001, VENDOR))
@@ -265,7 +265,7 @@ def test_slaves_do_not_wait_for_each_other():
 
 
 @pytest.mark.parametrize("length", [0, 3])
-def test_answer_has_to_fit(length):
+def test_answer_longer_than_the_room_of_the_client_is_refused(length):
     async def scene(client, engine):
         outcome = await client.do(DRIVE, VENDOR._replace(length=length))
         assert outcome == OperationOutcome(AdsError.SIZE)
@@ -274,7 +274,7 @@ def test_answer_has_to_fit(length):
     play(scene)
 
 
-def test_whatever_is_asked_is_answered(monkeypatch):
+def test_request_of_any_content_is_answered(monkeypatch):
     monkeypatch.setattr(slave_files, "ANSWER_S", 0.01)
     monkeypatch.setattr(slave_ads, "COMMAND_ANSWER_S", 0.01)
     pick = random.Random(7)

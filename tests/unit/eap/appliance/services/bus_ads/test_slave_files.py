@@ -42,7 +42,7 @@ def test_file_is_written_in_blocks(block):
     play(scene, "files")
 
 
-def test_read_and_write_do_as_well():
+def test_file_is_moved_by_read_and_write():
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         await client.write(DISK, WRITE, handle, b"short")
@@ -54,7 +54,7 @@ def test_read_and_write_do_as_well():
     play(scene, "files")
 
 
-def test_progress():
+def test_file_progress_has_the_octets_so_far():
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         await client.ask(DISK, WRITE, handle, bytes(1000), 0)
@@ -83,7 +83,7 @@ def test_progress():
         (OPEN_READ, bytes(300).replace(b"\0", b"n"), AdsError.SIZE, "300 octets"),
     ],
 )
-def test_file_that_cannot_be_opened(group, name, result, why):
+def test_file_that_cannot_be_opened_holds_up_no_other(group, name, result, why):
     async def scene(client, engine):
         outcome = await client.do(DISK, ReadWrite(group, 0, 4, name))
         assert outcome.result == result
@@ -94,7 +94,7 @@ def test_file_that_cannot_be_opened(group, name, result, why):
     play(scene, "files")
 
 
-def test_password_is_the_offset():
+def test_file_is_opened_with_the_offset_as_password():
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_READ, b"locked.bin", 42)
         assert await client.read_file(DISK, handle, 100) == b"secret"
@@ -102,7 +102,7 @@ def test_password_is_the_offset():
     play(scene, "files")
 
 
-def test_slave_that_takes_no_more():
+def test_file_that_is_too_long_is_refused_when_it_is_closed():
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"small.bin")
         await client.ask(DISK, WRITE, handle, bytes(2000), 0)
@@ -115,7 +115,7 @@ def test_slave_that_takes_no_more():
     play(scene, "files")
 
 
-def test_handle_belongs_to_a_net_id_through_any_connection():
+def test_file_handle_belongs_to_a_net_id_through_any_connection():
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_READ, b"a.bin")
         client.service.client_gone(client.way)
@@ -131,7 +131,7 @@ def test_handle_belongs_to_a_net_id_through_any_connection():
     play(scene, "files")
 
 
-def test_one_file_of_a_slave_at_a_time(monkeypatch):
+def test_file_is_busy_while_the_slave_moves_another_one(monkeypatch):
     monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
@@ -148,7 +148,7 @@ def test_one_file_of_a_slave_at_a_time(monkeypatch):
     play(scene, "files")
 
 
-def test_file_that_nobody_asks_for_is_closed(monkeypatch):
+def test_file_without_requests_is_closed(monkeypatch):
     monkeypatch.setattr(slave_files, "IDLE_S", 0.02)
 
     async def scene(client, engine):
@@ -163,7 +163,7 @@ def test_file_that_nobody_asks_for_is_closed(monkeypatch):
 
 
 @pytest.mark.parametrize("data", [b"\0", b"\1\2\3\4"])
-def test_close_with_data_closes_the_file(data):
+def test_file_is_closed_by_a_close_with_data(data):
     async def scene(client, engine):
         handle = await client.open_file(DISK, OPEN_WRITE, b"a.bin")
         await client.write(DISK, WRITE, handle, b"short")
@@ -248,7 +248,7 @@ def test_file_that_is_given_up_keeps_its_content():
     play(scene, "files")
 
 
-def test_slow_slave_is_waited_for_by_asking_again(monkeypatch):
+def test_file_of_a_slow_slave_is_busy_until_it_goes_on(monkeypatch):
     monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
@@ -271,7 +271,7 @@ def test_slow_slave_is_waited_for_by_asking_again(monkeypatch):
     play(scene, "files")
 
 
-def test_slave_that_says_yes_late(monkeypatch):
+def test_file_that_is_opened_late_is_read_then(monkeypatch):
     monkeypatch.setattr(slave_files, "ANSWER_S", 0.05)
 
     async def scene(client, engine):
@@ -293,7 +293,7 @@ def hold_mailboxes(engine):
     engine.holds = True
 
 
-def test_limits(monkeypatch):
+def test_file_requests_beyond_the_limits_are_refused(monkeypatch):
     monkeypatch.setattr(slave_files, "MAX_OF_CLIENT", 1)
 
     async def scene(client, engine):
