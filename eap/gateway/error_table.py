@@ -30,6 +30,9 @@ from eap.errors import EapError, EngineGoneError
 from eap.gateway.dialect import DialectFailure
 from eap.od.abort import AbortCode, SdoAbortError
 
+Box, Sdo, Soe, Foe, Ads = MailboxError, AbortCode, SoeErrorCode, FoeErrorCode, AdsError
+Fail = DialectFailure
+
 
 class ErrorCodes(NamedTuple):
     """One row of the table."""
@@ -46,311 +49,187 @@ class ErrorCodes(NamedTuple):
     is_from_slave: bool = False
 
 
-def _by_slave(
-    text: str,
-    sdo: AbortCode,
-    soe: SoeErrorCode,
-    foe: FoeErrorCode,
-    ads: AdsError,
-    dialect: DialectFailure,
-    *received: IntEnum,
-) -> ErrorCodes:
-    """Return the row of a refusal by the slave itself; VoE and EoE have no code for it."""
-    mailbox = MailboxError.SERVICE_NOT_SUPPORTED
-    return ErrorCodes(text, mailbox, sdo, soe, foe, ads, dialect, received, is_from_slave=True)
-
-
 class Cause(Enum):
     """Cause of a failed request to a slave; its codes are attributes named as the columns."""
 
     # The request did not reach the slave, or its answer did not come back.
     NO_SLAVE = ErrorCodes(
         "there is no such slave",
-        MailboxError.INVALID_HEADER,
-        AbortCode.NO_OBJECT,
-        SoeErrorCode.INVALID_DRIVE,
-        FoeErrorCode.NOT_FOUND,
-        AdsError.TARGET_PORT,
-        DialectFailure.MISSING,
-        (AdsError.TARGET_PORT, AdsError.TARGET_MACHINE),
-    )
+        Box.INVALID_HEADER, Sdo.NO_OBJECT, Soe.INVALID_DRIVE, Foe.NOT_FOUND, Ads.TARGET_PORT,
+        Fail.MISSING,
+        (Ads.TARGET_PORT, Ads.TARGET_MACHINE),
+    )  # fmt: skip
     NO_MAILBOX = ErrorCodes(
         "the slave has no mailbox in its state",
-        MailboxError.UNSUPPORTED_PROTOCOL,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.COMMAND_NOT_NOW,
-        FoeErrorCode.ILLEGAL,
-        AdsError.NOT_READY,
-        DialectFailure.NOT_SUPPORTED,
-        (AdsError.NOT_READY,),
-    )
+        Box.UNSUPPORTED_PROTOCOL, Sdo.LOCAL_CONTROL, Soe.COMMAND_NOT_NOW, Foe.ILLEGAL,
+        Ads.NOT_READY, Fail.NOT_SUPPORTED,
+        (Ads.NOT_READY,),
+    )  # fmt: skip
     NO_PROTOCOL = ErrorCodes(
         "it does not speak this protocol",
-        MailboxError.UNSUPPORTED_PROTOCOL,
-        AbortCode.UNSUPPORTED_ACCESS,
-        SoeErrorCode.NO_IDN,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.SERVICE,
-        DialectFailure.NOT_SUPPORTED,
-    )
+        Box.UNSUPPORTED_PROTOCOL, Sdo.UNSUPPORTED_ACCESS, Soe.NO_IDN, Foe.NOT_DEFINED,
+        Ads.SERVICE, Fail.NOT_SUPPORTED,
+    )  # fmt: skip
     TIMEOUT = ErrorCodes(
         "it did not answer in time",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.TIMEOUT,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.TIMEOUT,
-        DialectFailure.NO_RESPONSE,
-        (AdsError.TIMEOUT,),
-    )
+        Box.SERVICE_IN_WORK, Sdo.TIMEOUT, Soe.GENERAL, Foe.NOT_DEFINED, Ads.TIMEOUT,
+        Fail.NO_RESPONSE,
+        (Ads.TIMEOUT,),
+    )  # fmt: skip
     BUS_DOWN = ErrorCodes(
         "the bus is down",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.HARDWARE,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.HOST_UNREACHABLE,
-        DialectFailure.GENERAL,
-    )
+        Box.SERVICE_IN_WORK, Sdo.HARDWARE, Soe.GENERAL, Foe.NOT_DEFINED, Ads.HOST_UNREACHABLE,
+        Fail.GENERAL,
+    )  # fmt: skip
     UNREACHABLE = ErrorCodes(
         "its bus, or a station on the way to it, is down",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.HARDWARE,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.HOST_UNREACHABLE,
-        DialectFailure.GENERAL,
-        (AdsError.HOST_UNREACHABLE,),
-    )
+        Box.SERVICE_IN_WORK, Sdo.HARDWARE, Soe.GENERAL, Foe.NOT_DEFINED, Ads.HOST_UNREACHABLE,
+        Fail.GENERAL,
+        (Ads.HOST_UNREACHABLE,),
+    )  # fmt: skip
     TOO_LONG = ErrorCodes(
         "the message is longer than its mailbox",
-        MailboxError.INVALID_SIZE,
-        AbortCode.LONGER_THAN_MAILBOX,
-        SoeErrorCode.VALUE_TOO_LONG,
-        FoeErrorCode.DISK_FULL,
-        AdsError.SIZE,
-        DialectFailure.SIZE,
-    )
+        Box.INVALID_SIZE, Sdo.LONGER_THAN_MAILBOX, Soe.VALUE_TOO_LONG, Foe.DISK_FULL, Ads.SIZE,
+        Fail.SIZE,
+    )  # fmt: skip
     TOO_SHORT = ErrorCodes(
         "the message is too short",
-        MailboxError.SIZE_TOO_SHORT,
-        AbortCode.COMMAND,
-        SoeErrorCode.VALUE_TOO_SHORT,
-        FoeErrorCode.ILLEGAL,
-        AdsError.SIZE,
-        DialectFailure.GENERAL,
-    )
+        Box.SIZE_TOO_SHORT, Sdo.COMMAND, Soe.VALUE_TOO_SHORT, Foe.ILLEGAL, Ads.SIZE, Fail.GENERAL,
+    )  # fmt: skip
     SERVICE = ErrorCodes(
         "it does not offer this service",
-        MailboxError.SERVICE_NOT_SUPPORTED,
-        AbortCode.COMMAND,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.ILLEGAL,
-        AdsError.SERVICE,
-        DialectFailure.GENERAL,
-    )
+        Box.SERVICE_NOT_SUPPORTED, Sdo.COMMAND, Soe.GENERAL, Foe.ILLEGAL, Ads.SERVICE,
+        Fail.GENERAL,
+    )  # fmt: skip
     PROTOCOL = ErrorCodes(
         "its answer breaks the protocol",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.GENERAL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.GENERAL,
-        DialectFailure.GENERAL,
-    )
+        Box.SERVICE_IN_WORK, Sdo.GENERAL, Soe.GENERAL, Foe.NOT_DEFINED, Ads.GENERAL, Fail.GENERAL,
+    )  # fmt: skip
     BUSY = ErrorCodes(
         "it is busy with another client's transfer",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.COMMAND_ACTIVE,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.BUSY,
-        DialectFailure.GENERAL,
-        (AdsError.BUSY, MailboxError.SERVICE_IN_WORK),
-    )
+        Box.SERVICE_IN_WORK, Sdo.LOCAL_CONTROL, Soe.COMMAND_ACTIVE, Foe.NOT_DEFINED, Ads.BUSY,
+        Fail.GENERAL,
+        (Ads.BUSY, Box.SERVICE_IN_WORK),
+    )  # fmt: skip
     CROWDED = ErrorCodes(
         "too many requests wait already",
-        MailboxError.NO_MORE_MEMORY,
-        AbortCode.OUT_OF_MEMORY,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NO_USER,
-        AdsError.NO_MEMORY,
-        DialectFailure.GENERAL,
-    )
+        Box.NO_MORE_MEMORY, Sdo.OUT_OF_MEMORY, Soe.GENERAL, Foe.NO_USER, Ads.NO_MEMORY,
+        Fail.GENERAL,
+    )  # fmt: skip
     TOO_FAST = ErrorCodes(
         "more requests a second than the plant file allows",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.BUSY,
-        DialectFailure.GENERAL,
-    )
+        Box.SERVICE_IN_WORK, Sdo.LOCAL_CONTROL, Soe.GENERAL, Foe.NOT_DEFINED, Ads.BUSY,
+        Fail.GENERAL,
+    )  # fmt: skip
     DENIED = ErrorCodes(
         "access refused: the plant file has no rule that allows it",
-        MailboxError.SERVICE_NOT_SUPPORTED,
-        AbortCode.UNSUPPORTED_ACCESS,
-        SoeErrorCode.VALUE_PROTECTED,
-        FoeErrorCode.NO_RIGHTS,
-        AdsError.ACCESS_DENIED,
-        DialectFailure.READ_ONLY,
-        (AdsError.ACCESS_DENIED,),
-    )
+        Box.SERVICE_NOT_SUPPORTED, Sdo.UNSUPPORTED_ACCESS, Soe.VALUE_PROTECTED, Foe.NO_RIGHTS,
+        Ads.ACCESS_DENIED, Fail.READ_ONLY,
+        (Ads.ACCESS_DENIED,),
+    )  # fmt: skip
     NOT_RECORDED = ErrorCodes(
         "change refused: the audit is required and cannot record it",
-        MailboxError.SERVICE_IN_WORK,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.VALUE_PROTECTED,
-        FoeErrorCode.NO_RIGHTS,
-        AdsError.ACCESS_DENIED,
-        DialectFailure.READ_ONLY,
-    )
+        Box.SERVICE_IN_WORK, Sdo.LOCAL_CONTROL, Soe.VALUE_PROTECTED, Foe.NO_RIGHTS,
+        Ads.ACCESS_DENIED, Fail.READ_ONLY,
+    )  # fmt: skip
 
-    # The slave refused the request.
-    NOT_FOUND = _by_slave(
+    # The slave refused the request.  VoE and EoE have no code of their own for that.
+    NOT_FOUND = ErrorCodes(
         "there is no such object or entry",
-        AbortCode.NO_OBJECT,
-        SoeErrorCode.NO_IDN,
-        FoeErrorCode.NOT_FOUND,
-        AdsError.NOT_FOUND,
-        DialectFailure.MISSING,
-        AdsError.NOT_FOUND,
-        AbortCode.NO_OBJECT,
-        AbortCode.NO_SUBINDEX,
-        AbortCode.NOT_STORED,
-        SoeErrorCode.NO_IDN,
-        SoeErrorCode.NO_DEFAULT,
-        SoeErrorCode.NO_DATA_STATE,
-        SoeErrorCode.NO_ELEMENT,
-        SoeErrorCode.INVALID_DRIVE,
-        FoeErrorCode.NOT_FOUND,
-    )
-    UNSUPPORTED = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.NO_OBJECT, Soe.NO_IDN, Foe.NOT_FOUND, Ads.NOT_FOUND,
+        Fail.MISSING,
+        (
+            Ads.NOT_FOUND, Sdo.NO_OBJECT, Sdo.NO_SUBINDEX, Sdo.NOT_STORED, Soe.NO_IDN,
+            Soe.NO_DEFAULT, Soe.NO_DATA_STATE, Soe.NO_ELEMENT, Soe.INVALID_DRIVE, Foe.NOT_FOUND,
+        ),
+        is_from_slave=True,
+    )  # fmt: skip
+    UNSUPPORTED = ErrorCodes(
         "the device cannot do that",
-        AbortCode.UNSUPPORTED_ACCESS,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.ILLEGAL,
-        AdsError.SERVICE,
-        DialectFailure.NOT_SUPPORTED,
-        AdsError.SERVICE,
-        AbortCode.UNSUPPORTED_ACCESS,
-        AbortCode.NO_COMPLETE_ACCESS,
-        FoeErrorCode.ILLEGAL,
-        MailboxError.UNSUPPORTED_PROTOCOL,
-        MailboxError.SERVICE_NOT_SUPPORTED,
-    )
-    NO_GROUP = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.UNSUPPORTED_ACCESS, Soe.GENERAL, Foe.ILLEGAL, Ads.SERVICE,
+        Fail.NOT_SUPPORTED,
+        (
+            Ads.SERVICE, Sdo.UNSUPPORTED_ACCESS, Sdo.NO_COMPLETE_ACCESS, Foe.ILLEGAL,
+            Box.UNSUPPORTED_PROTOCOL, Box.SERVICE_NOT_SUPPORTED,
+        ),
+        is_from_slave=True,
+    )  # fmt: skip
+    NO_GROUP = ErrorCodes(
         "the device has no object dictionary",
-        AbortCode.GENERAL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.INDEX_GROUP,
-        DialectFailure.NOT_SUPPORTED,
-        AdsError.INDEX_GROUP,
-    )
-    ACCESS = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.GENERAL, Soe.GENERAL, Foe.NOT_DEFINED, Ads.INDEX_GROUP,
+        Fail.NOT_SUPPORTED,
+        (Ads.INDEX_GROUP,),
+        is_from_slave=True,
+    )  # fmt: skip
+    ACCESS = ErrorCodes(
         "it may not be read or written so",
-        AbortCode.READ_ONLY,
-        SoeErrorCode.VALUE_READ_ONLY,
-        FoeErrorCode.ACCESS_DENIED,
-        AdsError.ACCESS,
-        DialectFailure.READ_ONLY,
-        AdsError.ACCESS,
-        AbortCode.READ_ONLY,
-        AbortCode.WRITE_ONLY,
-        SoeErrorCode.DEFAULT_READ_ONLY,
-        SoeErrorCode.PASSWORD,
-        SoeErrorCode.CYCLIC,
-        SoeErrorCode.OTHER_SETTINGS,
-        FoeErrorCode.ACCESS_DENIED,
-        FoeErrorCode.NO_USER,
-        FoeErrorCode.NO_RIGHTS,
-    )
-    LENGTH = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.READ_ONLY, Soe.VALUE_READ_ONLY, Foe.ACCESS_DENIED,
+        Ads.ACCESS, Fail.READ_ONLY,
+        (
+            Ads.ACCESS, Sdo.READ_ONLY, Sdo.WRITE_ONLY, Soe.DEFAULT_READ_ONLY, Soe.PASSWORD,
+            Soe.CYCLIC, Soe.OTHER_SETTINGS, Foe.ACCESS_DENIED, Foe.NO_USER, Foe.NO_RIGHTS,
+        ),
+        is_from_slave=True,
+    )  # fmt: skip
+    LENGTH = ErrorCodes(
         "the wrong number of octets",
-        AbortCode.LENGTH,
-        SoeErrorCode.VALUE_TOO_LONG,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.SIZE,
-        DialectFailure.SIZE,
-        AdsError.SIZE,
-        AbortCode.LENGTH,
-        AbortCode.TOO_LONG,
-        AbortCode.TOO_SHORT,
-        SoeErrorCode.DEFAULT_TOO_LONG,
-        MailboxError.SIZE_TOO_SHORT,
-        MailboxError.INVALID_SIZE,
-    )
-    VALUE = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.LENGTH, Soe.VALUE_TOO_LONG, Foe.NOT_DEFINED, Ads.SIZE,
+        Fail.SIZE,
+        (
+            Ads.SIZE, Sdo.LENGTH, Sdo.TOO_LONG, Sdo.TOO_SHORT, Soe.DEFAULT_TOO_LONG,
+            Box.SIZE_TOO_SHORT, Box.INVALID_SIZE,
+        ),
+        is_from_slave=True,
+    )  # fmt: skip
+    VALUE = ErrorCodes(
         "not a value for it",
-        AbortCode.VALUE,
-        SoeErrorCode.INVALID_VALUE,
-        FoeErrorCode.CHECKSUM,
-        AdsError.VALUE,
-        DialectFailure.GENERAL,
-        AdsError.VALUE,
-        AbortCode.VALUE,
-        AbortCode.TOO_HIGH,
-        AbortCode.TOO_LOW,
-        SoeErrorCode.BELOW_MINIMUM,
-        SoeErrorCode.ABOVE_MAXIMUM,
-        SoeErrorCode.INVALID_VALUE,
-        FoeErrorCode.CHECKSUM,
-    )
-    STATE = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.VALUE, Soe.INVALID_VALUE, Foe.CHECKSUM, Ads.VALUE,
+        Fail.GENERAL,
+        (
+            Ads.VALUE, Sdo.VALUE, Sdo.TOO_HIGH, Sdo.TOO_LOW, Soe.BELOW_MINIMUM, Soe.ABOVE_MAXIMUM,
+            Soe.INVALID_VALUE, Foe.CHECKSUM,
+        ),
+        is_from_slave=True,
+    )  # fmt: skip
+    STATE = ErrorCodes(
         "not in the state that the device is in",
-        AbortCode.DEVICE_STATE,
-        SoeErrorCode.COMMAND_NOT_NOW,
-        FoeErrorCode.ILLEGAL,
-        AdsError.STATE,
-        DialectFailure.GENERAL,
-        AdsError.STATE,
-        AbortCode.DEVICE_STATE,
-        AbortCode.LOCAL_CONTROL,
-        SoeErrorCode.COMMAND_ACTIVE,
-        SoeErrorCode.COMMAND_NOT_INTERRUPTIBLE,
-        SoeErrorCode.COMMAND_NOT_NOW,
-        FoeErrorCode.BOOTSTRAP_ONLY,
-        FoeErrorCode.NOT_IN_BOOTSTRAP,
-    )
-    NO_MEMORY = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.DEVICE_STATE, Soe.COMMAND_NOT_NOW, Foe.ILLEGAL, Ads.STATE,
+        Fail.GENERAL,
+        (
+            Ads.STATE, Sdo.DEVICE_STATE, Sdo.LOCAL_CONTROL, Soe.COMMAND_ACTIVE,
+            Soe.COMMAND_NOT_INTERRUPTIBLE, Soe.COMMAND_NOT_NOW, Foe.BOOTSTRAP_ONLY,
+            Foe.NOT_IN_BOOTSTRAP,
+        ),
+        is_from_slave=True,
+    )  # fmt: skip
+    NO_MEMORY = ErrorCodes(
         "no room for it",
-        AbortCode.GENERAL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.DISK_FULL,
-        AdsError.NO_MEMORY,
-        DialectFailure.GENERAL,
-        AdsError.NO_MEMORY,
-        FoeErrorCode.DISK_FULL,
-        MailboxError.NO_MORE_MEMORY,
-    )
-    EXISTS = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.GENERAL, Soe.GENERAL, Foe.DISK_FULL, Ads.NO_MEMORY,
+        Fail.GENERAL,
+        (Ads.NO_MEMORY, Foe.DISK_FULL, Box.NO_MORE_MEMORY),
+        is_from_slave=True,
+    )  # fmt: skip
+    EXISTS = ErrorCodes(
         "the file exists already",
-        AbortCode.GENERAL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.ALREADY_EXISTS,
-        AdsError.EXISTS,
-        DialectFailure.GENERAL,
-        AdsError.EXISTS,
-        FoeErrorCode.ALREADY_EXISTS,
-    )
-    NO_HANDLE = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.GENERAL, Soe.GENERAL, Foe.ALREADY_EXISTS, Ads.EXISTS,
+        Fail.GENERAL,
+        (Ads.EXISTS, Foe.ALREADY_EXISTS),
+        is_from_slave=True,
+    )  # fmt: skip
+    NO_HANDLE = ErrorCodes(
         "too many files are open",
-        AbortCode.GENERAL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NO_USER,
-        AdsError.NO_MORE_HANDLES,
-        DialectFailure.GENERAL,
-        AdsError.NO_MORE_HANDLES,
-    )
-    GENERAL = _by_slave(
+        Box.SERVICE_NOT_SUPPORTED, Sdo.GENERAL, Soe.GENERAL, Foe.NO_USER, Ads.NO_MORE_HANDLES,
+        Fail.GENERAL,
+        (Ads.NO_MORE_HANDLES,),
+        is_from_slave=True,
+    )  # fmt: skip
+    GENERAL = ErrorCodes(
         "the device refuses",
-        AbortCode.GENERAL,
-        SoeErrorCode.GENERAL,
-        FoeErrorCode.NOT_DEFINED,
-        AdsError.GENERAL,
-        DialectFailure.GENERAL,
-    )
+        Box.SERVICE_NOT_SUPPORTED, Sdo.GENERAL, Soe.GENERAL, Foe.NOT_DEFINED, Ads.GENERAL,
+        Fail.GENERAL,
+        (),
+        is_from_slave=True,
+    )  # fmt: skip
 
     def __init__(self, *columns: object) -> None:
         row: ErrorCodes = self._value_
