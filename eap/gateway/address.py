@@ -1,4 +1,4 @@
-"""Whom a mailbox address means: the master, a slave, several slaves, or one somewhere else.
+"""Meaning of mailbox addresses: the master, a slave, several slaves, or one of another station.
 
 ETG.8200 has station addresses and 0 for the master.  Beside them stand what its implementations
 do: bit 15 marks what is for a slave in any case, 0xFFFF is for all of them, and virtual addresses
@@ -36,7 +36,7 @@ class RemoteAddress(NamedTuple):
 
 
 class GroupAddress(NamedTuple):
-    """Several that each answer for themselves; nobody knows beforehand who does not."""
+    """Several slaves that each answer for themselves."""
 
     members: tuple[int, ...]
     """Station addresses, or virtual ones."""
@@ -60,9 +60,9 @@ class AddressMap:
         self._virtual = dict(virtual or {})
 
     def resolve(self, address: int, stations: tuple[int, ...]) -> Destination:
-        """Return whom *address* means; *stations* are the slaves there are.
+        """Return the meaning of *address*; *stations* are the slaves of the bus.
 
-        A station address that nobody has is returned as such: to say so is for who asks there.
+        A station address without a slave is returned as such; the access to it is what fails.
         """
         if address == MASTER_ADDRESS:
             return MasterAddress()

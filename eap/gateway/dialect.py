@@ -115,7 +115,7 @@ class DialectFailure(IntEnum):
     """The protocol, or this use of it."""
     READ_ONLY = 3
     COMMAND = 4
-    """Nobody knows that command."""
+    """An unknown command."""
     SIZE = 5
     NO_RESPONSE = 6
     FILE_NAME = 7
@@ -172,7 +172,7 @@ def decode(kind: MailboxType, body: bytes) -> Task:
     """Return what a request asks for.
 
     Raises:
-        MalformedError: nobody can tell; its text says what was expected.
+        MalformedError: it is none of the dialect; the text says what was expected.
     """
     return _DECODERS[kind](body)
 
@@ -270,7 +270,7 @@ def encode_failure(
 
     Args:
         kind: The protocol.
-        request: What was asked.
+        request: Its octets.
         failure: Why.
         code: What the slave itself says, for protocols whose codes both sides share.
         text: For people, where the protocol has room for it.

@@ -1,7 +1,7 @@
-"""What is known of the clients of a gateway: what they wait for, and how much they may ask.
+"""Clients of a gateway: requests that wait, limits of their number and rate, memory of transfers.
 
-A client that hears nothing asks again with the same octets.  As long as its first request waits,
-the second is no other one, and both are answered once; afterwards the same octets are a new
+A client without an answer repeats its request with the same octets.  As long as its first request
+waits, the second is no other one, and both are answered once; afterwards the same octets are a new
 request, because real clients poll with a constant counter.
 """
 
@@ -16,7 +16,7 @@ _S = 1_000_000_000
 
 
 class ClientLimits(NamedTuple):
-    """How much a gateway takes on."""
+    """Limits for the clients of a gateway."""
 
     in_flight: int = 32
     """Requests of one client that wait."""
@@ -59,7 +59,7 @@ class MemoryBudget:
 
 
 class MemoryShare:
-    """What one session holds of a budget."""
+    """Part of a budget that one session holds."""
 
     def __init__(self, budget: MemoryBudget, host: str) -> None:
         self._budget = budget
@@ -75,7 +75,7 @@ class MemoryShare:
 
 
 class RequestAdmission(Enum):
-    """What becomes of a request."""
+    """Decision on taking a request."""
 
     TAKEN = "taken"
     REPEATED = "repeated"
@@ -87,11 +87,11 @@ class RequestAdmission(Enum):
 
 
 class Counts:
-    """What a gateway did for one client.
+    """Counters of one client.
 
     Attributes:
         requests: That were taken.
-        repeated: That waited already, or whose last answer went out once more.
+        repeated: That waited already, or got their last answer once more.
         errors: Answered by the gateway itself, with an error.
     """
 
@@ -172,7 +172,7 @@ class RequestTracker:
             self._in_flight -= len(client.waiting)
 
     def table(self) -> dict[Way, Counts]:
-        """Return all clients that are known, the one that asked last at the end."""
+        """Return all known clients, the most recent one at the end."""
         return {way: client.counts for way, client in self._clients.items()}
 
     def _client(self, way: Way, now_ns: int) -> _TrackedClient | None:
@@ -181,7 +181,7 @@ class RequestTracker:
             if len(self._clients) >= self._limits.clients and not self._make_room():
                 return None
             client = _TrackedClient(self._limits.rate, now_ns)
-        self._clients[way] = client  # at the end: who is at the front has been silent longest
+        self._clients[way] = client  # at the end: the one in front has been silent longest
         return client
 
     def _make_room(self) -> bool:
@@ -206,7 +206,7 @@ class RequestTracker:
 class Ticket:
     """A request that was taken, until it is answered.
 
-    It has to be given back before the answer goes out: who has that may send the same octets anew.
+    It is given back before the answer goes out: the client may then send the same octets anew.
 
     Args:
         tracker: That took it.

@@ -1,7 +1,7 @@
-"""What a mailbox request does, in the terms that access rules judge by (ETG.8200, ETG.1020).
+"""Mailbox requests as operations, in the terms of access rules (ETG.8200, ETG.1020).
 
-A plant file has one list of rules, whichever way somebody comes: here requests of the mailbox
-protocols become the operations that an ADS client would ask for to have the same done.
+A plant file has one list of rules for clients of every transport: here requests of the mailbox
+protocols become the operations by which an ADS client would do the same.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from eap.gateway.error_table import Cause, cause_of_result
 from eap.gateway.refusal import GatewayError, mailbox_error, refuse
 
 IDLE_S = 5.0
-"""How long a transfer waits for its client's next step."""
+"""Limit for the pause between two steps of a transfer."""
 WRITES = 5
 """Answer times that the last step of a download may take: the slave gets all of it then."""
 MAX_SESSIONS = 512

@@ -1,4 +1,4 @@
-"""Frames of type 5 that are no AoE to a station: they go to the gateway of its first bus."""
+"""Way of frames of type 5 to a gateway, unless they are AoE to a station itself."""
 
 from __future__ import annotations
 

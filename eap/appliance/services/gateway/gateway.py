@@ -77,7 +77,7 @@ from eap.ids import NetId
 ANSWER_S = 0.9
 """Limit for an answer, below the second after which usual clients give up."""
 STALL_S = 2.0
-"""How long a slave waits for the client of a file before that gives way to another client's."""
+"""Wait of a slave for the client of a file after which that gives way to another client's."""
 
 OpenRemote: TypeAlias = Callable[[RemoteAddress], SlaveAccess]
 """Returns access to a slave, or the master, of another station."""
@@ -97,7 +97,7 @@ class Settings(NamedTuple):
     """Of the bus port: targets of access rules."""
     answer_s: float = ANSWER_S
     is_silent: bool = False
-    """Whether it keeps its own errors to itself, and answers only as slaves do."""
+    """It sends no errors of its own, and answers only as slaves do."""
     room: int = 1486
     """Octets of the longest answer behind its headers: one datagram takes it."""
     limits: ClientLimits = ClientLimits()
@@ -184,7 +184,7 @@ class MailboxGateway:
         """
         header, body = decode_frame(frame)
         key = frame
-        if way.door.startswith(_BY_TCP):  # what comes twice there was asked twice
+        if way.door.startswith(_BY_TCP):  # TCP repeats nothing by itself
             self._count += 1
             key += self._count.to_bytes(8)
         now_ns = monotonic_ns()

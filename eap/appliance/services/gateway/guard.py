@@ -1,4 +1,4 @@
-"""Who may do what at a gateway: the rules of the plant file, and what the audit is told.
+"""Access rules at a gateway, and the audit of its changes and refusals.
 
 One line of the audit is written for each change, when it is known how it came out and before its
 client has the answer, and one for each refusal.
@@ -29,7 +29,7 @@ from eap.ids import NetId
 from eap.od.abort import SdoAbortError
 
 NOBODY = NetId(bytes(6))
-"""Source NetID of who has none."""
+"""Source NetID of clients, which have none here."""
 MASTER_PORT = 0xFFFF
 """AMS port by which rules name the master itself."""
 _SDO = frozenset((CoeService.SDO_REQUEST, CoeService.SDO_RESPONSE))
@@ -38,18 +38,18 @@ _SOE_ERROR = 0x10
 
 
 class RuleTarget(NamedTuple):
-    """Whom rules name: a NetID and an AMS port, which is 0xFFFF for a master."""
+    """Name of a slave in access rules: a NetID and an AMS port, which is 0xFFFF for a master."""
 
     net_id: NetId
     port: int
 
 
 class RequestDecision(msgspec.Struct, frozen=True):
-    """What a request does, to whom, and whether it may.
+    """Decision on a request.
 
     Attributes:
         station: Mailbox address that is counted.
-        target: Whom rules name.
+        target: Its name in access rules.
         operation: None for what needs no verdict: a step of what was judged when it began, and a
             read where everything may be read.
         verdict: Likewise.
@@ -84,7 +84,7 @@ class Guard:
         self._access = access
 
     def may_read(self, way: Way, target: RuleTarget, operation: Operation) -> bool:
-        """Say whether an operation is a read, of somebody of whom a client may read everything."""
+        """Return whether an operation is a read where the client may read everything."""
         if not isinstance(operation, Read):
             return False
         return self._access().grants(way, NOBODY, *target).may_read
@@ -124,10 +124,10 @@ class Guard:
 
         Args:
             way: Connection, or address, of the client.
-            target: Whom it was for.
+            target: Its name in access rules.
             operation: What was to be done.
             verdict: Whether it may be.
-            result: An error of ADS, 0 for none, None if nobody knows.
+            result: An error of ADS, 0 for none, None if it is unknown.
         """
         if not verdict.is_allowed:
             result = AdsError.ACCESS_DENIED

@@ -19,7 +19,7 @@ from eap.od.model import OdState
 
 
 class MasterSession:
-    """What one client does with the master; segmented transfers of two clients do not meet.
+    """Session of one client with the master: segmented transfers of two clients do not meet.
 
     Args:
         dictionary: Of the master.

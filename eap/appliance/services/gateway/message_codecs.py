@@ -43,7 +43,7 @@ _EOE_REQUESTS = frozenset(
         EoeType.GET_FILTER_REQUEST,
     )
 )
-"""What is answered of EoE; Ethernet frames are not."""
+"""Messages of EoE that are answered; Ethernet frames are not."""
 
 
 class MessageCodec:
@@ -225,7 +225,7 @@ class EoeListeners:
             of_slave.popitem(last=False)
 
     def of(self, station: int, now_ns: int) -> list[EoeListener]:
-        """Return who hears a slave now."""
+        """Return the clients that receive the frames of a slave now."""
         of_slave = self._of.get(station)
         if of_slave is None:
             return []

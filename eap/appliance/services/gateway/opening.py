@@ -1,4 +1,4 @@
-"""The gateways of an appliance, made from what the plant file says of its buses."""
+"""Assembly of the gateways of an appliance from the plant file."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def open_dictionaries(
     """
     providers = {}
     for bus in handover.buses:
-        told = _told(handover, bus.owner)
+        spec = _gateway_of(handover, bus.owner)
         providers[bus.owner] = MasterDictionaryProvider(
-            clients[bus.owner], release, full=told.full, padded=told.padded
+            clients[bus.owner], release, full=spec.full, padded=spec.padded
         )
     return providers
 
@@ -56,13 +56,13 @@ def open_gateways(
     """
     gateways = {}
     for bus in handover.buses:
-        told, router = _told(handover, bus.owner), routers[bus.owner.station]
+        spec, router = _gateway_of(handover, bus.owner), routers[bus.owner.station]
         provider = providers[bus.owner]
         settings = Settings(
             NetId.parse(handover.port(bus.owner).net_id),
-            answer_s=told.answer_ms / _MS,
-            is_silent=told.silent,
-            limits=ClientLimits(told.in_flight, told.rate, told.clients),
+            answer_s=spec.answer_ms / _MS,
+            is_silent=spec.silent,
+            limits=ClientLimits(spec.in_flight, spec.rate, spec.clients),
             name=clients[bus.owner].name,
         )
         gateway = MailboxGateway(
@@ -76,15 +76,15 @@ def open_gateways(
             ),
             partial(_access_of, router),
             settings,
-            AddressMap({each.address: _destination(each) for each in told.addresses}),
+            AddressMap({each.address: _destination(each) for each in spec.addresses}),
             partial(_open_remote, router, settings),
         )
-        gateway.is_open = told.enabled
+        gateway.is_open = spec.enabled
         gateways[bus.owner] = gateway
     return gateways
 
 
-def _told(handover: Handover, owner: PortName) -> GatewaySpec:
+def _gateway_of(handover: Handover, owner: PortName) -> GatewaySpec:
     return handover.port(owner).gateway or GatewaySpec()
 
 

@@ -19,7 +19,7 @@ from eap.gateway.error_table import Cause
 from eap.gateway.request_tracker import RequestTracker, Ticket
 
 Send: TypeAlias = Callable[[bytes], None]
-"""Sends a frame back to who sent a request, now or later."""
+"""Sends a frame back to the client of a request, now or later."""
 _ADDRESSES = 1 << 16
 _MAX_ROWS = 4096
 """Slaves that do not exist have no rows of their own above this."""

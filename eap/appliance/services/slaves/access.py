@@ -36,7 +36,7 @@ class RemoteAccessError(EapError):
 
 
 class SlaveAccess(Protocol):
-    """Access to one slave for one requester, whose operations wait in turn with those of others.
+    """Access to one slave for one requester; the operations of several requesters take turns.
 
     Every operation raises the errors that the module's text names.  Cancelling it ends what is
     under way, at the slave too.

@@ -31,7 +31,7 @@ class LocalSlave:
     Args:
         bus: Its bus.
         slave: As the engine describes it.
-        requester: Whose operations take turns with those of others.
+        requester: Client; the operations of several clients take turns.
         turn_s: Limit for the wait for a turn, which MailboxBusyError ends; None for no limit.
     """
 

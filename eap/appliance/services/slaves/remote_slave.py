@@ -37,7 +37,7 @@ BLOCK = 16 << 10
 STEP_S = 5.0
 """How long the answer to a block may take: routers give up after 4.5 s."""
 PAUSE_S = 0.02
-"""Before a station that is busy is asked again."""
+"""Pause before a station that is busy gets the request again."""
 _HANDLE_SIZE = 4
 _GIVE_UP = b"\1"
 LONGEST_ANSWER = 0x20002
@@ -274,10 +274,10 @@ class RemoteSlave:
 
 
 class RemoteFile(FileStream):
-    """A file of a slave of another station, which does not tell whose turn it is.
+    """A file of a slave of another station, which does not report turns.
 
     Args:
-        slave: Whose file it is.
+        slave: Owner of the file.
         name: Of the file, at the slave.
         password: Up to 32 bits.
         is_write: Whether it goes to the slave.
@@ -296,7 +296,7 @@ class RemoteFile(FileStream):
     def close(self) -> None:
         """Give the file up if it is not complete, at the slave too."""
         self._is_closed = True
-        if self.is_open:  # else the handle is not known yet by which the slave is told
+        if self.is_open:  # else the handle that closes it there is not known yet
             super().close()
 
     async def move(self) -> None:
