@@ -65,7 +65,8 @@ def assert_hears(appliance: Appliance, listener: str, *froms: str, frames: int =
         rx = appliance.rx(listener, source)
         assert (*troubles(rx), rx["state"]) == (0, 0, 0, "running")
         ticks = appliance.values(listener)[f"{source}.ticks"]
-        assert 0 <= ticks - rx["cycle_index"] < 1000
+        # The counter goes on in cycles that a busy machine leaves out.
+        assert 0 <= (ticks - rx["cycle_index"]) % 65536 < 20_000
 
 
 def test_multicast_over_udp_reaches_three_stations_of_one_appliance(farm: Plants) -> None:
@@ -307,7 +308,7 @@ def test_a_slow_tcp_peer_loses_whole_frames_and_delays_nobody(farm: Plants) -> N
         frame = data[start : start + size]
         assert frame[:10] == data[:10]  # header, publisher and count: no frame was ever cut
         carried, counted = (int.from_bytes(frame[at : at + 2], "little") for at in (22, 10))
-        assert (carried - counted) % 65536 < 1000  # the counter that the data carries
+        assert (carried - counted) % 65536 < 20_000  # the counter that the data carries
         cycles.append(int.from_bytes(frame[10:12], "little"))
     steps = [later - earlier for earlier, later in itertools.pairwise(cycles)]
     assert min(steps) == 1

@@ -15,6 +15,7 @@ import pytest
 import eap
 from eap.appliance.runtime import VARIABLE
 from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.machine import slowness
 from tests.support.namespaces import cable
 from tests.support.wiretap import Tapped, Wiretap
 
@@ -115,13 +116,14 @@ def test_two_servers_answer_on_loopback(farm: Plants) -> None:
     wait_until(lambda: plant.rx("desk", "lathe-part")["received"] >= 25)
     assert_all_is_well(plant.station("desk"), [plant.station("mill"), plant.station("lathe")])
     for name in ANSWERS:
-        assert plant.rx("desk", name)["response_us"]["p50"] < SERVER_CYCLE_US + CLIENT_CYCLE_US
+        limit_us = (SERVER_CYCLE_US + CLIENT_CYCLE_US) * slowness()
+        assert plant.rx("desk", name)["response_us"]["p50"] < limit_us
     plant.command("pd", "set", "desk", "job", "7")
     wait_until(lambda: plant.values("mill")["asked.job"] == plant.values("lathe")["asked.job"] == 7)
     shown = plant.command("status", "--full")
     assert "polled" in shown
     listed = plant.command("pd", "list", "--station", "mill")
-    assert "part  id 71, version 0, eap0 to requester, polled by asked" in listed
+    assert "→ part 71 0 eap0 requester, polled by asked" in " ".join(listed.split())
 
 
 def test_a_server_that_is_gone_leaves_the_other_and_comes_back(farm: Plants) -> None:
@@ -155,7 +157,8 @@ def test_answers_come_back_on_the_connection_of_the_request(farm: Plants) -> Non
     for name in ANSWERS:
         row = plant.rx("desk", name)
         assert row["state"] == "running"
-        assert row["response_us"]["p50"] < SERVER_CYCLE_US + 2 * CLIENT_CYCLE_US
+        limit_us = (SERVER_CYCLE_US + 2 * CLIENT_CYCLE_US) * slowness()
+        assert row["response_us"]["p50"] < limit_us
     for server_name in ("mill", "lathe"):
         for row in plant.station(server_name)["pd"]["tx"]:
             assert set(row["reason"]) == {"poll"}

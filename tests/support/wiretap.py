@@ -42,7 +42,10 @@ class Wiretap:
 
     def __init__(self, sock: socket.socket, interface: str) -> None:
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 8 << 20)
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 8 << 20)
+        except PermissionError:  # root of a user namespace
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
         sock.bind((interface, _ALL))
         sock.setblocking(False)
         self._sock = sock
