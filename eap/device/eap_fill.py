@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from ipaddress import IPv4Address
+from types import MappingProxyType
 from typing import Any
 
 from msgspec import Struct
@@ -148,7 +149,8 @@ class _Filling:
         kind = self._types[variable.name]
         self._dictionary.make(row, index)
         self._set_fields(index, variable)
-        self._set(index, {Var.TYPE_NAME: kind.text})
+        if kind.text != variable.type:
+            self._set(index, {Var.TYPE_NAME: kind.text})
         if variable.default is not None:
             default = kind.from_plain(variable.default)
             self._set(index, {Var.DEFAULT_GIVEN: True, Var.DEFAULT: default})
@@ -181,19 +183,16 @@ class _Filling:
         self._set_list(index, FrameSub.TXPD, [tx[pd.name] for pd in frame.pds])
 
     def _set_fields(
-        self, index: int, record: Struct, references: Mapping[str, int] | None = None
+        self, index: int, record: Struct, references: Mapping[str, int] = MappingProxyType({})
     ) -> None:
         """Set the entries that are fields of *record*; *references* are those that it may name."""
         values = {}
-        for each in profile.row_of(index).entries:
-            if each.field:
-                plain = _value(record, each.field)
-                if each.refers and references is not None:
-                    plain = references[plain] if plain else 0
-                else:
-                    plain = each.from_plain(plain)
-                if plain is not None:
-                    values[each.subindex] = plain
+        for subindex, path, row, is_plain in profile.FIELDS[profile.row_of(index).first]:
+            value = _value(record, path)
+            if not is_plain and value:
+                value = references[value] if row.refers else row.from_plain(value)
+            if value or row.default is not None:  # else a new object has it already
+                values[subindex] = value
         self._set(index, values)
 
     def _set_list(self, index: int, first: int, values: Iterable[Any]) -> None:
@@ -215,9 +214,9 @@ class _Filling:
             self._dictionary.put(index, subindex, octets.rstrip(b"\0") if entry.is_text else octets)
 
 
-def _value(record: Any, path: str) -> Any:
+def _value(record: Any, path: tuple[str, ...]) -> Any:
     """Return the value at *path* of *record*; of what is not there its default."""
-    for name in path.split("."):
+    for name in path:
         record = getattr(_NO_CHANGE if record is None else record, name)
     return record
 

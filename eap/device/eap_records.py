@@ -162,17 +162,15 @@ class PortReader:
         """Return the fields that are entries of the object at *index*, records within as dicts."""
         entries = self._dictionary[index].entries
         fields: dict[str, Any] = {}
-        for each in profile.row_of(index).entries:
-            if each.field:
-                value = entries[each.subindex].value
-                if each.refers:
-                    plain = self._name_at(value, index, each.subindex)
-                else:
-                    plain = each.to_plain(value)
-                part, (*outer, name) = fields, each.field.split(".")
-                for record in outer:
-                    part = part.setdefault(record, {})
-                part[name] = plain
+        for subindex, path, row, is_plain in profile.FIELDS[profile.row_of(index).first]:
+            value = entries[subindex].value
+            if not is_plain:
+                is_name = bool(row.refers)
+                value = self._name_at(value, index, subindex) if is_name else row.to_plain(value)
+            part = fields
+            for record in path[:-1]:
+                part = part.setdefault(record, {})
+            part[path[-1]] = value
         return fields
 
     def _name_at(self, target: int, index: int, subindex: int) -> str:

@@ -25,6 +25,7 @@ from eap.od.profiles.table import (
     Rule,
     config,
     derived,
+    field_rows,
     fixed,
     live,
     setting,
@@ -577,8 +578,8 @@ DEVICE = (
                  "Requests without an address to answer.")),
     single(0xF200, "EAP control", "What the device is asked to do.",
            ProfileEntry(1, "Requested state", "UINT", RW,
-                        "2 PreOp, 4 SafeOp, 8 Op; the status says "
-                    "what came of it.", rule=Rule.STATE)),
+                        "2 PreOp, 4 SafeOp, 8 Op; the status says what came of it.",
+                        rule=Rule.STATE)),
     single(0xF800, "Configured objects", "How many there are; counted by the device.",
            *(derived(sub, name, "UINT", Derived.COUNT, "How many exist.")
              for sub, name in enumerate(_KINDS, 1)),
@@ -639,6 +640,8 @@ PORT = 0xF810
 GROUPS = 0xF811
 NET_ID = 0xF920
 
+FIELDS = {row.first: field_rows(row) for row in ALL}
+"""By the first index of their range."""
 _BY_PAGE = {
     page: [row for row in ALL if row.first >> 8 <= page <= row.last >> 8] for page in range(0x100)
 }

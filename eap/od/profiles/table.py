@@ -243,6 +243,31 @@ class ProfileObject(NamedTuple):
         return self.name.format(n=index - self.first)
 
 
+class FieldRow(NamedTuple):
+    """Row of an entry that is one field of the specification."""
+
+    subindex: int
+    path: tuple[str, ...]
+    """Names of the records around the field, and its own."""
+    row: ProfileEntry
+    is_plain: bool
+    """Whether the specification has the value as it is in the entry."""
+
+
+def field_rows(described: ProfileObject) -> tuple[FieldRow, ...]:
+    """Return the entries of an object that are one field of the specification each."""
+    return tuple(
+        FieldRow(
+            row.subindex,
+            tuple(row.field.split(".")),
+            row,
+            is_plain=row.words is None and not row.refers and not row.form.is_address,
+        )
+        for row in described.entries
+        if row.field
+    )
+
+
 def single(
     index: int, name: str, description: str, *entries: ProfileEntry, section: str = ""
 ) -> ProfileObject:
