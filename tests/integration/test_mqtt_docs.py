@@ -58,7 +58,7 @@ def test_examples_of_the_page(farm, tmp_path):
     routes, trace, scan = told
     assert re.search(r"north +south +127.0.5.2.\*.\* +mqtt:works +127.0.5.2.1.1 +up", routes)
     for line in re.findall(
-        r"^ .*(?:south: mqtt|it is here|RUN).*$", PAGE.read_text(), re.MULTILINE
+        r"^ .*(?:south: mqtt|local target|RUN).*$", PAGE.read_text(), re.MULTILINE
     ):
         assert without_times(line) in without_times(trace)
     assert 'pyads.Connection("127.0.5.2.3.1", 1001, "127.0.5.1")' in scan

@@ -177,7 +177,7 @@ def test_values_move_and_can_be_set(appliance: Appliance) -> None:
     with client:
         assert client.request("write", station="left", values={"setpoint": 77}) == {"written": 1}
         events = client.events(station="right", names=[TICKS, SETPOINT], period_ms=20)
-        seen = [next(events)["values"] for _ in range(10)]
+        seen = [next(events).values for _ in range(10)]
         assert seen[-1][TICKS] > seen[0][TICKS]
         assert seen[-1][SETPOINT] == 77
     (other,) = connect()
