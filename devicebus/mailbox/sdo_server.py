@@ -32,24 +32,76 @@ from eap.od.model import OdState
 
 # Plain numbers, because members of enums are slow to reach.
 _UPLOAD, _DOWNLOAD, _ABORT = (SdoRequest[name].value for name in ("UPLOAD", "DOWNLOAD", "ABORT"))
-_OF_SEGMENTS = (SdoRequest.DOWNLOAD_SEGMENT.value, SdoRequest.UPLOAD_SEGMENT.value)
+SEGMENTS = {
+    SdoRequest.DOWNLOAD_SEGMENT.value: _DOWNLOAD,
+    SdoRequest.UPLOAD_SEGMENT.value: _UPLOAD,
+}
+"""Command specifiers of segments, and of the first messages of their transfers."""
 _UPLOADED, _RESPONSE = SdoResponse.UPLOAD, CoeService.SDO_RESPONSE
 
 
-class _Transfer:
-    """A segmented transfer that is under way."""
+class SegmentedTransfer:
+    """SDO in segments, as its server sees it.
 
-    __slots__ = ("complete", "content", "index", "is_upload", "size", "subindex", "toggle")
+    Args:
+        head: Of its first message.
+        size: Bytes in all.
+        data: What has come, of a download; what has still to go, of an upload.
 
-    def __init__(self, head: SdoHeader, content: bytearray, size: int, *, is_upload: bool) -> None:
-        self.index = head.index
-        self.subindex = head.subindex
-        self.complete = bool(head.complete)
-        self.is_upload = is_upload
-        self.content = content
-        """What was received so far, or has still to be sent."""
+    Attributes:
+        toggle: Toggle bit of the next segment.
+    """
+
+    __slots__ = ("data", "head", "size", "toggle")
+
+    def __init__(self, head: SdoHeader, size: int, data: bytes = b"") -> None:
+        self.head = head
         self.size = size
+        self.data = bytearray(data)
         self.toggle = 0
+
+    def take(self, segment: bytes) -> bool:
+        """Add a segment of a download; return true for the last one.
+
+        Raises:
+            SdoAbortError: it does not end where the first message said.
+        """
+        head, data = decode_segment(segment)
+        self.data += data
+        where = self.head.index, self.head.subindex
+        if len(self.data) > self.size:
+            raise SdoAbortError(AbortCode.TOO_LONG, *where, f"more than {self.size} octets")
+        if head.last and len(self.data) < self.size:
+            raise SdoAbortError(AbortCode.TOO_SHORT, *where, f"less than {self.size} octets")
+        return bool(head.last)
+
+
+def transfer_of(segment: bytes, running: SegmentedTransfer | None) -> SegmentedTransfer:
+    """Return the running transfer, which a segment goes on with.
+
+    Raises:
+        SdoAbortError: it belongs to no transfer under way, or is not its next one.
+    """
+    head = SdoSegmentHeader.decode(segment)
+    if running is None or running.head.specifier != SEGMENTS.get(head.specifier):
+        raise SdoAbortError(AbortCode.COMMAND, 0, 0, "no transfer of this kind is under way")
+    if head.toggle != running.toggle:
+        raise SdoAbortError(AbortCode.TOGGLE, running.head.index, running.head.subindex)
+    return running
+
+
+def size_of_download(head: SdoHeader, data: bytes) -> int:
+    """Return the size that the first message of a normal download names, *data* behind its head.
+
+    Raises:
+        SdoAbortError: it names none, or less than it brings.
+    """
+    where = head.index, head.subindex
+    if not head.has_size:
+        raise SdoAbortError(AbortCode.COMMAND, *where, "neither expedited nor with a size")
+    if len(data) > head.value:
+        raise SdoAbortError(AbortCode.LENGTH, *where, f"{len(data)} octets of {head.value}")
+    return int(head.value)
 
 
 class SdoServer:
@@ -67,7 +119,7 @@ class SdoServer:
         self._dictionary = dictionary
         self._state = state
         self._sizes = sizes
-        self._transfer: _Transfer | None = None
+        self._transfer: SegmentedTransfer | None = None
 
     def reset(self) -> None:
         """Forget the transfer under way."""
@@ -81,8 +133,8 @@ class SdoServer:
         if specifier == _ABORT:
             self._transfer = None
             return []
-        if specifier in _OF_SEGMENTS:
-            answer = self._continue(SdoRequest(specifier), body)
+        if specifier in SEGMENTS:
+            answer = self._continue(body)
         else:
             answer = self._start(SdoHeader.decode(body), body[SdoHeader.SIZE :])
         return [answer]
@@ -106,24 +158,19 @@ class SdoServer:
         data = read(index, subindex, self._state())
         room = self._sizes.to_master - INITIATE_OVERHEAD
         if len(data) > max(room, EXPEDITED_SIZE):
-            rest = bytearray(data[room:])
-            self._transfer = _Transfer(head, rest, len(data), is_upload=True)
+            self._transfer = SegmentedTransfer(head, len(data), data[room:])
         return encode_initiate(_UPLOADED, index, subindex, data, complete=complete, room=room)
 
     def _start_download(self, head: SdoHeader, rest: bytes) -> bytes:
         where = (head.index, head.subindex)
         complete = bool(head.complete)
         data = self._expedited(head) if head.expedited else rest
-        size = len(data) if head.expedited else head.value
-        if not head.expedited and not head.has_size:
-            raise SdoAbortError(AbortCode.COMMAND, *where, "neither expedited nor with a size")
-        if len(data) > size:
-            raise SdoAbortError(AbortCode.LENGTH, *where, f"{len(data)} octets of {size}")
+        size = len(data) if head.expedited else size_of_download(head, data)
         self._dictionary.check_download(*where, size, self._state(), complete=complete)
         if len(data) == size:
             self._store(head.index, head.subindex, data, complete=complete)
         else:
-            self._transfer = _Transfer(head, bytearray(data), size, is_upload=False)
+            self._transfer = SegmentedTransfer(head, size, data)
         return encode_plain(SdoResponse.DOWNLOAD, *where, complete=complete)
 
     def _expedited(self, head: SdoHeader) -> bytes:
@@ -133,44 +180,40 @@ class SdoServer:
         # The client did not say how many of the four octets count, so the entry does.
         return data[: self._dictionary.entry(head.index, head.subindex).kind.size]
 
-    def _continue(self, request: SdoRequest, body: bytes) -> bytes:
-        transfer = self._transfer
-        is_upload = request is SdoRequest.UPLOAD_SEGMENT
-        if transfer is None or transfer.is_upload is not is_upload:
-            self._transfer = None
-            return encode_abort(0, 0, AbortCode.COMMAND)
-        if SdoSegmentHeader.decode(body).toggle != transfer.toggle:
-            self._transfer = None
-            return encode_abort(transfer.index, transfer.subindex, AbortCode.TOGGLE)
+    def _continue(self, segment: bytes) -> bytes:
+        running, self._transfer = self._transfer, None
         try:
-            answer = self._send_segment(transfer) if is_upload else self._take(transfer, body)
+            transfer = transfer_of(segment, running)
         except SdoAbortError as exc:
-            self._transfer = None
-            return encode_abort(transfer.index, transfer.subindex, exc.code)
-        transfer.toggle ^= 1
+            return encode_abort(exc.index, exc.subindex, exc.code)
+        head = transfer.head
+        try:
+            is_upload = head.specifier == _UPLOAD
+            answer = self._send_segment(transfer) if is_upload else self._take(transfer, segment)
+        except SdoAbortError as exc:
+            return encode_abort(head.index, head.subindex, exc.code)
         return encode_message(_RESPONSE, answer)
 
-    def _send_segment(self, transfer: _Transfer) -> bytes:
+    def _send_segment(self, transfer: SegmentedTransfer) -> bytes:
         room = self._sizes.to_master - SEGMENT_OVERHEAD
-        data = bytes(transfer.content[:room])
-        del transfer.content[:room]
-        last = not transfer.content
-        if last:
-            self._transfer = None
-        return encode_segment(SdoResponse.UPLOAD_SEGMENT, data, toggle=transfer.toggle, last=last)
+        data, toggle = bytes(transfer.data[:room]), transfer.toggle
+        del transfer.data[:room]
+        last = not transfer.data
+        self._go_on(transfer, last=last)
+        return encode_segment(SdoResponse.UPLOAD_SEGMENT, data, toggle=toggle, last=last)
 
-    def _take(self, transfer: _Transfer, body: bytes) -> bytes:
-        head, data = decode_segment(body)
-        where = (transfer.index, transfer.subindex)
-        transfer.content += data
-        if len(transfer.content) > transfer.size:
-            raise SdoAbortError(AbortCode.TOO_LONG, *where, f"more than {transfer.size} octets")
-        if head.last:
-            if len(transfer.content) < transfer.size:
-                raise SdoAbortError(AbortCode.TOO_SHORT, *where, f"less than {transfer.size}")
-            self._store(*where, bytes(transfer.content), complete=transfer.complete)
-            self._transfer = None
-        return encode_segment_answer(SdoResponse.DOWNLOAD_SEGMENT, toggle=transfer.toggle)
+    def _take(self, transfer: SegmentedTransfer, segment: bytes) -> bytes:
+        head, toggle = transfer.head, transfer.toggle
+        last = transfer.take(segment)
+        if last:
+            complete = bool(head.complete)
+            self._store(head.index, head.subindex, bytes(transfer.data), complete=complete)
+        self._go_on(transfer, last=last)
+        return encode_segment_answer(SdoResponse.DOWNLOAD_SEGMENT, toggle=toggle)
+
+    def _go_on(self, transfer: SegmentedTransfer, *, last: bool) -> None:
+        transfer.toggle ^= 1
+        self._transfer = None if last else transfer
 
     def _store(self, index: int, subindex: int, data: bytes, *, complete: bool) -> None:
         dictionary = self._dictionary

@@ -9,6 +9,12 @@ client that pauses in the middle of one would keep the slave from all others).
 from __future__ import annotations
 
 from devicebus.mailbox.protocol import MailboxSizes
+from devicebus.mailbox.sdo_server import (
+    SEGMENTS,
+    SegmentedTransfer,
+    size_of_download,
+    transfer_of,
+)
 from eap.appliance.services.slaves.access import SlaveAccess
 from eap.appliance.services.slaves.object_stream import ObjectStream
 from eap.codec.coe import CoeHeader, CoeService, encode_message
@@ -20,8 +26,6 @@ from eap.codec.sdo import (
     SdoHeader,
     SdoRequest,
     SdoResponse,
-    SdoSegmentHeader,
-    decode_segment,
     encode_abort,
     encode_initiate,
     encode_plain,
@@ -37,44 +41,9 @@ from eap.od.abort import AbortCode, SdoAbortError
 
 _LAST = 0x01
 _UNANSWERED = frozenset((CoeService.TX_PDO, CoeService.RX_PDO, CoeService.EMERGENCY))
-_SEGMENTS = frozenset((SdoRequest.DOWNLOAD_SEGMENT, SdoRequest.UPLOAD_SEGMENT))
 _QUERIES = frozenset(
     (SdoInfoOpcode.LIST_REQUEST, SdoInfoOpcode.OBJECT_REQUEST, SdoInfoOpcode.ENTRY_REQUEST)
 )
-
-
-class _Upload:
-    """An object on its way to the client; *toggle* is the toggle bit of the next segment."""
-
-    def __init__(self, head: SdoHeader, stream: ObjectStream) -> None:
-        self.head = head
-        self.stream = stream
-        self.toggle = 0
-
-
-class _Download:
-    """An object on its way from the client; the slave gets it when it is whole."""
-
-    def __init__(self, head: SdoHeader, data: bytes) -> None:
-        self.head = head
-        self.size = head.value
-        self.toggle = 0
-        self.data = bytearray(data)
-
-    def take(self, segment: bytes) -> bool:
-        """Add a segment; return whether it was the last one.
-
-        Raises:
-            SdoAbortError: it does not end where the first message said.
-        """
-        head, data = decode_segment(segment)
-        self.data += data
-        where = self.head.index, self.head.subindex
-        if len(self.data) > self.size:
-            raise SdoAbortError(AbortCode.TOO_LONG, *where, f"more than {self.size} octets")
-        if head.last and len(self.data) < self.size:
-            raise SdoAbortError(AbortCode.TOO_SHORT, *where, f"less than {self.size} octets")
-        return bool(head.last)
 
 
 class ObjectCodec:
@@ -90,16 +59,17 @@ class ObjectCodec:
         self.sizes = sizes
         self._access = access
         self._memory = memory
-        self._transfer: _Upload | _Download | None = None
+        self._transfer: SegmentedTransfer | None = None
+        self._stream: ObjectStream | None = None
 
     @property
     def is_running(self) -> bool:
         """Whether an SDO in segments is under way."""
-        return self._transfer is not None
+        return self._transfer is not None or self._stream is not None
 
     def is_step(self, body: bytes) -> bool:
         """Return whether a request is a segment, or asks for one."""
-        return _specifier(body) in _SEGMENTS
+        return _specifier(body) in SEGMENTS
 
     def completes_write(self, body: bytes) -> bool:
         """Return whether a request is the last segment of a download."""
@@ -108,9 +78,10 @@ class ObjectCodec:
 
     def reset(self) -> None:
         """End the SDO that is under way."""
-        transfer, self._transfer = self._transfer, None
-        if isinstance(transfer, _Upload):
-            transfer.stream.close()
+        self._transfer = None
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
         self._memory.hold(0)
 
     async def answer(self, body: bytes) -> list[bytes]:
@@ -133,7 +104,7 @@ class ObjectCodec:
             return []
         head = SdoHeader(0, 0, 0, 0, 0, 0, 0)
         try:
-            if specifier in _SEGMENTS:
+            if specifier in SEGMENTS:
                 if self._transfer is not None:
                     head = self._transfer.head
                 answer = await self._segment(body)
@@ -157,14 +128,14 @@ class ObjectCodec:
 
     async def _upload(self, head: SdoHeader) -> bytes:
         where, complete = (head.index, head.subindex), bool(head.complete)
-        stream = await self._access.open_object(*where, complete=complete)
-        self._transfer = _Upload(head, stream)
+        stream = self._stream = await self._access.open_object(*where, complete=complete)
         size, room = stream.size, self.sizes.to_master - INITIATE_OVERHEAD
         if size <= max(room, EXPEDITED_SIZE):
             data = await stream.read(size)
             self.reset()
             return encode_initiate(SdoResponse.UPLOAD, *where, data, complete=complete, room=size)
         self._hold(head, size)
+        self._transfer = SegmentedTransfer(head, size)
         answer = SdoHeader(1, 0, 0, head.complete, SdoResponse.UPLOAD, *where, size)
         return answer.encode() + await stream.read(room)
 
@@ -175,38 +146,28 @@ class ObjectCodec:
             return
         if head.expedited:
             data = head.data
-        elif not head.has_size:
-            raise SdoAbortError(AbortCode.COMMAND, *where, "neither expedited nor with a size")
-        elif len(data) > head.value:
-            raise SdoAbortError(AbortCode.LENGTH, *where, f"{len(data)} octets of {head.value}")
-        elif len(data) < head.value:
-            self._hold(head, head.value)
-            self._transfer = _Download(head, data)
+        elif len(data) < (size := size_of_download(head, data)):
+            self._hold(head, size)
+            self._transfer = SegmentedTransfer(head, size, data)
             return
         await self._access.write_object(*where, data, complete=complete)
 
     async def _segment(self, body: bytes) -> bytes:
-        transfer, head = self._transfer, SdoSegmentHeader.decode(body)
-        is_upload = head.specifier == SdoRequest.UPLOAD_SEGMENT
-        if transfer is None or isinstance(transfer, _Upload) is not is_upload:
-            raise SdoAbortError(AbortCode.COMMAND, 0, 0, "no transfer of this kind is under way")
-        if head.toggle != transfer.toggle:
-            raise SdoAbortError(AbortCode.TOGGLE, transfer.head.index, transfer.head.subindex)
-        if isinstance(transfer, _Upload):
-            return await self._upload_segment(transfer)
-        if transfer.take(body):
-            opened = transfer.head
-            await self._access.write_object(
-                opened.index, opened.subindex, bytes(transfer.data), complete=bool(opened.complete)
-            )
-            self.reset()
+        transfer = transfer_of(body, self._transfer)
+        head, toggle = transfer.head, transfer.toggle
+        if self._stream is not None:
+            answer = await self._upload_segment(self._stream, toggle)
+        else:
+            if transfer.take(body):
+                data, complete = bytes(transfer.data), bool(head.complete)
+                await self._access.write_object(head.index, head.subindex, data, complete=complete)
+                self.reset()
+            answer = encode_segment_answer(SdoResponse.DOWNLOAD_SEGMENT, toggle=toggle)
         transfer.toggle ^= 1
-        return encode_segment_answer(SdoResponse.DOWNLOAD_SEGMENT, toggle=head.toggle)
+        return answer
 
-    async def _upload_segment(self, upload: _Upload) -> bytes:
-        stream, toggle = upload.stream, upload.toggle
+    async def _upload_segment(self, stream: ObjectStream, toggle: int) -> bytes:
         data = await stream.read(self.sizes.to_master - SEGMENT_OVERHEAD)
-        upload.toggle ^= 1
         last = stream.done == stream.size
         if last:
             self.reset()
