@@ -50,7 +50,7 @@ class FileWriter(Protocol):
 
 
 class FileStore(Protocol):
-    """Where the files are; each method may raise FoeError."""
+    """Store of a slave's files; each method may raise FoeError."""
 
     def open_read(self, name: str, password: int) -> FileReader:
         """Open a file for reading."""

@@ -47,7 +47,7 @@ class Probe(NamedTuple):
     is_found_dead: bool
     """Whether the questions before it make the hop a dead one, which it was not yet."""
     is_gone: bool = False
-    """Whether the hop has been dead for GONE_NS; told once."""
+    """True in one report, when the hop has been dead for GONE_NS."""
 
 
 class _Hop:

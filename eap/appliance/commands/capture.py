@@ -28,7 +28,7 @@ _MOST_WAITING = 64
 
 
 class TcpSegment(NamedTuple):
-    """Where the payload of a packet stands in its TCP stream."""
+    """Place of a packet's payload in its TCP stream."""
 
     sequence: int
     is_first: bool

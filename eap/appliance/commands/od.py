@@ -45,7 +45,7 @@ _LAST = 4
 
 
 class EntryInfo(msgspec.Struct, frozen=True):
-    """What a device says of one entry."""
+    """Description of one entry by its device."""
 
     subindex: int
     name: str
@@ -57,7 +57,7 @@ class EntryInfo(msgspec.Struct, frozen=True):
 
 
 class ObjectInfo(msgspec.Struct, frozen=True):
-    """What a device says of one object."""
+    """Description of one object by its device."""
 
     index: int
     name: str

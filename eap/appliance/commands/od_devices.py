@@ -82,12 +82,12 @@ class Target(NamedTuple):
 
     @property
     def is_address(self) -> bool:
-        """Whether it is a NetID, and no name."""
+        """True for a NetID, false for a name."""
         return not self.port and self.station.count(".") == _OCTETS - 1
 
     @property
     def is_here(self) -> bool:
-        """Whether its station runs here, or nothing does."""
+        """True if its station runs on this host, or no station does."""
         running = [info for _, info in find_running()]
         chosen = [info for info in running if self.plant in {None, info.plant}]
         names = {name for info in chosen for name in info.stations}

@@ -62,7 +62,7 @@ class StationPlan(msgspec.Struct, frozen=True):
 
     @property
     def differs(self) -> bool:
-        """Whether there is anything to do, or to refuse."""
+        """True if there is anything to do, or to refuse."""
         return bool(self.changes or self.notes or self.refused)
 
 

@@ -122,7 +122,7 @@ class AmsWindow:
 
     @property
     def is_full(self) -> bool:
-        """Whether the next request has to wait."""
+        """True if the next request has to wait."""
         return self.requests >= MAX_REQUESTS or self._octets >= MAX_OCTETS
 
     def take_in(self, packet: bytes) -> bool:

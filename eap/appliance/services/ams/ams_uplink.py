@@ -248,7 +248,7 @@ def source_for(host: str, sources: Collection[str]) -> str | None:
 
 
 class UplinkRouter(Hops, Protocol):
-    """What uplinks need of the router of their station.
+    """Router of a station, as its uplinks use it.
 
     Attributes:
         on_routes: Called with the hop of each route that was added or removed.

@@ -44,7 +44,7 @@ from eap.ids import NetId
 from eap.od.model import OdState
 
 LOOK_S = 0.05
-"""How often notifications look at the bus, at most: states change slowly."""
+"""Shortest time between two looks of notifications at the bus: states change slowly."""
 _ERROR = 0x10
 _NO_LINK = 0x01
 _ALL = 0

@@ -43,7 +43,7 @@ class GatewayReply(msgspec.Struct, frozen=True):
     reason: Cause | None = None
     """Of the gateway's own refusal; None for an answer of the slave."""
     is_again: bool = False
-    """Whether it answers a repeated step of a transfer, as it answered the step itself."""
+    """True for the answer to a repeated step of a transfer, the same as to the step itself."""
 
 
 class SessionCodec(Protocol):
